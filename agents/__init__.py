@@ -1,0 +1,1 @@
+"""Trained tuners and controllers."""

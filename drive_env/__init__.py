@@ -1,0 +1,26 @@
+"""A laboratory for servo drives: a faithful emulator on MuJoCo mechanics, behind the interface of real drives."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from drive_env import motion as motion
+    from drive_env.dictionary.access import ObjectAccessError as ObjectAccessError
+    from drive_env.drives import EmulatedDrives as EmulatedDrives
+    from drive_env.drives import Trace as Trace
+
+__all__ = ["EmulatedDrives", "ObjectAccessError", "Trace", "motion"]
+
+_HOMES = {"EmulatedDrives": "drives", "Trace": "drives", "ObjectAccessError": "dictionary.access"}
+
+
+def __getattr__(name: str) -> Any:
+    # The compiler and MuJoCo take half a second to import; whoever asks for --help should not pay it.
+    import importlib
+
+    if name == "motion":
+        return importlib.import_module("drive_env.motion")
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"drive_env.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'drive_env' has no attribute {name!r}")

@@ -1,0 +1,113 @@
+"""The devices: one folder each, with the object dictionary (EDS), its bindings and its behaviour as data."""
+
+from __future__ import annotations
+
+import importlib
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+from drive_env.dictionary.bindings import Binding
+from drive_env.dictionary.entries import ObjectDictionary
+
+FOLDER = Path(__file__).parent
+
+
+class StageParameter(NamedTuple):
+    """An imperfection of the power stage: default, randomisation range, value of a perfect stage, unit, source."""
+
+    default: float
+    low: float
+    high: float
+    ideal: float
+    unit: str
+    source: str
+
+
+class Emergency(NamedTuple):
+    """Emergency code and the five additional bytes."""
+
+    code: int
+    extra: tuple[int, ...]
+
+
+class Device(NamedTuple):
+    """Everything that makes a device; rates in Hz, otherwise SI."""
+
+    name: str
+    title: str
+    num_axes: int
+    eds: Path
+    bindings: dict[tuple[int, int], Binding]
+    current_rate: float
+    velocity_rate: float
+    profile_rate: float
+    current_full_scale: float
+    duty_limit: float
+    overcurrent: float
+    undervoltage: float
+    overvoltage: float
+    standstill: float
+    write_states: dict[tuple[int, int], str]
+    allowed_values: dict[tuple[int, int], tuple[int, ...]]
+    unsupported: frozenset[tuple[int, int]]
+    refuses_same_mode: bool
+    emergencies: dict[str, Emergency]
+    stage: dict[str, StageParameter]
+    presets: Path
+
+    def new_dictionary(self, node_id: int = 1) -> ObjectDictionary:
+        """Return the object dictionary of a node of this device."""
+        return ObjectDictionary(self.eds, node_id)
+
+    def preset(self, motor: str) -> dict[str, int]:
+        """Return the commissioning preset of a motor: object name -> raw value, in the order of writing."""
+        path = self.presets / f"{motor}.toml"
+        if not path.exists():
+            names = ", ".join(sorted(p.stem for p in self.presets.glob("*.toml")))
+            raise ValueError(f"device {self.name} has no preset for motor {motor!r}; it has {names}")
+        return dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
+
+
+def device_names() -> list[str]:
+    """Return the names of the devices there are."""
+    return sorted(path.parent.name for path in FOLDER.glob("*/device.toml"))
+
+
+@cache
+def find_device(name: str) -> Device:
+    """Return a device by name; ValueError lists the names there are."""
+    folder = FOLDER / name
+    if name not in device_names():
+        raise ValueError(f"no device is named {name!r}; there are {', '.join(device_names())}")
+    data = tomllib.loads((folder / "device.toml").read_text(encoding="utf-8"))
+    rows: tuple[Binding, ...] = importlib.import_module(f"drive_env.devices.{name}.bindings").BINDINGS
+    return Device(
+        name=data["name"],
+        title=data["title"],
+        num_axes=data["axes"],
+        eds=folder / data["eds"],
+        bindings={(row.index, row.sub): row for row in rows},
+        current_rate=data["rates"]["current"],
+        velocity_rate=data["rates"]["velocity"],
+        profile_rate=data["rates"]["profile"],
+        current_full_scale=data["current"]["full_scale"],
+        duty_limit=data["current"]["duty_limit"],
+        overcurrent=data["current"]["overcurrent"],
+        undervoltage=data["supply"]["undervoltage"],
+        overvoltage=data["supply"]["overvoltage"],
+        standstill=data["motion"]["standstill"],
+        write_states={_key(text): state for text, state in data["states"].items()},
+        allowed_values={_key(text): tuple(values) for text, values in data["values"].items()},
+        unsupported=frozenset(_key(text) for text in data["unsupported"]["objects"]),
+        refuses_same_mode=data["quirks"]["refuses_same_mode"],
+        emergencies={n: Emergency(e["code"], tuple(e["bytes"])) for n, e in data["emergencies"].items()},
+        stage={n: StageParameter(**row) for n, row in data["stage"].items()},
+        presets=folder / "presets",
+    )
+
+
+def _key(text: str) -> tuple[int, int]:
+    index, sub = text.split(":")
+    return int(index, 16), int(sub)

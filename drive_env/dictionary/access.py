@@ -1,0 +1,102 @@
+"""Access to objects: the errors, with their SDO abort codes, and the checks of type, access and range."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from drive_env.dictionary.entries import Entry
+
+# Abort codes of CiA 301 (table 22 of version 4.2).
+WRITE_ONLY = 0x06010001
+READ_ONLY = 0x06010002
+NO_SUCH_OBJECT = 0x06020000
+WRONG_TYPE = 0x06070010
+NO_SUCH_SUB_INDEX = 0x06090011
+VALUE_RANGE = 0x06090030
+VALUE_TOO_HIGH = 0x06090031
+VALUE_TOO_LOW = 0x06090032
+CANNOT_BE_STORED = 0x08000020
+WRONG_STATE = 0x08000022
+
+
+class ObjectAccessError(Exception):
+    """An access that the dictionary refuses; on the bus it is an SDO abort.
+
+    Attributes:
+        abort_code: The SDO abort code of CiA 301.
+    """
+
+    def __init__(self, abort_code: int, message: str) -> None:
+        super().__init__(f"{message} (abort code {abort_code >> 16:04X} {abort_code & 0xFFFF:04X}h)")
+        self.abort_code = abort_code
+
+
+def check_readable(entry: Entry) -> None:
+    """Raise 06010001h for an entry that can only be written."""
+    if entry.access == "wo":
+        raise ObjectAccessError(WRITE_ONLY, f"{entry.label} can only be written")
+
+
+def check_writable(entry: Entry) -> None:
+    """Raise 06010002h for an entry that can only be read."""
+    if entry.access in ("ro", "const"):
+        raise ObjectAccessError(READ_ONLY, f"{entry.label} can only be read")
+
+
+def checked_values(entry: Entry, value: Any, num_axes: int) -> NDArray[np.int64]:
+    """Return values as the wire carries them, int64 of shape (num_axes,), after the checks of type and range.
+
+    Args:
+        entry: What is to be written.
+        value: An integer or an array of them, one per axis.
+        num_axes: Number of axes.
+
+    Raises:
+        ObjectAccessError: 06070010h for what is no integer or does not fit the axes, 06090031h and 06090032h for a
+            value beyond the range.
+    """
+    raw = np.asarray(value)
+    if entry.bits is None or raw.dtype.kind not in "iu":
+        kind = "a text" if entry.bits is None else f"a {entry.bits}-bit integer"
+        raise ObjectAccessError(WRONG_TYPE, f"{entry.label} is {kind}; got {value!r}, which is {_describe(raw)}")
+    if raw.ndim > 1 or (raw.ndim == 1 and raw.shape[0] != num_axes):
+        raise ObjectAccessError(
+            WRONG_TYPE, f"{entry.label} takes one value or one for each of {num_axes} axes, not shape {raw.shape}"
+        )
+    _check_range(entry, raw)
+    return np.broadcast_to(raw.astype(np.int64), (num_axes,))
+
+
+def check_in_range(entry: Entry, raw: NDArray[Any]) -> None:
+    """Raise 06070010h, 06090031h or 06090032h unless every element is an integer within the entry's range."""
+    if raw.dtype.kind not in "iu":
+        raise ObjectAccessError(WRONG_TYPE, f"{entry.label} takes integers; got {_describe(raw)}")
+    _check_range(entry, raw)
+
+
+def check_allowed(entry: Entry, raw: NDArray[np.int64], allowed: tuple[int, ...]) -> None:
+    """Raise 06090030h for a value that is none of the few that the object knows."""
+    wrong = raw[~np.isin(raw, allowed)]
+    if wrong.size:
+        raise ObjectAccessError(
+            VALUE_RANGE, f"{entry.label} cannot be {wrong[0]}; it knows {', '.join(str(a) for a in allowed)}"
+        )
+
+
+def _check_range(entry: Entry, raw: NDArray[Any]) -> None:
+    if raw.size == 0 or entry.low is None or entry.high is None:
+        return
+    if int(raw.max()) > entry.high:
+        raise ObjectAccessError(
+            VALUE_TOO_HIGH, f"{entry.label} cannot be {int(raw.max())}; its highest is {entry.high}"
+        )
+    if int(raw.min()) < entry.low:
+        raise ObjectAccessError(VALUE_TOO_LOW, f"{entry.label} cannot be {int(raw.min())}; its lowest is {entry.low}")
+
+
+def _describe(raw: NDArray[Any]) -> str:
+    return {"f": "a float", "b": "a truth value", "U": "a text", "c": "complex"}.get(raw.dtype.kind, str(raw.dtype))

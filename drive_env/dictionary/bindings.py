@@ -1,0 +1,21 @@
+"""Bindings: which object of the dictionary is which field of the drive record, in which unit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Binding:
+    """A row of a device's table of bindings.
+
+    `event` names what a write sets off in the firmware: "controlword", "mode" or nothing. `part` chooses in a deep
+    field. The unit "position window" is increments with a value for "off".
+    """
+
+    index: int
+    sub: int
+    field: str
+    unit: str = "raw"
+    part: int = 0
+    event: str = ""

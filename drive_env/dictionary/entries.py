@@ -1,0 +1,132 @@
+"""The entries of a device's object dictionary, read from its EDS, found by index or by name."""
+
+from __future__ import annotations
+
+import difflib
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import canopen
+from canopen.objectdictionary import ODVariable, datatypes
+
+from drive_env.dictionary.access import (
+    NO_SUCH_OBJECT,
+    NO_SUCH_SUB_INDEX,
+    ObjectAccessError,
+)
+
+# How callers name an object: index (sub-index 0), (index, sub-index), or a name of CiA's; a sub-object's name is
+# "Object.Sub-object". Case does not matter.
+ObjectName: TypeAlias = int | tuple[int, int] | str
+
+# Width [bits], least and greatest value of each integer type of CiA 301.
+INTEGER_TYPES = {
+    datatypes.BOOLEAN: (1, 0, 1),
+    datatypes.INTEGER8: (8, -(2**7), 2**7 - 1),
+    datatypes.INTEGER16: (16, -(2**15), 2**15 - 1),
+    datatypes.INTEGER32: (32, -(2**31), 2**31 - 1),
+    datatypes.UNSIGNED8: (8, 0, 2**8 - 1),
+    datatypes.UNSIGNED16: (16, 0, 2**16 - 1),
+    datatypes.UNSIGNED32: (32, 0, 2**32 - 1),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One sub-index: everything the dictionary says of it. `bits`, `low`, `high` are None for a text."""
+
+    index: int
+    sub: int
+    name: str
+    bits: int | None
+    access: str
+    low: int | None
+    high: int | None
+    default: int | str
+    unit: str
+    pdo_mappable: bool
+
+    @property
+    def label(self) -> str:
+        """Index and name as a message shows them, e.g. `2042h:01 Velocity Mode Settings.P_Parameter`."""
+        return f"{self.index:04X}h:{self.sub:02X} {self.name}"
+
+
+class ObjectDictionary:
+    """All entries of a device, from its EDS.
+
+    Args:
+        path: The EDS; a file that is not UTF-8 is read as cp1252, which many vendors' are.
+        node_id: For defaults that depend on it.
+    """
+
+    def __init__(self, path: Path, node_id: int = 1) -> None:
+        self.path = path
+        raw = path.read_bytes()
+        try:
+            text = raw.decode("utf-8")
+        except UnicodeDecodeError:
+            text = raw.decode("cp1252")
+        source = io.StringIO(text)
+        source.name = str(path)
+        self._entries: dict[tuple[int, int], Entry] = {}
+        self._names: dict[str, tuple[int, int]] = {}
+        for item in canopen.import_od(source, node_id).values():
+            if isinstance(item, ODVariable):
+                self._add(item, item.name)
+            else:
+                for member in item.values():
+                    self._add(member, item.name if member.subindex == 0 else f"{item.name}.{member.name}")
+
+    def __iter__(self) -> Iterator[Entry]:
+        return iter(self._entries.values())
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def find(self, name: ObjectName) -> Entry:
+        """Return the entry of that name.
+
+        Raises:
+            ObjectAccessError: 06020000h if there is no such object, 06090011h if it has no such sub-index.
+        """
+        if isinstance(name, str):
+            key = self._names.get(name.strip().casefold())
+            if key is None:
+                near = difflib.get_close_matches(name.casefold(), self._names, 3, 0.5)
+                hint = "; did you mean " + " or ".join(repr(self._entries[self._names[n]].name) for n in near)
+                raise ObjectAccessError(
+                    NO_SUCH_OBJECT, f"no object is named {name!r}{hint if near else '; see the device EDS'}"
+                )
+            return self._entries[key]
+        index, sub = name if isinstance(name, tuple) else (name, 0)
+        if (index, sub) in self._entries:
+            return self._entries[index, sub]
+        subs = [s for i, s in self._entries if i == index]
+        if subs:
+            raise ObjectAccessError(
+                NO_SUCH_SUB_INDEX, f"object {index:04X}h has no sub-index {sub}; the highest is {max(subs)}"
+            )
+        raise ObjectAccessError(NO_SUCH_OBJECT, f"object {index:04X}h does not exist in {self.path.name}")
+
+    def _add(self, variable: ODVariable, name: str) -> None:
+        kind = INTEGER_TYPES.get(variable.data_type or 0)
+        low: int | None
+        high: int | None
+        default: int | str
+        if kind is None:
+            bits = low = high = None
+            default = str(variable.default or "")
+        else:
+            bits, low, high = kind
+            low = low if variable.min is None else int(variable.min)
+            high = high if variable.max is None else int(variable.max)
+            default = int(variable.default or 0)
+        key = (variable.index, variable.subindex)
+        self._entries[key] = Entry(
+            *key, name, bits, variable.access_type, low, high, default, variable.unit, bool(variable.pdo_mappable)
+        )
+        self._names[name.casefold()] = key

@@ -1,0 +1,299 @@
+"""The drive's cycle: one call per stage, in the order in which the data flows.
+
+Per millisecond: protection, automaton, mode and profile, statusword. Per window (the velocity loop's period): encoder,
+position and velocity loops, winding matrices; then the current ticks; then one step of the load's mechanics.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import mechanics.compiled
+from drive_env.firmware import fsa, modes, protection
+from drive_env.firmware.arithmetic import TWO_PI, sine_cosine
+from drive_env.firmware.loops import current_loop, motion_loops
+from drive_env.firmware.modes import pp
+from drive_env.firmware.power_stage import power_stage, refresh_winding
+from drive_env.firmware.record import LANES
+from drive_env.firmware.sensors import measure_angle, measure_currents, measure_motion
+from mechanics import stepping
+from mechanics.compiled import cached, inlined, stage
+
+_SOURCES = (Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
+
+# How a played or written value acts on a field.
+REAL, INTEGER, CONTROLWORD, MODE = 0, 1, 2, 3
+
+# Time constant of the speed that decides whether the motor rotates [s]: encoder noise must not light bit 14.
+ACTIVITY_TIME = 0.02
+
+
+class Rates(NamedTuple):
+    """Periods [s] and their ratios; data of the device and of the physics."""
+
+    tick: float  # current loop
+    window: float  # velocity and position loop
+    period: float  # profile, automaton, protection: the communication cycle
+    ticks: int  # per window
+    windows: int  # per period
+    substeps: int  # physics steps per window
+    # Share of each tick's torque in the mean of each physics step, shape (substeps, ticks).
+    weights: NDArray[np.float64]
+
+
+@inlined
+def tick(drive, rates, k):
+    """Run one period of the current loop, tick k of its window."""
+    measure_angle(drive)
+    measure_currents(drive)
+    current_loop(drive)
+    power_stage(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
+    for s in range(rates.substeps):
+        weight = rates.weights[s, k]
+        for lane in range(LANES):
+            drive.tau_window[s, lane] += weight * drive.tau_m[lane]
+
+
+@inlined
+def start_window(drive, rates):
+    """Read the encoder, close position and velocity loop, and prepare the winding for the ticks of this window."""
+    measure_motion(drive, rates.window)
+    motion_loops(drive)
+    for lane in range(LANES):
+        s, _ = sine_cosine(drive.cogging_order[lane] * drive.theta_m[lane] + drive.cogging_phase[lane])
+        drive.tau_cogging[lane] = drive.cogging_torque[lane] * s
+    for s in range(rates.substeps):
+        for lane in range(LANES):
+            drive.tau_window[s, lane] = drive.tau_cogging[lane]
+    refresh_winding(drive, rates.tick, rates.window)
+
+
+@stage
+def window(drive, rates):
+    """Run the drive through one window."""
+    start_window(drive, rates)
+    for k in range(rates.ticks):
+        tick(drive, rates, k)
+
+
+@stage
+def supervise(drive, rates):
+    """Run what the drive does once per millisecond."""
+    for lane in range(LANES):
+        if drive.live[lane] == 0 or drive.diverged[lane] == 1:
+            continue
+        drive.omega_slow[lane] += (drive.omega_meas[lane] - drive.omega_slow[lane]) * (rates.period / ACTIVITY_TIME)
+        protection.protect(drive, lane)
+        fsa.automatic_transitions(drive, lane)
+        modes.generate_demand(drive, lane, rates.period)
+        fsa.update_statusword(drive, lane, modes.bit_12(drive, lane))
+        drive.status_flags[lane] = modes.status_flags(drive, lane) | protection.fault_flags(drive, lane)
+
+
+@stage
+def write_controlword(drive, lane, word):
+    """Process a write of 6040h completely: fault reset edge, state commands, new set-point, statusword."""
+    before = drive.controlword[lane]
+    drive.controlword[lane] = word
+    if word & fsa.BIT_FAULT_RESET and not before & fsa.BIT_FAULT_RESET:
+        fsa.reset_fault(drive, lane, protection.causes_gone(drive, lane))
+    fsa.command(drive, lane)
+    if drive.mode_display[lane] == modes.PP:
+        pp.new_set_point(drive, lane, before)
+    fsa.update_statusword(drive, lane, modes.bit_12(drive, lane))
+
+
+@stage
+def write_mode(drive, lane, mode):
+    """Process a write of 6060h: the mode changes at once."""
+    drive.mode[lane] = mode
+    if mode != drive.mode_display[lane]:
+        modes.change_mode(drive, lane)
+    fsa.update_statusword(drive, lane, modes.bit_12(drive, lane))
+
+
+@stage
+def play_row(records, reals, integers, values, kinds, offsets, row, first_axis, num_axes):
+    """Write one row of played values to the axes of this group."""
+    for k in range(kinds.shape[0]):
+        for axis in range(num_axes):
+            block, lane = axis // LANES, axis % LANES
+            value = values[row, k, first_axis + axis]
+            if kinds[k] == REAL:
+                reals[block, offsets[k] + lane] = value
+            elif kinds[k] == INTEGER:
+                integers[block, offsets[k] + lane] = int(value)
+            elif kinds[k] == CONTROLWORD:
+                write_controlword(records[block], lane, int(value))
+            else:
+                write_mode(records[block], lane, int(value))
+
+
+@stage
+def sample_row(reals, integers, samples, kinds, offsets, row, first_axis, num_axes):
+    """Copy the recorded fields of this group's axes into one row of samples."""
+    for k in range(kinds.shape[0]):
+        for axis in range(num_axes):
+            block, lane = axis // LANES, axis % LANES
+            if kinds[k] == REAL:
+                samples[row, k, first_axis + axis] = reals[block, offsets[k] + lane]
+            else:
+                samples[row, k, first_axis + axis] = integers[block, offsets[k] + lane]
+
+
+@stage
+def mechanics_window(records, plant, rates, motion, num_axes):
+    """Step the load through one window and bring the rotors to where it has them; `motion` is scratch (5, axes)."""
+    torque, theta, omega, reaction, total = motion[0], motion[1], motion[2], motion[3], motion[4]
+    h = rates.window / rates.substeps
+    for axis in range(num_axes):
+        total[axis] = 0.0
+    for s in range(rates.substeps):
+        for axis in range(num_axes):
+            torque[axis] = records[axis // LANES].tau_window[s, axis % LANES]
+        stepping.step(plant, torque, h, theta, omega, reaction)
+        for axis in range(num_axes):
+            total[axis] += reaction[axis]
+    axes_per_copy = plant.axis_dof.shape[0]
+    for axis in range(num_axes):
+        drive = records[axis // LANES]
+        lane = axis % LANES
+        drive.theta_m[lane] = theta[axis]
+        drive.omega_m[lane] = omega[axis]
+        drive.tau_reaction_before[lane] = drive.tau_reaction[lane]
+        drive.tau_reaction[lane] = total[axis] / rates.substeps
+        if plant.diverged[axis // axes_per_copy] == 1 and drive.diverged[lane] == 0:
+            halt_diverged(drive, lane)
+
+
+@stage
+def halt_diverged(drive, lane):
+    """Take a lane out of the world: its machine left physics; its numbers must not reach anything."""
+    drive.diverged[lane] = 1
+    drive.drive_function[lane] = 0.0
+    drive.i_d[lane] = 0.0
+    drive.i_q[lane] = 0.0
+    drive.tau_m[lane] = 0.0
+    drive.u_dc[lane] = drive.supply_voltage[lane]
+    drive.tau_reaction[lane] = 0.0
+    drive.tau_reaction_before[lane] = 0.0
+
+
+@cached(*_SOURCES)
+def run(
+    records, reals, integers, plant, rates, motion, first_axis, num_axes, cycles,
+    play_values, play_kinds, play_offsets, samples, sample_kinds, sample_offsets, every,
+):  # fmt: skip
+    """Run one group of machines for whole communication cycles.
+
+    Cycle k: play row k, record row k (every `every` cycles), simulate one period.
+
+    Args:
+        records: The group's records, shape (blocks,).
+        reals: The same memory as doubles, shape (blocks, doubles per record).
+        integers: The same memory as 32-bit integers, shape (blocks, integers per record).
+        plant: The group's mechanics.
+        rates: Periods.
+        motion: Scratch, shape (5, axes).
+        first_axis: Number of the group's first axis in play and samples.
+        num_axes: Axes of the group.
+        cycles: Communication cycles to run.
+        play_values: SI values, shape (cycles, objects, all axes).
+        play_kinds: REAL, INTEGER, CONTROLWORD or MODE, shape (objects,).
+        play_offsets: Index of lane 0 in `reals` or `integers`, shape (objects,).
+        samples: SI values, written, shape (rows, objects, all axes).
+        sample_kinds: REAL or INTEGER, shape (objects,).
+        sample_offsets: Like play_offsets.
+        every: Cycles per sample.
+    """
+    for cycle in range(cycles):
+        play_row(records, reals, integers, play_values, play_kinds, play_offsets, cycle, first_axis, num_axes)
+        if cycle % every == 0:
+            sample_row(reals, integers, samples, sample_kinds, sample_offsets, cycle // every, first_axis, num_axes)
+        for block in range(records.shape[0]):
+            supervise(records[block], rates)
+        for _ in range(rates.windows):
+            for block in range(records.shape[0]):
+                window(records[block], rates)
+            mechanics_window(records, plant, rates, motion, num_axes)
+
+
+@cached(*_SOURCES)
+def run_drives_alone(records, rates, windows):
+    """Run the drives without mechanics, rotors driven by their predicted torque balance; the benchmark's bound."""
+    for _ in range(windows):
+        for block in range(records.shape[0]):
+            window(records[block], rates)
+
+
+@cached(*_SOURCES)
+def write_events(records, kind, values, where):
+    """Process writes of the controlword or the mode for the axes where the mask is true."""
+    for axis in range(values.shape[0]):
+        if where[axis]:
+            drive = records[axis // LANES]
+            if kind == CONTROLWORD:
+                write_controlword(drive, axis % LANES, values[axis])
+            else:
+                write_mode(drive, axis % LANES, values[axis])
+
+
+@cached(*_SOURCES)
+def power_on(records, where):
+    """Start the drive's firmware anew on the axes where the mask is true: transitions 0 and 1, encoder at zero.
+
+    The commutation is aligned: the angle at which the rotor stands is known up to the commutation offset.
+    """
+    for axis in range(where.shape[0]):
+        if not where[axis]:
+            continue
+        drive = records[axis // LANES]
+        lane = axis % LANES
+        drive.fsa[lane] = fsa.NOT_READY
+        drive.transition_pending[lane] = 0
+        drive.fault[lane] = 0
+        drive.error_register[lane] = 0
+        drive.emergency_count[lane] = 0
+        drive.internal_limit[lane] = 0
+        drive.stopping[lane] = 0
+        drive.set_point_valid[lane] = 0
+        drive.set_point_acknowledged[lane] = 0
+        drive.target_reached[lane] = 0
+        drive.drive_function[lane] = 0.0
+        drive.loop_level[lane] = 0
+        drive.mode_display[lane] = drive.mode[lane]
+        drive.i_d[lane] = 0.0
+        drive.i_q[lane] = 0.0
+        drive.tau_m[lane] = 0.0
+        drive.duty_alpha[lane] = 0.0
+        drive.duty_beta[lane] = 0.0
+        drive.duty_next_alpha[lane] = 0.0
+        drive.duty_next_beta[lane] = 0.0
+        drive.current_sum_d[lane] = 0.0
+        drive.current_sum_q[lane] = 0.0
+        drive.velocity_sum[lane] = 0.0
+        drive.i_q_ref[lane] = 0.0
+        drive.omega_meas[lane] = 0.0
+        drive.omega_slow[lane] = 0.0
+        drive.velocity_filter_z[0, lane] = 0.0
+        drive.velocity_filter_z[1, lane] = 0.0
+        drive.u_dc[lane] = drive.supply_voltage[lane]
+        s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
+        drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
+        count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI)
+        drive.count[lane] = count
+        drive.count_zero[lane] = count
+        drive.angle_zero[lane] = (
+            drive.n_p[lane] * (count + 0.5) * TWO_PI / drive.encoder_counts[lane] + drive.commutation_offset[lane]
+        )
+        drive.theta_meas[lane] = 0.0
+        drive.position_demand[lane] = 0.0
+        drive.velocity_demand[lane] = 0.0
+        drive.torque_demand[lane] = 0.0
+        fsa.automatic_transitions(drive, lane)
+        fsa.update_statusword(drive, lane, modes.bit_12(drive, lane))
+        drive.status_flags[lane] = modes.status_flags(drive, lane)

@@ -1,0 +1,251 @@
+"""The finite state automaton of CiA 402: controlword to state, state to statusword.
+
+States, commands and transitions are the manual's figure 4 and tables 142, 143 and 149. What a transition does beside
+changing the state is in `_enter`.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from drive_env.firmware.record import EMERGENCY_QUEUE
+from mechanics.compiled import stage
+
+
+class State(IntEnum):
+    """State of the power drive system, in the order of CiA 402's figure."""
+
+    NOT_READY_TO_SWITCH_ON = 0
+    SWITCH_ON_DISABLED = 1
+    READY_TO_SWITCH_ON = 2
+    SWITCHED_ON = 3
+    OPERATION_ENABLED = 4
+    QUICK_STOP_ACTIVE = 5
+    FAULT_REACTION_ACTIVE = 6
+    FAULT = 7
+
+
+# Statusword pattern of each state: bits that the state fixes, and their value (table 149).
+STATE_CODING = {
+    State.NOT_READY_TO_SWITCH_ON: (0x4F, 0x00),
+    State.SWITCH_ON_DISABLED: (0x4F, 0x40),
+    State.READY_TO_SWITCH_ON: (0x6F, 0x21),
+    State.SWITCHED_ON: (0x6F, 0x23),
+    State.OPERATION_ENABLED: (0x6F, 0x27),
+    State.QUICK_STOP_ACTIVE: (0x6F, 0x07),
+    State.FAULT_REACTION_ACTIVE: (0x4F, 0x0F),
+    State.FAULT: (0x4F, 0x08),
+}
+
+
+class Command(NamedTuple):
+    """A command of table 143: the controlword's bits that make it."""
+
+    mask: int
+    value: int
+
+
+SHUTDOWN = Command(0x87, 0x06)
+SWITCH_ON = Command(0x8F, 0x07)
+ENABLE_OPERATION = Command(0x8F, 0x0F)
+DISABLE_VOLTAGE = Command(0x82, 0x00)
+QUICK_STOP = Command(0x86, 0x02)
+DISABLE_OPERATION = Command(0x8F, 0x07)
+FAULT_RESET = Command(0x80, 0x80)  # on the rising edge only
+AUTOMATIC = Command(0, 0)
+
+
+class Transition(NamedTuple):
+    """A row of figure 4; number as there."""
+
+    number: int
+    start: State
+    command: Command
+    end: State
+
+
+TRANSITIONS = (
+    Transition(2, State.SWITCH_ON_DISABLED, SHUTDOWN, State.READY_TO_SWITCH_ON),
+    Transition(3, State.READY_TO_SWITCH_ON, SWITCH_ON, State.SWITCHED_ON),
+    # "Switch on & enable operation" takes transitions 3 and 4: after this row the controlword is looked at again.
+    Transition(3, State.READY_TO_SWITCH_ON, ENABLE_OPERATION, State.SWITCHED_ON),
+    Transition(4, State.SWITCHED_ON, ENABLE_OPERATION, State.OPERATION_ENABLED),
+    Transition(5, State.OPERATION_ENABLED, DISABLE_OPERATION, State.SWITCHED_ON),
+    Transition(6, State.SWITCHED_ON, SHUTDOWN, State.READY_TO_SWITCH_ON),
+    Transition(7, State.READY_TO_SWITCH_ON, DISABLE_VOLTAGE, State.SWITCH_ON_DISABLED),
+    Transition(7, State.READY_TO_SWITCH_ON, QUICK_STOP, State.SWITCH_ON_DISABLED),
+    Transition(8, State.OPERATION_ENABLED, SHUTDOWN, State.READY_TO_SWITCH_ON),
+    Transition(9, State.OPERATION_ENABLED, DISABLE_VOLTAGE, State.SWITCH_ON_DISABLED),
+    Transition(10, State.SWITCHED_ON, DISABLE_VOLTAGE, State.SWITCH_ON_DISABLED),
+    Transition(10, State.SWITCHED_ON, QUICK_STOP, State.SWITCH_ON_DISABLED),
+    Transition(11, State.OPERATION_ENABLED, QUICK_STOP, State.QUICK_STOP_ACTIVE),
+    Transition(12, State.QUICK_STOP_ACTIVE, DISABLE_VOLTAGE, State.SWITCH_ON_DISABLED),
+    Transition(15, State.FAULT, FAULT_RESET, State.SWITCH_ON_DISABLED),
+    Transition(16, State.QUICK_STOP_ACTIVE, ENABLE_OPERATION, State.OPERATION_ENABLED),
+)
+# Transitions that no command makes: power-on (0, 1), the end of a quick stop ramp (12), faults (13, 14).
+AUTOMATIC_TRANSITIONS = (
+    Transition(1, State.NOT_READY_TO_SWITCH_ON, AUTOMATIC, State.SWITCH_ON_DISABLED),
+    Transition(12, State.QUICK_STOP_ACTIVE, AUTOMATIC, State.SWITCH_ON_DISABLED),
+    Transition(13, State.OPERATION_ENABLED, AUTOMATIC, State.FAULT_REACTION_ACTIVE),
+    Transition(14, State.FAULT_REACTION_ACTIVE, AUTOMATIC, State.FAULT),
+)
+
+_ROWS = np.array([(t.number, t.start, t.command.mask, t.command.value, t.end) for t in TRANSITIONS], np.int32)
+_CODING = np.array([STATE_CODING[state][1] for state in State], np.int32)
+
+# As plain integers: an IntEnum member inside a kernel is an object to the compiler.
+NOT_READY = int(State.NOT_READY_TO_SWITCH_ON)
+DISABLED = int(State.SWITCH_ON_DISABLED)
+SWITCHED = int(State.SWITCHED_ON)
+ENABLED = int(State.OPERATION_ENABLED)
+STOPPING = int(State.QUICK_STOP_ACTIVE)
+REACTING = int(State.FAULT_REACTION_ACTIVE)
+FAULTED = int(State.FAULT)
+
+# Controlword bits outside the command coding.
+BIT_NEW_SET_POINT = 0x0010
+BIT_RELATIVE = 0x0040
+BIT_FAULT_RESET = 0x0080
+BIT_HALT = 0x0100
+
+# Rows of every device's emergency table that the automaton itself sends.
+EMERGENCY_RESET = 0
+
+# Option codes of 605Ah that end in switch on disabled, and those that ramp with 6085h.
+STOP_AND_STAY = 5
+
+
+@stage
+def push_emergency(drive, lane, row):
+    """Queue a row of the device's emergency table; a full queue loses the newest, as a transmit buffer does."""
+    count = drive.emergency_count[lane]
+    if count < EMERGENCY_QUEUE:
+        drive.emergency[count, lane] = row + 1
+        drive.emergency_count[lane] = count + 1
+
+
+@stage
+def has_drive_function(state):
+    """Return whether current is available to the motor in this state."""
+    return state in (ENABLED, STOPPING, REACTING)
+
+
+@stage
+def _enter(drive, lane, number, end):
+    """Make transition `number` to the state `end`, with what it does to the axis."""
+    drive.fsa[lane] = end
+    drive.transition_pending[lane] = 0
+    if number == 4:
+        drive.position_demand[lane] = drive.theta_meas[lane]
+        drive.velocity_demand[lane] = 0.0
+        drive.torque_demand[lane] = 0.0
+        drive.velocity_sum[lane] = 0.0
+    if number == 4 or number == 16:
+        # No set-point of before moves the axis: a new one must be given.
+        drive.set_point_valid[lane] = 0
+        drive.stopping[lane] = 0
+    if number == 11 or number == 13:
+        drive.stopping[lane] = 1
+    if number == 15:
+        drive.fault[lane] = 0
+        drive.error_register[lane] = 0
+        push_emergency(drive, lane, EMERGENCY_RESET)
+    drive.drive_function[lane] = 1.0 if has_drive_function(end) else 0.0
+    if not has_drive_function(end):
+        drive.stopping[lane] = 0
+        drive.set_point_valid[lane] = 0
+
+
+@stage
+def command(drive, lane):
+    """Process the controlword completely: every transition that it commands from the present state.
+
+    While a disable-operation ramp runs (transition 5) other commands wait until it has ended, as the manual's note
+    demands; only disable voltage is obeyed at once, since it takes the energy away.
+    """
+    word = drive.controlword[lane]
+    for _ in range(2):
+        state = drive.fsa[lane]
+        moved = False
+        for k in range(_ROWS.shape[0]):
+            number, start, mask, value, end = _ROWS[k, 0], _ROWS[k, 1], _ROWS[k, 2], _ROWS[k, 3], _ROWS[k, 4]
+            if start != state or (word & mask) != value or number == 15:
+                continue
+            if number == 16 and (drive.quick_stop_option[lane] < STOP_AND_STAY or drive.velocity_demand[lane] != 0.0):
+                continue
+            if drive.transition_pending[lane] == 5 and number != 9:
+                continue
+            if number == 5:
+                drive.transition_pending[lane] = 5
+                drive.stopping[lane] = 1
+            else:
+                _enter(drive, lane, number, end)
+                moved = True
+            break
+        if not moved:
+            break
+
+
+@stage
+def reset_fault(drive, lane, causes_gone):
+    """Leave fault by the rising edge of controlword bit 7 (transition 15) if the cause is gone."""
+    if drive.fsa[lane] == FAULTED and causes_gone:
+        _enter(drive, lane, 15, DISABLED)
+
+
+@stage
+def automatic_transitions(drive, lane):
+    """Make the transitions that need no command, once per millisecond: 1, and what waited for a ramp's end."""
+    if drive.fsa[lane] == NOT_READY:
+        _enter(drive, lane, 1, DISABLED)
+    if drive.stopping[lane] == 1 and drive.velocity_demand[lane] == 0.0:
+        if drive.fsa[lane] == REACTING:
+            _enter(drive, lane, 14, FAULTED)
+        elif drive.fsa[lane] == STOPPING and drive.quick_stop_option[lane] < STOP_AND_STAY:
+            _enter(drive, lane, 12, DISABLED)
+        elif drive.transition_pending[lane] == 5:
+            _enter(drive, lane, 5, SWITCHED)
+            command(drive, lane)  # what was commanded while the ramp ran
+
+
+@stage
+def fault(drive, lane, cut):
+    """Take transition 13; with `cut` the stage is switched off at once and 14 follows."""
+    if drive.fsa[lane] == FAULTED or (drive.fsa[lane] == REACTING and not cut):
+        return
+    if cut or not has_drive_function(drive.fsa[lane]):
+        _enter(drive, lane, 14, FAULTED)
+    else:
+        _enter(drive, lane, 13, REACTING)
+
+
+@stage
+def update_statusword(drive, lane, bit_12):
+    """Write 6041h and the status flags from the state; `bit_12` is the mode's.
+
+    Bit 4 tells that the supply is present, bit 9 (remote) is always set: this drive takes commands from the bus only.
+    Bit 15 is set while the motor turns in the negative direction (the manual does not say which).
+    """
+    state = drive.fsa[lane]
+    word = _CODING[state]
+    if drive.u_dc[lane] > drive.undervoltage[lane]:
+        word |= 0x0010
+    if state in (DISABLED, FAULTED, REACTING, NOT_READY) and drive.controlword[lane] & 0x0004:
+        word |= 0x0020  # bit 5 is free in these states: it shows that no quick stop is commanded
+    word |= 0x0200
+    if drive.target_reached[lane]:
+        word |= 0x0400
+    if drive.internal_limit[lane]:
+        word |= 0x0800
+    if bit_12:
+        word |= 0x1000
+    rotates = abs(drive.omega_slow[lane]) > drive.standstill[lane]
+    if rotates:
+        word |= 0x4000
+        if drive.omega_slow[lane] < 0.0:
+            word |= 0x8000
+    drive.statusword[lane] = word

@@ -1,0 +1,73 @@
+"""Profile position mode (manual, section 6)."""
+
+from __future__ import annotations
+
+from drive_env.firmware import fsa, profiles
+from mechanics.compiled import stage
+
+
+@stage
+def new_set_point(drive, lane, word_before):
+    """Take the target position over on the rising edge of controlword bit 4; bit 12 tells it until the bit falls.
+
+    There is no "change immediately" on this drive: a new edge plans anew from where the axis is.
+    """
+    word = drive.controlword[lane]
+    if not word & fsa.BIT_NEW_SET_POINT:
+        drive.set_point_acknowledged[lane] = 0
+        return
+    if word_before & fsa.BIT_NEW_SET_POINT or drive.fsa[lane] != fsa.ENABLED or drive.stopping[lane] == 1:
+        return
+    target = drive.target_position[lane]
+    if word & fsa.BIT_RELATIVE:
+        option = drive.positioning_option[lane] & 3
+        if option == 0:
+            target += drive.profile_target[lane] if drive.set_point_valid[lane] else drive.position_demand[lane]
+        elif option == 1:
+            target += drive.position_demand[lane]
+        else:
+            target += drive.theta_meas[lane]
+    drive.internal_limit[lane] = 0
+    if target > drive.position_max[lane]:
+        target = drive.position_max[lane]
+        drive.internal_limit[lane] = 1
+    elif target < drive.position_min[lane]:
+        target = drive.position_min[lane]
+        drive.internal_limit[lane] = 1
+    drive.profile_target[lane] = target
+    drive.set_point_valid[lane] = 1
+    drive.set_point_acknowledged[lane] = 1
+    drive.target_reached[lane] = 0
+    drive.in_window_time[lane] = 0.0
+
+
+@stage
+def generate(drive, lane, ramp, dt):
+    """Move the demand along the profile; without a set-point, brake with `ramp` and hold."""
+    drive.loop_level[lane] = 2
+    x, v = drive.position_demand[lane], drive.velocity_demand[lane]
+    if drive.set_point_valid[lane] == 0:
+        x, v = profiles.stop(x, v, ramp, dt)
+        drive.position_demand[lane] = x
+        drive.velocity_demand[lane] = v
+        return
+    up = drive.acceleration[lane]
+    v_max = drive.max_velocity[lane]
+    target = drive.profile_target[lane]
+    if up > 0.0 and v_max > 0.0:
+        # Factory values of 6081h and 6083h are 0: then there is no speed to move with, and the axis stays.
+        down = drive.deceleration[lane] if drive.deceleration[lane] > 0.0 else up
+        x, v = profiles.trapezoid(x, v, target, v_max, up, down, dt)
+        drive.position_demand[lane] = x
+        drive.velocity_demand[lane] = v
+    window = drive.position_window[lane]
+    if window == 0.0 or window > 1e300:
+        drive.target_reached[lane] = 1 if x == target and v == 0.0 else 0
+        return
+    if abs(drive.theta_meas[lane] - target) <= window:
+        drive.in_window_time[lane] += dt
+    else:
+        drive.in_window_time[lane] = 0.0
+    # The window time is whole milliseconds; half of one keeps the sum's rounding out.
+    reached = drive.in_window_time[lane] > drive.position_window_time[lane] + 0.5 * dt
+    drive.target_reached[lane] = 1 if reached else 0

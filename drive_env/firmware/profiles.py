@@ -1,0 +1,89 @@
+"""Trapezoidal profile: the time-optimal way from (x, v) to rest at the target, one period at a time, in closed form.
+
+Every period plans the rest of the move anew from where it is and goes one period along it. On an undisturbed move
+that reproduces the one analytic trapezoid or triangle exactly, and a changed target, velocity or ramp needs no case.
+"""
+
+from __future__ import annotations
+
+from mechanics.compiled import stage
+
+
+@stage
+def ramp(v, v_end, rate, dt):
+    """Return the velocity [rad/s] after dt [s] of a ramp towards v_end; a rate of 0 jumps."""
+    if rate <= 0.0:
+        return v_end
+    step = rate * dt
+    if abs(v_end - v) <= step:
+        return v_end
+    return v + step if v_end > v else v - step
+
+
+@stage
+def stop(x, v, rate, dt):
+    """Return position and velocity after dt [s] of braking to standstill with `rate` [rad/s^2]; 0 stops at once."""
+    if v == 0.0 or rate <= 0.0:
+        return x, 0.0
+    t = abs(v) / rate
+    if t <= dt:
+        return x + 0.5 * v * t, 0.0
+    a = -rate if v > 0.0 else rate
+    return x + (v + 0.5 * a * dt) * dt, v + a * dt
+
+
+@stage
+def trapezoid(x, v, target, v_max, a_up, a_down, dt):
+    """Return position [rad] and velocity [rad/s] after dt [s] on the way to rest at the target.
+
+    Args:
+        x: Position now [rad].
+        v: Velocity now [rad/s], of any sign and size.
+        target: Where the move ends [rad].
+        v_max: Largest speed, positive [rad/s]; an axis that is faster brakes to it first.
+        a_up: Acceleration, positive [rad/s^2].
+        a_down: Deceleration, positive [rad/s^2].
+        dt: Period [s].
+    """
+    if v == 0.0 and x == target:
+        return x, 0.0
+    # The side on which the target lies once the axis has stopped decides the direction of what follows.
+    beyond = target - x - 0.5 * v * abs(v) / a_down
+    sign = 1.0 if beyond > 0.0 or (beyond == 0.0 and v > 0.0) else -1.0
+    distance = sign * (target - x)
+    u = sign * v
+    left = dt
+    moved = 0.0
+    if u < 0.0:
+        t = -u / a_down
+        if t >= left:
+            return x + sign * (u + 0.5 * a_down * left) * left, sign * (u + a_down * left)
+        moved += 0.5 * u * t
+        left -= t
+        u = 0.0
+    if u > v_max:
+        # Brake to v_max, or all the way if the target needs it.
+        t = (u - v_max) / a_down
+        if t >= left:
+            return x + sign * (moved + (u - 0.5 * a_down * left) * left), sign * (u - a_down * left)
+        moved += 0.5 * (u + v_max) * t
+        left -= t
+        u = v_max
+    rest = max(distance - moved, 0.5 * u * u / a_down)
+    peak = ((2.0 * a_up * rest + u * u) * a_down / (a_up + a_down)) ** 0.5
+    peak = max(min(peak, v_max), u)
+    t_up = (peak - u) / a_up
+    t_down = peak / a_down
+    cruise = rest - 0.5 * (u + peak) * t_up - 0.5 * peak * t_down
+    t_cruise = max(cruise, 0.0) / peak if peak > 0.0 else 0.0
+    if left >= t_up + t_cruise + t_down:
+        return target, 0.0
+    if left < t_up:
+        return x + sign * (moved + (u + 0.5 * a_up * left) * left), sign * (u + a_up * left)
+    moved += 0.5 * (u + peak) * t_up
+    left -= t_up
+    if left < t_cruise:
+        return x + sign * (moved + peak * left), sign * peak
+    moved += peak * t_cruise
+    left -= t_cruise
+    return x + sign * (moved + (peak - 0.5 * a_down * left) * left), sign * (peak - a_down * left)

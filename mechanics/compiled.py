@@ -1,0 +1,77 @@
+"""How our Numba kernels are compiled and where their machine code is kept."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from numba import config, njit
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+# error_model="numpy" makes a division by zero give inf as the hardware does; Python's raises, which is a branch in
+# every division and keeps LLVM from vectorising the loop around it.
+OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
+
+
+def user_cache_folder() -> Path:
+    """Return the folder in which compiled kernels are kept; `DRIVE_ENV_CACHE` overrides the platform's own."""
+    if chosen := os.environ.get("DRIVE_ENV_CACHE"):
+        return Path(chosen)
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "drive-env"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "drive-env"
+    return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "drive-env"
+
+
+def source_hash(folders: Iterable[Path]) -> str:
+    """Return a hash of all Python sources under the folders and of Numba's version.
+
+    Numba's own cache looks at the file of the outermost function only, so an edit in a stage that is inlined from
+    another file would go unseen; a folder per state of the sources cannot miss one.
+    """
+    digest = hashlib.sha256(numba.__version__.encode())
+    for folder in folders:
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.relative_to(folder).as_posix().encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cached(*folders: Path) -> Callable[[Function], Function]:
+    """Return a decorator that compiles an entry point and keeps its machine code on disk, keyed by the sources.
+
+    Args:
+        folders: The source folders of everything that the entry point calls.
+    """
+    folder = user_cache_folder() / source_hash(folders)
+
+    def decorate(function: Function) -> Function:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            return njit(**OPTIONS)(function)  # type: ignore[no-any-return]
+        before = config.CACHE_DIR
+        config.CACHE_DIR = str(folder)
+        try:
+            return njit(cache=True, **OPTIONS)(function)  # type: ignore[no-any-return]
+        finally:
+            config.CACHE_DIR = before
+
+    return decorate
+
+
+def stage(function: Function) -> Function:
+    """Compile a function that kernels call."""
+    return njit(**OPTIONS)(function)  # type: ignore[no-any-return]
+
+
+def inlined(function: Function) -> Function:
+    """Compile a function whose body is put in place of each call; what a vectorised lane loop calls must be one."""
+    return njit(inline="always", **OPTIONS)(function)  # type: ignore[no-any-return]

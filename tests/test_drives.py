@@ -1,0 +1,130 @@
+"""The Drives interface as DESIGN section 6 has it, on emulated drives."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from drive_env import EmulatedDrives, ObjectAccessError, motion
+
+
+def test_drives_come_up_commissioned_in_switch_on_disabled(axis):
+    assert axis.read("Statusword")[0] & 0x4F == 0x40
+    assert axis.read("Motor Type")[0] == 3
+    assert axis.read("Limit switches")[0] == 3  # the load has none
+    assert axis.read((0x2042, 1))[0] == 445
+    assert axis.emergencies() == []
+
+
+def test_factory_state_has_the_manuals_defaults():
+    drives = EmulatedDrives(load="inertia", motor=None)
+    assert drives.read("Maximum Current")[0] == 0
+    assert drives.read("Motor Type")[0] == 0
+    assert drives.read("Profile velocity")[0] == 0
+    assert drives.read("Position window")[0] == 0xFFFFFFFF
+    assert drives.read((0x2080, 2))[0] == 8192
+
+
+def test_read_returns_integers_per_axis_and_texts():
+    drives = EmulatedDrives(num_machines=3)
+    assert drives.num_axes == 3
+    position = drives.read("Position actual value")
+    assert position.dtype == np.int64
+    assert position.shape == (3,)
+    assert list(drives.read("Manufacturer device name")) == ["TMCM-1636"] * 3
+
+
+def test_write_where_touches_the_chosen_axes_only():
+    drives = EmulatedDrives(num_machines=3)
+    drives.write((0x2042, 1), [100, 200, 300], where=np.array([True, False, True]))
+    assert list(drives.read((0x2042, 1))) == [100, 445, 300]
+    with pytest.raises(ValueError, match=r"boolean array of shape \(3,\)"):
+        drives.write(0x6083, 1, where=np.array([1, 0, 1]))
+
+
+def test_time_passes_in_whole_communication_cycles(axis):
+    axis.advance(0.0)
+    with pytest.raises(ValueError, match=r"0\.0015 s is not a whole number of communication cycles of 0\.001 s"):
+        axis.advance(0.0015)
+    with pytest.raises(ValueError, match="not a whole number"):
+        axis.advance(-0.001)
+    with pytest.raises(ValueError, match="period must be at least"):
+        axis.record([0x6064], 0.01, period=0.0)
+
+
+def test_record_samples_at_the_start_of_each_cycle(running):
+    now = running.read("Position actual value")
+    trace = running.record(["Position actual value", 0x606C, (0x2042, 1)], 0.05)
+    assert trace.t.shape == (50,)
+    assert trace.t[1] == 0.001
+    assert trace["position actual VALUE"].shape == (50, 1)
+    assert trace[0x6064][0] == now
+    assert np.all(np.diff(trace[0x6064][:, 0]) > 0)
+    assert np.all(trace[0x2042, 1] == 445)
+    with pytest.raises(KeyError, match="6077h:00 Torque actual value was not recorded; there are 6064h"):
+        trace[0x6077]
+
+
+def test_record_can_sample_slower(running):
+    trace = running.record([0x6064], 0.022, period=0.005)
+    assert list(trace.t) == pytest.approx([0.0, 0.005, 0.010, 0.015, 0.020])
+
+
+def test_play_writes_one_row_per_cycle(axis):
+    motion.enable(axis, mode="cst")
+    rows = np.arange(10)
+    trace = axis.record(["Target torque"], 0.01, play={"Target torque": rows})
+    assert list(trace["Target torque"][:, 0]) == list(rows)
+    assert axis.read("Target torque")[0] == 9
+    with pytest.raises(ValueError, match=r"one row per cycle, not \(9,\)"):
+        axis.record([], 0.01, play={"Target torque": rows[:9]})
+    with pytest.raises(ObjectAccessError, match=r"cannot be 40000; its highest is 32767"):
+        axis.record([], 0.01, play={"Target torque": np.full(10, 40_000)})
+
+
+def test_a_played_controlword_is_an_event(axis):
+    axis.write("Modes of operation", 3)
+    axis.record([], 0.004, play={"Controlword": np.array([6, 7, 15, 15])})
+    assert axis.read("Statusword")[0] & 0x6F == 0x27
+
+
+def test_load_torque_disturbs_and_the_loop_recovers(running):
+    rpm = 60.0 / 65536.0
+    running.machine.load_torque = -0.05
+    trace = running.record([0x606C, 0x6077], 0.4)
+    speed = trace[0x606C][:, 0] * rpm
+    assert speed.min() < 970.0
+    assert speed[-50:].mean() == pytest.approx(1000.0, abs=3.0)
+    torque_constant = 0.125 / 3.5
+    friction = 1.5e-3 + 2e-3  # bearings of motor and load
+    assert trace[0x6077][-50:].mean() * 1e-3 == pytest.approx((0.05 + friction) / torque_constant, rel=0.05)
+
+
+def test_unknown_names_list_what_there_is():
+    for options, message in (
+        ({"device": "acme"}, "no device is named 'acme'; there are tmcm1636"),
+        ({"load": "acme"}, "no load is named 'acme'; there are inertia, two_mass"),
+        ({"motor": "acme"}, "no motor is named 'acme'; there are ec_i_40, qbl4208"),
+        ({"num_machines": 0}, "num_machines must be 1 or more, not 0"),
+        ({"randomise": ["mass"]}, "nothing to randomise is named 'mass'; there are load, motor, stage"),
+        ({"parameters": {"load.mass": 1.0}}, "machines have no parameter 'load.mass'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            EmulatedDrives(**options)
+
+
+def test_identical_machines_differ_in_nothing():
+    drives = EmulatedDrives(num_machines=3, randomise=True, identical=True, first_machine=7, seed=3)
+    alone = EmulatedDrives(num_machines=1, randomise=True, first_machine=7, seed=3)
+    for both in (drives, alone):
+        motion.enable(both, mode="pv")
+        both.write(0x60FF, 500_000)
+    many, one = (both.record([0x6064, 0x6077], 0.1) for both in (drives, alone))
+    for name in (0x6064, 0x6077):
+        assert np.all(many[name] == one[name])
+
+
+def test_importing_the_package_loads_neither_compiler_nor_physics():
+    code = "import sys, drive_env; print([m for m in ('numba', 'mujoco', 'matplotlib') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"

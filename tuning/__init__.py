@@ -1,0 +1,1 @@
+"""Sweeps, identification, rules and optimisers for drive gains."""
