@@ -223,11 +223,14 @@ def run(
 
 
 @cached(*_SOURCES)
-def run_drives_alone(records, rates, windows):
+def run_drives_alone(records, rates, cycles):
     """Run the drives without mechanics, rotors driven by their predicted torque balance; the benchmark's bound."""
-    for _ in range(windows):
+    for _ in range(cycles):
         for block in range(records.shape[0]):
-            window(records[block], rates)
+            supervise(records[block], rates)
+        for _ in range(rates.windows):
+            for block in range(records.shape[0]):
+                window(records[block], rates)
 
 
 @cached(*_SOURCES)

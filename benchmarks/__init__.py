@@ -1,0 +1,1 @@
+"""How fast the emulator is, measured in one run against the bound of its parts."""

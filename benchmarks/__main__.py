@@ -1,0 +1,187 @@
+"""`python -m benchmarks`: prints tables and writes JSON.
+
+Every figure is the best of several repetitions: on a shared machine the fastest is the one least disturbed. The bound
+is measured in the same run: the drives without mechanics plus MuJoCo's packed step without drives.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import mujoco
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from drive_env import EmulatedDrives, motion
+from drive_env.firmware import cycle
+
+SIZES = (1, 8, 64, 1024, 16384)
+LOAD = "two_mass"
+OBSERVED = ("Position actual value", "Velocity actual value", "Torque actual value")
+SPEED_PPS = 1_000_000
+
+
+def best_time(function: Callable[[], Any], repetitions: int = 5) -> float:
+    """Return the shortest of several run times [s]."""
+    times = []
+    for _ in range(repetitions):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def running_drives(machines: int, threads: int) -> EmulatedDrives:
+    drives = EmulatedDrives(load=LOAD, num_machines=machines, num_threads=threads)
+    motion.enable(drives, mode="pv")
+    drives.write("Target velocity", SPEED_PPS)
+    drives.advance(0.01)
+    return drives
+
+
+def ticks() -> dict[str, float]:
+    """Return ns per drive and current tick, all firmware stages included, for one live lane and for eight."""
+    result = {}
+    cycles = 2000
+    for name, machines in (("1 lane", 1), ("8 lanes", 8)):
+        drives = running_drives(machines, 1)
+        group = drives._groups[0]
+        seconds = best_time(lambda g=group, d=drives: cycle.run_drives_alone(d._records, g._rates, cycles))
+        result[name] = seconds / (cycles * group._rates.windows * group._rates.ticks * machines) * 1e9
+    return result
+
+
+def bound(machines: int = 64) -> dict[str, float]:
+    """Return microseconds per axis and millisecond on one core: the parts alone, the whole, and the ratio."""
+    drives = running_drives(machines, 1)
+    group = drives._groups[0]
+    cycles = 200
+    whole = best_time(lambda: drives.advance(cycles * 1e-3))
+    alone = best_time(lambda: cycle.run_drives_alone(drives._records, group._rates, cycles))
+    steps = cycles * group._rates.windows
+    physics = best_time(lambda: mujoco.mj_step(group.load.model, group.load.data, steps))
+    per_axis = 1e6 / (cycles * machines)
+    return {
+        "drive alone": alone * per_axis,
+        "packed mj_step alone": physics * per_axis,
+        "bound": (alone + physics) * per_axis,
+        "emulator": whole * per_axis,
+        "share of bound": (alone + physics) / whole,
+        "x real time": cycles * 1e-3 * machines / whole,
+    }
+
+
+def throughput(sizes: tuple[int, ...], progress: Progress) -> list[dict[str, float]]:
+    """Return steps of 1 ms per second: in one call for many milliseconds, and as an environment makes them."""
+    threads = (1, 2)
+    rows = []
+    task = progress.add_task("throughput", total=len(sizes) * len(threads))
+    for machines in sizes:
+        for count in threads:
+            drives = running_drives(machines, count)
+            cycles = max(10, min(400, 100_000 // machines))
+            whole = best_time(lambda d=drives, n=cycles: d.advance(n * 1e-3), 3)
+            steps = max(3, min(200, 20_000 // machines))
+
+            def env_steps(d: EmulatedDrives = drives, n: int = steps) -> None:
+                for _ in range(n):
+                    d.write("Target velocity", SPEED_PPS)
+                    d.advance(0.001)
+                    for name in OBSERVED:
+                        d.read(name)
+
+            env = best_time(env_steps, 3)
+            rows.append(
+                {
+                    "machines": machines,
+                    "threads": count,
+                    "advance_steps_per_s": cycles * machines / whole,
+                    "env_steps_per_s": steps * machines / env,
+                }
+            )
+            drives.close()
+            progress.advance(task)
+    return rows
+
+
+def start_up() -> dict[str, float]:
+    """Return seconds of a fresh process: import, first result with an empty cache, first result with a full one."""
+    first = (
+        "import time; t = time.perf_counter(); import drive_env; a = time.perf_counter() - t;"
+        "d = drive_env.EmulatedDrives(); d.advance(0.001); print(a, time.perf_counter() - t)"
+    )
+    result = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("cold compile", "cached"):
+            environment = {**os.environ, "DRIVE_ENV_CACHE": folder}
+            run = subprocess.run(
+                [sys.executable, "-c", first], env=environment, capture_output=True, text=True, check=True
+            )
+            imported, seconds = (float(word) for word in run.stdout.split())
+            result[f"first result, {name} [s]"] = seconds
+            result["import drive_env [s]"] = imported
+    return result
+
+
+def print_table(console: Console, title: str, columns: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
+    table = Table(*columns, title=title, title_justify="left")
+    for row in rows:
+        table.add_row(*(f"{cell:,.3g}" if isinstance(cell, float) and abs(cell) < 1000 else f"{cell:,.0f}"
+                        if isinstance(cell, float) else str(cell) for cell in row))  # fmt: skip
+    console.print(table)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder of the JSON file")
+    parser.add_argument("--quick", action="store_true", help="leave out the largest size and the cold compile")
+    options = parser.parse_args()
+    console = Console()
+    sizes = SIZES[:-1] if options.quick else SIZES
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("firmware, bound, start-up", total=3)
+        result: dict[str, Any] = {"ns per drive and tick": ticks()}
+        progress.advance(task)
+        result["us per axis and ms, 64 machines, 1 thread"] = bound()
+        progress.advance(task)
+        if not options.quick:
+            result["start-up"] = start_up()
+        progress.advance(task)
+        result["throughput"] = throughput(sizes, progress)
+    for name in ("ns per drive and tick", "us per axis and ms, 64 machines, 1 thread", "start-up"):
+        if name in result:
+            print_table(console, name, ("what", "figure"), list(result[name].items()))
+    rows = [tuple(row.values()) for row in result["throughput"]]
+    print_table(
+        console, f"1 ms steps per second, {LOAD}", ("machines", "threads", "advance", "as an environment"), rows
+    )
+    by_size = {(row["machines"], row["threads"]): row["advance_steps_per_s"] for row in result["throughput"]}
+    scaling = {f"{n} machines": by_size[n, 2] / by_size[n, 1] for n in sizes if n > 64}
+    print_table(console, "two threads over one", ("size", "ratio"), list(scaling.items()))
+    result |= {
+        "two threads over one": scaling,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores",
+        "versions": {name: version(name) for name in ("drive-env", "numpy", "numba", "mujoco")},
+    }
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "benchmarks.json"
+    path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    console.print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    main()
