@@ -35,7 +35,7 @@ from drive_env.firmware.modes import MODES
 from drive_env.firmware.protection import CAUSES
 from drive_env.firmware.record import get_lanes, new_records, set_lanes
 from drive_env.group import MACHINES_PER_GROUP, Channels, Group, channels, rates_of
-from drive_env.machine import Machines, apply_to_records, draw_parameters, parameter_table
+from drive_env.machine import Machines, apply_to_records, check_parameter, draw_parameters, parameter_table
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.packed import PackedLoad, compile_packed
@@ -44,7 +44,8 @@ Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE}
+_EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
+SWITCHES = ("left", "right", "home")  # bits of 60FDh
 _NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
 
 
@@ -228,14 +229,12 @@ class EmulatedDrives:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis."""
         messages = []
         counts = get_lanes(self._records, "emergency_count", self.num_axes)
-        registers = get_lanes(self._records, "error_register", self.num_axes)
         for axis in np.flatnonzero(counts):
             for k in range(int(counts[axis])):
-                row = int(get_lanes(self._records, "emergency", self.num_axes, k)[axis]) - 1
-                cause = CAUSES[row]
+                queued = int(get_lanes(self._records, "emergency", self.num_axes, k)[axis])
+                cause = CAUSES[(queued & 0xFF) - 1]
                 emergency = self.device.emergencies[cause.name]
-                register = 0 if emergency.code == 0 else int(registers[axis])
-                messages.append(EmergencyMessage(int(axis), emergency.code, register, emergency.extra, cause.name))
+                messages.append(EmergencyMessage(int(axis), emergency.code, queued >> 8, emergency.extra, cause.name))
         set_lanes(self._records, "emergency_count", np.zeros(self.num_axes, np.int32))
         return messages
 
@@ -270,11 +269,13 @@ class EmulatedDrives:
         defaults = {p.name: float(single.get(p.name)[0]) for p in self.load.parameters}
         table = parameter_table(self.device, self.motor, self.load, defaults)
         self._parameters, noise = draw_parameters(table, seed, numbers, randomise, ideal)
-        self._noise_seeds = np.repeat(noise, len(self.load.axes)) + np.tile(np.arange(axes[1]), self.num_machines)
+        seeds = np.repeat(noise, len(self.load.axes)) + np.tile(np.arange(axes[1]), self.num_machines)
+        self._noise_seeds = np.mod(seeds, 2.0**32 - 1.0) + 1.0  # xorshift stays at 0 for ever
         for name, value in given.items():
             if name not in table:
                 raise ValueError(f"machines have no parameter {name!r}; they have {', '.join(table)}")
             self._parameters[name] = np.broadcast_to(np.asarray(value, float), (self.num_machines,)).copy()
+            check_parameter(name, self._parameters[name])
 
     def _build_groups(self, physics_steps: int, integrator: str) -> list[Group]:
         rates = rates_of(self.device, physics_steps)
@@ -294,6 +295,7 @@ class EmulatedDrives:
                 rates.window / physics_steps,
                 integrator=integrator,
                 template=templates[count],
+                first_machine=first,
             )
             block = first // MACHINES_PER_GROUP * (axes_per_group // 8)
             blocks = -(-count * len(self.load.axes) // 8)
@@ -308,7 +310,23 @@ class EmulatedDrives:
         records["undervoltage"] = device.undervoltage
         records["overvoltage"] = device.overvoltage
         records["standstill"] = device.standstill
+        records["warning_temperature"] = device.warning_temperature
+        records["error_temperature"] = device.error_temperature
+        records["nominal_current"] = device.nominal_current
+        records["overload_time"] = device.overload_time
+        records["is_dc"] = motor.kind == "dc"
+        records["phase_factor"] = 1.0 if motor.kind == "dc" else 1.5
+        records["flux_temperature"] = motor.flux_temperature
+        records["hall_true_polarity"] = motor.hall_polarity
+        records["hall_true_direction"] = motor.hall_direction
         records["n_p"] = motor.n_p
+        for switch in self.load.switches:
+            kind = SWITCHES.index(switch.kind)
+            axes = np.tile(np.arange(len(self.load.axes)) == switch.axis, self.num_machines)
+            set_lanes(records, "switch_low", np.full(self.num_axes, switch.low), axes, kind)
+            set_lanes(records, "switch_high", np.full(self.num_axes, switch.high), axes, kind)
+            wired = get_lanes(records, "wired", self.num_axes).astype(np.int32)
+            set_lanes(records, "wired", wired | (1 << kind), axes)
         records["cogging_order"] = motor.cogging_order
         records["supply_voltage"] = supply
         set_lanes(records, "random", self._noise_seeds)
@@ -330,15 +348,20 @@ class EmulatedDrives:
             return
         before, self._parameters[name] = self._parameters[name], values
         try:
-            for group in self._groups:
-                if name.startswith("load."):
-                    group.load.set(name.removeprefix("load."), values[group.machines], machines[group.machines])
-                else:
-                    group.load.set_motor(self._armature()[group.machines], self._bearings()[group.machines])
+            self._apply_to_loads(name, machines)
         except ValueError:
             self._parameters[name] = before
+            self._apply_to_loads(name, machines)
             raise
         self._refresh_inertia()
+
+    def _apply_to_loads(self, name: str, machines: Mask) -> None:
+        values = self._parameters[name]
+        for group in self._groups:
+            if name.startswith("load."):
+                group.load.set(name.removeprefix("load."), values[group.machines], machines[group.machines])
+            else:
+                group.load.set_motor(self._armature()[group.machines], self._bearings()[group.machines])
 
     def _refresh_inertia(self) -> None:
         inertia = np.concatenate([group.load.plant.axis_inertia.reshape(-1) for group in self._groups])
@@ -390,6 +413,7 @@ class EmulatedDrives:
         device = self.device
         return units.Context(
             position_scaler=get_lanes(self._records, "position_scaler", self.num_axes).astype(float),
+            encoder_steps=get_lanes(self._records, "encoder_steps", self.num_axes).astype(float),
             adc_step=get_lanes(self._records, "adc_step", self.num_axes).astype(float),
             current_lsb=device.current_full_scale / 32768.0,
             current_period=1.0 / device.current_rate,
@@ -453,7 +477,10 @@ class EmulatedDrives:
             self._set_value(entry, raw, where)
             return
         event = _EVENTS[self.device.bindings[key].event]
-        if event >= 0:
+        if event == cycle.SET_POINT:
+            self._set_field(entry, raw, where)
+            set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
+        elif event >= 0:
             cycle.write_events(self._records, event, raw, where)
         elif key == (0x2058, 0):
             self._rescale(entry, raw, where)

@@ -48,7 +48,10 @@ def rates_of(device: Device, physics_steps: int) -> cycle.Rates:
     edges = np.linspace(0.0, ticks, physics_steps + 1)
     start, end = edges[:-1, None], edges[1:, None]
     tick = np.arange(ticks)
-    overlap = np.clip(np.minimum(end, tick + 1) - np.maximum(start, tick), 0.0, None)
+    first, last = np.maximum(start, tick), np.minimum(end, tick + 1)
+    overlap = np.clip(last - first, 0.0, None)
+    weights = overlap / (end - start)
+    late = (0.5 * (first + last) - 0.5 * (start + end)) / device.current_rate
     return cycle.Rates(
         tick=1.0 / device.current_rate,
         window=1.0 / device.velocity_rate,
@@ -56,7 +59,8 @@ def rates_of(device: Device, physics_steps: int) -> cycle.Rates:
         ticks=ticks,
         windows=round(device.velocity_rate / device.profile_rate),
         substeps=physics_steps,
-        weights=np.ascontiguousarray(overlap / (end - start)),
+        weights=np.ascontiguousarray(weights),
+        moments=np.ascontiguousarray(weights * late),
     )
 
 
@@ -73,7 +77,7 @@ class Group:
         memory = records.view(np.uint8).reshape(len(records), RECORD.itemsize)
         self._reals = memory.view(np.float64)
         self._integers = memory.view(np.int32)
-        self._motion = np.zeros((5, self._num_axes))
+        self._motion = np.zeros((7, self._num_axes))
 
     def run(
         self,

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import motors
 from drive_env.devices import Device
-from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.firmware.record import STATE, get_lanes, set_lanes
 from drive_env.motors import Motor
 from mechanics.loads import Load
 
@@ -39,10 +39,18 @@ class MachineParameter(NamedTuple):
 
 # Parameters that are a field of the record as they stand: name -> (field, part).
 _FIELDS = {
-    "motor.R_s": ("R_s", 0),
+    "motor.R_s": ("R_nominal", 0),
     "motor.L_d": ("L_d", 0),
     "motor.L_q": ("L_q", 0),
-    "motor.psi_m": ("psi_m", 0),
+    "motor.psi_m": ("psi_nominal", 0),
+    "motor.thermal_resistance": ("thermal_resistance", 0),
+    "motor.thermal_time": ("thermal_time", 0),
+    "motor.ambient": ("ambient", 0),
+    "motor.hall_offset": ("hall_true_offset", 0),
+    "motor.hall_broken": ("hall_broken", 0),
+    "motor.encoder_broken": ("encoder_broken", 0),
+    "motor.open_a": ("open_a", 0),
+    "motor.open_b": ("open_b", 0),
     "motor.cogging_torque": ("cogging_torque", 0),
     "motor.cogging_phase": ("cogging_phase", 0),
     "motor.encoder_line_error": ("encoder_line_error", 0),
@@ -53,7 +61,18 @@ _FIELDS = {
     "stage.adc_offset_a": ("adc_offset_error", 0),
     "stage.adc_offset_b": ("adc_offset_error", 1),
     "stage.supply_resistance": ("supply_resistance", 0),
+    "stage.dc_capacitance": ("dc_capacitance", 0),
+    "stage.chopper_resistance": ("chopper_resistance", 0),
+    "stage.idle_current": ("idle_current", 0),
+    "stage.supply_sinks": ("supply_sinks", 0),
+    "stage.on_resistance": ("on_resistance", 0),
+    "stage.thermal_resistance": ("stage_thermal_resistance", 0),
+    "stage.thermal_time": ("stage_thermal_time", 0),
+    "stage.short_conductance": ("short_conductance", 0),
 }
+
+
+_AT_TEMPERATURE = {"motor.R_s": "R_s", "motor.psi_m": "psi_m"}
 
 
 def parameter_table(
@@ -72,6 +91,21 @@ def parameter_table(
         rows.append(MachineParameter(f"motor.{name}", "rad", value, low * value, high * value, 0.0))
     for name in ("cogging_phase", "encoder_line_phase"):
         rows.append(MachineParameter(f"motor.{name}", "rad", 0.0, 0.0, 2.0 * np.pi, 0.0))
+    for name, unit, value in (
+        ("thermal_time", "s", motor.thermal_time),
+        ("ambient", "degC", 25.0),
+        ("hall_offset", "rad", 0.0),
+        # Broken cables: 1 is broken. Never drawn: a world with faults is made on purpose.
+        ("hall_broken", "1", 0.0),
+        ("encoder_broken", "1", 0.0),
+        ("open_a", "1", 0.0),
+        ("open_b", "1", 0.0),
+    ):
+        rows.append(MachineParameter(f"motor.{name}", unit, value, value, value, value))
+    # An ideal winding does not warm.
+    heat = motor.thermal_resistance
+    rows.append(MachineParameter("motor.thermal_resistance", "K/W", heat, 0.7 * heat, 1.4 * heat, 0.0))
+    rows.append(MachineParameter("stage.short_conductance", "S", 0.0, 0.0, 0.0, 0.0))
     rows.append(MachineParameter("motor.encoder_interpolation", "1", 1.0, 1.0, 1.0, 4096.0))
     rows += [
         MachineParameter(f"stage.{name}", row.unit, row.default, row.low, row.high, row.ideal)
@@ -132,6 +166,31 @@ def draw_parameters(
         else:
             values[row.name] = np.full(len(machines), row.ideal if ideal else row.default)
     return values, noise
+
+
+# Parameters that may be negative: errors, offsets and phases. Those that may be 0: losses and faults. All others are
+# positive.
+_SIGNED = ("offset", "error", "phase", "ambient")
+_MAY_VANISH = (
+    "cogging_torque", "coulomb", "breakaway", "viscous", "damping", "stiffness", "broken", "open_a", "open_b",
+    "short_conductance", "noise", "dead_time", "resistance",
+    "supply_sinks",
+)  # fmt: skip
+
+
+def check_parameter(name: str, values: Floats) -> None:
+    """Raise ValueError unless every value is one that a machine can have."""
+    if not np.all(np.isfinite(values)):
+        raise ValueError(f"{name} must be finite, not {values[~np.isfinite(values)][0]}")
+    if any(word in name for word in _SIGNED) or values.size == 0:
+        return
+    if name == "stage.adc_bits" and values.min() < 1.0:
+        raise ValueError(f"{name} must be 1 or more, not {values.min():g}")
+    if any(name.endswith(word) for word in _MAY_VANISH):
+        if values.min() < 0.0:
+            raise ValueError(f"{name} must be 0 or more, not {values.min():g}")
+    elif values.min() <= 0.0:
+        raise ValueError(f"{name} must be above 0, not {values.min():g}")
 
 
 def _chosen(table: Mapping[str, MachineParameter], randomise: bool | Collection[str]) -> set[str]:
@@ -204,6 +263,33 @@ class Machines:
         """True motor torque, mean of the last current tick [N*m], shape (num_axes,)."""
         return self._axis_field("tau_m")
 
+    @property
+    def switches(self) -> NDArray[np.int64]:
+        """Inputs as the load presses them, bits of 60FDh, shape (num_axes,)."""
+        return self._axis_field("inputs").astype(np.int64)
+
+    @property
+    def enable_input(self) -> Mask:
+        """Whether the enable input is closed, shape (num_axes,); set it to a value or one per axis."""
+        return self._axis_field("enable_input") > 0
+
+    @enable_input.setter
+    def enable_input(self, value: ArrayLike) -> None:
+        drives = self._drives
+        closed = np.broadcast_to(np.asarray(value, bool), (drives.num_axes,))
+        set_lanes(drives._records, "enable_input", closed.astype(np.int32))
+
+    @property
+    def temperatures(self) -> tuple[Floats, Floats]:
+        """Winding and stage temperature [degC], each of shape (num_axes,)."""
+        return self._axis_field("T_winding"), self._axis_field("T_stage")
+
+    def set_temperatures(self, winding: ArrayLike, stage: ArrayLike) -> None:
+        """Set winding and stage temperature [degC], as if the axis had worked before."""
+        for name, value in (("T_winding", winding), ("T_stage", stage)):
+            values = np.broadcast_to(np.asarray(value, float), (self._drives.num_axes,))
+            set_lanes(self._drives._records, name, values)
+
     def set(self, name: str, value: ArrayLike, where: Mask | None = None) -> None:
         """Set a true parameter [SI] of the machines where the mask is true; bad input changes nothing.
 
@@ -214,6 +300,7 @@ class Machines:
         if name not in drives._parameters:
             raise ValueError(f"machines have no parameter {name!r}; they have {', '.join(drives._parameters)}")
         mask = self._mask(where)
+        check_parameter(name, self._per_machine(value, name)[mask])
         values = np.where(mask, self._per_machine(value, name), drives._parameters[name])
         drives._apply_parameter(name, values, mask)
         drives._parameters[name] = values
@@ -225,9 +312,11 @@ class Machines:
         for group in drives._groups:
             group.load.reset(mask[group.machines])
         axes = np.repeat(mask, drives.num_axes // drives.num_machines)
-        for name in ("theta_m", "omega_m", "tau_reaction", "tau_reaction_before", "diverged"):
-            set_lanes(drives._records, name, np.zeros(drives.num_axes), axes)
+        for field in STATE:
+            for part in range(field.depth):
+                set_lanes(drives._records, field.name, np.full(drives.num_axes, field.initial), axes, part)
         set_lanes(drives._records, "random", drives._noise_seeds, axes)
+        drives._reported[mask] = False
         drives._restart(axes)
 
     def power_cycle(self, where: Mask | None = None) -> None:
@@ -278,6 +367,9 @@ def apply_to_records(drives: EmulatedDrives, name: str, values: Floats, axes: Ma
     if name in _FIELDS:
         field, part = _FIELDS[name]
         set_lanes(records, field, values, axes, part)
+        if name in _AT_TEMPERATURE:
+            # The thermal model sets the live value once a millisecond; until then it is the one at 25 degC.
+            set_lanes(records, _AT_TEMPERATURE[name], values, axes)
         return True
     special: dict[str, Callable[[], None]] = {
         "motor.encoder_interpolation": lambda: _set_encoder(drives, values, axes),

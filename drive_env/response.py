@@ -225,12 +225,12 @@ def steady_state_error(t: Floats, error: Floats, *, tail: float) -> Floats:
 
 def iae(t: Floats, error: Floats) -> Floats:
     """Return the integral of |error| dt [unit of error * s] by the trapezoid rule."""
-    return np.asarray(_trapezoid_weights(t) @ np.abs(error))
+    return _weighted_sum(_trapezoid_weights(t), np.abs(error))
 
 
 def itae(t: Floats, error: Floats) -> Floats:
     """Return the integral of t |error| dt [unit of error * s^2] by the trapezoid rule; t runs from the step."""
-    return np.asarray((_trapezoid_weights(t) * t) @ np.abs(error))
+    return _weighted_sum(_trapezoid_weights(t) * t, np.abs(error))
 
 
 def peak(x: Floats) -> Floats:
@@ -240,7 +240,7 @@ def peak(x: Floats) -> Floats:
 
 def rms(x: Floats) -> Floats:
     """Return the root of the mean square [unit of x] of even samples."""
-    return np.asarray(np.sqrt(np.einsum("i...,i...->...", x, x) / len(x)))
+    return np.asarray(np.sqrt(_weighted_sum(np.full(len(x), 1.0 / len(x)), x * x)))
 
 
 def oscillation(t: ArrayLike, x: ArrayLike, *, amplitude: ArrayLike) -> tuple[NDArray[np.bool_], Floats]:
@@ -280,8 +280,8 @@ def oscillation(t: ArrayLike, x: ArrayLike, *, amplitude: ArrayLike) -> tuple[ND
     late_swing = _swing(columns[late:, rings])
     lasting = (late_swing >= LATE_SWING * smallest[rings]) & (late_swing >= DECAY * _swing(columns[early:late, rings]))
     rings = rings[lasting]
-    rings = rings[_reversals(columns[:, rings], SWING * smallest[rings]) >= REVERSALS]
-
+    if rings.size:  # the one loop over time; most records can do without
+        rings = rings[_reversals(columns[:, rings], SWING * smallest[rings]) >= REVERSALS]
     oscillating, frequency = diverged, np.full(smallest.shape, np.nan)
     if rings.size:
         oscillating[rings] = True
@@ -357,6 +357,14 @@ def _divide(a: Floats, b: Floats) -> Floats:
     return np.divide(a, b, out=np.zeros(np.shape(a)), where=np.asarray(b != 0))
 
 
+def _weighted_sum(weights: Floats, x: Floats) -> Floats:
+    """Return sum over samples of weights * x, in the order of the samples.
+
+    A matrix product rounds differently with the number of axes; an axis must have the last digit that it has alone.
+    """
+    return np.asarray(np.cumsum(weights.reshape(-1, *(1,) * (x.ndim - 1)) * x, axis=0)[-1])
+
+
 def _trapezoid_weights(t: Floats) -> Floats:
     """Return w [s] with w @ x the trapezoid integral of x."""
     half = np.diff(t) / 2
@@ -380,22 +388,22 @@ def _index_at(t: Floats, time: float) -> int:
 
 def _before(t: Floats, y: Floats, time: float) -> Floats:
     """Return the last sample of y not later than the time [s]."""
-    return np.asarray(y[np.searchsorted(t, time + ROUNDING * (t[-1] - t[0]), side="right") - 1])
+    return np.asarray(y[np.searchsorted(t, time + ROUNDING * (t[-1] - t[0])) - 1])
 
 
 def _window(t: Floats, start: float, end: float | None, name: str) -> slice:
     """Return the samples from start to end [s]."""
-    if not t[0] <= start < t[-1]:
+    slack = ROUNDING * (t[-1] - t[0])
+    if not t[0] - slack <= start < t[-1]:
         raise ValueError(
             f"{name}={start:g} s lies outside the record of {t[0]:g} s to {t[-1]:g} s; choose {name} within it, "
             "before its last sample"
         )
     if end is None:
         end = float(t[-1])
-    slack = ROUNDING * (t[-1] - t[0])
     if not start < end <= t[-1] + slack:
         raise ValueError(f"t_end={end:g} s lies outside {name}={start:g} s to {t[-1]:g} s; choose t_end within them")
-    window = slice(_index_at(t, start), int(np.searchsorted(t, end + slack, side="right")))
+    window = slice(_index_at(t, start), int(np.searchsorted(t, end + slack)))
     if window.stop - window.start < 2:
         raise ValueError(
             f"empty window: {name}={start:g} s to t_end={end:g} s holds {window.stop - window.start} samples of at "

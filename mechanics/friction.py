@@ -38,8 +38,9 @@ def friction_torque(v, other, J, h, coulomb, breakaway, stribeck, viscous):
         x = v_mid / stribeck
         limit += (breakaway - coulomb) * math.exp(-x * x)
     if viscous != 0.0:
-        # With the mean speed of the step, itself reduced by the force: second order, and stable for any b.
-        limit += viscous * v_mid / (1.0 + 0.5 * mobility * viscous)
+        # With the mean speed of the step, itself reduced by friction: second order, and stable for any b.
+        v_mean = max(v_mid - 0.5 * mobility * limit, 0.0)
+        limit += viscous * v_mean / (1.0 + 0.5 * mobility * viscous)
     torque = v_free / mobility
     if torque > limit:
         return -limit

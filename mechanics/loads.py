@@ -44,11 +44,31 @@ class Friction(NamedTuple):
     viscous: float = 0.0
 
 
+class Switch(NamedTuple):
+    """A switch of an axis: "left", "right" or "home", pressed while the axis's `position` lies in low...high."""
+
+    kind: str
+    axis: int
+    low: float
+    high: float
+
+
+class EndStop(NamedTuple):
+    """Rubber end stops of a motion: free from low to high [rad or m], then a spring [N/m] and a damper [N*s/m]."""
+
+    motion: Combination
+    low: float
+    high: float
+    stiffness: float
+    damping: float
+
+
 class Load(NamedTuple):
     """A row of the table of loads.
 
     `axes` are the joints that the drives turn, in the order of the axes; `disturbance` is the motion on which the
-    external load torque acts; `has_switches` tells whether limit switches are wired.
+    external load torque (force) acts; `gears` are each axis's rotor angle per unit of its joint, 1 where not given;
+    `positions` the motion that presses each axis's switches, its joint where not given.
     """
 
     name: str
@@ -57,8 +77,16 @@ class Load(NamedTuple):
     disturbance: Combination
     frictions: tuple[Friction, ...]
     parameters: tuple[Parameter, ...]
-    has_switches: bool
     meaning: str
+    gears: tuple[float, ...] = ()
+    positions: tuple[Combination, ...] = ()
+    switches: tuple[Switch, ...] = ()
+    end_stops: tuple[EndStop, ...] = ()
+
+    @property
+    def has_switches(self) -> bool:
+        """Whether limit switches are wired."""
+        return any(switch.kind != "home" for switch in self.switches)
 
 
 _LOAD_FRICTION_PARAMETERS = (
@@ -66,6 +94,8 @@ _LOAD_FRICTION_PARAMETERS = (
     Parameter("breakaway", "N*m", "breakaway", "load", 1.0, 2.0, "friction at standstill"),
     Parameter("viscous", "N*m*s/rad", "viscous", "load", 0.0, 5.0, "friction that grows with speed"),
 )
+
+_CARRIAGE = {"pulley": 1.0, "stretch": 1.0}
 
 LOADS: dict[str, Load] = {
     row.name: row
@@ -80,7 +110,6 @@ LOADS: dict[str, Load] = {
                 Parameter("inertia", "kg*m^2", "body_inertia", "load", 0.2, 5.0, "inertia of the load"),
                 *_LOAD_FRICTION_PARAMETERS,
             ),
-            has_switches=False,
             meaning="a disc rigidly on the shaft",
         ),
         Load(
@@ -99,8 +128,31 @@ LOADS: dict[str, Load] = {
                 Parameter("damping", "N*m*s/rad", "dof_damping", "twist", 0.5, 3.0, "of shaft and coupling"),
                 *_LOAD_FRICTION_PARAMETERS,
             ),
-            has_switches=False,
             meaning="a disc on an elastic shaft: one resonance, one anti-resonance",
+        ),
+        Load(
+            "belt",
+            MODELS / "belt.xml",
+            axes=("pulley",),
+            disturbance=_CARRIAGE,
+            frictions=(Friction("carriage", _CARRIAGE, coulomb=0.8, breakaway=1.2, stribeck=0.01, viscous=2.0),),
+            parameters=(
+                Parameter("mass", "kg", "body_mass", "carriage", 0.3, 4.0, "of carriage and payload"),
+                Parameter("stiffness", "N/m", "jnt_stiffness", "stretch", 0.4, 2.5, "of the belt"),
+                Parameter("damping", "N*s/m", "dof_damping", "stretch", 0.5, 3.0, "of the belt"),
+                Parameter("coulomb", "N", "coulomb", "carriage", 0.0, 3.0, "sliding friction of the guide"),
+                Parameter("breakaway", "N", "breakaway", "carriage", 1.0, 2.0, "friction at standstill"),
+                Parameter("viscous", "N*s/m", "viscous", "carriage", 0.0, 5.0, "friction that grows with speed"),
+            ),
+            meaning="a carriage on a toothed belt, 0.5 m of travel, limit switches, home switch, rubber end stops",
+            gears=(1.0 / 0.006366,),  # pulley of 40 mm per turn
+            positions=(_CARRIAGE,),
+            switches=(
+                Switch("left", 0, -1.0, -0.23),
+                Switch("right", 0, 0.23, 1.0),
+                Switch("home", 0, -0.06, -0.02),
+            ),
+            end_stops=(EndStop(_CARRIAGE, -0.25, 0.25, 4e4, 60.0),),
         ),
     )
 }

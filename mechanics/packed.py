@@ -7,7 +7,7 @@ touch, and without a constraint solver the result of a copy is bit for bit what 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -64,6 +64,7 @@ class PackedLoad:
         h: Physics step [s].
         integrator: "leapfrog" (implicitfast, staggered) or "rk4", the slower oracle.
         template: Compiled model to copy instead of compiling again.
+        first_machine: Number of copy 0, for messages.
 
     Raises:
         ValueError: If a resonance is too fast for the step, or a parameter is unknown.
@@ -79,11 +80,13 @@ class PackedLoad:
         *,
         integrator: str = "leapfrog",
         template: mujoco.MjModel | None = None,
+        first_machine: int = 0,
     ) -> None:
         self.load = load
         self.copies: int = armature.shape[0]
         self.num_axes: int = armature.shape[1]
         self.h = h
+        self._first_machine = first_machine
         self.staggered = integrator == "leapfrog"
         self.model = compile_packed(load, self.copies) if template is None else _copy_model(template)
         self.num_dofs = self.model.nv // self.copies
@@ -91,7 +94,10 @@ class PackedLoad:
         self._armature = np.array(armature)
         self._joints = [self._joint_name(d) for d in range(self.num_dofs)]
         self._axis_dof = np.array([self._joints.index(axis) for axis in load.axes])
-        self._motions = [{axis: 1.0} for axis in load.axes] + [f.motion for f in load.frictions]
+        # A joint's speed times its gear is the rotor's: the bearings' friction acts there.
+        self._gears = np.array(load.gears or (1.0,) * self.num_axes)
+        turning = [{axis: gear} for axis, gear in zip(load.axes, self._gears, strict=True)]
+        self._motions = turning + [f.motion for f in load.frictions]
         self._friction = np.zeros((self.copies, len(self._motions), 5))
         self._friction[:, : self.num_axes, 1:] = motor_friction
         for k, row in enumerate(load.frictions, self.num_axes):
@@ -110,8 +116,9 @@ class PackedLoad:
         parameter = self._parameter(name)
         if parameter.field in _FRICTION_COLUMNS:
             return self._friction[:, self._friction_row(parameter), _FRICTION_COLUMNS[parameter.field]].copy()
-        if parameter.field == "body_inertia":
-            return np.array([self.model.body(f"{k}/{parameter.element}").inertia[0] for k in range(self.copies)])
+        if parameter.field in ("body_inertia", "body_mass"):
+            bodies = [self.model.body(f"{k}/{parameter.element}") for k in range(self.copies)]
+            return np.array([b.mass[0] if parameter.field == "body_mass" else b.inertia[0] for b in bodies])
         array = self._stiffness if parameter.field == "jnt_stiffness" else self._damping
         return array[:, self._joints.index(parameter.element)].copy()
 
@@ -203,12 +210,13 @@ class PackedLoad:
             )
         if parameter.field in _FRICTION_COLUMNS:
             self._friction[where, self._friction_row(parameter), _FRICTION_COLUMNS[parameter.field]] = values
-        elif parameter.field == "body_inertia":
+        elif parameter.field in ("body_inertia", "body_mass"):
             if np.any(values <= 0.0):
                 raise ValueError(f"{parameter.name} of load {self.load.name!r} must be above 0 {parameter.unit}")
             copies = np.arange(self.copies)[where]
             for k, value in zip(copies, np.broadcast_to(values, copies.shape), strict=True):
-                self.model.body(f"{k}/{parameter.element}").inertia[:] = value
+                body = self.model.body(f"{k}/{parameter.element}")
+                (body.mass if parameter.field == "body_mass" else body.inertia)[:] = value
         else:
             array = self._stiffness if parameter.field == "jnt_stiffness" else self._damping
             array[where, self._joints.index(parameter.element)] = values
@@ -224,45 +232,60 @@ class PackedLoad:
             qfrc_applied=self.data.qfrc_applied,
             qvel_before=np.zeros(self.model.nv),
             axis_dof=self._axis_dof.astype(np.int64),
+            axis_gear=self._gears,
             axis_inertia=np.zeros((self.copies, self.num_axes)),
+            axis_position=self._combinations(self.load.positions or [{axis: 1.0} for axis in self.load.axes]),
+            axis_kick=np.zeros((self.copies, self.num_axes, self.num_dofs)),
             stiffness=np.zeros(shape),
+            compliance=np.zeros((self.copies, self.num_dofs, self.num_dofs)),
+            compliance_moment=np.zeros((self.copies, self.num_dofs, self.num_axes)),
+            stuck=np.zeros((self.copies, len(self._motions)), np.int64),
             spring_zero=np.array(self.model.qpos_spring[: self.num_dofs]),
             damping=np.zeros(shape),
-            friction_motion=np.array([self._combination(m) for m in self._motions]),
+            friction_motion=self._combinations(self._motions),
             friction_share=np.zeros((self.copies, len(self._motions), self.num_dofs)),
             friction=np.zeros((self.copies, len(self._motions), 5)),
-            disturbance=self._combination(self.load.disturbance),
+            bumper_motion=self._combinations([stop.motion for stop in self.load.end_stops]),
+            bumper=np.tile(
+                np.array([stop[1:] for stop in self.load.end_stops], float).reshape(-1, 4), (self.copies, 1, 1)
+            ),
+            disturbance=self._combinations([self.load.disturbance])[0],
             load_torque=np.zeros(self.copies),
             diverged=np.zeros(self.copies, np.int64),
         )
 
-    def _combination(self, motion: Combination) -> Floats:
-        vector = np.zeros(self.num_dofs)
-        for joint, coefficient in motion.items():
-            vector[self._joints.index(joint)] = coefficient
-        return vector
+    def _combinations(self, motions: Sequence[Combination]) -> Floats:
+        """Return motions as coefficients of the joints, shape (motions, D)."""
+        rows = np.zeros((len(motions), self.num_dofs))
+        for row, motion in zip(rows, motions, strict=True):
+            for joint, coefficient in motion.items():
+                row[self._joints.index(joint)] = coefficient
+        return rows
 
     def _apply(self) -> None:
         """Bring parameters into MuJoCo's model and the plant: stiffness corrected, damping halved, inertias derived."""
-        self._by_copy(self.model.dof_armature)[:, self._axis_dof] = self._armature
+        self._by_copy(self.model.dof_armature)[:, self._axis_dof] = self._armature * self._gears**2
         moving = (self.data.qpos.copy(), self.data.qvel.copy())
         mujoco.mj_setConst(self.model, self.data)
-        self.data.qpos[:], self.data.qvel[:] = moving
+        # At the reference position, so that setting one copy cannot change the rounding of another.
+        self.data.qpos[:], self.data.qvel[:] = self.model.qpos0, 0.0
         inverse = np.linalg.inv(self.mass_matrix())
-        phase = 0.5 * self.h * np.sqrt(self._stiffness * np.einsum("cdd->cd", inverse))
+        self.data.qpos[:], self.data.qvel[:] = moving
+        phase = np.asarray(0.5 * self.h * np.sqrt(self._stiffness * np.einsum("cdd->cd", inverse)), np.float64)
         if self.staggered and 2.0 * phase.max() > MAX_PHASE_PER_STEP:
             worst, dof = np.unravel_index(int(phase.argmax()), phase.shape)
             resonance = phase.max() / (np.pi * self.h)
             limit = MAX_PHASE_PER_STEP / (2.0 * np.pi * self.h)
             raise ValueError(
-                f"joint {self._joints[int(dof)]!r} of machine copy {worst} resonates at {resonance:.0f} Hz; the limit "
-                f"is {limit:.0f} Hz at a physics step of {self.h * 1e6:.0f} us; lower its stiffness, raise its inertia "
-                "or take more physics steps per millisecond"
+                f"joint {self._joints[int(dof)]!r} of machine {self._first_machine + int(worst)} resonates at "
+                f"{resonance:.0f} Hz; the limit is {limit:.0f} Hz at a physics step of {self.h * 1e6:.0f} us; lower "
+                "its stiffness, raise its inertia or take more physics steps per millisecond"
             )
         # sin(x)/x: the leapfrog puts a resonance too high by x/sin(x); numpy's sinc has pi in it.
         correction = np.sinc(phase / np.pi) ** 2 if self.staggered else np.ones_like(phase)
         self.plant.stiffness[:] = self._stiffness * correction
         self.plant.damping[:] = self._damping
+        self._apply_held_torque(phase, inverse)
         self._by_copy(self.model.jnt_stiffness)[:] = self.plant.stiffness
         self._by_copy(self.model.dof_damping)[:] = self._damping * (0.5 if self.staggered else 1.0)
         motion = self.plant.friction_motion
@@ -272,6 +295,24 @@ class PackedLoad:
         self.plant.friction[:] = self._friction
         self.plant.friction[:, :, 0] = inertia
         self.plant.axis_inertia[:] = inertia[:, : self.num_axes]
+
+    def _apply_held_torque(self, phase: Floats, inverse: Floats) -> None:
+        """Derive what makes torque that is held over a step, or changes within it, act as it does in continuous time.
+
+        The leapfrog takes a step's torque as an impulse in its middle, which excites a resonance by 1/cos(x). Torque
+        held over the step excites it by sin(x)/x, and a first moment m of the torque in time moves the rotor by -m/J
+        less until the next step and shakes the resonance by m w, x = w h / 2. Solved for force and displacement this
+        gives the factors below.
+        """
+        turning = inverse[:, :, self._axis_dof] * self._gears
+        if not self.staggered:
+            return
+        diagonal = np.einsum("cdd->cd", inverse)[:, :, None]
+        self.plant.compliance[:] = (np.sinc(2.0 * phase / np.pi) - 1.0)[:, :, None] * inverse / diagonal
+        self.plant.compliance_moment[:] = (2.0 * phase / self.h * np.sin(phase))[:, :, None] * turning / diagonal
+        stretch = 1.0 / np.sinc(phase / np.pi) - 1.0
+        kick = turning + np.einsum("cde,ce,cea->cda", inverse, stretch, turning / diagonal)
+        self.plant.axis_kick[:] = np.swapaxes(kick, 1, 2)
 
 
 def _copy_model(model: mujoco.MjModel) -> mujoco.MjModel:

@@ -48,6 +48,10 @@ class Device(NamedTuple):
     overcurrent: float
     undervoltage: float
     overvoltage: float
+    warning_temperature: float
+    error_temperature: float
+    nominal_current: float
+    overload_time: float
     standstill: float
     write_states: dict[tuple[int, int], str]
     allowed_values: dict[tuple[int, int], tuple[int, ...]]
@@ -97,6 +101,10 @@ def find_device(name: str) -> Device:
         overcurrent=data["current"]["overcurrent"],
         undervoltage=data["supply"]["undervoltage"],
         overvoltage=data["supply"]["overvoltage"],
+        warning_temperature=data["temperature"]["warning"],
+        error_temperature=data["temperature"]["error"],
+        nominal_current=data["current"]["nominal"],
+        overload_time=data["current"]["overload_time"],
         standstill=data["motion"]["standstill"],
         write_states={_key(text): state for text, state in data["states"].items()},
         allowed_values={_key(text): tuple(values) for text, values in data["values"].items()},

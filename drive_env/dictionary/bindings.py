@@ -9,8 +9,8 @@ from dataclasses import dataclass
 class Binding:
     """A row of a device's table of bindings.
 
-    `event` names what a write sets off in the firmware: "controlword", "mode" or nothing. `part` chooses in a deep
-    field. The unit "position window" is increments with a value for "off".
+    `event` names what a write sets off in the firmware: "controlword", "mode", "set_point" or nothing. `part` chooses
+    in a deep field. The unit "position window" is increments with a value for "off".
     """
 
     index: int

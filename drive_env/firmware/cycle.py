@@ -13,20 +13,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mechanics.compiled
-from drive_env.firmware import fsa, modes, protection
+from drive_env.firmware import alignment, fsa, inputs, modes, protection, thermal
 from drive_env.firmware.arithmetic import TWO_PI, sine_cosine
+from drive_env.firmware.derived import derive
 from drive_env.firmware.loops import current_loop, motion_loops
-from drive_env.firmware.modes import pp
-from drive_env.firmware.power_stage import power_stage, refresh_winding
+from drive_env.firmware.modes import hm, pp
+from drive_env.firmware.power_stage import (
+    convert_energy,
+    open_phases,
+    power_stage,
+    refresh_winding,
+)
 from drive_env.firmware.record import LANES
-from drive_env.firmware.sensors import measure_angle, measure_currents, measure_motion
+from drive_env.firmware.sensors import measure_angle, measure_currents, measure_halls, measure_motion
 from mechanics import stepping
 from mechanics.compiled import cached, inlined, stage
 
 _SOURCES = (Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
 
 # How a played or written value acts on a field.
-REAL, INTEGER, CONTROLWORD, MODE = 0, 1, 2, 3
+REAL, INTEGER, CONTROLWORD, MODE, SET_POINT = 0, 1, 2, 3, 4
 
 # Time constant of the speed that decides whether the motor rotates [s]: encoder noise must not light bit 14.
 ACTIVITY_TIME = 0.02
@@ -43,24 +49,41 @@ class Rates(NamedTuple):
     substeps: int  # physics steps per window
     # Share of each tick's torque in the mean of each physics step, shape (substeps, ticks).
     weights: NDArray[np.float64]
+    # The same times the time from the step's middle to the tick's [s].
+    moments: NDArray[np.float64]
+
+
+@inlined
+def collect_torque(drive, s, weight, moment):
+    """Add this tick's share to mean and first moment of the torque of physics step s of the window."""
+    for lane in range(LANES):
+        drive.tau_window[s, lane] += weight * drive.tau_m[lane]
+    for lane in range(LANES):
+        drive.moment_window[s, lane] += moment * drive.tau_m[lane]
 
 
 @inlined
 def tick(drive, rates, k):
     """Run one period of the current loop, tick k of its window."""
-    measure_angle(drive)
+    if drive.block_uses_halls[0]:
+        measure_halls(drive, rates.tick)
+    measure_angle(drive, rates.tick)
     measure_currents(drive)
     current_loop(drive)
-    power_stage(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
-    for s in range(rates.substeps):
-        weight = rates.weights[s, k]
-        for lane in range(LANES):
-            drive.tau_window[s, lane] += weight * drive.tau_m[lane]
+    power_stage(drive)
+    if drive.block_has_open_phase[0]:
+        open_phases(drive)
+    convert_energy(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
+    collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
+    for s in range(1, rates.substeps):
+        collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
 
 
 @inlined
 def start_window(drive, rates):
     """Read the encoder, close position and velocity loop, and prepare the winding for the ticks of this window."""
+    if not drive.block_uses_halls[0]:
+        measure_halls(drive, rates.window)
     measure_motion(drive, rates.window)
     motion_loops(drive)
     for lane in range(LANES):
@@ -69,6 +92,7 @@ def start_window(drive, rates):
     for s in range(rates.substeps):
         for lane in range(LANES):
             drive.tau_window[s, lane] = drive.tau_cogging[lane]
+            drive.moment_window[s, lane] = 0.0
     refresh_winding(drive, rates.tick, rates.window)
 
 
@@ -83,15 +107,27 @@ def window(drive, rates):
 @stage
 def supervise(drive, rates):
     """Run what the drive does once per millisecond."""
+    thermal.warm(drive, rates.period)
+    derive(drive, rates.tick)
     for lane in range(LANES):
         if drive.live[lane] == 0 or drive.diverged[lane] == 1:
             continue
         drive.omega_slow[lane] += (drive.omega_meas[lane] - drive.omega_slow[lane]) * (rates.period / ACTIVITY_TIME)
-        protection.protect(drive, lane)
-        fsa.automatic_transitions(drive, lane)
+        inputs.read_inputs(drive, lane)
+        protection.protect(drive, lane, rates.period)
+        fsa.automatic_transitions(drive, lane, rates.period)
+        alignment.commutate(drive, lane, rates.period)
         modes.generate_demand(drive, lane, rates.period)
-        fsa.update_statusword(drive, lane, modes.bit_12(drive, lane))
+        fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane))
         drive.status_flags[lane] = modes.status_flags(drive, lane) | protection.fault_flags(drive, lane)
+    # What few drives need is left out of the ticks of a block where none does.
+    drive.block_uses_halls[0] = 0
+    drive.block_has_open_phase[0] = 0
+    for lane in range(LANES):
+        if drive.angle_source[lane] == alignment.HALL:
+            drive.block_uses_halls[0] = 1
+        if drive.open_a[lane] > 0.0 or drive.open_b[lane] > 0.0:
+            drive.block_has_open_phase[0] = 1
 
 
 @stage
@@ -104,7 +140,9 @@ def write_controlword(drive, lane, word):
     fsa.command(drive, lane)
     if drive.mode_display[lane] == modes.PP:
         pp.new_set_point(drive, lane, before)
-    fsa.update_statusword(drive, lane, modes.bit_12(drive, lane))
+    elif drive.mode_display[lane] == modes.HM:
+        hm.start_or_stop(drive, lane, before)
+    fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane))
 
 
 @stage
@@ -113,7 +151,7 @@ def write_mode(drive, lane, mode):
     drive.mode[lane] = mode
     if mode != drive.mode_display[lane]:
         modes.change_mode(drive, lane)
-    fsa.update_statusword(drive, lane, modes.bit_12(drive, lane))
+    fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane))
 
 
 @stage
@@ -125,6 +163,9 @@ def play_row(records, reals, integers, values, kinds, offsets, row, first_axis, 
             value = values[row, k, first_axis + axis]
             if kinds[k] == REAL:
                 reals[block, offsets[k] + lane] = value
+            elif kinds[k] == SET_POINT:
+                reals[block, offsets[k] + lane] = value
+                records[block].set_point_fresh[lane] = 1
             elif kinds[k] == INTEGER:
                 integers[block, offsets[k] + lane] = int(value)
             elif kinds[k] == CONTROLWORD:
@@ -147,15 +188,17 @@ def sample_row(reals, integers, samples, kinds, offsets, row, first_axis, num_ax
 
 @stage
 def mechanics_window(records, plant, rates, motion, num_axes):
-    """Step the load through one window and bring the rotors to where it has them; `motion` is scratch (5, axes)."""
-    torque, theta, omega, reaction, total = motion[0], motion[1], motion[2], motion[3], motion[4]
+    """Step the load through one window and bring the rotors to where it has them; `motion` is scratch (7, axes)."""
+    torque, moment, theta, omega = motion[0], motion[1], motion[2], motion[3]
+    reaction, total, position = motion[4], motion[5], motion[6]
     h = rates.window / rates.substeps
     for axis in range(num_axes):
         total[axis] = 0.0
     for s in range(rates.substeps):
         for axis in range(num_axes):
             torque[axis] = records[axis // LANES].tau_window[s, axis % LANES]
-        stepping.step(plant, torque, h, theta, omega, reaction)
+            moment[axis] = records[axis // LANES].moment_window[s, axis % LANES]
+        stepping.step(plant, torque, moment, h, theta, omega, reaction, position)
         for axis in range(num_axes):
             total[axis] += reaction[axis]
     axes_per_copy = plant.axis_dof.shape[0]
@@ -164,6 +207,7 @@ def mechanics_window(records, plant, rates, motion, num_axes):
         lane = axis % LANES
         drive.theta_m[lane] = theta[axis]
         drive.omega_m[lane] = omega[axis]
+        drive.load_position[lane] = position[axis]
         drive.tau_reaction_before[lane] = drive.tau_reaction[lane]
         drive.tau_reaction[lane] = total[axis] / rates.substeps
         if plant.diverged[axis // axes_per_copy] == 1 and drive.diverged[lane] == 0:
@@ -198,12 +242,12 @@ def run(
         integers: The same memory as 32-bit integers, shape (blocks, integers per record).
         plant: The group's mechanics.
         rates: Periods.
-        motion: Scratch, shape (5, axes).
+        motion: Scratch, shape (7, axes).
         first_axis: Number of the group's first axis in play and samples.
         num_axes: Axes of the group.
         cycles: Communication cycles to run.
         play_values: SI values, shape (cycles, objects, all axes).
-        play_kinds: REAL, INTEGER, CONTROLWORD or MODE, shape (objects,).
+        play_kinds: REAL, INTEGER, CONTROLWORD, MODE or SET_POINT, shape (objects,).
         play_offsets: Index of lane 0 in `reals` or `integers`, shape (objects,).
         samples: SI values, written, shape (rows, objects, all axes).
         sample_kinds: REAL or INTEGER, shape (objects,).
@@ -267,6 +311,15 @@ def power_on(records, where):
         drive.set_point_acknowledged[lane] = 0
         drive.target_reached[lane] = 0
         drive.drive_function[lane] = 0.0
+        drive.stage_on[lane] = 0.0
+        drive.active[lane] = 0
+        drive.blocked[lane] = 0
+        drive.warning[lane] = 0
+        drive.overload[lane] = 0.0
+        drive.init_state[lane] = alignment.NEEDED
+        drive.home_shift[lane] = 0.0
+        drive.homing_state[lane] = hm.IDLE
+        drive.homing_attained[lane] = 0
         drive.loop_level[lane] = 0
         drive.mode_display[lane] = drive.mode[lane]
         drive.i_d[lane] = 0.0
@@ -293,10 +346,20 @@ def power_on(records, where):
         drive.angle_zero[lane] = (
             drive.n_p[lane] * (count + 0.5) * TWO_PI / drive.encoder_counts[lane] + drive.commutation_offset[lane]
         )
+        sector = np.floor((drive.n_p[lane] * drive.theta_m[lane] + drive.hall_true_offset[lane]) * (6.0 / TWO_PI))
+        reverse = abs(drive.hall_true_direction[lane] - drive.hall_direction[lane])
+        sector += reverse * (-1.0 - 2.0 * sector)
+        sector += 3.0 * abs(drive.hall_true_polarity[lane] - drive.hall_polarity[lane])
+        drive.hall_sector[lane] = sector
+        drive.hall_zero[lane] = sector
+        drive.hall_time[lane] = 1.0
+        drive.hall_period[lane] = 1.0
+        drive.angle_hall[lane] = (sector + 0.5) * (TWO_PI / 6.0) - drive.hall_offset[lane]
         drive.theta_meas[lane] = 0.0
         drive.position_demand[lane] = 0.0
         drive.velocity_demand[lane] = 0.0
         drive.torque_demand[lane] = 0.0
-        fsa.automatic_transitions(drive, lane)
-        fsa.update_statusword(drive, lane, modes.bit_12(drive, lane))
+        inputs.read_inputs(drive, lane)
+        fsa.automatic_transitions(drive, lane, 0.0)
+        fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane))
         drive.status_flags[lane] = modes.status_flags(drive, lane)

@@ -112,8 +112,14 @@ BIT_RELATIVE = 0x0040
 BIT_FAULT_RESET = 0x0080
 BIT_HALT = 0x0100
 
+INITIALIZATION_FAILED = 4  # state of alignment.py
+WARNING_BIT = 0x0080
+
 # Rows of every device's emergency table that the automaton itself sends.
 EMERGENCY_RESET = 0
+
+LONGEST_STOP = 1.0  # s after the ramp's end; a motor that still turns then is not held by its loops
+STANDSTILL_NOISE = 2.0  # what the unfiltered velocity may show at rest, as a multiple of the standstill threshold
 
 # Option codes of 605Ah that end in switch on disabled, and those that ramp with 6085h.
 STOP_AND_STAY = 5
@@ -124,7 +130,8 @@ def push_emergency(drive, lane, row):
     """Queue a row of the device's emergency table; a full queue loses the newest, as a transmit buffer does."""
     count = drive.emergency_count[lane]
     if count < EMERGENCY_QUEUE:
-        drive.emergency[count, lane] = row + 1
+        # With the error register of this moment, which a reset clears before the message may be fetched.
+        drive.emergency[count, lane] = (row + 1) | drive.error_register[lane] << 8
         drive.emergency_count[lane] = count + 1
 
 
@@ -150,10 +157,15 @@ def _enter(drive, lane, number, end):
         drive.stopping[lane] = 0
     if number == 11 or number == 13:
         drive.stopping[lane] = 1
+        drive.stop_time[lane] = 0.0
     if number == 15:
         drive.fault[lane] = 0
         drive.error_register[lane] = 0
         push_emergency(drive, lane, EMERGENCY_RESET)
+    if number == 3:
+        drive.active[lane] = 0
+        if drive.init_state[lane] == INITIALIZATION_FAILED:
+            drive.init_state[lane] = 0  # tried again
     drive.drive_function[lane] = 1.0 if has_drive_function(end) else 0.0
     if not has_drive_function(end):
         drive.stopping[lane] = 0
@@ -182,6 +194,7 @@ def command(drive, lane):
             if number == 5:
                 drive.transition_pending[lane] = 5
                 drive.stopping[lane] = 1
+                drive.stop_time[lane] = 0.0
             else:
                 _enter(drive, lane, number, end)
                 moved = True
@@ -198,11 +211,27 @@ def reset_fault(drive, lane, causes_gone):
 
 
 @stage
-def automatic_transitions(drive, lane):
-    """Make the transitions that need no command, once per millisecond: 1, and what waited for a ramp's end."""
+def has_stopped(drive, lane, dt):
+    """Return whether a stop ramp has ended and the motor stands; one that will not stand is given up on.
+
+    The power goes off after the stop: taken at the ramp's end alone it would leave a soft axis coasting.
+    """
+    if drive.velocity_demand[lane] != 0.0:
+        drive.stop_time[lane] = 0.0
+        return False
+    drive.stop_time[lane] += dt
+    stands = abs(drive.omega_slow[lane]) <= drive.standstill[lane] and abs(drive.omega_meas[lane]) <= (
+        STANDSTILL_NOISE * drive.standstill[lane]
+    )
+    return stands or drive.stop_time[lane] > LONGEST_STOP
+
+
+@stage
+def automatic_transitions(drive, lane, dt):
+    """Make the transitions that need no command, once per period of dt [s]: 1, and what waited for standstill."""
     if drive.fsa[lane] == NOT_READY:
         _enter(drive, lane, 1, DISABLED)
-    if drive.stopping[lane] == 1 and drive.velocity_demand[lane] == 0.0:
+    if drive.stopping[lane] == 1 and has_stopped(drive, lane, dt):
         if drive.fsa[lane] == REACTING:
             _enter(drive, lane, 14, FAULTED)
         elif drive.fsa[lane] == STOPPING and drive.quick_stop_option[lane] < STOP_AND_STAY:
@@ -224,8 +253,8 @@ def fault(drive, lane, cut):
 
 
 @stage
-def update_statusword(drive, lane, bit_12):
-    """Write 6041h and the status flags from the state; `bit_12` is the mode's.
+def update_statusword(drive, lane, mode_bits):
+    """Write 6041h and the status flags from the state; `mode_bits` are bits 12 and 13.
 
     Bit 4 tells that the supply is present, bit 9 (remote) is always set: this drive takes commands from the bus only.
     Bit 15 is set while the motor turns in the negative direction (the manual does not say which).
@@ -241,8 +270,9 @@ def update_statusword(drive, lane, bit_12):
         word |= 0x0400
     if drive.internal_limit[lane]:
         word |= 0x0800
-    if bit_12:
-        word |= 0x1000
+    word |= mode_bits
+    if drive.warning[lane]:
+        word |= WARNING_BIT
     rotates = abs(drive.omega_slow[lane]) > drive.standstill[lane]
     if rotates:
         word |= 0x4000

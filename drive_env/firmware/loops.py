@@ -43,11 +43,12 @@ def current_loop(drive):
         c = drive.cos_meas[lane]
         i_d = c * drive.i_alpha_meas[lane] + s * drive.i_beta_meas[lane]
         i_q = c * drive.i_beta_meas[lane] - s * drive.i_alpha_meas[lane]
-        error_d = -i_d
+        error_d = drive.i_d_ref[lane] - i_d
         shaft_sign = 1.0 - 2.0 * drive.shaft_direction[lane]
-        error_q = shaft_sign * drive.i_q_ref[lane] - i_q
-        on = drive.drive_function[lane]
-        limit = drive.duty_limit[lane]
+        error_q = shaft_sign * drive.torque_share[lane] * drive.i_q_ref[lane] - i_q
+        on = drive.stage_on[lane]
+        # Between two legs lies the whole supply, not the voltage circle.
+        limit = 1.0 if drive.angle_source[lane] == 5.0 else drive.duty_limit[lane]
         p_d = drive.current_p[lane] * error_d
         p_q = drive.current_p[lane] * error_q
         sum_d = clip(drive.current_sum_d[lane] + p_d * drive.current_i[lane], limit) * on

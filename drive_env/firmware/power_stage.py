@@ -1,4 +1,4 @@
-"""Inverter, supply and the winding of a permanent-magnet synchronous motor, solved exactly over a tick.
+"""Inverter, DC link and the winding of a PMSM or a DC motor, solved exactly over a tick.
 
 The bridge holds a voltage in the stator frame. In the rotor frame, at constant speed, that voltage turns backwards:
 
@@ -6,7 +6,7 @@ The bridge holds a voltage in the stator frame. In the rotor frame, at constant 
     du/dt = W u                W = [[0, w], [-w, 0]],  e = [0, -w psi/L_q]
 
 so one tick is i(dt) = exp(A dt) i + G u + g with G the solution of A G - G W = exp(A dt) B - B exp(W dt). The
-matrices change with speed only and are refreshed once per window.
+matrices change with speed only and are refreshed once per window. A DC motor is the q axis of a frame at rest.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined
 
 SQRT3 = 3.0**0.5
+ENDLESS = 1e300  # V
+SMALLEST_VOLTAGE = 1e-3  # V; an empty DC link divides nothing
 
 
 @inlined
@@ -26,7 +28,9 @@ def refresh_winding(drive, dt, h):
         L_d = drive.L_d[lane]
         L_q = drive.L_q[lane]
         acceleration = (drive.tau_m[lane] + drive.tau_cogging[lane] - drive.tau_reaction[lane]) / drive.J_rotor[lane]
-        w = drive.n_p[lane] * (drive.omega_m[lane] + 0.5 * h * acceleration)
+        omega_e = drive.n_p[lane] * (drive.omega_m[lane] + 0.5 * h * acceleration)
+        # A DC motor's frame does not turn, its back-EMF is there all the same.
+        w = omega_e * (1.0 - drive.is_dc[lane])
         a_dd = -R / L_d
         a_qq = -R / L_q
         a_dq = w * L_q / L_d
@@ -70,7 +74,7 @@ def refresh_winding(drive, dt, h):
         g_qd = (k_dd * m_qd - k_qd * m_dd) * k
         g_qq = (k_dd * m_qq - k_qd * m_dq) * k
         # Back-EMF: A^-1 (exp(A dt) - I) e.
-        e_q = -w * drive.psi_m[lane] * b_q
+        e_q = -omega_e * drive.psi_m[lane] * b_q
         det = 1.0 / (r + w * w)
         f_d = p_dq * e_q
         f_q = (p_qq - 1.0) * e_q
@@ -92,6 +96,8 @@ def refresh_winding(drive, dt, h):
         cs = sine_series(z)
         # (1 - cos)/wt without cancellation: the series of (1 - cos x)/x^2 is that of sin(x/2)^2.
         half = sine_series(0.25 * z)
+        drive.half_turn_sin[lane] = 0.5 * wt * half
+        drive.half_turn_cos[lane] = cosine_series(0.25 * z)
         vs = 0.5 * wt * half * half
         d_dd = p_dd - 1.0
         d_qq = p_qq - 1.0
@@ -114,15 +120,8 @@ def refresh_winding(drive, dt, h):
 
 
 @inlined
-def power_stage(drive, dt, progress):
-    """Hold the bridge's duty for one tick of dt [s]: writes i_d, i_q, tau_m, and moves the rotor on.
-
-    Args:
-        drive: The record.
-        dt: Current-loop period [s].
-        progress: Middle of this tick, as a share of the window, plus one half: the load's reaction is extrapolated
-            from the middles of the last two windows to it.
-    """
+def power_stage(drive):
+    """Hold the bridge's duty for one tick: writes the currents at its end, their means, and the voltage held."""
     for lane in range(LANES):
         s = drive.sin_e[lane]
         c = drive.cos_e[lane]
@@ -132,16 +131,19 @@ def power_stage(drive, dt, progress):
         # While both switches of a leg are off the current chooses the rail: a phase loses dead_time u_dc sign(i).
         i_alpha = c * i_d - s * i_q
         i_beta = s * i_d + c * i_q
-        per_ampere = 1.0 / drive.dead_time_current[lane]
+        per_ampere = drive.dead_time_slope[lane]
         lost = u_dc * drive.dead_time_duty[lane]
         lost_a = clip(i_alpha * per_ampere, 1.0)
         lost_b = clip(0.5 * (SQRT3 * i_beta - i_alpha) * per_ampere, 1.0)
         lost_c = clip(-0.5 * (SQRT3 * i_beta + i_alpha) * per_ampere, 1.0)
-        u_alpha = drive.duty_alpha[lane] * u_dc - lost * (1.0 / 3.0) * (2.0 * lost_a - lost_b - lost_c)
-        u_beta = drive.duty_beta[lane] * u_dc - lost * (1.0 / SQRT3) * (lost_b - lost_c)
+        is_dc = drive.is_dc[lane]
+        # A DC motor lies between two legs: each loses its share, and there is no beta.
+        lost_alpha = lost * (2.0 * lost_a if is_dc > 0.5 else (1.0 / 3.0) * (2.0 * lost_a - lost_b - lost_c))
+        u_alpha = drive.duty_alpha[lane] * u_dc - lost_alpha
+        u_beta = (drive.duty_beta[lane] * u_dc - lost * (1.0 / SQRT3) * (lost_b - lost_c)) * (1.0 - is_dc)
         u_d = c * u_alpha + s * u_beta
         u_q = c * u_beta - s * u_alpha
-        on = drive.drive_function[lane]
+        on = drive.stage_on[lane]
         new_d = (
             drive.step_i[0, lane] * i_d
             + drive.step_i[1, lane] * i_q
@@ -170,19 +172,92 @@ def power_stage(drive, dt, progress):
             + drive.mean_u[3, lane] * u_q
             + drive.mean_e[1, lane]
         ) * on
-        # mean(i_d i_q) of currents that change linearly within the tick.
-        mean_dq = mean_d * mean_q + (new_d - i_d) * (new_q - i_q) * (1.0 / 12.0)
-        tau = 1.5 * drive.n_p[lane] * (drive.psi_m[lane] * mean_q + (drive.L_d[lane] - drive.L_q[lane]) * mean_dq)
+        drive.i_d_before[lane] = i_d
+        drive.i_q_before[lane] = i_q
         drive.i_d[lane] = new_d
         drive.i_q[lane] = new_q
-        drive.tau_m[lane] = tau
-        # The supply's sag follows the DC current of this tick, one tick later.
-        power = 1.5 * (u_d * i_d + u_q * i_q) * on
-        drive.u_dc[lane] = drive.supply_voltage[lane] - drive.supply_resistance[lane] * power / u_dc
-        reaction = drive.tau_reaction[lane] + progress * (drive.tau_reaction[lane] - drive.tau_reaction_before[lane])
-        omega = drive.omega_m[lane]
-        new_omega = omega + dt * (tau + drive.tau_cogging[lane] - reaction) / drive.J_rotor[lane]
-        drive.omega_m[lane] = new_omega
-        drive.theta_m[lane] += 0.5 * dt * (omega + new_omega)
+        drive.i_d_mean[lane] = mean_d
+        drive.i_q_mean[lane] = mean_q
+        drive.u_d[lane] = u_d
+        drive.u_q[lane] = u_q
         drive.duty_alpha[lane] = drive.duty_next_alpha[lane]
         drive.duty_beta[lane] = drive.duty_next_beta[lane]
+
+
+@inlined
+def open_phases(drive):
+    """Take out the current along a phase whose cable is broken."""
+    for lane in range(LANES):
+        s = drive.sin_e[lane]
+        c = drive.cos_e[lane]
+        # Axes of phases A and B in the rotor frame.
+        a_d = c
+        a_q = -s
+        b_d = 0.5 * (SQRT3 * s - c)
+        b_q = 0.5 * (SQRT3 * c + s)
+        i_d = drive.i_d[lane]
+        i_q = drive.i_q[lane]
+        out = drive.open_a[lane] * (i_d * a_d + i_q * a_q)
+        i_d -= out * a_d
+        i_q -= out * a_q
+        out = drive.open_b[lane] * (i_d * b_d + i_q * b_q)
+        drive.i_d[lane] = i_d - out * b_d
+        drive.i_q[lane] = i_q - out * b_q
+        m_d = drive.i_d_mean[lane]
+        m_q = drive.i_q_mean[lane]
+        out = drive.open_a[lane] * (m_d * a_d + m_q * a_q)
+        m_d -= out * a_d
+        m_q -= out * a_q
+        out = drive.open_b[lane] * (m_d * b_d + m_q * b_q)
+        drive.i_d_mean[lane] = m_d - out * b_d
+        drive.i_q_mean[lane] = m_q - out * b_q
+
+
+@inlined
+def convert_energy(drive, dt, progress):
+    """Turn the tick's mean currents into torque and supply current: writes tau_m, u_dc, and moves the rotor on.
+
+    Args:
+        drive: The record.
+        dt: Current-loop period [s].
+        progress: Middle of this tick, as a share of the window, plus one half: the load's reaction is extrapolated
+            from the middles of the last two windows to it.
+    """
+    for lane in range(LANES):
+        u_dc = drive.u_dc[lane]
+        mean_d = drive.i_d_mean[lane]
+        mean_q = drive.i_q_mean[lane]
+        change = (drive.i_d[lane] - drive.i_d_before[lane]) * (drive.i_q[lane] - drive.i_q_before[lane])
+        # mean(i_d i_q) of currents that change linearly within the tick.
+        mean_dq = mean_d * mean_q + change * (1.0 / 12.0)
+        tau = (
+            drive.phase_factor[lane]
+            * drive.n_p[lane]
+            * (drive.psi_m[lane] * mean_q + (drive.L_d[lane] - drive.L_q[lane]) * mean_dq)
+        )
+        drive.tau_m[lane] = tau
+        # Power from the DC link: the held voltage, as the rotor frame sees it in the middle of the tick, times the mean
+        # current. The source feeds through a diode: braking charges the link, and only the chopper takes it away.
+        half_s = drive.half_turn_sin[lane]
+        half_c = drive.half_turn_cos[lane]
+        mid_d = half_c * drive.u_d[lane] + half_s * drive.u_q[lane]
+        mid_q = half_c * drive.u_q[lane] - half_s * drive.u_d[lane]
+        power = drive.phase_factor[lane] * (mid_d * mean_d + mid_q * mean_q)
+        drive.bridge_power[lane] = power
+        limit = drive.chopper_voltage[lane]
+        chopper = drive.chopper[lane]
+        chopper = 0.0 if u_dc < limit - drive.chopper_hysteresis[lane] else chopper
+        chopper = drive.chopper_enable[lane] if u_dc > limit else chopper
+        drive.chopper[lane] = chopper
+        conductance = chopper * drive.chopper_conductance[lane] + drive.short_conductance[lane]
+        drained = drive.idle_current[lane] + power / u_dc + u_dc * conductance
+        blocked = u_dc - drive.link_step[lane] * drained
+        fed = (blocked + drive.link_feed[lane] * drive.supply_voltage[lane]) * drive.link_share[lane]
+        floor = drive.supply_voltage[lane] if drive.supply_sinks[lane] < 0.5 else ENDLESS
+        link = fed if blocked < floor else blocked
+        drive.u_dc[lane] = link if link > SMALLEST_VOLTAGE else SMALLEST_VOLTAGE
+        reaction = drive.tau_reaction[lane] + progress * (drive.tau_reaction[lane] - drive.tau_reaction_before[lane])
+        omega = drive.omega_m[lane]
+        new_omega = omega + drive.tick_mobility[lane] * (tau + drive.tau_cogging[lane] - reaction)
+        drive.omega_m[lane] = new_omega
+        drive.theta_m[lane] += 0.5 * dt * (omega + new_omega)

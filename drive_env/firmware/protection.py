@@ -1,85 +1,222 @@
 """Protection: the causes that this drive watches, once per millisecond, and what each does.
 
-A cause is a physical condition of the axis; its emergency code and bytes are the device's data (by name).
+A cause is a physical condition of the axis. Its emergency code and bytes are the device's data, by name; which cause
+has which reaction is decided here: what endangers the stage cuts it, what endangers the machine stops it with the
+fault reaction of 605Eh, a limit of travel stops the axis and stays enabled, a warning only tells.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from drive_env.firmware import fsa
+from drive_env.firmware import alignment, fsa, inputs
 from mechanics.compiled import stage
+
+CUT, STOP, LIMIT, WARN = 0, 1, 2, 3
 
 
 class Cause(NamedTuple):
-    """A row: name as in the device's emergency table, whether the stage is cut at once, bits of 1001h and 2101h."""
+    """A row: name as in the device's emergency table, reaction, bits of 1001h and of 2101h."""
 
     name: str
-    cut: bool
+    reaction: int
     error_register: int
     status_flag: int
 
 
 # Row 0 is the answer to a fault reset, which every device sends with code 0000h.
 CAUSES = (
-    Cause("fault_reset", False, 0x00, 0x0),
-    Cause("overcurrent", True, 0x02, 0x1),
-    Cause("undervoltage", True, 0x04, 0x2),
-    Cause("overvoltage", True, 0x04, 0x4),
-    Cause("following_error", False, 0x20, 0x0),
+    Cause("fault_reset", WARN, 0x00, 0x0),
+    Cause("overcurrent_high_side", CUT, 0x02, 0x1),
+    Cause("overcurrent_bridge_a", CUT, 0x02, 0x1),
+    Cause("overcurrent_bridge_b", CUT, 0x02, 0x1),
+    Cause("undervoltage", CUT, 0x04, 0x2),
+    Cause("overvoltage", CUT, 0x04, 0x4),
+    Cause("overtemperature", CUT, 0x08, 0x8),
+    Cause("hall_error", CUT, 0x20, 0x20),
+    Cause("shutdown_switch", CUT, 0x80, 0x1000),
+    Cause("encoder_initialization", CUT, 0x20, 0x80),
+    Cause("open_load_a", STOP, 0x80, 0x40),
+    Cause("open_load_b", STOP, 0x80, 0x40),
+    Cause("following_error", STOP, 0x20, 0x0),
+    Cause("overload", STOP, 0x02, 0x20000),
+    Cause("overtemperature_warning", WARN, 0x08, 0x0),
+    Cause("positive_software_limit", LIMIT, 0x00, 0x0),
+    Cause("negative_software_limit", LIMIT, 0x00, 0x0),
+    Cause("positive_limit_switch", LIMIT, 0x00, 0x0),
+    Cause("negative_limit_switch", LIMIT, 0x00, 0x0),
 )
+(
+    _RESET,
+    HIGH_SIDE,
+    BRIDGE_A,
+    BRIDGE_B,
+    UNDERVOLTAGE,
+    OVERVOLTAGE,
+    OVERTEMPERATURE,
+    HALL_ERROR,
+    SHUTDOWN_SWITCH,
+    INITIALIZATION,
+    OPEN_LOAD_A,
+    OPEN_LOAD_B,
+    FOLLOWING_ERROR,
+    OVERLOAD,
+    WARM,
+    POSITIVE_SOFTWARE,
+    NEGATIVE_SOFTWARE,
+    POSITIVE_SWITCH,
+    NEGATIVE_SWITCH,
+) = range(len(CAUSES))
 GENERIC_ERROR = 0x01  # bit 0 of 1001h is set with every error
-OVERCURRENT, UNDERVOLTAGE, OVERVOLTAGE, FOLLOWING_ERROR = 1, 2, 3, 4
-_FLAGS = tuple(cause.status_flag for cause in CAUSES)
-_CUT = tuple(cause.cut for cause in CAUSES)
+BLOCKS_NEGATIVE, BLOCKS_POSITIVE = 1, 2
+HOMING = 6  # limit switches are what homing looks for
+
+_CUTS, _STOPS, _LIMITS, _WARNS = (
+    sum(1 << row for row, cause in enumerate(CAUSES) if row and cause.reaction == reaction)
+    for reaction in (CUT, STOP, LIMIT, WARN)
+)
+_POSITIVE = 1 << POSITIVE_SOFTWARE | 1 << POSITIVE_SWITCH
+_NEGATIVE = 1 << NEGATIVE_SOFTWARE | 1 << NEGATIVE_SWITCH
 _REGISTER = tuple(cause.error_register for cause in CAUSES)
+_FLAGS = tuple(cause.status_flag for cause in CAUSES)
+
+OPEN_LOAD_TIME = 0.05  # s for which a phase must stay without the current that is asked for
+OPEN_LOAD_DEMAND = 1.0  # A of phase current that must be asked for
+OPEN_LOAD_CURRENT = 0.3  # A below which there is none
+SQRT3 = 3.0**0.5
 
 
 @stage
-def is_present(drive, lane, cause):
-    """Return whether a cause's condition holds now."""
-    if cause == OVERCURRENT:
-        limit = drive.overcurrent[lane]
-        return drive.i_d_meas[lane] ** 2 + drive.i_q_meas[lane] ** 2 > limit * limit
-    if cause == UNDERVOLTAGE:
-        return drive.u_dc[lane] < drive.undervoltage[lane]
-    if cause == OVERVOLTAGE:
-        return drive.u_dc[lane] > drive.overvoltage[lane]
-    if cause == FOLLOWING_ERROR:
+def watch_phases(drive, lane, dt):
+    """Measure for how long a phase carries no current although the loop asks for it; then forget the peaks."""
+    # What each phase should carry now; a rotor at rest may well ask nothing of one of them.
+    q = drive.i_q_ref[lane] * drive.torque_share[lane] * (1.0 - 2.0 * drive.shaft_direction[lane])
+    d = drive.i_d_ref[lane]
+    alpha = drive.cos_meas[lane] * d - drive.sin_meas[lane] * q
+    beta = drive.sin_meas[lane] * d + drive.cos_meas[lane] * q
+    asked_a = abs(alpha)
+    asked_b = asked_a if drive.is_dc[lane] == 1.0 else abs(0.5 * (SQRT3 * beta - alpha))
+    # Near no-load speed no current flows for want of voltage: the other phase, or standstill, must show that it could.
+    stands = abs(drive.omega_slow[lane]) <= drive.standstill[lane]
+    on = drive.stage_on[lane] > 0.0
+    could_a = on and asked_a > OPEN_LOAD_DEMAND and (stands or drive.peak_b[lane] >= OPEN_LOAD_CURRENT)
+    could_b = on and asked_b > OPEN_LOAD_DEMAND and (stands or drive.peak_a[lane] >= OPEN_LOAD_CURRENT)
+    if could_a and drive.peak_a[lane] < OPEN_LOAD_CURRENT:
+        drive.open_load_time_a[lane] += dt
+    elif not on or drive.peak_a[lane] >= OPEN_LOAD_CURRENT:
+        drive.open_load_time_a[lane] = 0.0
+    if could_b and drive.peak_b[lane] < OPEN_LOAD_CURRENT:
+        drive.open_load_time_b[lane] += dt
+    elif not on or drive.peak_b[lane] >= OPEN_LOAD_CURRENT:
+        drive.open_load_time_b[lane] = 0.0
+
+
+@stage
+def conditions(drive, lane):
+    """Return the causes whose condition holds now, as bits 1 << row."""
+    bits = 0
+    if drive.u_dc[lane] * drive.short_conductance[lane] > drive.overcurrent[lane]:
+        bits |= 1 << HIGH_SIDE
+    if drive.peak_a[lane] > drive.overcurrent[lane]:
+        bits |= 1 << BRIDGE_A
+    if drive.peak_b[lane] > drive.overcurrent[lane]:
+        bits |= 1 << BRIDGE_B
+    if drive.u_dc[lane] < drive.undervoltage[lane]:
+        bits |= 1 << UNDERVOLTAGE
+    if drive.u_dc[lane] > drive.overvoltage[lane]:
+        bits |= 1 << OVERVOLTAGE
+    if drive.T_stage[lane] > drive.warning_temperature[lane]:
+        bits |= 1 << WARM
+        if drive.T_stage[lane] > drive.error_temperature[lane]:
+            bits |= 1 << OVERTEMPERATURE
+    if drive.hall_broken[lane] > 0.0 and alignment.needs_halls(drive, lane):
+        # All three lines alike is a pattern that no rotor position gives.
+        bits |= 1 << HALL_ERROR
+    if (drive.inputs[lane] & inputs.ENABLE) == 0:
+        bits |= 1 << SHUTDOWN_SWITCH
+    if alignment.has_failed(drive, lane):
+        bits |= 1 << INITIALIZATION
+    if drive.open_load_time_a[lane] > OPEN_LOAD_TIME:
+        bits |= 1 << OPEN_LOAD_A
+    if drive.open_load_time_b[lane] > OPEN_LOAD_TIME:
+        bits |= 1 << OPEN_LOAD_B
+    if drive.overload[lane] > 1.0:
+        bits |= 1 << OVERLOAD
+    if drive.drive_function[lane] > 0.0:
         window = drive.following_error_window[lane]
-        return (
-            window > 0.0
-            and drive.loop_level[lane] > 0
-            and drive.drive_function[lane] > 0.0
-            and abs(drive.position_demand[lane] - drive.theta_meas[lane]) > window
-        )
-    return False
+        error = abs(drive.position_demand[lane] - drive.theta_meas[lane])
+        if window > 0.0 and drive.loop_level[lane] > 0.0 and error > window:
+            bits |= 1 << FOLLOWING_ERROR
+        # Limit switches are what homing looks for, and before it positions mean nothing.
+        if drive.mode_display[lane] != HOMING:
+            if drive.position_demand[lane] > corrected_maximum(drive, lane):
+                bits |= 1 << POSITIVE_SOFTWARE
+            if drive.position_demand[lane] < corrected_minimum(drive, lane):
+                bits |= 1 << NEGATIVE_SOFTWARE
+            if inputs.is_active(drive, lane, 1):
+                bits |= 1 << POSITIVE_SWITCH
+            if inputs.is_active(drive, lane, 0):
+                bits |= 1 << NEGATIVE_SWITCH
+    return bits
+
+
+@stage
+def corrected_minimum(drive, lane):
+    """Return 607Dh:01 corrected by the home offset (manual, section 6.1.11) [rad]."""
+    return drive.position_min[lane] - drive.home_offset[lane]
+
+
+@stage
+def corrected_maximum(drive, lane):
+    """Return 607Dh:02 corrected by the home offset [rad]."""
+    return drive.position_max[lane] - drive.home_offset[lane]
 
 
 @stage
 def causes_gone(drive, lane):
-    """Return whether the cause that holds the drive in fault is gone."""
-    return drive.fault[lane] == 0 or not is_present(drive, lane, drive.fault[lane] - 1)
+    """Return whether no cause that takes the drive into fault holds any more.
+
+    A failed initialisation does not count: it is tried again at the next enabling, and its cause is only seen then.
+    """
+    return conditions(drive, lane) & (_CUTS | _STOPS) & ~(1 << INITIALIZATION) == 0
 
 
 @stage
-def protect(drive, lane):
-    """Look at every cause; the first that appears takes the drive into fault and queues its emergency."""
-    # A drive whose supply is missing is no fault before anybody switches it on: voltage is watched once it is.
+def protect(drive, lane, dt):
+    """Look at every cause; one that appears queues its emergency and has its reaction."""
+    watch_phases(drive, lane, dt)
+    present = conditions(drive, lane)
     if drive.fsa[lane] < fsa.SWITCHED or drive.fsa[lane] == fsa.FAULTED:
+        # A drive whose supply or enable is missing is in no fault before anybody switches it on.
+        present &= ~(_CUTS | _STOPS)
+    drive.peak_a[lane] = 0.0
+    drive.peak_b[lane] = 0.0
+    appeared = present & ~drive.active[lane]
+    drive.active[lane] = present
+    drive.warning[lane] = 1 if present & _WARNS else 0
+    drive.blocked[lane] = (BLOCKS_POSITIVE if present & _POSITIVE else 0) | (
+        BLOCKS_NEGATIVE if present & _NEGATIVE else 0
+    )
+    if appeared == 0:
         return
-    for cause in range(1, len(_CUT)):
-        if drive.fault[lane] == cause + 1 or not is_present(drive, lane, cause):
+    for cause in range(1, len(_REGISTER)):
+        if not appeared & (1 << cause):
             continue
-        drive.fault[lane] = cause + 1
-        drive.error_register[lane] |= GENERIC_ERROR | _REGISTER[cause]
-        fsa.push_emergency(drive, lane, cause)
-        fsa.fault(drive, lane, _CUT[cause])
-        if drive.fsa[lane] == fsa.FAULTED:
-            return
+        push_emergency = True
+        if (_CUTS | _STOPS) & (1 << cause):
+            cut = _CUTS & (1 << cause) != 0
+            # The stage that is cut has answered: what else it sees in the same moment follows from it.
+            push_emergency = drive.fsa[lane] != fsa.FAULTED
+            if push_emergency:
+                drive.fault[lane] = cause + 1
+                drive.error_register[lane] |= GENERIC_ERROR | _REGISTER[cause]
+                fsa.fault(drive, lane, cut)
+        if push_emergency:
+            fsa.push_emergency(drive, lane, cause)
 
 
 @stage
 def fault_flags(drive, lane):
     """Return the bits of 2101h that tell which fault the drive is in."""
-    return _FLAGS[drive.fault[lane] - 1] if drive.fault[lane] > 0 else 0
+    flags = _FLAGS[drive.fault[lane] - 1] if drive.fault[lane] > 0 else 0
+    return flags

@@ -9,6 +9,8 @@ from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined
 
 SQRT3 = 3.0**0.5
+PI = 3.141592653589793
+HALL_STANDSTILL = 0.05  # s without an edge after which the halls tell no speed
 U32 = np.uint32  # without it every operation of the generator widens to 64 bits
 # Sum of four random bytes: mean 510, variance 4 (256^2 - 1) / 12.
 _BYTES_MEAN = 510.0
@@ -25,18 +27,27 @@ def measure_motion(drive, h):
     for lane in range(LANES):
         s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
         drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
-        count = np.floor(
-            (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] * (1.0 / TWO_PI)
-        )
-        per_count = (
-            (1.0 - 2.0 * drive.shaft_direction[lane])
-            * (1.0 - 2.0 * drive.encoder_direction[lane])
-            * TWO_PI
-            / (drive.encoder_steps[lane] * drive.encoder_interpolation[lane])
-        )
-        raw = (count - drive.count[lane]) * per_count / h
+        count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.counts_per_rad[lane])
+        before = drive.count[lane]
+        count = before if drive.encoder_broken[lane] > 0.5 else count
+        shaft = 1.0 - 2.0 * drive.shaft_direction[lane]
+        per_count = shaft * TWO_PI * drive.turns_per_count[lane]
+        # Under hall commutation the halls are the encoder, unless 2043h:03 says otherwise: 6 steps per pole pair, speed
+        # from the time between edges. All is computed and then chosen: a branch would cost the loop its vectors.
+        per_sector = shaft * (PI / 3.0) / drive.pole_pairs[lane]
+        elapsed = drive.hall_time[lane]
+        period = drive.hall_period[lane]
+        since = elapsed if elapsed > period else period
+        hall_speed = per_sector * drive.hall_sense[lane] / since
+        hall_speed = 0.0 if since > HALL_STANDSTILL else hall_speed
+        hall_position = (drive.hall_sector[lane] - drive.hall_zero[lane]) * per_sector
+        by_hall = (1.0 if drive.angle_source[lane] == 2.0 else 0.0) * (1.0 - drive.always_use_encoder[lane])
+        speed = (count - before) * per_count / h
+        position = (count - drive.count_zero[lane]) * per_count
+        raw = hall_speed if by_hall > 0.5 else speed
+        position = hall_position if by_hall > 0.5 else position
         drive.count[lane] = count
-        drive.theta_meas[lane] = (count - drive.count_zero[lane]) * per_count
+        drive.theta_meas[lane] = position - drive.home_shift[lane]
         b = drive.velocity_filter_b[lane]
         omega = b * raw + drive.velocity_filter_z[0, lane]
         drive.velocity_filter_z[0, lane] = (
@@ -47,18 +58,49 @@ def measure_motion(drive, h):
 
 
 @inlined
-def measure_angle(drive):
-    """Find the electrical angle that the encoder tells, once per current tick: writes sin_meas, cos_meas."""
+def measure_halls(drive, dt):
+    """Read the halls after dt [s]: writes their sector, the time between edges, and angle_hall."""
     for lane in range(LANES):
-        count = np.floor(
-            (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] * (1.0 / TWO_PI)
-        )
-        turns = (
-            (count - drive.count_zero[lane])
-            * (1.0 - 2.0 * drive.encoder_direction[lane])
-            / (drive.encoder_steps[lane] * drive.encoder_interpolation[lane])
-        )
-        angle = drive.angle_zero[lane] + drive.pole_pairs[lane] * turns * TWO_PI
+        # Halls: six sectors per electrical turn; wrong polarity is three sectors off, wrong direction counts backwards.
+        true_sector = np.floor((drive.n_p[lane] * drive.theta_m[lane] + drive.hall_true_offset[lane]) * (3.0 / PI))
+        reverse = abs(drive.hall_true_direction[lane] - drive.hall_direction[lane])
+        inverse = abs(drive.hall_true_polarity[lane] - drive.hall_polarity[lane])
+        sector = true_sector + reverse * (-1.0 - 2.0 * true_sector) + 3.0 * inverse
+        sector = drive.hall_sector[lane] if drive.hall_broken[lane] > 0.5 else sector
+        change = sector - drive.hall_sector[lane]
+        elapsed = drive.hall_time[lane] + dt
+        edge = change != 0.0
+        period = elapsed if edge else drive.hall_period[lane]
+        elapsed = 0.0 if edge else elapsed
+        sense = (1.0 if change > 0.0 else -1.0) if edge else drive.hall_sense[lane]
+        drive.hall_sector[lane] = sector
+        drive.hall_time[lane] = elapsed
+        drive.hall_period[lane] = period
+        drive.hall_sense[lane] = sense
+        share = elapsed / period
+        share = 1.0 if share > 1.0 else share
+        entered = sector if sense > 0.0 else sector + 1.0
+        moving = drive.hall_interpolation[lane] > 0.5 and elapsed < HALL_STANDSTILL and period < HALL_STANDSTILL
+        hall = (entered + sense * share if moving else sector + 0.5) * (PI / 3.0) - drive.hall_offset[lane]
+        drive.angle_hall[lane] = hall
+
+
+@inlined
+def measure_angle(drive, dt):
+    """Find the electrical angle of the commutation in use, every current tick of dt [s]: writes sin_meas, cos_meas."""
+    for lane in range(LANES):
+        count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.counts_per_rad[lane])
+        count = drive.count[lane] if drive.encoder_broken[lane] > 0.5 else count
+        turns = (count - drive.count_zero[lane]) * drive.turns_per_count[lane]
+        encoder = drive.angle_zero[lane] + drive.pole_pairs[lane] * turns * TWO_PI
+        open_loop = drive.angle_open_loop[lane] + dt * drive.pole_pairs[lane] * drive.velocity_demand[lane]
+        drive.angle_encoder[lane] = encoder
+        drive.angle_open_loop[lane] = open_loop
+        source = drive.angle_source[lane]
+        angle = encoder if source == 3.0 else drive.angle_forced[lane]
+        angle = drive.angle_hall[lane] if source == 2.0 else angle
+        angle = open_loop if source == 1.0 else angle
+        angle = -0.5 * PI if source == 5.0 else angle
         s, c = sine_cosine(angle)
         drive.angle_meas[lane] = angle
         drive.sin_meas[lane] = s
@@ -69,13 +111,14 @@ def measure_angle(drive):
 def measure_currents(drive):
     """Sample phase currents a and b with offset, gain error, noise, quantisation: writes i_alpha_meas, i_beta_meas."""
     for lane in range(LANES):
-        s, c = sine_cosine(drive.n_p[lane] * drive.theta_m[lane])
+        # A DC motor's current flows along alpha, which is its q axis turned back by a quarter.
+        s, c = sine_cosine(-0.5 * PI if drive.is_dc[lane] > 0.5 else drive.n_p[lane] * drive.theta_m[lane])
         drive.sin_e[lane] = s
         drive.cos_e[lane] = c
         i_alpha = c * drive.i_d[lane] - s * drive.i_q[lane]
         i_beta = s * drive.i_d[lane] + c * drive.i_q[lane]
         i_a = i_alpha
-        i_b = 0.5 * (SQRT3 * i_beta - i_alpha)
+        i_b = -i_alpha if drive.is_dc[lane] > 0.5 else 0.5 * (SQRT3 * i_beta - i_alpha)
         # Two words of xorshift32, four bytes each: a sum of four is close enough to a normal deviate.
         x = U32(drive.random[lane])
         x = U32(x ^ U32(x << U32(13)))
@@ -92,7 +135,7 @@ def measure_currents(drive):
         noise_a = (np.float64(sum_a) - _BYTES_MEAN) * _BYTES_SCALE
         noise_b = (np.float64(sum_b) - _BYTES_MEAN) * _BYTES_SCALE
         noise = drive.adc_noise[lane]
-        inverse_step = 1.0 / drive.adc_step[lane]
+        inverse_step = drive.adc_steps_per_ampere[lane]
         steps_a = np.floor(
             (i_a * drive.adc_gain[0, lane] + drive.adc_offset_error[0, lane] + noise * noise_a) * inverse_step + 0.5
         )
@@ -105,14 +148,19 @@ def measure_currents(drive):
         raw_b = 0.0 if raw_b < 0.0 else (65535.0 if raw_b > 65535.0 else raw_b)
         drive.adc_raw[0, lane] = raw_a
         drive.adc_raw[1, lane] = raw_b
-        per_lsb = drive.adc_step[lane] / drive.adc_step_lsb[lane]
+        per_lsb = drive.ampere_per_lsb[lane]
         i_a_meas = (raw_a - drive.adc_offset[0, lane]) * per_lsb
         i_b_meas = (raw_b - drive.adc_offset[1, lane]) * per_lsb
         drive.adc_current[0, lane] = i_a_meas
         drive.adc_current[1, lane] = i_b_meas
         drive.adc_current[2, lane] = -i_a_meas - i_b_meas
         drive.i_alpha_meas[lane] = i_a_meas
-        drive.i_beta_meas[lane] = (i_a_meas + 2.0 * i_b_meas) * (1.0 / SQRT3)
+        driven_as_dc = drive.motor_type[lane] == 1.0
+        drive.i_beta_meas[lane] = 0.0 if driven_as_dc else (i_a_meas + 2.0 * i_b_meas) * (1.0 / SQRT3)
+        peak_a = abs(i_a_meas)
+        peak_b = abs(i_b_meas)
+        drive.peak_a[lane] = peak_a if peak_a > drive.peak_a[lane] else drive.peak_a[lane]
+        drive.peak_b[lane] = peak_b if peak_b > drive.peak_b[lane] else drive.peak_b[lane]
 
 
 # Reading of the ADC registers at zero current when the channel has no offset error (default of 2060h:03 and :04).

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from drive_env.firmware import fsa, profiles
-from drive_env.firmware.modes import cst, idle, pp, pv
+from drive_env.firmware import alignment, fsa, profiles, protection
+from drive_env.firmware.modes import csp, cst, csv, cyclic, hm, idle, pp, pv
 from mechanics.compiled import stage
 
 
@@ -23,9 +23,12 @@ MODES = (
     Mode(0, "no", "No mode", None, 1),
     Mode(1, "pp", "Profile position mode", 0, 2),
     Mode(3, "pv", "Profile velocity mode", 2, 1),
+    Mode(6, "hm", "Homing mode", 5, 2),
+    Mode(8, "csp", "Cyclic synchronous position mode", 7, 2),
+    Mode(9, "csv", "Cyclic synchronous velocity mode", 8, 1),
     Mode(10, "cst", "Cyclic synchronous torque mode", 9, 0),
 )
-PP, PV, CST = 1, 3, 10
+PP, PV, HM, CSP, CSV, CST = 1, 3, 6, 8, 9, 10
 
 
 @stage
@@ -75,6 +78,34 @@ def change_mode(drive, lane):
     drive.set_point_acknowledged[lane] = 0
     drive.target_reached[lane] = 0
     drive.in_window_time[lane] = 0.0
+    cyclic.forget(drive, lane)
+    hm.forget(drive, lane)
+
+
+@stage
+def asked_direction(drive, lane):
+    """Return the sign of the motion that the targets of the present mode ask for."""
+    mode = drive.mode_display[lane]
+    way = 0.0
+    if mode == PP:
+        way = drive.profile_target[lane] - drive.position_demand[lane] if drive.set_point_valid[lane] == 1 else 0.0
+    elif mode == PV:
+        way = drive.target_velocity[lane]
+    elif mode == CSP:
+        way = drive.target_position[lane] + drive.position_offset[lane] - drive.position_demand[lane]
+    elif mode == CSV:
+        way = drive.target_velocity[lane] + drive.velocity_offset[lane]
+    elif mode == CST:
+        way = drive.target_torque[lane] + drive.torque_offset[lane]
+    return 1.0 if way > 0.0 else (-1.0 if way < 0.0 else 0.0)
+
+
+@stage
+def is_blocked(drive, lane):
+    """Return whether a limit of travel forbids the motion that is asked for; away from it is allowed."""
+    way = asked_direction(drive, lane)
+    blocked = drive.blocked[lane]
+    return (way > 0.0 and blocked & protection.BLOCKS_POSITIVE) or (way < 0.0 and blocked & protection.BLOCKS_NEGATIVE)
 
 
 @stage
@@ -88,12 +119,26 @@ def generate_demand(drive, lane, dt):
         drive.velocity_demand[lane] = 0.0
         drive.torque_demand[lane] = 0.0
         drive.target_reached[lane] = 0
+        cyclic.forget(drive, lane)
         return
+    if alignment.is_busy(drive, lane):
+        drive.position_demand[lane] = drive.theta_meas[lane]
+        drive.velocity_demand[lane] = 0.0
+        drive.velocity_sum[lane] = 0.0
+        return
+    if mode != PP and mode != CSP:
+        drive.internal_limit[lane] = 0
     halted = (drive.controlword[lane] & fsa.BIT_HALT) != 0
     if drive.stopping[lane] == 1:
         brake(drive, lane, stop_ramp(drive, lane), dt)
         drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
-    elif halted and mode != 0:
+    elif is_blocked(drive, lane):
+        brake(drive, lane, drive.quick_stop_deceleration[lane], dt)
+        drive.internal_limit[lane] = 1
+        drive.target_reached[lane] = 0
+        if drive.velocity_demand[lane] == 0.0:
+            drive.set_point_valid[lane] = 0
+    elif halted and mode != 0 and mode != HM:
         brake(drive, lane, slow_down_ramp(drive, lane), dt)
         # CiA 402: with halt set, bit 10 tells that the axis has come to rest.
         drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
@@ -101,6 +146,12 @@ def generate_demand(drive, lane, dt):
         pp.generate(drive, lane, slow_down_ramp(drive, lane), dt)
     elif mode == PV:
         pv.generate(drive, lane, dt)
+    elif mode == HM:
+        hm.generate(drive, lane, dt)
+    elif mode == CSP:
+        csp.generate(drive, lane, dt)
+    elif mode == CSV:
+        csv.generate(drive, lane, dt)
     elif mode == CST:
         cst.generate(drive, lane)
     else:
@@ -108,30 +159,38 @@ def generate_demand(drive, lane, dt):
 
 
 @stage
-def bit_12(drive, lane):
-    """Return bit 12 of the statusword as the present mode documents it."""
+def mode_bits(drive, lane):
+    """Return bits 12 and 13 of the statusword as the present mode documents them (tables 148, 217, 237, 263, 283)."""
     mode = drive.mode_display[lane]
+    bits = 0
     if mode == PP:
-        return drive.set_point_acknowledged[lane] == 1
-    if mode == CST:
-        # Table 283: 1 while the target torque is the input of the control loop.
-        return (
+        if drive.set_point_acknowledged[lane] == 1:
+            bits |= 0x1000
+    elif mode == HM:
+        if drive.homing_attained[lane] == 1:
+            bits |= 0x1000
+    elif mode in (CSP, CSV, CST):
+        # 1 while the target is the input of the control loop.
+        if (
             drive.fsa[lane] == fsa.ENABLED
             and drive.stopping[lane] == 0
             and (drive.controlword[lane] & fsa.BIT_HALT) == 0
-        )
-    return False
+        ):
+            bits |= 0x1000
+        if mode == CSP and drive.fault[lane] == protection.FOLLOWING_ERROR + 1:
+            bits |= 0x2000
+    return bits
 
 
 # Bits of 2101h (table 85); those of the faults are the protection's.
 FLAG_HALTED, FLAG_STOP, FLAG_VELOCITY, FLAG_POSITION, FLAG_TORQUE = 1 << 4, 1 << 8, 1 << 9, 1 << 10, 1 << 11
-FLAG_POSITION_END, FLAG_INITIALIZED = 1 << 14, 1 << 15
+FLAG_POSITION_END, FLAG_INITIALIZED, FLAG_BRAKE = 1 << 14, 1 << 15, 1 << 18
 
 
 @stage
 def status_flags(drive, lane):
     """Return the bits of 2101h that tell what the motor does."""
-    flags = FLAG_INITIALIZED
+    flags = FLAG_INITIALIZED if drive.init_state[lane] == alignment.DONE else 0
     if abs(drive.omega_slow[lane]) <= drive.standstill[lane]:
         flags |= FLAG_HALTED
     if drive.drive_function[lane] == 0.0 or drive.stopping[lane] == 1:
@@ -144,4 +203,6 @@ def status_flags(drive, lane):
         flags |= FLAG_TORQUE
     if drive.mode_display[lane] == PP and drive.target_reached[lane] == 1:
         flags |= FLAG_POSITION_END
+    if drive.chopper[lane] > 0.0:
+        flags |= FLAG_BRAKE
     return flags

@@ -7,9 +7,10 @@ from mechanics.compiled import stage
 
 @stage
 def generate(drive, lane):
-    """Hand 6071h to the current loop; position demand follows the axis."""
+    """Hand 6071h + 60B2h to the current loop; position demand follows the axis."""
     drive.loop_level[lane] = 0
-    drive.torque_demand[lane] = drive.target_torque[lane]
+    drive.torque_demand[lane] = drive.target_torque[lane] + drive.torque_offset[lane]
     drive.position_demand[lane] = drive.theta_meas[lane]
-    drive.velocity_demand[lane] = 0.0
+    # What a stop ramp starts from.
+    drive.velocity_demand[lane] = drive.omega_meas[lane]
     drive.target_reached[lane] = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from drive_env.firmware import fsa, profiles
+from drive_env.firmware.protection import corrected_maximum, corrected_minimum
 from mechanics.compiled import stage
 
 
@@ -28,11 +29,9 @@ def new_set_point(drive, lane, word_before):
         else:
             target += drive.theta_meas[lane]
     drive.internal_limit[lane] = 0
-    if target > drive.position_max[lane]:
-        target = drive.position_max[lane]
-        drive.internal_limit[lane] = 1
-    elif target < drive.position_min[lane]:
-        target = drive.position_min[lane]
+    low, high = corrected_minimum(drive, lane), corrected_maximum(drive, lane)
+    if target > high or target < low:
+        target = high if target > high else low
         drive.internal_limit[lane] = 1
     drive.profile_target[lane] = target
     drive.set_point_valid[lane] = 1

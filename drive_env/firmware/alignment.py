@@ -1,0 +1,116 @@
+"""Commutation: which angle the current loop uses, and how the encoder is aligned with the rotor (2055h, 2080h:03).
+
+Estimate offset holds a current along one angle, then a quarter electrical turn further: the rotor must follow, and in
+the direction in which the encoder counts. Use hall takes the middle of the sector, half a sector off at most. Use
+offset knows the alignment from before.
+"""
+
+from __future__ import annotations
+
+from drive_env.firmware import fsa
+from mechanics.compiled import stage
+
+TWO_PI = 6.283185307179586
+QUARTER = 0.25 * TWO_PI
+
+DC, BLDC = 1.0, 3.0
+DISABLED, OPEN_LOOP, HALL, ENCODER = 0.0, 1.0, 2.0, 3.0
+FORCED, DC_FRAME = 4.0, 5.0
+ESTIMATE, USE_OFFSET, USE_HALL = 0, 1, 2
+
+# States of the initialisation.
+NEEDED, FIRST_ANGLE, SECOND_ANGLE, DONE, FAILED = 0, 1, 2, 3, 4
+
+HOLD_TIME = 0.4  # s at each angle: the rotor swings in
+TOLERANCE = 0.3  # of a quarter turn, by which its motion may differ
+
+
+@stage
+def _encoder_turn(drive, lane):
+    """Return the electrical angle that the encoder has counted since power-on [rad]."""
+    turns = (drive.count[lane] - drive.count_zero[lane]) * drive.turns_per_count[lane]
+    return turns * TWO_PI * drive.pole_pairs[lane]
+
+
+@stage
+def is_busy(drive, lane):
+    """Return whether an initialisation turns the motor, so that the mode has to wait."""
+    return drive.init_state[lane] == FIRST_ANGLE or drive.init_state[lane] == SECOND_ANGLE
+
+
+@stage
+def commutate(drive, lane, dt):
+    """Choose the angle's source and switch the stage, once per period of dt [s]; runs the initialisation."""
+    on = drive.drive_function[lane] > 0.0
+    drive.torque_share[lane] = 1.0
+    drive.i_d_ref[lane] = 0.0
+    mode = drive.commutation_mode[lane]
+    if drive.motor_type[lane] == DC:
+        drive.angle_source[lane] = DC_FRAME
+        # A stage set for two legs does not drive three phases, nor the reverse.
+        drive.stage_on[lane] = 1.0 if on and drive.is_dc[lane] == 1.0 else 0.0
+        drive.init_state[lane] = DONE
+        return
+    if drive.motor_type[lane] != BLDC or drive.is_dc[lane] == 1.0 or mode == DISABLED:
+        drive.angle_source[lane] = DISABLED
+        drive.stage_on[lane] = 0.0
+        return
+    drive.stage_on[lane] = 1.0 if on else 0.0
+    drive.angle_source[lane] = mode
+    if mode == OPEN_LOOP:
+        drive.torque_share[lane] = 0.0
+        drive.i_d_ref[lane] = min(drive.open_loop_current[lane], drive.i_max[lane])
+        return
+    if mode == HALL or drive.init_state[lane] == FAILED:
+        return
+    if drive.init_state[lane] == NEEDED:
+        if drive.encoder_init_mode[lane] == USE_OFFSET:
+            drive.init_state[lane] = DONE
+        elif drive.encoder_init_mode[lane] == USE_HALL:
+            drive.angle_zero[lane] = drive.angle_hall[lane] - _encoder_turn(drive, lane)
+            drive.init_state[lane] = DONE
+        elif on:
+            drive.init_state[lane] = FIRST_ANGLE
+            drive.init_time[lane] = 0.0
+    if not is_busy(drive, lane):
+        return
+    if not on:
+        drive.init_state[lane] = NEEDED
+        return
+    drive.angle_source[lane] = FORCED
+    drive.torque_share[lane] = 0.0
+    current = drive.open_loop_current[lane] if drive.open_loop_current[lane] > 0.0 else 0.5 * drive.i_max[lane]
+    drive.i_d_ref[lane] = min(current, drive.i_max[lane])
+    drive.init_time[lane] += dt
+    if drive.init_state[lane] == FIRST_ANGLE:
+        # Swept to the first angle, or a rotor exactly opposite would stay where it is.
+        drive.angle_forced[lane] = QUARTER * (min(2.0 * drive.init_time[lane] / HOLD_TIME, 1.0) - 1.0)
+        if drive.init_time[lane] >= HOLD_TIME:
+            drive.init_angle[lane] = _encoder_turn(drive, lane)
+            drive.init_state[lane] = SECOND_ANGLE
+            drive.init_time[lane] = 0.0
+        return
+    # Turned there step by step, or a rotor on the far side would fall to either hand.
+    drive.angle_forced[lane] = QUARTER * min(2.0 * drive.init_time[lane] / HOLD_TIME, 1.0)
+    if drive.init_time[lane] < 2.0 * HOLD_TIME:
+        return
+    turned = _encoder_turn(drive, lane) - drive.init_angle[lane]
+    if abs(turned - QUARTER) > TOLERANCE * QUARTER:
+        drive.init_state[lane] = FAILED
+        return
+    drive.angle_zero[lane] = QUARTER - _encoder_turn(drive, lane)
+    drive.init_state[lane] = DONE
+
+
+@stage
+def needs_halls(drive, lane):
+    """Return whether the halls tell the angle, or have to at the initialisation of the encoder."""
+    return drive.angle_source[lane] == HALL or (
+        drive.angle_source[lane] == ENCODER and drive.encoder_init_mode[lane] == USE_HALL
+    )
+
+
+@stage
+def has_failed(drive, lane):
+    """Return whether the encoder's initialisation failed."""
+    return drive.init_state[lane] == FAILED and drive.fsa[lane] >= fsa.SWITCHED

@@ -1,0 +1,28 @@
+"""Quotients that the ticks need, computed once per millisecond: a division costs a tick as much as ten products."""
+
+from __future__ import annotations
+
+from drive_env.firmware.arithmetic import TWO_PI
+from drive_env.firmware.record import LANES
+from mechanics.compiled import inlined
+
+SMALLEST_RESISTANCE = 1e-15  # ohm; a supply without resistance is one that holds its voltage
+
+
+@inlined
+def derive(drive, dt):
+    """Compute the constants of encoder, current sensor, DC link and rotor for ticks of dt [s]."""
+    for lane in range(LANES):
+        steps = drive.encoder_steps[lane] * drive.encoder_interpolation[lane]
+        drive.turns_per_count[lane] = (1.0 - 2.0 * drive.encoder_direction[lane]) / steps
+        drive.counts_per_rad[lane] = drive.encoder_counts[lane] * (1.0 / TWO_PI)
+        drive.adc_steps_per_ampere[lane] = 1.0 / drive.adc_step[lane]
+        drive.ampere_per_lsb[lane] = drive.adc_step[lane] / drive.adc_step_lsb[lane]
+        drive.dead_time_slope[lane] = 1.0 / drive.dead_time_current[lane]
+        drive.chopper_conductance[lane] = 1.0 / drive.chopper_resistance[lane]
+        drive.tick_mobility[lane] = dt / drive.J_rotor[lane]
+        step = dt / drive.dc_capacitance[lane]
+        feed = step / (drive.supply_resistance[lane] + SMALLEST_RESISTANCE)
+        drive.link_step[lane] = step
+        drive.link_feed[lane] = feed
+        drive.link_share[lane] = 1.0 / (1.0 + feed)

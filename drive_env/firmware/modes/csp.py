@@ -1,0 +1,24 @@
+"""Cyclic synchronous position mode (manual, section 9)."""
+
+from __future__ import annotations
+
+from drive_env.firmware.modes import cyclic
+from drive_env.firmware.protection import corrected_maximum, corrected_minimum
+from mechanics.compiled import stage
+
+
+@stage
+def generate(drive, lane, dt):
+    """Move the position demand to 607Ah + 60B0h within the interpolation period; 607Dh limits it and sets bit 11."""
+    drive.loop_level[lane] = 2
+    target = drive.target_position[lane] + drive.position_offset[lane]
+    drive.internal_limit[lane] = 0
+    low, high = corrected_minimum(drive, lane), corrected_maximum(drive, lane)
+    if target > high or target < low:
+        target = high if target > high else low
+        drive.internal_limit[lane] = 1
+    before = drive.position_demand[lane]
+    demand = cyclic.interpolate(drive, lane, before, target, dt)
+    drive.position_demand[lane] = demand
+    drive.velocity_demand[lane] = (demand - before) / dt
+    drive.target_reached[lane] = 0

@@ -1,0 +1,153 @@
+"""Homing mode (manual, section 8): methods 17, 18, 19, 21 and 35; 0 does nothing.
+
+A switch is searched fast; once it is touched the axis brakes, and looks for the edge slowly, always in the same
+direction, until the switch changes; that edge is home. Then the axis returns to the edge and rests there. Search and
+edge as the methods have them:
+
+    17  search left until the left limit switch is active, edge to the right where it becomes inactive
+    18  search right until the right limit switch is active, edge to the left
+    19  search right until the home switch is active, edge to the left; a limit switch turns the search round
+    21  search left until the home switch is active, edge to the right; a limit switch turns the search round
+    35  here
+"""
+
+from __future__ import annotations
+
+from drive_env.firmware import fsa, inputs, profiles
+from mechanics.compiled import stage
+
+LEFT, RIGHT, HOME = 0, 1, 2
+
+# States of a homing run.
+IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, RETURN, STOPPED, DONE, FAILED = range(10)
+
+
+@stage
+def _switch(method):
+    """Return which switch a method looks for."""
+    if method == 17:
+        return LEFT
+    if method == 18:
+        return RIGHT
+    return HOME
+
+
+@stage
+def _search_sign(method):
+    """Return the direction in which a method searches its switch."""
+    return -1.0 if method in (17, 21) else 1.0
+
+
+@stage
+def start_or_stop(drive, lane, word_before):
+    """Start homing on the rising edge of controlword bit 4, stop it on the falling one."""
+    word = drive.controlword[lane]
+    if word & fsa.BIT_NEW_SET_POINT and not word_before & fsa.BIT_NEW_SET_POINT:
+        drive.homing_attained[lane] = 0
+        drive.target_reached[lane] = 0
+        method = drive.homing_method[lane]
+        if method == 35:
+            # Does not need operation enabled.
+            set_home(drive, lane, drive.theta_meas[lane], 0.0)
+            drive.homing_state[lane] = DONE
+            drive.homing_attained[lane] = 1
+            drive.target_reached[lane] = 1
+        elif drive.fsa[lane] == fsa.ENABLED:
+            unable = (
+                drive.homing_fast[lane] <= 0.0
+                or drive.homing_slow[lane] <= 0.0
+                or drive.homing_acceleration[lane] <= 0.0
+            )
+            drive.homing_state[lane] = FAILED if method == 0 or unable else SEARCH
+            drive.target_reached[lane] = 1 if drive.homing_state[lane] == FAILED else 0
+    elif not word & fsa.BIT_NEW_SET_POINT and SEARCH <= drive.homing_state[lane] <= RETURN:
+        drive.homing_state[lane] = STOPPED
+
+
+@stage
+def forget(drive, lane):
+    """Leave homing: a run that was not finished is none."""
+    drive.homing_state[lane] = IDLE
+    drive.homing_attained[lane] = 0
+
+
+@stage
+def set_home(drive, lane, position, value):
+    """Give `position` [rad] the value `value` [rad]; demand and measurement move together, so nothing jumps."""
+    shift = position - value
+    drive.home_shift[lane] += shift
+    drive.theta_meas[lane] -= shift
+    drive.position_demand[lane] -= shift
+    drive.profile_target[lane] -= shift
+    drive.homing_edge[lane] = value
+
+
+@stage
+def _run(drive, lane, velocity, dt):
+    """Ramp the demand to a velocity [rad/s] with the homing acceleration."""
+    v = drive.velocity_demand[lane]
+    v_new = profiles.ramp(v, velocity, drive.homing_acceleration[lane], dt)
+    drive.position_demand[lane] += 0.5 * (v + v_new) * dt
+    drive.velocity_demand[lane] = v_new
+
+
+@stage
+def generate(drive, lane, dt):
+    """Run homing for one period of dt [s]; without a run the axis holds."""
+    drive.loop_level[lane] = 2
+    state = drive.homing_state[lane]
+    method = drive.homing_method[lane]
+    fast, slow = drive.homing_fast[lane], drive.homing_slow[lane]
+    sign = _search_sign(method)
+    active = inputs.is_active(drive, lane, _switch(method))
+    if state in (SEARCH, TURNED):
+        direction = sign if state == SEARCH else -sign
+        drive.homing_direction[lane] = direction
+        if active:
+            state = BRAKE
+        elif method in (19, 21) and inputs.is_active(drive, lane, RIGHT if direction > 0.0 else LEFT):
+            # The search led away from the switch: it lies on the other side, or nowhere.
+            state = TURNED if state == SEARCH else FAILED
+        if state in (SEARCH, TURNED):
+            _run(drive, lane, (sign if state == SEARCH else -sign) * fast, dt)
+    if state == BRAKE:
+        _run(drive, lane, 0.0, dt)
+        if drive.velocity_demand[lane] == 0.0:
+            state = TO_EDGE if active else AWAY
+    elif state == AWAY:
+        # Braking carried the axis across a narrow switch: back onto it, slowly.
+        back = -drive.homing_direction[lane]
+        if not active:
+            _run(drive, lane, back * slow, dt)
+        else:
+            state = TO_EDGE if back * sign < 0.0 else BRAKE
+    elif state == TO_EDGE:
+        if not active and drive.velocity_demand[lane] * sign < 0.0:
+            set_home(drive, lane, drive.theta_meas[lane], -drive.home_offset[lane])
+            state = RETURN
+        elif inputs.is_active(drive, lane, LEFT if sign > 0.0 else RIGHT):
+            state = FAILED
+        else:
+            _run(drive, lane, -sign * slow, dt)
+    elif state == RETURN:
+        x, v = profiles.trapezoid(
+            drive.position_demand[lane],
+            drive.velocity_demand[lane],
+            drive.homing_edge[lane],
+            slow,
+            drive.homing_acceleration[lane],
+            drive.homing_acceleration[lane],
+            dt,
+        )
+        drive.position_demand[lane] = x
+        drive.velocity_demand[lane] = v
+        if v == 0.0 and x == drive.homing_edge[lane]:
+            state = DONE
+            drive.homing_attained[lane] = 1
+            drive.target_reached[lane] = 1
+    elif state in (STOPPED, FAILED):
+        _run(drive, lane, 0.0, dt)
+        drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
+    elif state in (IDLE, DONE):
+        _run(drive, lane, 0.0, dt)
+    drive.homing_state[lane] = state

@@ -1,0 +1,87 @@
+"""Where results go and what made them: run folders that are complete or absent, and the versions that computed them."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+HEADER = "# The whole experiment of this run. It repeats from this file: drive-tune sweep --config settings.toml\n"
+_PACKAGES = ("drive-env", "numpy", "numba", "llvmlite", "mujoco")
+
+
+def versions() -> dict[str, str]:
+    """Return what decides the last digit: packages, Python, and the processor for which the kernels are compiled."""
+    import llvmlite.binding
+
+    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return found | {"python": platform.python_version(), "processor": str(llvmlite.binding.get_host_cpu_name())}
+
+
+def differences(recorded: Mapping[str, str]) -> list[str]:
+    """Return a line for each version that is not the recorded one: the last digits may then differ."""
+    if not recorded:
+        return []
+    here = versions()
+    return [
+        f"the run was made with {name} {version}, this is {here.get(name, 'none')}: last digits may differ"
+        for name, version in recorded.items()
+        if here.get(name) != version
+    ]
+
+
+def run_folder(kind: str, parent: str | Path = "runs") -> Path:
+    """Return a folder name that does not exist yet: runs/<date>-<time>-<kind>."""
+    stem = f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}"
+    name, k = Path(parent) / stem, 2
+    while name.exists():
+        name, k = Path(parent) / f"{stem}-{k}", k + 1
+    return name
+
+
+def check_folder(folder: str | Path) -> None:
+    """Raise OSError unless results can be written into the folder: new or empty, and its place writable.
+
+    Raises:
+        FileExistsError: If something is there already.
+        PermissionError: If the place cannot be written.
+        NotADirectoryError: If a file stands in the way.
+    """
+    path = Path(folder)
+    if path.is_dir():
+        if any(path.iterdir()):
+            raise FileExistsError(f"the folder {path} is not empty; choose another --out or remove it")
+    elif path.exists():
+        raise FileExistsError(f"{path} is a file; choose another --out")
+    place = path.absolute().parent
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir():
+        raise NotADirectoryError(f"{place} is a file, so that {path} cannot be a folder; choose another --out")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise PermissionError(f"the folder {place} cannot be written; choose another --out or change its permissions")
+
+
+@contextmanager
+def new_folder(folder: str | Path) -> Iterator[Path]:
+    """Give a partial folder to write into; it takes its name once all is written, and vanishes if anything fails."""
+    path = Path(folder)
+    check_folder(path)
+    partial = path.absolute().with_name(f".{path.absolute().name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+    except OSError as error:
+        raise OSError(f"the folder {path} cannot be made: {error.strerror}; choose another --out") from None
+    try:
+        yield partial
+        if path.is_dir():
+            path.rmdir()  # empty; a rename onto a folder fails on Windows
+        partial.rename(path)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise

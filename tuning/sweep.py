@@ -1,0 +1,277 @@
+"""The sweep: every point of a grid of gains on a machine of its own, all of them the same machine, in parallel."""
+
+from __future__ import annotations
+
+import csv
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import EmulatedDrives, motion
+from drive_env.drives import Trace
+from tuning import metrics, provenance
+from tuning.experiment import Experiment, Resolved, label, resolve
+from tuning.experiment import load_experiment as load_experiment
+from tuning.metrics import Recording
+
+VELOCITY, CURRENT, CURRENT_LIMIT = 0x606C, 0x6077, 0x2003
+FLAGS = ("diverged", "oscillates", "fault")
+PIECE = 0.02  # s of simulation between two reports of progress
+MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
+MAX_MACHINES = 4096  # at a time
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What a sweep found.
+
+    Attributes:
+        experiment: The experiment.
+        objects: Labels of the swept objects, e.g. `2042h:01`.
+        names: The same with their names.
+        columns: Every column of the table by name, each of shape (points,), in the order of the grid.
+        order: The points from best to worst.
+        response: The recording of the best point.
+        simulated: Simulated time of all machines together [s].
+        wall: Wall time of the simulation [s].
+    """
+
+    experiment: Experiment
+    objects: tuple[str, ...]
+    names: tuple[str, ...]
+    columns: dict[str, NDArray[Any]]
+    order: NDArray[np.int64]
+    response: Recording
+    simulated: float
+    wall: float
+
+    @property
+    def score_column(self) -> str:
+        """Name of the column that ranks; inf where a point oscillates, tripped, diverged or has no such figure."""
+        return f"score [{metrics.unit_of(self.experiment.metric.name)}]"
+
+    @property
+    def score(self) -> NDArray[np.float64]:
+        """What ranks, shape (points,)."""
+        return np.asarray(self.columns[self.score_column])
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Which points neither oscillate nor tripped nor diverged, shape (points,)."""
+        return np.asarray(~np.any([self.columns[flag] for flag in FLAGS], axis=0))
+
+    def best(self, count: int = 10) -> list[dict[str, Any]]:
+        """Return the best rows of the table, best first, as column name -> value."""
+        return [{name: column[k].item() for name, column in self.columns.items()} for k in self.order[:count]]
+
+    def without_effect(self) -> list[str]:
+        """Return the swept objects that change nothing at all in this excitation."""
+        shape = self.experiment.shape()
+        names = [name for name in self.columns if name not in self.objects and name != "rank"]
+        found = []
+        for axis, swept in enumerate(self.objects):
+            grids = [np.moveaxis(self.columns[name].reshape(shape), axis, 0) for name in names]
+            if shape[axis] > 1 and all(np.array_equal(g, np.broadcast_to(g[:1], g.shape), g.dtype.kind == "f")
+                                       for g in grids):  # fmt: skip
+                found.append(swept)
+        return found
+
+    def save(self, folder: str | Path) -> Path:
+        """Write results.csv, heatmap.png, best_response.png and settings.toml into a new folder and return it.
+
+        The files are complete or absent: they are written beside the folder and moved.
+
+        Raises:
+            FileExistsError: If the folder holds something already.
+            OSError: If it cannot be written.
+        """
+        from tuning import plots
+
+        with provenance.new_folder(folder) as partial:
+            with (partial / "results.csv").open("w", newline="", encoding="utf-8") as file:
+                self._write_csv(file)
+            plots.heat_map(self).savefig(partial / "heatmap.png")
+            plots.best_response(self).savefig(partial / "best_response.png")
+            settings = provenance.HEADER + self.experiment.to_toml(provenance.versions())
+            (partial / "settings.toml").write_text(settings, encoding="utf-8")
+        return Path(folder)
+
+    def _write_csv(self, file: Any) -> None:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(self.columns)
+        # Python's floats are written with as many digits as tell them apart: nothing is lost, and inf and nan say so.
+        columns = [column.astype(int) if column.dtype == bool else column for column in self.columns.values()]
+        writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def run(experiment: Experiment, progress: Progress | None = None, num_threads: int | None = None) -> SweepResult:
+    """Simulate every point of an experiment and rank them.
+
+    Args:
+        experiment: The experiment.
+        progress: Called with what is being done and its share done so far.
+        num_threads: Threads that simulate; the number of cores by default. It changes no digit.
+
+    Raises:
+        ExperimentError: If the experiment cannot be.
+    """
+    report = progress or (lambda _what, _share: None)
+    resolved = resolve(experiment)
+    report("compiling", 0.0)
+    _compile(experiment)
+    points = experiment.points()
+    samples = round(experiment.excitation.duration / experiment.excitation.sampling_period)
+    size = int(np.clip(MAX_SAMPLES // samples, 64, MAX_MACHINES))
+    batches = [points[first : first + size] for first in range(0, len(points), size)]
+    parts: list[dict[str, NDArray[Any]]] = []
+    best: tuple[float, Recording] | None = None
+    simulated = wall = 0.0
+    done = 0
+    for batch in batches:
+        with _machines(experiment, len(batch), num_threads) as drives:
+
+            def report_batch(share: float, done: int = done, size: int = len(batch)) -> None:
+                report("simulating", (done + share * size) / len(points))
+
+            started = time.perf_counter()
+            recording, fault = _record(drives, experiment, resolved, batch, report_batch)
+            wall += time.perf_counter() - started
+            columns = _evaluate(experiment, recording) | {"fault": fault}
+            columns["diverged"] = np.asarray(columns["diverged"] | drives.machine.diverged)
+        simulated += experiment.excitation.duration * len(batch)
+        done += len(batch)
+        parts.append(columns)
+        ranked = _score(columns)
+        k = int(np.argmin(ranked))
+        if best is None or ranked[k] < best[0]:
+            best = (float(ranked[k]), recording.point(k))
+    assert best is not None, "an experiment has at least one point"
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return _ranked(experiment, resolved, points, joined, best[1], simulated, wall)
+
+
+def _compile(experiment: Experiment) -> None:
+    """Compile the kernels, or load them, here and now: from a thread, Ctrl-C would have to wait for the compiler."""
+    with _machines(experiment, 1, 1) as drives:
+        motion.enable(drives, mode="pv")
+        drives.record([VELOCITY, CURRENT], 0.001)
+
+
+def _machines(experiment: Experiment, count: int, num_threads: int | None) -> EmulatedDrives:
+    return EmulatedDrives(
+        experiment.device,
+        load=experiment.load,
+        motor=experiment.motor,
+        num_machines=count,
+        seed=experiment.seed,
+        identical=True,
+        num_threads=num_threads,
+    )
+
+
+def _record(
+    drives: EmulatedDrives,
+    experiment: Experiment,
+    resolved: Resolved,
+    points: NDArray[np.int64],
+    report: Callable[[float], None],
+) -> tuple[Recording, NDArray[np.bool_]]:
+    """Return the recording of every point, and which ended in fault."""
+    excitation = experiment.excitation
+    # Enabled with the preset's gains, which are stable, so that the point's gains meet every axis in the same state.
+    motion.enable(drives, mode="pv")
+    drives.write((0x6083, 0), resolved.acceleration)
+    for column, entry in enumerate(resolved.entries):
+        drives.write((entry.index, entry.sub), points[:, column])
+    traces: list[Trace] = []
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)  # a flag of the table
+        for start, end in _pieces(excitation.velocity_time, excitation.load_time, excitation.duration, PIECE,
+                                  excitation.sampling_period):  # fmt: skip
+            if start == excitation.velocity_time:
+                drives.write(0x60FF, resolved.velocity)
+            if start == excitation.load_time:
+                drives.machine.load_torque = excitation.load_torque
+            period = excitation.sampling_period
+            traces.append(drives.record([VELOCITY, CURRENT], round((end - start) / period) * period, period=period))
+            report(end / excitation.duration)
+    t = np.arange(sum(map(len, traces)), dtype=np.float64) * excitation.sampling_period
+    rpm = 60.0 / resolved.position_scaler
+    ramp = np.clip((t - excitation.velocity_time) * resolved.acceleration, 0.0, abs(resolved.velocity))
+    recording = Recording(
+        t=t,
+        reference_rpm=np.sign(resolved.velocity) * ramp * rpm,
+        speed_rpm=np.concatenate([trace[VELOCITY] for trace in traces]) * rpm,
+        current=np.concatenate([trace[CURRENT] for trace in traces]) * 1e-3,
+        current_limit=drives.read(CURRENT_LIMIT).astype(np.float64) * 1e-3,
+        t_step=excitation.velocity_time,
+        t_load=excitation.load_time,
+    )
+    mask, value = motion.FAULT_BIT  # fault, or the reaction that leads to it
+    return recording, drives.read(0x6041) & mask == value
+
+
+def _pieces(step: float, load: float, end: float, piece: float, period: float) -> list[tuple[float, float]]:
+    """Return the pieces [s] in which a run is recorded: of whole sampling periods, cut at the two events."""
+    edges = [0.0, step, load, end]
+    size = max(1, round(piece / period)) * period
+    pieces = []
+    for first, last in pairwise(edges):
+        start = first
+        while last - start > 1e-9:
+            stop = min(start + size, last) if last - start - size > 1e-9 else last
+            pieces.append((start, stop))
+            start = stop
+    return pieces
+
+
+def _evaluate(experiment: Experiment, recording: Recording) -> dict[str, NDArray[Any]]:
+    """Return the score before the flags count, every metric, and the flags but the fault's."""
+    found = metrics.figures(recording)
+    choice = experiment.metric
+    columns: dict[str, NDArray[Any]] = {"score": metrics.score(choice.name, choice.weights, found)}
+    for row in metrics.METRICS.values():
+        columns[row.name] = np.asarray(row.function(found), np.float64)
+    columns["diverged"] = np.asarray(~np.isfinite(recording.speed_rpm).all(axis=0))
+    columns["oscillates"] = metrics.oscillates(found)
+    return columns
+
+
+def _score(columns: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """Return what ranks: inf for a point with a flag, or without the figure."""
+    flagged = np.any([columns[flag] for flag in FLAGS], axis=0) | np.isnan(columns["score"])
+    return np.where(flagged, np.inf, columns["score"])
+
+
+def _ranked(
+    experiment: Experiment,
+    resolved: Resolved,
+    points: NDArray[np.int64],
+    found: dict[str, NDArray[Any]],
+    best: Recording,
+    simulated: float,
+    wall: float,
+) -> SweepResult:
+    score = _score(found)
+    order = np.argsort(score, kind="stable")
+    rank = np.empty(len(points), np.int64)
+    rank[order] = np.arange(1, len(points) + 1)
+    objects = tuple(label(entry) for entry in resolved.entries)
+    columns: dict[str, NDArray[Any]] = {name: points[:, k] for k, name in enumerate(objects)}
+    columns["rank"] = rank
+    columns[f"score [{metrics.unit_of(experiment.metric.name)}]"] = score
+    for row in metrics.METRICS.values():
+        columns[f"{row.name} [{row.unit}]"] = found[row.name]
+    for flag in FLAGS:
+        columns[flag] = found[flag]
+    names = tuple(entry.label for entry in resolved.entries)
+    return SweepResult(experiment, objects, names, columns, order, best, simulated, wall)
