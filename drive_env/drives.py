@@ -15,28 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import Device, find_device
-from drive_env.dictionary import units
-from drive_env.dictionary.access import (
-    CANNOT_BE_STORED,
-    VALUE_RANGE,
-    WRONG_STATE,
-    ObjectAccessError,
-    check_allowed,
-    check_in_range,
-    check_readable,
-    check_writable,
-    checked_values,
-)
-from drive_env.dictionary.bindings import Binding
-from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
-from drive_env.firmware import cycle
-from drive_env.firmware.fsa import State
-from drive_env.firmware.modes import MODES
+from drive_env.dictionary.entries import ObjectDictionary, ObjectName
 from drive_env.firmware.protection import CAUSES
 from drive_env.firmware.record import get_lanes, new_records, set_lanes
 from drive_env.group import MACHINES_PER_GROUP, Channels, Group, channels, rates_of
-from drive_env.machine import Machines, apply_to_records, check_parameter, draw_parameters, parameter_table
+from drive_env.live_dictionary import NOTHING, LiveDictionary
+from drive_env.machine import Machines
 from drive_env.motors import find_motor
+from drive_env.parameters import apply_to_records, check_parameter, draw_parameters, parameter_table
 from mechanics.loads import find_load
 from mechanics.packed import PackedLoad, compile_packed
 
@@ -44,9 +30,7 @@ Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 SWITCHES = ("left", "right", "home")  # bits of 60FDh
-_NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
 
 
 class EmergencyMessage(NamedTuple):
@@ -131,7 +115,6 @@ class EmulatedDrives:
         self.load = find_load(load)
         self.num_machines = num_machines
         self.num_axes = num_machines * len(self.load.axes)
-        self._dictionary = self.device.new_dictionary()
         self._records = new_records(self.num_axes)
         self._threads = max(1, num_threads if num_threads is not None else os.cpu_count() or 1)
         self._executor: ThreadPoolExecutor | None = None
@@ -143,12 +126,16 @@ class EmulatedDrives:
         self._groups = self._build_groups(physics_steps, integrator)
         self._set_constants(self.motor.voltage if supply is None else supply)
         for name, values in self._parameters.items():
-            apply_to_records(self, name, np.repeat(values, len(self.load.axes)), np.ones(self.num_axes, bool))
+            everywhere = np.ones(self.num_axes, bool)
+            per_axis = np.repeat(values, len(self.load.axes))
+            apply_to_records(self._records, self.device, self.motor, name, per_axis, everywhere)
         self._refresh_inertia()
         self.machine = Machines(self)
-        self._values: dict[tuple[int, int], Integers | str] = {}
-        self._stored = self._commission(motor)
-        self._restart(np.ones(self.num_axes, bool))
+        preset = {} if motor is None else self.device.preset(motor)
+        if motor is not None and not self.load.has_switches:
+            preset = {"Limit switches": 3, **preset}
+        self._objects = LiveDictionary(self.device, self._records, self.num_axes, preset)
+        self._objects.restart(np.ones(self.num_axes, bool))
 
     # --- the interface --------------------------------------------------------------------------------------------
     def read(self, name: ObjectName) -> Integers:
@@ -157,9 +144,7 @@ class EmulatedDrives:
         Raises:
             ObjectAccessError: If there is no such object or it cannot be read.
         """
-        entry = self._dictionary.find(name)
-        check_readable(entry)
-        return self._read(entry)
+        return self._objects.read(name)
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
         """Write an object of the axes where the mask is true: one integer, or one per axis.
@@ -169,18 +154,13 @@ class EmulatedDrives:
         Raises:
             ObjectAccessError: With the SDO abort code, if the object, the value or the state does not allow it.
         """
-        entry = self._dictionary.find(name)
-        check_writable(entry)
-        raw = checked_values(entry, value, self.num_axes)
-        mask = self._axis_mask(where)
-        self._check(entry, raw, mask)
-        self._write(entry, raw, mask)
+        self._objects.write(name, value, self._axis_mask(where))
 
     def advance(self, duration: float) -> None:
         """Let `duration` [s] pass, whole communication cycles of 1 ms."""
         cycles = self._cycles(duration)
         nothing = np.empty((cycles, 0, self.num_axes))
-        self._run(cycles, nothing, _NOTHING, np.empty((cycles, 0, self.num_axes)), _NOTHING, 1)
+        self._run(cycles, nothing, NOTHING, np.empty((cycles, 0, self.num_axes)), NOTHING, 1)
 
     def record(
         self,
@@ -207,23 +187,22 @@ class EmulatedDrives:
         every = self._cycles(period)
         if every < 1:
             raise ValueError(f"period must be at least {self._cycle:g} s, not {period:g} s")
-        entries = [self._dictionary.find(name) for name in objects]
-        for entry in entries:
-            check_readable(entry)
-        bound = {(e.index, e.sub): self.device.bindings[e.index, e.sub] for e in entries if self._is_bound(e)}
-        sampled = channels([(b.field, b.part) for b in bound.values()])
-        values, played = self._plan_play(play or {}, cycles)
+        known = self._objects.entries
+        entries = [known.find(name) for name in objects]
+        bindings = {(e.index, e.sub): self._objects.recordable(e) for e in entries}
+        live = {key: binding for key, binding in bindings.items() if binding is not None}
+        sampled = channels([(b.field, b.part) for b in live.values()]) if live else NOTHING
+        values, played = self._objects.plan_play(play or {}, cycles)
         rows = -(-cycles // every)
-        samples = np.empty((rows, len(bound), self.num_axes))
+        samples = np.empty((rows, len(live), self.num_axes))
         self._run(cycles, values, played, samples, sampled, every)
         result: dict[tuple[int, int], Integers] = {}
-        for k, key in enumerate(bound):
-            result[key] = self._to_od(self._dictionary.find(key), bound[key], samples[:, k])
-        for entry in entries:
-            key = (entry.index, entry.sub)
+        for k, (key, binding) in enumerate(live.items()):
+            result[key] = self._objects.to_od(known.find(key), binding, samples[:, k])
+        for key in bindings:
             if key not in result:
-                result[key] = np.broadcast_to(self._read(entry), (rows, self.num_axes))
-        return Trace(np.arange(rows, dtype=np.float64) * (every * self._cycle), result, self._dictionary)
+                result[key] = np.broadcast_to(self._objects.read(key), (rows, self.num_axes))
+        return Trace(np.arange(rows, dtype=np.float64) * (every * self._cycle), result, known)
 
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis."""
@@ -240,7 +219,7 @@ class EmulatedDrives:
 
     def reset_node(self, where: Mask | None = None) -> None:
         """Reset the drives (NMT reset node): values return to the stored ones, the automaton starts anew."""
-        self._restart(self._axis_mask(where))
+        self._objects.restart(self._axis_mask(where))
 
     def close(self) -> None:
         """Give the threads back; the drives cannot be used afterwards."""
@@ -341,10 +320,10 @@ class EmulatedDrives:
         return np.repeat(one[:, None, :], len(self.load.axes), 1)
 
     def _apply_parameter(self, name: str, values: Floats, machines: Mask) -> None:
-        """Bring a true parameter into records and mechanics."""
+        """Bring a true parameter into records and mechanics; a refused one changes nothing."""
         axes_per_machine = len(self.load.axes)
         axes = np.repeat(machines, axes_per_machine)
-        if apply_to_records(self, name, np.repeat(values, axes_per_machine), axes):
+        if apply_to_records(self._records, self.device, self.motor, name, np.repeat(values, axes_per_machine), axes):
             return
         before, self._parameters[name] = self._parameters[name], values
         try:
@@ -366,150 +345,6 @@ class EmulatedDrives:
     def _refresh_inertia(self) -> None:
         inertia = np.concatenate([group.load.plant.axis_inertia.reshape(-1) for group in self._groups])
         set_lanes(self._records, "J_rotor", inertia)
-
-    def _commission(self, motor: str | None) -> dict[tuple[int, int], Integers]:
-        """Write factory values, then the motor's preset; return the raw values that a reset restores."""
-        everywhere = np.ones(self.num_axes, bool)
-        stored: dict[tuple[int, int], Integers] = {}
-        for entry in self._dictionary:
-            if isinstance(entry.default, str):
-                self._values[entry.index, entry.sub] = entry.default
-            else:
-                stored[entry.index, entry.sub] = np.full(self.num_axes, entry.default, np.int64)
-        modes = sum(1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None)
-        stored[0x6502, 0] = np.full(self.num_axes, modes, np.int64)
-        if motor is not None:
-            preset = self.device.preset(motor)
-            if not self.load.has_switches:
-                preset = {"Limit switches": 3, **preset}
-            for name, value in preset.items():
-                entry = self._dictionary.find(name)
-                raw = checked_values(entry, value, self.num_axes)
-                self._check_value(entry, raw)
-                stored[entry.index, entry.sub] = raw.copy()
-        # The scaler first: the factors of positions follow it.
-        for key in sorted(stored, key=lambda key: key != (0x2058, 0)):
-            self._restore(self._dictionary.find(key), stored[key], everywhere)
-        return stored
-
-    def _restore(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Write a value without what a write sets off; a read-only field that the firmware computes stays."""
-        if self._is_bound(entry):
-            if entry.access not in ("ro", "const"):
-                self._set_field(entry, raw, where)
-        else:
-            self._set_value(entry, raw, where)
-
-    def _restart(self, axes: Mask) -> None:
-        for key in sorted(self._stored, key=lambda key: key != (0x2058, 0)):
-            self._restore(self._dictionary.find(key), self._stored[key], axes)
-        cycle.power_on(self._records, axes)
-
-    # --- access ---------------------------------------------------------------------------------------------------
-    def _is_bound(self, entry: Entry) -> bool:
-        return (entry.index, entry.sub) in self.device.bindings
-
-    def _context(self) -> units.Context:
-        device = self.device
-        return units.Context(
-            position_scaler=get_lanes(self._records, "position_scaler", self.num_axes).astype(float),
-            encoder_steps=get_lanes(self._records, "encoder_steps", self.num_axes).astype(float),
-            adc_step=get_lanes(self._records, "adc_step", self.num_axes).astype(float),
-            current_lsb=device.current_full_scale / 32768.0,
-            current_period=1.0 / device.current_rate,
-            velocity_period=1.0 / device.velocity_rate,
-        )
-
-    def _read(self, entry: Entry) -> Integers:
-        if self._is_bound(entry):
-            binding = self.device.bindings[entry.index, entry.sub]
-            value = get_lanes(self._records, binding.field, self.num_axes, binding.part)
-            return self._to_od(entry, binding, value.astype(float))
-        stored = self._values[entry.index, entry.sub]
-        return np.full(self.num_axes, stored) if isinstance(stored, str) else stored.copy()
-
-    def _to_od(self, entry: Entry, binding: Binding, value: Floats) -> Integers:
-        if binding.unit == "position window":
-            return units.window_to_od(value, self._context())
-        low, high = entry.low, entry.high
-        assert low is not None and high is not None, "only numbers are bound"
-        return units.to_od(binding.unit, value, self._context(), low, high)
-
-    def _from_od(self, binding: Binding, raw: NDArray[Any]) -> Floats:
-        if binding.unit == "position window":
-            return units.window_from_od(raw, self._context())
-        return units.from_od(binding.unit, raw, self._context())
-
-    def _check(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        self._check_value(entry, raw[where])
-        key = (entry.index, entry.sub)
-        if key in self.device.write_states:
-            needed = State[self.device.write_states[key]]
-            states = get_lanes(self._records, "fsa", self.num_axes)[where]
-            wrong = states[states != needed]
-            if wrong.size:
-                raise ObjectAccessError(
-                    WRONG_STATE,
-                    f"{entry.label} can only be written in {_state_name(needed)}; the drive is in "
-                    f"{_state_name(State(int(wrong[0])))}",
-                )
-        if key == (0x6060, 0) and self.device.refuses_same_mode:
-            same = raw[where] == get_lanes(self._records, "mode", self.num_axes)[where]
-            if np.any(same):
-                raise ObjectAccessError(
-                    WRONG_STATE,
-                    f"{entry.label} is {raw[where][same][0]} already, and this drive refuses the same mode twice; "
-                    "read 6061h first",
-                )
-
-    def _check_value(self, entry: Entry, raw: Integers) -> None:
-        key = (entry.index, entry.sub)
-        if key in self.device.unsupported:
-            raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} has no service behind it in this emulator")
-        if key in self.device.allowed_values:
-            check_allowed(entry, raw, self.device.allowed_values[key])
-        if key == (0x6060, 0):
-            check_allowed(entry, raw, tuple(mode.number for mode in MODES))
-
-    def _write(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        key = (entry.index, entry.sub)
-        if not self._is_bound(entry):
-            self._set_value(entry, raw, where)
-            return
-        event = _EVENTS[self.device.bindings[key].event]
-        if event == cycle.SET_POINT:
-            self._set_field(entry, raw, where)
-            set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
-        elif event >= 0:
-            cycle.write_events(self._records, event, raw, where)
-        elif key == (0x2058, 0):
-            self._rescale(entry, raw, where)
-        else:
-            self._set_field(entry, raw, where)
-
-    def _rescale(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Change 2058h: what is stored in increments keeps its integers, and so changes its SI value."""
-        if np.any(raw[where] == 0):
-            raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be 0 increments per revolution")
-        kept = [
-            (other, self._read(other))
-            for other in self._dictionary
-            if self._is_bound(other)
-            and other.access not in ("ro", "const")
-            and self.device.bindings[other.index, other.sub].unit in {*units.SCALED_BY_POSITION, "position window"}
-        ]
-        self._set_field(entry, raw, where)
-        for other, value in kept:
-            self._set_field(other, value, where)
-
-    def _set_field(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        binding = self.device.bindings[entry.index, entry.sub]
-        set_lanes(self._records, binding.field, self._from_od(binding, raw), where, binding.part)
-
-    def _set_value(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        key = (entry.index, entry.sub)
-        before = self._values.get(key)
-        self._values[key] = raw.copy() if before is None else np.where(where, raw, before)
 
     def _axis_mask(self, where: Mask | None) -> Mask:
         if where is None:
@@ -534,29 +369,6 @@ class EmulatedDrives:
                 f"use {max(cycles, 0) * self._cycle:g} s"
             )
         return cycles
-
-    def _plan_play(self, play: Mapping[ObjectName, ArrayLike], cycles: int) -> tuple[Floats, Channels]:
-        values = np.empty((cycles, len(play), self.num_axes))
-        fields: list[tuple[str, int]] = []
-        kinds: list[int] = []
-        for k, (name, given) in enumerate(play.items()):
-            entry = self._dictionary.find(name)
-            check_writable(entry)
-            if not self._is_bound(entry) or (entry.index, entry.sub) == (0x2058, 0):
-                raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} cannot be played; write it before")
-            raw = np.asarray(given)
-            if raw.shape not in ((cycles,), (cycles, self.num_axes)):
-                raise ValueError(
-                    f"{entry.label}: play takes shape ({cycles},) or ({cycles}, {self.num_axes}), one row per cycle, "
-                    f"not {raw.shape}"
-                )
-            check_in_range(entry, raw)
-            self._check_value(entry, raw.astype(np.int64).reshape(-1))
-            binding = self.device.bindings[entry.index, entry.sub]
-            values[:, k] = self._from_od(binding, raw if raw.ndim == 2 else raw[:, None])
-            fields.append((binding.field, binding.part))
-            kinds.append(_EVENTS[binding.event])
-        return values, channels(fields, kinds) if fields else _NOTHING
 
     def _run(self, cycles: int, play: Floats, played: Channels, samples: Floats, sampled: Channels, every: int) -> None:
         if cycles == 0:
@@ -586,7 +398,3 @@ class EmulatedDrives:
                 RuntimeWarning,
                 stacklevel=4,
             )
-
-
-def _state_name(state: State) -> str:
-    return state.name.lower().replace("_", " ")

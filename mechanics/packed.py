@@ -269,7 +269,7 @@ class PackedLoad:
         mujoco.mj_setConst(self.model, self.data)
         # At the reference position, so that setting one copy cannot change the rounding of another.
         self.data.qpos[:], self.data.qvel[:] = self.model.qpos0, 0.0
-        inverse = np.linalg.inv(self.mass_matrix())
+        inverse = np.asarray(np.linalg.inv(self.mass_matrix()), np.float64)
         self.data.qpos[:], self.data.qvel[:] = moving
         phase = np.asarray(0.5 * self.h * np.sqrt(self._stiffness * np.einsum("cdd->cd", inverse)), np.float64)
         if self.staggered and 2.0 * phase.max() > MAX_PHASE_PER_STEP:

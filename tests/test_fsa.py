@@ -370,7 +370,7 @@ def test_transition_16_is_not_there_for_options_1_and_2(drives, option):
 
 
 @pytest.mark.parametrize("mode", ["pp", "pv"])
-def test_a_quick_stop_ends_with_the_motor_stopped(shared, drives, mode):
+def test_a_quick_stop_ends_with_the_motor_stopped(drives, mode):
     # With the commissioned values of ramps and gains: power taken from a motor that still runs is no stop.
     motion.enable(drives, mode=mode)
     if mode == "pp":

@@ -59,7 +59,9 @@ def checked_values(entry: Entry, value: Any, num_axes: int) -> NDArray[np.int64]
         ObjectAccessError: 06070010h for what is no integer or does not fit the axes, 06090031h and 06090032h for a
             value beyond the range.
     """
-    raw = np.asarray(value)
+    raw = _as_array(value)
+    if raw.dtype == object and all(isinstance(item, int) for item in raw.flat):
+        _check_range(entry, raw)  # an integer beyond 64 bits
     if entry.bits is None or raw.dtype.kind not in "iu":
         kind = "a text" if entry.bits is None else f"a {entry.bits}-bit integer"
         raise ObjectAccessError(WRONG_TYPE, f"{entry.label} is {kind}; got {value!r}, which is {_describe(raw)}")
@@ -69,6 +71,14 @@ def checked_values(entry: Entry, value: Any, num_axes: int) -> NDArray[np.int64]
         )
     _check_range(entry, raw)
     return np.broadcast_to(raw.astype(np.int64), (num_axes,))
+
+
+def _as_array(value: Any) -> NDArray[Any]:
+    """Return the value as an array; what makes none becomes an array of objects, which is no integer."""
+    try:
+        return np.asarray(value)
+    except ValueError:
+        return np.array(None)
 
 
 def check_in_range(entry: Entry, raw: NDArray[Any]) -> None:
@@ -99,4 +109,6 @@ def _check_range(entry: Entry, raw: NDArray[Any]) -> None:
 
 
 def _describe(raw: NDArray[Any]) -> str:
-    return {"f": "a float", "b": "a truth value", "U": "a text", "c": "complex"}.get(raw.dtype.kind, str(raw.dtype))
+    return {"f": "a float", "b": "a truth value", "U": "a text", "c": "complex", "O": "no array of integers"}.get(
+        raw.dtype.kind, str(raw.dtype)
+    )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import canopen
+import numpy as np
 from canopen.objectdictionary import ODVariable, datatypes
 
 from drive_env.dictionary.access import (
@@ -102,7 +103,11 @@ class ObjectDictionary:
                     NO_SUCH_OBJECT, f"no object is named {name!r}{hint if near else '; see the device EDS'}"
                 )
             return self._entries[key]
-        index, sub = name if isinstance(name, tuple) else (name, 0)
+        index, sub = name if isinstance(name, tuple) and len(name) == 2 else (name, 0)
+        if not isinstance(index, (int, np.integer)) or not isinstance(sub, (int, np.integer)):
+            raise ObjectAccessError(
+                NO_SUCH_OBJECT, f"an object is named by index, (index, sub-index) or name, not {name!r}"
+            )
         if (index, sub) in self._entries:
             return self._entries[index, sub]
         subs = [s for i, s in self._entries if i == index]

@@ -87,8 +87,7 @@ def to_od(unit: str, value: NDArray[Any], context: Context, low: int, high: int)
 def window_from_od(raw: NDArray[Any], context: Context) -> Floats:
     """Return a position window [rad]; FFFFFFFFh is inf, which switches the control off."""
     window = from_od("inc", raw, context)
-    window[np.asarray(raw) == NO_WINDOW] = np.inf
-    return window
+    return np.where(np.asarray(raw) == NO_WINDOW, np.inf, window)
 
 
 def window_to_od(window: NDArray[Any], context: Context) -> NDArray[np.int64]:

@@ -13,7 +13,9 @@ SMALLEST_RESISTANCE = 1e-15  # ohm; a supply without resistance is one that hold
 def derive(drive, dt):
     """Compute the constants of encoder, current sensor, DC link and rotor for ticks of dt [s]."""
     for lane in range(LANES):
+        # 2080h:02 may be 0, which is no encoder that could be counted with.
         steps = drive.encoder_steps[lane] * drive.encoder_interpolation[lane]
+        steps = steps if steps > 0.0 else 1.0
         drive.turns_per_count[lane] = (1.0 - 2.0 * drive.encoder_direction[lane]) / steps
         drive.counts_per_rad[lane] = drive.encoder_counts[lane] * (1.0 / TWO_PI)
         drive.adc_steps_per_ampere[lane] = 1.0 / drive.adc_step[lane]

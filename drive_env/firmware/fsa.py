@@ -231,6 +231,8 @@ def automatic_transitions(drive, lane, dt):
     """Make the transitions that need no command, once per period of dt [s]: 1, and what waited for standstill."""
     if drive.fsa[lane] == NOT_READY:
         _enter(drive, lane, 1, DISABLED)
+    if drive.fsa[lane] == STOPPING and drive.quick_stop_option[lane] >= STOP_AND_STAY:
+        command(drive, lane)  # enable operation, commanded while the ramp ran
     if drive.stopping[lane] == 1 and has_stopped(drive, lane, dt):
         if drive.fsa[lane] == REACTING:
             _enter(drive, lane, 14, FAULTED)

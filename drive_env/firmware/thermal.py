@@ -6,6 +6,7 @@ from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined
 
 COPPER = 0.00393  # 1/K, relative change of resistance
+LARGEST_SQUARE = 1e12  # A^2
 NOMINAL = 25.0  # degC at which the motor's row holds
 
 
@@ -14,6 +15,7 @@ def warm(drive, dt):
     """Move both temperatures on by dt [s], first-order models to ambient; writes R_s and psi_m."""
     for lane in range(LANES):
         square = drive.i_d[lane] * drive.i_d[lane] + drive.i_q[lane] * drive.i_q[lane]
+        square = square if square < LARGEST_SQUARE else 0.0  # a frozen lane's currents may be no numbers
         factor = drive.phase_factor[lane]
         T = drive.T_winding[lane]
         loss = factor * drive.R_s[lane] * square

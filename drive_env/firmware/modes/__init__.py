@@ -74,6 +74,10 @@ def change_mode(drive, lane):
     if before != 2:
         drive.position_demand[lane] = drive.theta_meas[lane]
     drive.mode_display[lane] = drive.mode[lane]
+    by_position = drive.mode[lane] == PP or drive.mode[lane] == HM or drive.mode[lane] == CSP
+    if before != 2 and by_position and drive.position_p[lane] > 0.0:
+        # The position loop asks for the present speed only with the lag that it has at that speed.
+        drive.position_demand[lane] += drive.velocity_demand[lane] / drive.position_p[lane]
     drive.set_point_valid[lane] = 0
     drive.set_point_acknowledged[lane] = 0
     drive.target_reached[lane] = 0
@@ -156,6 +160,8 @@ def generate_demand(drive, lane, dt):
         cst.generate(drive, lane)
     else:
         idle.generate(drive, lane, slow_down_ramp(drive, lane), dt)
+    if mode in (CSP, CSV, CST):
+        drive.target_reached[lane] = 0  # bit 10 is reserved in these modes (tables 237, 263, 283)
 
 
 @stage

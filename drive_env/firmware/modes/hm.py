@@ -47,7 +47,9 @@ def start_or_stop(drive, lane, word_before):
         drive.target_reached[lane] = 0
         method = drive.homing_method[lane]
         if method == 35:
-            # Does not need operation enabled.
+            # Does not need operation enabled. At rest the demand is zero too, whatever is left of the position error.
+            if drive.velocity_demand[lane] == 0.0:
+                drive.position_demand[lane] = drive.theta_meas[lane]
             set_home(drive, lane, drive.theta_meas[lane], 0.0)
             drive.homing_state[lane] = DONE
             drive.homing_attained[lane] = 1
@@ -105,6 +107,9 @@ def generate(drive, lane, dt):
         drive.homing_direction[lane] = direction
         if active:
             state = BRAKE
+            # An axis that still comes from the other way leaves a narrow switch on that side.
+            v = drive.velocity_demand[lane]
+            drive.homing_direction[lane] = direction if v == 0.0 else (1.0 if v > 0.0 else -1.0)
         elif method in (19, 21) and inputs.is_active(drive, lane, RIGHT if direction > 0.0 else LEFT):
             # The search led away from the switch: it lies on the other side, or nowhere.
             state = TURNED if state == SEARCH else FAILED
@@ -112,7 +117,8 @@ def generate(drive, lane, dt):
             _run(drive, lane, (sign if state == SEARCH else -sign) * fast, dt)
     if state == BRAKE:
         _run(drive, lane, 0.0, dt)
-        if drive.velocity_demand[lane] == 0.0:
+        # The axis lags behind its demand: where it comes to rest decides on which side of the edge it is.
+        if drive.velocity_demand[lane] == 0.0 and abs(drive.omega_slow[lane]) <= drive.standstill[lane]:
             state = TO_EDGE if active else AWAY
     elif state == AWAY:
         # Braking carried the axis across a narrow switch: back onto it, slowly.

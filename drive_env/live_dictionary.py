@@ -1,0 +1,259 @@
+"""The object dictionary of emulated drives, alive: its values are the fields of their records.
+
+Reading and writing check type, access, range and state exactly as the bus does; the error carries the SDO abort code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env.devices import Device
+from drive_env.dictionary import units
+from drive_env.dictionary.access import (
+    CANNOT_BE_STORED,
+    VALUE_RANGE,
+    WRONG_STATE,
+    ObjectAccessError,
+    check_allowed,
+    check_in_range,
+    check_readable,
+    check_writable,
+    checked_values,
+)
+from drive_env.dictionary.bindings import Binding
+from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
+from drive_env.firmware import cycle
+from drive_env.firmware.fsa import State
+from drive_env.firmware.modes import MODES
+from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.group import Channels, channels
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
+NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
+POSITION_SCALER = (0x2058, 0)
+
+
+class LiveDictionary:
+    """Objects of all axes.
+
+    Args:
+        device: Whose dictionary it is.
+        records: The axes' records.
+        num_axes: Number of axes.
+        preset: Object name -> raw value, written after the factory values; both are what a reset restores.
+    """
+
+    def __init__(self, device: Device, records: NDArray[np.void], num_axes: int, preset: Mapping[str, int]) -> None:
+        self.device = device
+        self.entries: ObjectDictionary = device.new_dictionary()
+        self._records = records
+        self.num_axes = num_axes
+        self._values: dict[tuple[int, int], Integers | str] = {}
+        self._stored = self._commission(preset)
+
+    def read(self, name: ObjectName) -> Integers:
+        """Return an object of every axis, int64 of shape (num_axes,); a text as an array of str."""
+        entry = self.entries.find(name)
+        check_readable(entry)
+        return self._read(entry)
+
+    def write(self, name: ObjectName, value: ArrayLike, where: Mask) -> None:
+        """Write an object of the axes where the mask is true; everything is checked before anything changes."""
+        entry = self.entries.find(name)
+        check_writable(entry)
+        raw = checked_values(entry, value, self.num_axes)
+        self._check(entry, raw, where)
+        self._write(entry, raw, where)
+
+    def impose(self, name: ObjectName, raw: ArrayLike) -> None:
+        """Set what a read-only object that the firmware does not compute shows, from outside; its range is checked."""
+        entry = self.entries.find(name)
+        self._set_value(entry, checked_values(entry, raw, self.num_axes), np.ones(self.num_axes, bool))
+
+    def restart(self, axes: Mask) -> None:
+        """Restore the stored values of the axes where the mask is true, and start their firmware anew."""
+        for key in sorted(self._stored, key=lambda key: key != POSITION_SCALER):
+            self._restore(self.entries.find(key), self._stored[key], axes)
+        cycle.power_on(self._records, axes)
+
+    def recordable(self, entry: Entry) -> Binding | None:
+        """Return the binding of an entry whose value changes by itself, None of one that only a write changes."""
+        check_readable(entry)
+        return self.device.bindings.get((entry.index, entry.sub))
+
+    def plan_play(self, play: Mapping[ObjectName, ArrayLike], cycles: int) -> tuple[Floats, Channels]:
+        """Return SI values, shape (cycles, objects, num_axes), and the fields that they go to.
+
+        Raises:
+            ObjectAccessError: For an object that cannot be played or a value that it cannot have.
+            ValueError: For rows that do not fit.
+        """
+        values = np.empty((cycles, len(play), self.num_axes))
+        fields: list[tuple[str, int]] = []
+        kinds: list[int] = []
+        for k, (name, given) in enumerate(play.items()):
+            entry = self.entries.find(name)
+            check_writable(entry)
+            if not self._is_bound(entry) or (entry.index, entry.sub) == POSITION_SCALER:
+                raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} cannot be played; write it before")
+            raw = np.asarray(given)
+            if raw.shape not in ((cycles,), (cycles, self.num_axes)):
+                raise ValueError(
+                    f"{entry.label}: play takes shape ({cycles},) or ({cycles}, {self.num_axes}), one row per cycle, "
+                    f"not {raw.shape}"
+                )
+            check_in_range(entry, raw)
+            self._check_value(entry, raw.astype(np.int64).reshape(-1))
+            binding = self.device.bindings[entry.index, entry.sub]
+            values[:, k] = self._from_od(binding, raw if raw.ndim == 2 else raw[:, None])
+            fields.append((binding.field, binding.part))
+            kinds.append(_EVENTS[binding.event])
+        return values, channels(fields, kinds) if fields else NOTHING
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _commission(self, preset: Mapping[str, int]) -> dict[tuple[int, int], Integers]:
+        """Write factory values, then the preset; return the raw values that a reset restores."""
+        everywhere = np.ones(self.num_axes, bool)
+        stored: dict[tuple[int, int], Integers] = {}
+        for entry in self.entries:
+            if isinstance(entry.default, str):
+                self._values[entry.index, entry.sub] = entry.default
+            else:
+                stored[entry.index, entry.sub] = np.full(self.num_axes, entry.default, np.int64)
+        modes = sum(1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None)
+        stored[0x6502, 0] = np.full(self.num_axes, modes, np.int64)
+        for name, value in preset.items():
+            entry = self.entries.find(name)
+            raw = checked_values(entry, value, self.num_axes)
+            self._check_value(entry, raw)
+            stored[entry.index, entry.sub] = raw.copy()
+        # The scaler first: the factors of positions follow it.
+        for key in sorted(stored, key=lambda key: key != POSITION_SCALER):
+            self._restore(self.entries.find(key), stored[key], everywhere)
+        return stored
+
+    def _restore(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        """Write a value without what a write sets off; a read-only field that the firmware computes stays."""
+        if self._is_bound(entry):
+            if entry.access not in ("ro", "const"):
+                self._set_field(entry, raw, where)
+        else:
+            self._set_value(entry, raw, where)
+
+    def _is_bound(self, entry: Entry) -> bool:
+        return (entry.index, entry.sub) in self.device.bindings
+
+    def _context(self) -> units.Context:
+        device = self.device
+        return units.Context(
+            position_scaler=get_lanes(self._records, "position_scaler", self.num_axes).astype(float),
+            encoder_steps=get_lanes(self._records, "encoder_steps", self.num_axes).astype(float),
+            adc_step=get_lanes(self._records, "adc_step", self.num_axes).astype(float),
+            current_lsb=device.current_full_scale / 32768.0,
+            current_period=1.0 / device.current_rate,
+            velocity_period=1.0 / device.velocity_rate,
+        )
+
+    def _read(self, entry: Entry) -> Integers:
+        if self._is_bound(entry):
+            binding = self.device.bindings[entry.index, entry.sub]
+            value = get_lanes(self._records, binding.field, self.num_axes, binding.part)
+            return self.to_od(entry, binding, value.astype(float))
+        stored = self._values[entry.index, entry.sub]
+        return np.full(self.num_axes, stored) if isinstance(stored, str) else stored.copy()
+
+    def to_od(self, entry: Entry, binding: Binding, value: Floats) -> Integers:
+        """Return integers on the wire of SI values; axes are the last dimension."""
+        if binding.unit == "position window":
+            return units.window_to_od(value, self._context())
+        low, high = entry.low, entry.high
+        assert low is not None and high is not None, "only numbers are bound"
+        return units.to_od(binding.unit, value, self._context(), low, high)
+
+    def _from_od(self, binding: Binding, raw: NDArray[Any]) -> Floats:
+        if binding.unit == "position window":
+            return units.window_from_od(raw, self._context())
+        return units.from_od(binding.unit, raw, self._context())
+
+    def _check(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        self._check_value(entry, raw[where])
+        key = (entry.index, entry.sub)
+        if key in self.device.write_states:
+            needed = State[self.device.write_states[key]]
+            states = get_lanes(self._records, "fsa", self.num_axes)[where]
+            wrong = states[states != needed]
+            if wrong.size:
+                raise ObjectAccessError(
+                    WRONG_STATE,
+                    f"{entry.label} can only be written in {_state_name(needed)}; the drive is in "
+                    f"{_state_name(State(int(wrong[0])))}",
+                )
+        if key == (0x6060, 0) and self.device.refuses_same_mode:
+            same = raw[where] == get_lanes(self._records, "mode", self.num_axes)[where]
+            if np.any(same):
+                raise ObjectAccessError(
+                    WRONG_STATE,
+                    f"{entry.label} is {raw[where][same][0]} already, and this drive refuses the same mode twice; "
+                    "read 6061h first",
+                )
+
+    def _check_value(self, entry: Entry, raw: Integers) -> None:
+        key = (entry.index, entry.sub)
+        if key in self.device.unsupported:
+            raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} has no service behind it in this emulator")
+        if key in self.device.allowed_values:
+            check_allowed(entry, raw, self.device.allowed_values[key])
+        if key == (0x6060, 0):
+            check_allowed(entry, raw, tuple(mode.number for mode in MODES))
+
+    def _write(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        key = (entry.index, entry.sub)
+        if not self._is_bound(entry):
+            self._set_value(entry, raw, where)
+            return
+        event = _EVENTS[self.device.bindings[key].event]
+        if event == cycle.SET_POINT:
+            self._set_field(entry, raw, where)
+            set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
+        elif event >= 0:
+            cycle.write_events(self._records, event, raw, where)
+        elif key == POSITION_SCALER:
+            self._rescale(entry, raw, where)
+        else:
+            self._set_field(entry, raw, where)
+
+    def _rescale(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        """Change 2058h: what is stored in increments keeps its integers, and so changes its SI value."""
+        if np.any(raw[where] == 0):
+            raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be 0 increments per revolution")
+        kept = [
+            (other, self._read(other))
+            for other in self.entries
+            if self._is_bound(other)
+            and other.access not in ("ro", "const")
+            and self.device.bindings[other.index, other.sub].unit in {*units.SCALED_BY_POSITION, "position window"}
+        ]
+        self._set_field(entry, raw, where)
+        for other, value in kept:
+            self._set_field(other, value, where)
+
+    def _set_field(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        binding = self.device.bindings[entry.index, entry.sub]
+        set_lanes(self._records, binding.field, self._from_od(binding, raw), where, binding.part)
+
+    def _set_value(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        key = (entry.index, entry.sub)
+        before = self._values.get(key)
+        self._values[key] = raw.copy() if before is None else np.where(where, raw, before)
+
+
+def _state_name(state: State) -> str:
+    return state.name.lower().replace("_", " ")
