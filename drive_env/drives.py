@@ -171,7 +171,8 @@ class EmulatedDrives:
     ) -> Trace:
         """Let `duration` [s] pass while objects are recorded and played.
 
-        Cycle k: row k of `play` is written, then row k is recorded, then one communication cycle passes.
+        Cycle k: row k of `play` is written, then row k is recorded, then one communication cycle passes. In csp and
+        csv every row is a set-point that arrives, also one that repeats the last.
 
         Args:
             objects: What to record.

@@ -174,6 +174,11 @@ class LiveDictionary:
         """Return integers on the wire of SI values; axes are the last dimension."""
         if binding.unit == "position window":
             return units.window_to_od(value, self._context())
+        if binding.unit == "position limit":
+            return units.limit_to_od(value, self._context())
+        if (entry.index, entry.sub) in units.WRAPPING:
+            increments = np.rint(value / units.UNITS["inc"].factor(self._context()))
+            return np.nan_to_num(units.wrap(increments)).astype(np.int64)
         low, high = entry.low, entry.high
         assert low is not None and high is not None, "only numbers are bound"
         return units.to_od(binding.unit, value, self._context(), low, high)
@@ -181,6 +186,8 @@ class LiveDictionary:
     def _from_od(self, binding: Binding, raw: NDArray[Any]) -> Floats:
         if binding.unit == "position window":
             return units.window_from_od(raw, self._context())
+        if binding.unit == "position limit":
+            return units.limit_from_od(raw, self._context())
         return units.from_od(binding.unit, raw, self._context())
 
     def _check(self, entry: Entry, raw: Integers, where: Mask) -> None:
@@ -239,7 +246,7 @@ class LiveDictionary:
             for other in self.entries
             if self._is_bound(other)
             and other.access not in ("ro", "const")
-            and self.device.bindings[other.index, other.sub].unit in {*units.SCALED_BY_POSITION, "position window"}
+            and self.device.bindings[other.index, other.sub].unit in units.SCALED_BY_POSITION
         ]
         self._set_field(entry, raw, where)
         for other, value in kept:

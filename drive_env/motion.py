@@ -17,6 +17,7 @@ SWITCH_ON_DISABLED = (0x4F, 0x40)
 READY_TO_SWITCH_ON = (0x6F, 0x21)
 SWITCHED_ON = (0x6F, 0x23)
 OPERATION_ENABLED = (0x6F, 0x27)
+QUICK_STOP_ACTIVE = (0x6F, 0x07)
 FAULT = (0x4F, 0x08)
 FAULT_BIT = (0x08, 0x08)  # fault or fault reaction active
 TARGET_REACHED = (0x0400, 0x0400)
@@ -98,6 +99,10 @@ def enable(drives: Drives, mode: str | None = None, where: Mask | None = None, t
         reset_fault(drives, where=in_fault, timeout=timeout)
     if mode is not None:
         select_mode(drives, mode, where)
+    stopped = axes & (drives.read(0x6041) & QUICK_STOP_ACTIVE[0] == QUICK_STOP_ACTIVE[1])
+    if stopped.any():
+        drives.write(0x6040, 0x0F, where=stopped)
+        wait_for(drives, OPERATION_ENABLED, timeout, "operation enabled after the quick stop", stopped)
     not_enabled = axes & (drives.read(0x6041) & OPERATION_ENABLED[0] != OPERATION_ENABLED[1])
     if not not_enabled.any():
         return

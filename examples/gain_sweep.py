@@ -8,6 +8,7 @@ A coarser grid than `drive-tune sweep`'s, so that it takes seconds.
 import argparse
 from dataclasses import dataclass, replace
 
+from drive_env.motors import MOTORS
 from tuning import sweep
 
 
@@ -37,7 +38,7 @@ def main(arguments: Arguments) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=Arguments.points, help="values per gain")
-    parser.add_argument("--motor", default=Arguments.motor, help="motor")
+    parser.add_argument("--motor", default=Arguments.motor, choices=MOTORS, help="motor")
     parser.add_argument("--seed", type=int, default=Arguments.seed, help="seed of the machine and its noise")
     parser.add_argument("--out", default=Arguments.out, help="folder for the results; nothing is written without")
     main(Arguments(**vars(parser.parse_args())))

@@ -1,7 +1,8 @@
-"""The Drives interface as DESIGN section 6 has it, on emulated drives."""
+"""The Drives interface, on emulated drives."""
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -128,3 +129,10 @@ def test_identical_machines_differ_in_nothing():
 def test_importing_the_package_loads_neither_compiler_nor_physics():
     code = "import sys, drive_env; print([m for m in ('numba', 'mujoco', 'matplotlib') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+def test_the_example_of_one_drive_runs():
+    script = Path(__file__).parent.parent / "examples" / "one_drive.py"
+    done = subprocess.run([sys.executable, script, "--machines", "2"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "positions reached [inc]: [" in done.stdout

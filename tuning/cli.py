@@ -109,7 +109,7 @@ def _run_with_progress(sweep: Any, experiment: Any, console: Any) -> Any:
     from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     texts = {
-        "compiling": "loading the kernels (the first time: 20 s)",
+        "compiling": "loading the kernels (the first time: half a minute)",
         "simulating": f"simulating {experiment.size()} machines",
     }
     columns = (

@@ -217,7 +217,10 @@ def _record(
         t_load=excitation.load_time,
     )
     mask, value = motion.FAULT_BIT  # fault, or the reaction that leads to it
-    return recording, drives.read(0x6041) & mask == value
+    tripped = drives.read(0x6041) & mask == value
+    for message in drives.emergencies():
+        tripped[message.axis] = True  # a limit of travel too: what follows it says nothing of the gains
+    return recording, tripped
 
 
 def _pieces(step: float, load: float, end: float, piece: float, period: float) -> list[tuple[float, float]]:

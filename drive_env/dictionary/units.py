@@ -38,7 +38,7 @@ class Unit(NamedTuple):
 RPM = TWO_PI / 60.0
 PID_SUM_FRACTION = 256.0  # the loops' error sums are read with 8 fractional bits
 
-# Gains (DESIGN: TMC4671 data sheet 2.08 with P as Q8.8, I as Q8.8/256 per sample, position P as Q4.12): an error in
+# Gains (after the TMC4671 data sheet 2.08 with P as Q8.8, I as Q8.8/256 per sample, position P as Q4.12): an error in
 # LSB of current, rpm or 1/65536 revolution gives duty, current or rpm in LSB.
 UNITS: dict[str, Unit] = {
     unit.name: unit
@@ -64,7 +64,9 @@ UNITS: dict[str, Unit] = {
     )
 }
 # Units whose factor follows 2058h: what is stored in them is kept in raw integers when the scaler changes.
-SCALED_BY_POSITION = frozenset({"inc", "pps", "pps^2"})
+SCALED_BY_POSITION = frozenset({"inc", "pps", "pps^2", "position window", "position limit"})
+# Position counters go on past the end of their type, as a counter in a drive does; everything else saturates.
+WRAPPING = frozenset({(0x6062, 0), (0x6063, 0), (0x6064, 0)})
 
 NO_WINDOW = 0xFFFFFFFF  # 6067h: window control switched off
 
@@ -82,6 +84,26 @@ def to_od(unit: str, value: NDArray[Any], context: Context, low: int, high: int)
         raw = np.mod(raw + 32768.0, 65536.0) - 32768.0
     limited: Floats = np.nan_to_num(np.clip(raw, low, high))
     return limited.astype(np.int64)
+
+
+def wrap(value: NDArray[Any], bits: int = 32) -> Floats:
+    """Return increments [float] wrapped into the range of a signed counter."""
+    half = 2.0 ** (bits - 1)
+    return np.mod(np.asarray(value, np.float64) + half, 2.0 * half) - half
+
+
+def limit_from_od(raw: NDArray[Any], context: Context) -> Floats:
+    """Return a software limit [rad]; the ends of the type, which are the factory's, are no limits: infinite."""
+    limit = from_od("inc", raw, context)
+    limit = np.where(np.asarray(raw) >= 2**31 - 1, np.inf, limit)
+    return np.where(np.asarray(raw) <= -(2**31), -np.inf, limit)
+
+
+def limit_to_od(limit: NDArray[Any], context: Context) -> NDArray[np.int64]:
+    """Return 607Dh of a software limit [rad]; infinite is the end of the type."""
+    finite = np.where(np.isinf(limit), 0.0, limit)
+    raw = to_od("inc", finite, context, -(2**31), 2**31 - 1)
+    return np.where(np.isinf(limit), np.where(np.asarray(limit) > 0.0, 2**31 - 1, -(2**31)), raw)
 
 
 def window_from_od(raw: NDArray[Any], context: Context) -> Floats:

@@ -22,6 +22,7 @@ ESTIMATE, USE_OFFSET, USE_HALL = 0, 1, 2
 NEEDED, FIRST_ANGLE, SECOND_ANGLE, DONE, FAILED = 0, 1, 2, 3, 4
 
 HOLD_TIME = 0.4  # s at each angle: the rotor swings in
+LONGEST_HOLD = 3.0  # s after which the angle is taken even if it still swings
 TOLERANCE = 0.3  # of a quarter turn, by which its motion may differ
 
 
@@ -30,6 +31,12 @@ def _encoder_turn(drive, lane):
     """Return the electrical angle that the encoder has counted since power-on [rad]."""
     turns = (drive.count[lane] - drive.count_zero[lane]) * drive.turns_per_count[lane]
     return turns * TWO_PI * drive.pole_pairs[lane]
+
+
+@stage
+def has_come_to_rest(drive, lane):
+    """Return whether the held rotor stands, or has had time enough."""
+    return abs(drive.omega_slow[lane]) <= 0.25 * drive.standstill[lane] or drive.init_time[lane] > LONGEST_HOLD
 
 
 @stage
@@ -85,14 +92,14 @@ def commutate(drive, lane, dt):
     if drive.init_state[lane] == FIRST_ANGLE:
         # Swept to the first angle, or a rotor exactly opposite would stay where it is.
         drive.angle_forced[lane] = QUARTER * (min(2.0 * drive.init_time[lane] / HOLD_TIME, 1.0) - 1.0)
-        if drive.init_time[lane] >= HOLD_TIME:
+        if drive.init_time[lane] >= HOLD_TIME and has_come_to_rest(drive, lane):
             drive.init_angle[lane] = _encoder_turn(drive, lane)
             drive.init_state[lane] = SECOND_ANGLE
             drive.init_time[lane] = 0.0
         return
     # Turned there step by step, or a rotor on the far side would fall to either hand.
     drive.angle_forced[lane] = QUARTER * min(2.0 * drive.init_time[lane] / HOLD_TIME, 1.0)
-    if drive.init_time[lane] < 2.0 * HOLD_TIME:
+    if drive.init_time[lane] < 2.0 * HOLD_TIME or not has_come_to_rest(drive, lane):
         return
     turned = _encoder_turn(drive, lane) - drive.init_angle[lane]
     if abs(turned - QUARTER) > TOLERANCE * QUARTER:

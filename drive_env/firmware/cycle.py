@@ -218,13 +218,27 @@ def mechanics_window(records, plant, rates, motion, num_axes):
 def halt_diverged(drive, lane):
     """Take a lane out of the world: its machine left physics; its numbers must not reach anything."""
     drive.diverged[lane] = 1
+    # Seen from the bus the axis is in fault and stands.
+    drive.fsa[lane] = fsa.FAULTED
+    drive.error_register[lane] |= protection.GENERIC_ERROR
     drive.drive_function[lane] = 0.0
+    drive.stage_on[lane] = 0.0
+    drive.omega_slow[lane] = 0.0
+    drive.omega_meas[lane] = 0.0
+    drive.velocity_filter_z[0, lane] = 0.0
+    drive.velocity_filter_z[1, lane] = 0.0
+    drive.velocity_sum[lane] = 0.0
+    drive.current_sum_d[lane] = 0.0
+    drive.current_sum_q[lane] = 0.0
+    drive.velocity_demand[lane] = 0.0
+    drive.position_demand[lane] = drive.theta_meas[lane]
     drive.i_d[lane] = 0.0
     drive.i_q[lane] = 0.0
     drive.tau_m[lane] = 0.0
     drive.u_dc[lane] = drive.supply_voltage[lane]
     drive.tau_reaction[lane] = 0.0
     drive.tau_reaction_before[lane] = 0.0
+    fsa.update_statusword(drive, lane, 0)
 
 
 @cached(*_SOURCES)

@@ -162,10 +162,8 @@ def _enter(drive, lane, number, end):
         drive.fault[lane] = 0
         drive.error_register[lane] = 0
         push_emergency(drive, lane, EMERGENCY_RESET)
-    if number == 3:
-        drive.active[lane] = 0
-        if drive.init_state[lane] == INITIALIZATION_FAILED:
-            drive.init_state[lane] = 0  # tried again
+    if number == 3 and drive.init_state[lane] == INITIALIZATION_FAILED:
+        drive.init_state[lane] = 0  # tried again
     drive.drive_function[lane] = 1.0 if has_drive_function(end) else 0.0
     if not has_drive_function(end):
         drive.stopping[lane] = 0

@@ -6,6 +6,8 @@ that reproduces the one analytic trapezoid or triangle exactly, and a changed ta
 
 from __future__ import annotations
 
+import math
+
 from mechanics.compiled import stage
 
 
@@ -18,6 +20,19 @@ def ramp(v, v_end, rate, dt):
     if abs(v_end - v) <= step:
         return v_end
     return v + step if v_end > v else v - step
+
+
+@stage
+def unwrapped(target, position, scaler):
+    """Return an absolute target [rad] in the turn of the 32-bit counter in which the position [rad] is.
+
+    Positions on the bus wrap at 2^31 increments (`scaler` per revolution); a target that the master gives refers to
+    what it reads.
+    """
+    turn = 4294967296.0 * 6.283185307179586 / abs(scaler)
+    if abs(position) < 0.5 * turn:
+        return target
+    return target + turn * math.floor((position - target) / turn + 0.5)
 
 
 @stage

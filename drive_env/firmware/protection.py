@@ -69,6 +69,7 @@ CAUSES = (
 ) = range(len(CAUSES))
 GENERIC_ERROR = 0x01  # bit 0 of 1001h is set with every error
 BLOCKS_NEGATIVE, BLOCKS_POSITIVE = 1, 2
+ROUNDING = 1e-9  # rad: a target at the corrected limit itself is within it
 HOMING = 6  # limit switches are what homing looks for
 
 _CUTS, _STOPS, _LIMITS, _WARNS = (
@@ -136,9 +137,10 @@ def conditions(drive, lane):
         bits |= 1 << SHUTDOWN_SWITCH
     if alignment.has_failed(drive, lane):
         bits |= 1 << INITIALIZATION
-    if drive.open_load_time_a[lane] > OPEN_LOAD_TIME:
+    # With one phase open the other lacks current too while the rotor stands across it: that follows from the first.
+    if drive.open_load_time_a[lane] > OPEN_LOAD_TIME and drive.fault[lane] != OPEN_LOAD_B + 1:
         bits |= 1 << OPEN_LOAD_A
-    if drive.open_load_time_b[lane] > OPEN_LOAD_TIME:
+    if drive.open_load_time_b[lane] > OPEN_LOAD_TIME and drive.fault[lane] != OPEN_LOAD_A + 1:
         bits |= 1 << OPEN_LOAD_B
     if drive.overload[lane] > 1.0:
         bits |= 1 << OVERLOAD
@@ -192,7 +194,9 @@ def protect(drive, lane, dt):
     drive.peak_a[lane] = 0.0
     drive.peak_b[lane] = 0.0
     appeared = present & ~drive.active[lane]
-    drive.active[lane] = present
+    # Until the fault reaction has ended, what began it is no new occurrence when it goes and comes again.
+    told = drive.active[lane] & _STOPS if drive.fsa[lane] == fsa.REACTING else 0
+    drive.active[lane] = present | told
     drive.warning[lane] = 1 if present & _WARNS else 0
     drive.blocked[lane] = (BLOCKS_POSITIVE if present & _POSITIVE else 0) | (
         BLOCKS_NEGATIVE if present & _NEGATIVE else 0

@@ -179,6 +179,7 @@ STATE = (
     Field("emergency_count", "i4", "", "emergencies that wait to be fetched"),
     Field("mode_display", "i4", "", "6061h"),
     Field("stopping", "i4", "", "1: a stop ramp runs or holds the axis at standstill"),
+    Field("braking", "i4", "", "1: a stop ramp has begun"),
     Field("stop_time", "f8", "s", "since the stop ramp's end"),
     Field("set_point_acknowledged", "i4", "", "statusword bit 12 in pp"),
     Field("set_point_valid", "i4", "", "a set-point of pp was accepted"),
@@ -188,7 +189,7 @@ STATE = (
     Field("set_point_fresh", "i4", "", "1: a cyclic set-point has arrived since the last look"),
     Field("set_point_steps", "i4", "", "periods left until the demand is at the cyclic set-point; -1: none came yet"),
     Field("blocked", "i4", "", "directions that limits forbid: bit 0 negative, bit 1 positive"),
-    Field("homing_state", "i4", "", "see homing.py"),
+    Field("homing_state", "i4", "", "see modes/hm.py"),
     Field("homing_direction", "f8", "", "direction in which the switch was found"),
     Field("homing_attained", "i4", "", "statusword bit 12 in hm"),
     Field("homing_edge", "f8", "rad", "where the switch changed"),
@@ -309,7 +310,8 @@ _ORDERED = sorted(FIELDS, key=lambda field: field.kind != "f8")
 _PACKED = np.dtype([(f.name, f.kind, (LANES,) if f.depth == 1 else (f.depth, LANES)) for f in _ORDERED])
 CACHE_LINE = 64
 _PADDING = -_PACKED.itemsize % CACHE_LINE
-RECORD = np.dtype([*((name, _PACKED[name]) for name in _PACKED.names or ()), ("padding", "u1", (max(_PADDING, 1),))])
+_PAD = [("padding", "u1", (_PADDING,))] if _PADDING else []
+RECORD = np.dtype([*((name, _PACKED[name]) for name in _PACKED.names or ()), *_PAD])
 
 
 def new_records(num_axes: int) -> NDArray[np.void]:

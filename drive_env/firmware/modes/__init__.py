@@ -54,12 +54,29 @@ def stop_ramp(drive, lane):
 
 
 @stage
+def start_braking(drive, lane):
+    """Let a stop begin with the motion there is, where the demand does not tell it.
+
+    A torque mode has no speed demand; a set-point of csp may jump; and after a following error the axis is not where
+    the demand is.
+    """
+    level = drive.loop_level[lane]
+    if level != 0 and drive.mode_display[lane] != CSP and drive.fsa[lane] != fsa.REACTING:
+        return
+    drive.velocity_demand[lane] = drive.omega_meas[lane]
+    drive.position_demand[lane] = drive.theta_meas[lane]
+    if level == 0:
+        drive.loop_level[lane] = 1
+    elif level == 2 and drive.position_p[lane] > 0.0:
+        drive.position_demand[lane] += drive.velocity_demand[lane] / drive.position_p[lane]
+
+
+@stage
 def brake(drive, lane, rate, dt):
     """Bring the demand to standstill; a torque mode is braked by the velocity loop."""
-    if drive.loop_level[lane] == 0:
-        drive.loop_level[lane] = 1
-        drive.velocity_demand[lane] = drive.omega_meas[lane]
-        drive.position_demand[lane] = drive.theta_meas[lane]
+    if drive.braking[lane] == 0:
+        drive.braking[lane] = 1
+        start_braking(drive, lane)
     x, v = profiles.stop(drive.position_demand[lane], drive.velocity_demand[lane], rate, dt)
     drive.position_demand[lane] = x
     drive.velocity_demand[lane] = v
@@ -77,7 +94,10 @@ def change_mode(drive, lane):
     by_position = drive.mode[lane] == PP or drive.mode[lane] == HM or drive.mode[lane] == CSP
     if before != 2 and by_position and drive.position_p[lane] > 0.0:
         # The position loop asks for the present speed only with the lag that it has at that speed.
-        drive.position_demand[lane] += drive.velocity_demand[lane] / drive.position_p[lane]
+        lag = drive.velocity_demand[lane] / drive.position_p[lane]
+        window = drive.following_error_window[lane]
+        if window == 0.0 or abs(lag) < window:
+            drive.position_demand[lane] += lag
     drive.set_point_valid[lane] = 0
     drive.set_point_acknowledged[lane] = 0
     drive.target_reached[lane] = 0
@@ -95,7 +115,7 @@ def asked_direction(drive, lane):
         way = drive.profile_target[lane] - drive.position_demand[lane] if drive.set_point_valid[lane] == 1 else 0.0
     elif mode == PV:
         way = drive.target_velocity[lane]
-    elif mode == CSP:
+    elif mode == CSP and drive.set_point_steps[lane] != cyclic.NO_SET_POINT:
         way = drive.target_position[lane] + drive.position_offset[lane] - drive.position_demand[lane]
     elif mode == CSV:
         way = drive.target_velocity[lane] + drive.velocity_offset[lane]
@@ -113,40 +133,9 @@ def is_blocked(drive, lane):
 
 
 @stage
-def generate_demand(drive, lane, dt):
-    """Run the mode for one period of dt [s]: reads targets; writes position, velocity or torque demand and bit 10."""
-    if drive.mode[lane] != drive.mode_display[lane]:
-        change_mode(drive, lane)
-    mode = drive.mode_display[lane]
-    if drive.drive_function[lane] == 0.0:
-        drive.position_demand[lane] = drive.theta_meas[lane]
-        drive.velocity_demand[lane] = 0.0
-        drive.torque_demand[lane] = 0.0
-        drive.target_reached[lane] = 0
-        cyclic.forget(drive, lane)
-        return
-    if alignment.is_busy(drive, lane):
-        drive.position_demand[lane] = drive.theta_meas[lane]
-        drive.velocity_demand[lane] = 0.0
-        drive.velocity_sum[lane] = 0.0
-        return
-    if mode != PP and mode != CSP:
-        drive.internal_limit[lane] = 0
-    halted = (drive.controlword[lane] & fsa.BIT_HALT) != 0
-    if drive.stopping[lane] == 1:
-        brake(drive, lane, stop_ramp(drive, lane), dt)
-        drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
-    elif is_blocked(drive, lane):
-        brake(drive, lane, drive.quick_stop_deceleration[lane], dt)
-        drive.internal_limit[lane] = 1
-        drive.target_reached[lane] = 0
-        if drive.velocity_demand[lane] == 0.0:
-            drive.set_point_valid[lane] = 0
-    elif halted and mode != 0 and mode != HM:
-        brake(drive, lane, slow_down_ramp(drive, lane), dt)
-        # CiA 402: with halt set, bit 10 tells that the axis has come to rest.
-        drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
-    elif mode == PP:
+def follow(drive, lane, mode, dt):
+    """Run the mode's own generator for one period of dt [s]."""
+    if mode == PP:
         pp.generate(drive, lane, slow_down_ramp(drive, lane), dt)
     elif mode == PV:
         pv.generate(drive, lane, dt)
@@ -160,6 +149,46 @@ def generate_demand(drive, lane, dt):
         cst.generate(drive, lane)
     else:
         idle.generate(drive, lane, slow_down_ramp(drive, lane), dt)
+
+
+@stage
+def generate_demand(drive, lane, dt):
+    """Run the mode for one period of dt [s]: reads targets; writes position, velocity or torque demand and bit 10."""
+    if drive.mode[lane] != drive.mode_display[lane]:
+        change_mode(drive, lane)
+    mode = drive.mode_display[lane]
+    if drive.drive_function[lane] == 0.0:
+        drive.position_demand[lane] = drive.theta_meas[lane]
+        drive.velocity_demand[lane] = 0.0
+        drive.torque_demand[lane] = 0.0
+        drive.target_reached[lane] = 0
+        drive.braking[lane] = 0
+        cyclic.forget(drive, lane)
+        return
+    if alignment.is_busy(drive, lane):
+        drive.position_demand[lane] = drive.theta_meas[lane]
+        drive.velocity_demand[lane] = 0.0
+        drive.velocity_sum[lane] = 0.0
+        return
+    if mode != PP and mode != CSP:
+        drive.internal_limit[lane] = 0
+    halted = (drive.controlword[lane] & fsa.BIT_HALT) != 0
+    if drive.stopping[lane] == 1:
+        brake(drive, lane, stop_ramp(drive, lane), dt)
+        drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
+    elif halted and mode != 0 and mode != HM:
+        brake(drive, lane, slow_down_ramp(drive, lane), dt)
+        # CiA 402: with halt set, bit 10 tells that the axis has come to rest.
+        drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
+    elif is_blocked(drive, lane):
+        brake(drive, lane, drive.quick_stop_deceleration[lane], dt)
+        drive.internal_limit[lane] = 1
+        drive.target_reached[lane] = 0
+        if drive.velocity_demand[lane] == 0.0:
+            drive.set_point_valid[lane] = 0
+    else:
+        drive.braking[lane] = 0
+        follow(drive, lane, mode, dt)
     if mode in (CSP, CSV, CST):
         drive.target_reached[lane] = 0  # bit 10 is reserved in these modes (tables 237, 263, 283)
 
@@ -181,6 +210,7 @@ def mode_bits(drive, lane):
             drive.fsa[lane] == fsa.ENABLED
             and drive.stopping[lane] == 0
             and (drive.controlword[lane] & fsa.BIT_HALT) == 0
+            and not is_blocked(drive, lane)
         ):
             bits |= 0x1000
         if mode == CSP and drive.fault[lane] == protection.FOLLOWING_ERROR + 1:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from drive_env.firmware import profiles
 from drive_env.firmware.modes import cyclic
-from drive_env.firmware.protection import corrected_maximum, corrected_minimum
+from drive_env.firmware.protection import ROUNDING, corrected_maximum, corrected_minimum
 from mechanics.compiled import stage
 
 
@@ -12,11 +13,10 @@ def generate(drive, lane, dt):
     """Move the position demand to 607Ah + 60B0h within the interpolation period; 607Dh limits it and sets bit 11."""
     drive.loop_level[lane] = 2
     target = drive.target_position[lane] + drive.position_offset[lane]
-    drive.internal_limit[lane] = 0
+    target = profiles.unwrapped(target, drive.position_demand[lane], drive.position_scaler[lane])
     low, high = corrected_minimum(drive, lane), corrected_maximum(drive, lane)
-    if target > high or target < low:
-        target = high if target > high else low
-        drive.internal_limit[lane] = 1
+    drive.internal_limit[lane] = 1 if target > high + ROUNDING or target < low - ROUNDING else 0
+    target = min(max(target, low), high)
     before = drive.position_demand[lane]
     demand = cyclic.interpolate(drive, lane, before, target, dt)
     drive.position_demand[lane] = demand

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drive_env.firmware import fsa, profiles
-from drive_env.firmware.protection import corrected_maximum, corrected_minimum
+from drive_env.firmware.protection import ROUNDING, corrected_maximum, corrected_minimum
 from mechanics.compiled import stage
 
 
@@ -28,11 +28,11 @@ def new_set_point(drive, lane, word_before):
             target += drive.position_demand[lane]
         else:
             target += drive.theta_meas[lane]
-    drive.internal_limit[lane] = 0
+    else:
+        target = profiles.unwrapped(target, drive.position_demand[lane], drive.position_scaler[lane])
     low, high = corrected_minimum(drive, lane), corrected_maximum(drive, lane)
-    if target > high or target < low:
-        target = high if target > high else low
-        drive.internal_limit[lane] = 1
+    drive.internal_limit[lane] = 1 if target > high + ROUNDING or target < low - ROUNDING else 0
+    target = min(max(target, low), high)
     drive.profile_target[lane] = target
     drive.set_point_valid[lane] = 1
     drive.set_point_acknowledged[lane] = 1
