@@ -45,14 +45,16 @@ class Motor(NamedTuple):
 
     @property
     def thermal_resistance(self) -> float:
-        """Winding to ambient [K/W]: the rated current warms the winding by `RATED_RISE`."""
-        return RATED_RISE / (self._phase_factor * self.R_s * self.rated_current**2)
+        """Winding to ambient [K/W]: the rated current warms the winding, then of higher resistance, by `RATED_RISE`."""
+        hot = self.R_s * (1.0 + COPPER * RATED_RISE)
+        return RATED_RISE / (self._phase_factor * hot * self.rated_current**2)
 
     @property
     def _phase_factor(self) -> float:
         return 1.0 if self.kind == "dc" else 1.5
 
 
+COPPER = 0.00393  # 1/K, relative change of a winding's resistance
 RATED_RISE = 80.0  # K, a class of insulation's common limit at 40 degC ambient
 
 

@@ -136,3 +136,57 @@ def test_the_example_of_one_drive_runs():
     done = subprocess.run([sys.executable, script, "--machines", "2"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "positions reached [inc]: [" in done.stdout
+
+
+def test_outputs_are_those_that_the_mask_lets_through(axis):
+    """2703h (table 98): bits 16 to 19 are GPO0 to GPO3."""
+    axis.write((0x2703, 1), 0x000F0000)
+    assert axis.machine.outputs[0] == 0
+    axis.write((0x2703, 2), 0x00050000)
+    assert axis.machine.outputs[0] == 0b0101
+    axis.write((0x2703, 1), 0x00040000)
+    assert axis.machine.outputs[0] == 0b0100
+
+
+def test_analog_inputs_read_what_is_applied(axis):
+    axis.machine.analog_inputs = [[1234], [4095]]
+    assert axis.read((0x270E, 1))[0] == 1234
+    assert axis.read((0x270E, 2))[0] == 4095
+    with pytest.raises(ObjectAccessError, match="cannot be 4096; its highest is 4095"):
+        axis.machine.analog_inputs = 4096
+
+
+def test_a_turning_axis_is_taken_over_at_its_speed(running):
+    motion.disable(running)
+    running.advance(0.01)
+    speed = int(running.read(0x606C)[0])
+    motion.enable(running, mode="pv")
+    trace = running.record([0x606C], 0.05)
+    assert speed > 500_000
+    assert trace[0x606C].min() > 0.8 * speed
+
+
+def test_positions_wrap_like_a_counter_and_the_axis_turns_on(running):
+    near_the_end = 2**31 - 100_000
+    shift = (near_the_end - int(running.read(0x6064)[0])) * 2 * np.pi / 65536
+    running._records["home_shift"] -= shift
+    for field in ("position_demand", "theta_meas"):
+        running._records[field] += shift
+    trace = running.record([0x6064], 0.5)
+    assert trace[0x6064][0, 0] > 2**31 - 120_000
+    assert trace[0x6064][-1, 0] < -(2**31) + 600_000
+    assert running.emergencies() == []
+    motion.select_mode(running, "pp")
+    running.advance(0.5)
+    here = int(running.read(0x6064)[0])
+    motion.move_to(running, here + 100_000)
+    assert abs(int(running.read(0x6064)[0]) - here - 100_000) < 300
+
+
+def test_enable_resumes_from_a_quick_stop_that_stays(running):
+    running.write(0x605A, 6)
+    motion.quick_stop(running)
+    running.advance(0.5)
+    assert running.read(0x6041)[0] & 0x6F == 0x07
+    motion.enable(running)
+    assert running.read(0x6041)[0] & 0x6F == 0x27

@@ -111,7 +111,8 @@ def test_encoders_fit_the_object_and_the_drive(motor):
 
 def test_the_rated_current_warms_the_winding_by_80_k(motor):
     phases = 1.0 if dc(motor) else 1.5
-    loss = phases * motor.R_s * motor.rated_current**2
+    hot = motor.R_s * (1.0 + 0.00393 * 80.0)
+    loss = phases * hot * motor.rated_current**2
     assert loss * motor.thermal_resistance == pytest.approx(80.0, rel=1e-12)
     assert 60.0 <= motor.thermal_time <= 3600.0
 

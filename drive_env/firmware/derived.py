@@ -27,4 +27,6 @@ def derive(drive, dt):
         feed = step / (drive.supply_resistance[lane] + SMALLEST_RESISTANCE)
         drive.link_step[lane] = step
         drive.link_feed[lane] = feed
-        drive.link_share[lane] = 1.0 / (1.0 + feed)
+        short = step * drive.short_conductance[lane]
+        drive.link_decay[lane] = 1.0 / (1.0 + short)
+        drive.link_share[lane] = 1.0 / (1.0 + feed + short)

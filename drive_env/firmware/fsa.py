@@ -148,7 +148,9 @@ def _enter(drive, lane, number, end):
     drive.transition_pending[lane] = 0
     if number == 4:
         drive.position_demand[lane] = drive.theta_meas[lane]
-        drive.velocity_demand[lane] = 0.0
+        # An axis that turns already is taken over at its speed.
+        turns = abs(drive.omega_slow[lane]) > drive.standstill[lane]
+        drive.velocity_demand[lane] = drive.omega_meas[lane] if turns else 0.0
         drive.torque_demand[lane] = 0.0
         drive.velocity_sum[lane] = 0.0
     if number == 4 or number == 16:

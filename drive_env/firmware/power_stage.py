@@ -249,10 +249,11 @@ def convert_energy(drive, dt, progress):
         chopper = 0.0 if u_dc < limit - drive.chopper_hysteresis[lane] else chopper
         chopper = drive.chopper_enable[lane] if u_dc > limit else chopper
         drive.chopper[lane] = chopper
-        conductance = chopper * drive.chopper_conductance[lane] + drive.short_conductance[lane]
-        drained = drive.idle_current[lane] + power / u_dc + u_dc * conductance
-        blocked = u_dc - drive.link_step[lane] * drained
-        fed = (blocked + drive.link_feed[lane] * drive.supply_voltage[lane]) * drive.link_share[lane]
+        drained = drive.idle_current[lane] + power / u_dc + u_dc * chopper * drive.chopper_conductance[lane]
+        # A short circuit is implicit: it may empty the link within a tick.
+        left = u_dc - drive.link_step[lane] * drained
+        blocked = left * drive.link_decay[lane]
+        fed = (left + drive.link_feed[lane] * drive.supply_voltage[lane]) * drive.link_share[lane]
         floor = drive.supply_voltage[lane] if drive.supply_sinks[lane] < 0.5 else ENDLESS
         link = fed if blocked < floor else blocked
         drive.u_dc[lane] = link if link > SMALLEST_VOLTAGE else SMALLEST_VOLTAGE

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from drive_env.firmware.record import LANES
+from drive_env.motors import COPPER
 from mechanics.compiled import inlined
 
-COPPER = 0.00393  # 1/K, relative change of resistance
 LARGEST_SQUARE = 1e12  # A^2
 NOMINAL = 25.0  # degC at which the motor's row holds
 
