@@ -265,7 +265,7 @@ def test_a_blocked_axis_warms_and_its_torque_per_ampere_falls():
 
 
 @pytest.mark.parametrize("name", sorted(MOTORS))
-def test_rated_current_warms_the_winding_by_80_K_in_the_end(name):
+def test_rated_current_warms_the_winding_by_80_k_in_the_end(name):
     """In the end: resistance and so the loss have grown with the temperature by then."""
     motor = MOTORS[name]
     records = new_winding(motor, thermal_time=0.2, i_q=motor.rated_current)
