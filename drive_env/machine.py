@@ -38,7 +38,7 @@ class Machines:
 
     @property
     def load_torque(self) -> Floats:
-        """External torque on the load [N*m], shape (num_machines,); set it to a value or one per machine."""
+        """External torque on the load [N*m; N on a belt], shape (num_machines,); set one value or one per machine."""
         return np.concatenate([group.load.plant.load_torque for group in self._drives._groups])
 
     @load_torque.setter

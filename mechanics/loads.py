@@ -82,6 +82,7 @@ class Load(NamedTuple):
     positions: tuple[Combination, ...] = ()
     switches: tuple[Switch, ...] = ()
     end_stops: tuple[EndStop, ...] = ()
+    disturbance_unit: str = "N*m"
 
     @property
     def has_switches(self) -> bool:
@@ -153,6 +154,7 @@ LOADS: dict[str, Load] = {
                 Switch("home", 0, -0.06, -0.02),
             ),
             end_stops=(EndStop(_CARRIAGE, -0.25, 0.25, 4e4, 60.0),),
+            disturbance_unit="N",
         ),
     )
 }

@@ -494,19 +494,23 @@ def test_limit_of_travel_stops_the_axis_and_leaves_it_enabled(name):
     limit = LIMITS[name]
     with at_limit(limit) as drives:
         assert [(m.axis, m.code, m.error_register, m.extra) for m in drives.emergencies()] == [
-            (0, 0xFF01, 0, (limit.extra, 0, 0, 0, 0))
+            (0, 0xFF01, 0x21, (limit.extra, 0, 0, 0, 0))
         ]
         assert [state(drives, machine) for machine in (0, 1)] == [ENABLED, ENABLED]
         assert bits(drives, INTERNAL_LIMIT) == INTERNAL_LIMIT
         assert bits(drives, INTERNAL_LIMIT, 1) == 0
-        assert drives.read(0x1001).tolist() == [0, 0]
+        assert drives.read(0x1001).tolist() == [0x21, 0]  # generic and profile specific, while it lasts
         assert drives.read(0x2101)[0] & FAULT_FLAGS == 0
+        assert drives.read(0x2101)[0] & 0x100  # stop mode
         assert abs(drives.machine.rotor_speed[0]) < 0.5
         # Behind the edge by the ramp of 6085h, the loops' lag and the belt's stretch.
         behind = limit.side * (int(drives.read(0x6064)[0]) - limit.edge)
         assert 0 <= behind < 300_000**2 / (2 * QUICK) + 25_000
         drives.advance(0.5)
         assert messages(drives) == []
+        drives.write(0x60FF, [-limit.side * 300_000, 0])
+        drives.advance(0.5)
+        assert drives.read(0x1001).tolist() == [0, 0]
 
 
 def command(drives: Drives, mode: str, way: int) -> None:

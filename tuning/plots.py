@@ -14,6 +14,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullLocator
 from numpy.typing import NDArray
 
+from mechanics.loads import find_load
 from tuning import metrics
 from tuning.experiment import SweptObject
 
@@ -67,7 +68,8 @@ def best_response(result: SweepResult) -> Figure:
     current.set_ylabel("current i_q [A]")
     torque = np.where(recording.t >= recording.t_load - 1e-9, excitation.load_torque, 0.0)
     load.plot(t, torque, color="#009e73", linewidth=1.4, drawstyle="steps-post")
-    load.set_ylabel("load\ntorque [N·m]")
+    unit = find_load(result.experiment.load).disturbance_unit
+    load.set_ylabel(f"load\n{'force' if unit == 'N' else 'torque'} [{unit.replace('*', '·')}]")
     load.set_xlabel("time [ms]")
     load.set_xlim(0.0, 1e3 * excitation.duration)
     load.margins(y=0.2)

@@ -41,10 +41,10 @@ CAUSES = (
     Cause("following_error", STOP, 0x20, 0x0),
     Cause("overload", STOP, 0x02, 0x20000),
     Cause("overtemperature_warning", WARN, 0x08, 0x0),
-    Cause("positive_software_limit", LIMIT, 0x00, 0x0),
-    Cause("negative_software_limit", LIMIT, 0x00, 0x0),
-    Cause("positive_limit_switch", LIMIT, 0x00, 0x0),
-    Cause("negative_limit_switch", LIMIT, 0x00, 0x0),
+    Cause("positive_software_limit", LIMIT, 0x20, 0x0),
+    Cause("negative_software_limit", LIMIT, 0x20, 0x0),
+    Cause("positive_limit_switch", LIMIT, 0x20, 0x0),
+    Cause("negative_limit_switch", LIMIT, 0x20, 0x0),
 )
 (
     _RESET,
@@ -201,6 +201,11 @@ def protect(drive, lane, dt):
     drive.blocked[lane] = (BLOCKS_POSITIVE if present & _POSITIVE else 0) | (
         BLOCKS_NEGATIVE if present & _NEGATIVE else 0
     )
+    # A limit shows in 1001h while it lasts; what made a fault stays there until the reset.
+    if present & _LIMITS:
+        drive.error_register[lane] |= GENERIC_ERROR | _REGISTER[POSITIVE_SOFTWARE]
+    elif drive.fault[lane] == 0:
+        drive.error_register[lane] = 0
     if appeared == 0:
         return
     for cause in range(1, len(_REGISTER)):

@@ -229,7 +229,7 @@ def status_flags(drive, lane):
     flags = FLAG_INITIALIZED if drive.init_state[lane] == alignment.DONE else 0
     if abs(drive.omega_slow[lane]) <= drive.standstill[lane]:
         flags |= FLAG_HALTED
-    if drive.drive_function[lane] == 0.0 or drive.stopping[lane] == 1:
+    if drive.drive_function[lane] == 0.0 or drive.stopping[lane] == 1 or drive.braking[lane] == 1:
         flags |= FLAG_STOP
     elif drive.loop_level[lane] == 2.0:
         flags |= FLAG_POSITION
