@@ -284,7 +284,6 @@ class EmulatedDrives:
 
     def _set_constants(self, supply: float) -> None:
         records, device, motor = self._records, self.device, self.motor
-        records["current_scale"] = device.current_full_scale
         records["duty_limit"] = device.duty_limit
         records["overcurrent"] = device.overcurrent
         records["undervoltage"] = device.undervoltage

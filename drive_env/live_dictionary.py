@@ -156,10 +156,7 @@ class LiveDictionary:
         return units.Context(
             position_scaler=get_lanes(self._records, "position_scaler", self.num_axes).astype(float),
             encoder_steps=get_lanes(self._records, "encoder_steps", self.num_axes).astype(float),
-            adc_step=get_lanes(self._records, "adc_step", self.num_axes).astype(float),
             current_lsb=device.current_full_scale / 32768.0,
-            current_period=1.0 / device.current_rate,
-            velocity_period=1.0 / device.velocity_rate,
         )
 
     def _read(self, entry: Entry) -> Integers:

@@ -323,10 +323,7 @@ def context(scaler=65536.0, **other):
     values = {
         "position_scaler": np.array([scaler]),
         "encoder_steps": np.array([4096.0]),
-        "adc_step": np.array([200.0 / 4096.0]),
         "current_lsb": 100.0 / 32768.0,
-        "current_period": 1.0 / 25_000.0,
-        "velocity_period": 1.0 / 5_000.0,
     }
     values.update(other)
     return units.Context(**{name: values[name] for name in units.Context._fields})

@@ -21,10 +21,7 @@ class Context(NamedTuple):
 
     position_scaler: Floats  # [inc/rev], 2058h
     encoder_steps: Floats  # [1/rev], 2080h:02
-    adc_step: Floats  # [A]
     current_lsb: float  # [A] per LSB of the current loop
-    current_period: float  # [s]
-    velocity_period: float  # [s]
 
 
 class Unit(NamedTuple):

@@ -92,7 +92,6 @@ PARAMETERS = (
     Field("position_min", "f8", "rad", "607Dh:01"),
     Field("position_max", "f8", "rad", "607Dh:02"),
     # --- data of the device and of its power stage ----------------------------------------------------------------
-    Field("current_scale", "f8", "A", "current of 32768 LSB", 100.0),
     Field("duty_limit", "f8", "1", "radius of the voltage circle as a share of the supply", 0.5773502691896258),
     Field("adc_step", "f8", "A", "one step of the current measurement"),
     Field("adc_step_lsb", "f8", "LSB", "one step of the current measurement in the ADC's register"),
