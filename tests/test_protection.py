@@ -750,3 +750,16 @@ def test_load_stronger_than_the_motor_is_a_following_error():
         assert messages(drives) == [(0, 0x8611, (0, 0, 0, 0, 0))]
         assert (state(drives), state(drives, 1)) == (FAULT, ENABLED)
         assert drives.read(0x1001).tolist() == [GENERIC | PROFILE, 0]
+
+
+@pytest.mark.parametrize("leg", ["motor.open_a", "motor.open_b"])
+def test_a_dc_motor_with_either_leg_open_carries_no_current(leg):
+    """Two legs in series: the current that one cannot carry does not flow in the other."""
+    with EmulatedDrives(load="inertia", motor="re_40", ideal=True) as drives:
+        motion.enable(drives, mode="cst")
+        drives.write("Target torque", 2000)
+        drives.advance(0.01)
+        assert drives.machine.motor_torque[0] > 0.05
+        drives.machine.set(leg, 1.0)
+        drives.advance(0.002)
+        assert abs(drives.machine.motor_torque[0]) < 1e-9

@@ -190,11 +190,12 @@ def open_phases(drive):
     for lane in range(LANES):
         s = drive.sin_e[lane]
         c = drive.cos_e[lane]
-        # Axes of phases A and B in the rotor frame.
+        # Axes of phases A and B in the rotor frame; a DC motor's two legs are in series and share one.
+        is_dc = drive.is_dc[lane] > 0.5
         a_d = c
         a_q = -s
-        b_d = 0.5 * (SQRT3 * s - c)
-        b_q = 0.5 * (SQRT3 * c + s)
+        b_d = a_d if is_dc else 0.5 * (SQRT3 * s - c)
+        b_q = a_q if is_dc else 0.5 * (SQRT3 * c + s)
         i_d = drive.i_d[lane]
         i_q = drive.i_q[lane]
         out = drive.open_a[lane] * (i_d * a_d + i_q * a_q)
