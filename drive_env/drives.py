@@ -9,6 +9,7 @@ import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,19 +19,24 @@ from drive_env.devices import Device, find_device
 from drive_env.dictionary.entries import ObjectDictionary, ObjectName
 from drive_env.firmware.protection import CAUSES
 from drive_env.firmware.record import get_lanes, new_records, set_lanes
-from drive_env.group import MACHINES_PER_GROUP, Channels, Group, channels, rates_of
+from drive_env.group import Channels, Group, channels, rates_of
 from drive_env.live_dictionary import NOTHING, LiveDictionary
 from drive_env.machine import Machines
+from drive_env.misfit import warn_of_misfits
 from drive_env.motors import find_motor
 from drive_env.parameters import apply_to_records, check_parameter, draw_parameters, parameter_table
+from mechanics.load import Load
 from mechanics.loads import find_load
-from mechanics.packed import PackedLoad, compile_packed
+from mechanics.model import compile_packed, copies_per_model
+from mechanics.packed import PackedLoad
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SWITCHES = ("left", "right", "home")  # bits of 60FDh
+
+BRAKE_TORQUE = 2.0  # of the motor's rated torque, usual for holding brakes
 
 
 class EmergencyMessage(NamedTuple):
@@ -70,7 +76,7 @@ class EmulatedDrives:
 
     Args:
         device: Name of the device.
-        load: Name of the load.
+        load: A load's name, the path of your own MJCF, or a `mechanics.Load`.
         motor: Name of the motor, or None for factory values.
         num_machines: Machines, each with its drives.
         seed: Seed of everything random. Machine k of a seed is the same machine in every set.
@@ -83,6 +89,7 @@ class EmulatedDrives:
         num_threads: Threads that run machines; the number of cores by default.
         physics_steps: Physics steps per velocity-loop period.
         integrator: "leapfrog", or "rk4", the slower oracle.
+        friction: How the load's friction is modelled: "none", "coulomb_viscous", "stribeck" or "lugre".
 
     Raises:
         ValueError: For an unknown name, or a machine that cannot be.
@@ -93,7 +100,7 @@ class EmulatedDrives:
     def __init__(
         self,
         device: str = "tmcm1636",
-        load: str = "two_mass",
+        load: str | Path | Load = "two_mass",
         motor: str | None = DEFAULT_MOTOR,
         num_machines: int = 1,
         seed: int = 0,
@@ -107,6 +114,7 @@ class EmulatedDrives:
         num_threads: int | None = None,
         physics_steps: int = 1,
         integrator: str = "leapfrog",
+        friction: str = "stribeck",
     ) -> None:
         if num_machines < 1:
             raise ValueError(f"num_machines must be 1 or more, not {num_machines}")
@@ -114,7 +122,7 @@ class EmulatedDrives:
         self.motor = find_motor(motor or self.DEFAULT_MOTOR)
         self.load = find_load(load)
         self.num_machines = num_machines
-        self.num_axes = num_machines * len(self.load.axes)
+        self.num_axes = num_machines * self.load.num_axes
         self._records = new_records(self.num_axes)
         self._threads = max(1, num_threads if num_threads is not None else os.cpu_count() or 1)
         self._executor: ThreadPoolExecutor | None = None
@@ -123,13 +131,17 @@ class EmulatedDrives:
             [first_machine] * num_machines if identical else list(range(first_machine, first_machine + num_machines))
         )
         self._draw(seed, numbers, randomise, ideal, parameters or {})
-        self._groups = self._build_groups(physics_steps, integrator)
+        self._groups = self._build_groups(physics_steps, integrator, friction)
         self._set_constants(self.motor.voltage if supply is None else supply)
         for name, values in self._parameters.items():
             everywhere = np.ones(self.num_axes, bool)
-            per_axis = np.repeat(values, len(self.load.axes))
+            per_axis = np.repeat(values, self.load.num_axes)
             apply_to_records(self._records, self.device, self.motor, name, per_axis, everywhere)
         self._refresh_inertia()
+        set_lanes(self._records, "brake_torque", np.full(self.num_axes, BRAKE_TORQUE * self.motor.rated_torque))
+        self._now = 0  # cycles since the beginning
+        self._schedule: list[tuple[int, str, Floats, Mask]] = []
+        warn_of_misfits([group.load for group in self._groups], self.motor)
         self.machine = Machines(self)
         preset = {} if motor is None else self.device.preset(motor)
         if motor is not None and not self.load.has_switches:
@@ -244,12 +256,12 @@ class EmulatedDrives:
         given: Mapping[str, ArrayLike],
     ) -> None:
         template = compile_packed(self.load, 1)
-        axes = (1, len(self.load.axes))
+        axes = (1, self.load.num_axes)
         single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6, template=template)
         defaults = {p.name: float(single.get(p.name)[0]) for p in self.load.parameters}
         table = parameter_table(self.device, self.motor, self.load, defaults)
         self._parameters, noise = draw_parameters(table, seed, numbers, randomise, ideal)
-        seeds = np.repeat(noise, len(self.load.axes)) + np.tile(np.arange(axes[1]), self.num_machines)
+        seeds = np.repeat(noise, self.load.num_axes) + np.tile(np.arange(axes[1]), self.num_machines)
         self._noise_seeds = np.mod(seeds, 2.0**32 - 1.0) + 1.0  # xorshift stays at 0 for ever
         for name, value in given.items():
             if name not in table:
@@ -257,13 +269,14 @@ class EmulatedDrives:
             self._parameters[name] = np.broadcast_to(np.asarray(value, float), (self.num_machines,)).copy()
             check_parameter(name, self._parameters[name])
 
-    def _build_groups(self, physics_steps: int, integrator: str) -> list[Group]:
+    def _build_groups(self, physics_steps: int, integrator: str, friction: str) -> list[Group]:
         rates = rates_of(self.device, physics_steps)
         templates: dict[int, Any] = {}
         groups = []
-        axes_per_group = MACHINES_PER_GROUP * len(self.load.axes)
-        for first in range(0, self.num_machines, MACHINES_PER_GROUP):
-            machines = slice(first, min(first + MACHINES_PER_GROUP, self.num_machines))
+        per_group = copies_per_model(self.load)
+        axes_per_group = per_group * self.load.num_axes
+        for first in range(0, self.num_machines, per_group):
+            machines = slice(first, min(first + per_group, self.num_machines))
             count = machines.stop - machines.start
             if count not in templates:
                 templates[count] = compile_packed(self.load, count)
@@ -274,11 +287,14 @@ class EmulatedDrives:
                 {p.name: self._parameters[f"load.{p.name}"][machines] for p in self.load.parameters},
                 rates.window / physics_steps,
                 integrator=integrator,
+                friction=friction,
+                # A joint does not go far in a millisecond, and sliding friction does not depend on inertia.
+                weigh_every=rates.windows * physics_steps,
                 template=templates[count],
                 first_machine=first,
             )
-            block = first // MACHINES_PER_GROUP * (axes_per_group // 8)
-            blocks = -(-count * len(self.load.axes) // 8)
+            block = first // per_group * (axes_per_group // 8)
+            blocks = -(-count * self.load.num_axes // 8)
             groups.append(Group(machines, load, self._records[block : block + blocks], rates))
         return groups
 
@@ -301,7 +317,7 @@ class EmulatedDrives:
         records["n_p"] = motor.n_p
         for switch in self.load.switches:
             kind = SWITCHES.index(switch.kind)
-            axes = np.tile(np.arange(len(self.load.axes)) == switch.axis, self.num_machines)
+            axes = np.tile(np.arange(self.load.num_axes) == switch.axis, self.num_machines)
             set_lanes(records, "switch_low", np.full(self.num_axes, switch.low), axes, kind)
             set_lanes(records, "switch_high", np.full(self.num_axes, switch.high), axes, kind)
             wired = get_lanes(records, "wired", self.num_axes).astype(np.int32)
@@ -311,17 +327,17 @@ class EmulatedDrives:
         set_lanes(records, "random", self._noise_seeds)
 
     def _armature(self) -> Floats:
-        return np.repeat(self._parameters["motor.inertia"][:, None], len(self.load.axes), 1)
+        return np.repeat(self._parameters["motor.inertia"][:, None], self.load.num_axes, 1)
 
     def _bearings(self) -> Floats:
         """Return the motors' friction; their breakaway is that of sliding, so Stribeck's speed does not matter."""
         coulomb, viscous = self._parameters["motor.coulomb"], self._parameters["motor.viscous"]
         one = np.stack([coulomb, coulomb, np.ones_like(coulomb), viscous], -1)
-        return np.repeat(one[:, None, :], len(self.load.axes), 1)
+        return np.repeat(one[:, None, :], self.load.num_axes, 1)
 
     def _apply_parameter(self, name: str, values: Floats, machines: Mask) -> None:
         """Bring a true parameter into records and mechanics; a refused one changes nothing."""
-        axes_per_machine = len(self.load.axes)
+        axes_per_machine = self.load.num_axes
         axes = np.repeat(machines, axes_per_machine)
         if apply_to_records(self._records, self.device, self.motor, name, np.repeat(values, axes_per_machine), axes):
             return
@@ -343,7 +359,8 @@ class EmulatedDrives:
                 group.load.set_motor(self._armature()[group.machines], self._bearings()[group.machines])
 
     def _refresh_inertia(self) -> None:
-        inertia = np.concatenate([group.load.plant.axis_inertia.reshape(-1) for group in self._groups])
+        axes = self.load.num_axes
+        inertia = np.concatenate([group.load.plant.mass[:, :axes].reshape(-1) for group in self._groups])
         set_lanes(self._records, "J_rotor", inertia)
 
     def _axis_mask(self, where: Mask | None) -> Mask:
@@ -371,21 +388,33 @@ class EmulatedDrives:
         return cycles
 
     def _run(self, cycles: int, play: Floats, played: Channels, samples: Floats, sampled: Channels, every: int) -> None:
-        if cycles == 0:
-            return
+        begin, done = self._now, 0
+        while done < cycles:
+            while self._schedule and self._schedule[0][0] <= begin + done:
+                _, name, values, where = self._schedule.pop(0)
+                self.machine.set(name, values, where)
+            until = min([cycles, *(due - begin for due, *_ in self._schedule[:1])])
+            self._run_groups(done, until, play, played, samples, sampled, every)
+            done = until
+            self._now = begin + done
+        if cycles:
+            self._report_divergence()
+
+    def _run_groups(
+        self, start: int, end: int, play: Floats, played: Channels, samples: Floats, sampled: Channels, every: int
+    ) -> None:
         if self._threads == 1 or len(self._groups) == 1:
             for group in self._groups:
-                group.run(cycles, play, played, samples, sampled, every)
+                group.run(start, end, play, played, samples, sampled, every)
         else:
             if self._executor is None:
                 self._executor = ThreadPoolExecutor(self._threads, thread_name_prefix="drives")
             jobs = [
-                self._executor.submit(group.run, cycles, play, played, samples, sampled, every)
+                self._executor.submit(group.run, start, end, play, played, samples, sampled, every)
                 for group in self._groups
             ]
             for job in jobs:
                 job.result()
-        self._report_divergence()
 
     def _report_divergence(self) -> None:
         diverged = self.machine.diverged

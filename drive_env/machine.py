@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_BRAKES = ("open", "closed", "with_stage")  # numbers of firmware/cycle.py
+
 
 class Machines:
     """The emulated machines behind drives: one value per machine, shape (num_machines,), unless said otherwise."""
@@ -46,6 +48,93 @@ class Machines:
         values = self._per_machine(value, "load torque")
         for group in self._drives._groups:
             group.load.plant.load_torque[:] = values[group.machines]
+
+    def load_profile(
+        self,
+        at: ArrayLike | None,
+        torque: ArrayLike | None = None,
+        *,
+        of: str = "time",
+        period: float | None = None,
+    ) -> None:
+        """Add a torque from a table to `load_torque`, interpolated linearly, in all machines; None takes it away.
+
+        Args:
+            at: Times from now [s], or positions of the first axis's joint or carriage [rad or m]; increasing, (n,).
+            torque: On the load [N*m; N where the load moves in a line], shape (n,) or (num_machines, n).
+            of: "time" or "position".
+            period: After which the table begins anew; without one the first and last values hold outside.
+
+        Raises:
+            ValueError: For a table that is none; nothing is changed then.
+        """
+        drives = self._drives
+        if of not in ("time", "position"):
+            raise ValueError(f"a load profile is of time or of position, not of {of!r}")
+        points = np.zeros(0) if at is None else np.asarray(at, float)
+        values = np.zeros(0) if torque is None else np.asarray(torque, float)
+        if points.ndim != 1 or np.any(np.diff(points) <= 0.0) or not np.all(np.isfinite(points)):
+            raise ValueError("a load profile needs one finite, increasing row of times or positions")
+        if values.shape not in (points.shape, (drives.num_machines, *points.shape)) or not np.all(np.isfinite(values)):
+            raise ValueError(
+                f"a load profile of {len(points)} points needs finite torques of shape ({len(points)},) or "
+                f"({drives.num_machines}, {len(points)}), not {values.shape}"
+            )
+        if period is not None and (not len(points) or not period >= points[-1] - points[0] or not period > 0.0):
+            raise ValueError(f"the period of a load profile must be above 0 and span its points, not {period:g}")
+        rows = np.broadcast_to(values, (drives.num_machines, len(points)))
+        for group in drives._groups:
+            group.load.set_profile(points, rows[group.machines], of_position=of == "position", period=period or 0.0)
+
+    def schedule(self, name: str, times: ArrayLike, values: ArrayLike, where: Mask | None = None) -> None:
+        """Let a parameter change while time passes: a payload that is picked up, a supply line that warms.
+
+        Args:
+            name: A parameter, as in `set`.
+            times: Times from now [s], whole communication cycles, shape (n,).
+            values: What the parameter becomes then [SI], shape (n,) or (n, num_machines).
+            where: Machines.
+
+        Raises:
+            ValueError: As in `set`, at once, and for times that are past or no whole cycles.
+        """
+        drives = self._drives
+        if name not in drives._parameters:
+            raise ValueError(f"machines have no parameter {name!r}; they have {', '.join(drives._parameters)}")
+        mask, rows = self._mask(where), np.asarray(values, float)
+        cycles = [drives._cycles(float(time)) for time in np.atleast_1d(np.asarray(times, float))]
+        if rows.shape not in ((len(cycles),), (len(cycles), drives.num_machines)):
+            raise ValueError(
+                f"a schedule of {len(cycles)} times needs values of shape ({len(cycles)},) or "
+                f"({len(cycles)}, {drives.num_machines}), not {rows.shape}"
+            )
+        check_parameter(name, rows)
+        if name.startswith("load."):
+            drives._groups[0].load.check(name.removeprefix("load."), rows)
+        drives._schedule += [(drives._now + cycle, name, row, mask) for cycle, row in zip(cycles, rows, strict=True)]
+        drives._schedule.sort(key=lambda change: change[0])
+
+    @property
+    def brake(self) -> NDArray[np.str_]:
+        """Holding brake of each axis: "open", "closed", or "with_stage", closed while the stage is off; set likewise.
+
+        Its torque is twice the motor's rated torque: what holding brakes of this size are built for.
+        """
+        return np.array([_BRAKES[int(mode)] for mode in self._axis_field("brake_mode")])
+
+    @brake.setter
+    def brake(self, value: ArrayLike) -> None:
+        drives = self._drives
+        chosen = np.broadcast_to(np.asarray(value), (drives.num_axes,))
+        for state in chosen:
+            if state not in _BRAKES:
+                raise ValueError(f"a brake is {', '.join(_BRAKES)}, not {str(state)!r}")
+        set_lanes(drives._records, "brake_mode", np.array([_BRAKES.index(state) for state in chosen], float))
+
+    @property
+    def joint_positions(self) -> Floats:
+        """Positions of the load's joints, in the order of its MJCF [rad or m], shape (num_machines, joints)."""
+        return np.concatenate([group.load.joint_positions() for group in self._drives._groups])
 
     @property
     def supply(self) -> Floats:

@@ -12,7 +12,7 @@ from drive_env import motors
 from drive_env.devices import Device
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import Motor
-from mechanics.loads import Load
+from mechanics.load import Load
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -167,9 +167,8 @@ def draw_parameters(
 # positive.
 _SIGNED = ("offset", "error", "phase", "ambient")
 _MAY_VANISH = (
-    "cogging_torque", "coulomb", "breakaway", "viscous", "damping", "stiffness", "broken", "open_a", "open_b",
-    "short_conductance", "noise", "dead_time", "resistance",
-    "supply_sinks",
+    "cogging_torque", "coulomb", "viscous", "broken", "open_a", "open_b", "short_conductance", "noise", "dead_time",
+    "resistance", "supply_sinks",
 )  # fmt: skip
 
 
@@ -181,7 +180,8 @@ def check_parameter(name: str, values: Floats) -> None:
         return
     if name == "stage.adc_bits" and values.min() < 1.0:
         raise ValueError(f"{name} must be 1 or more, not {values.min():g}")
-    if any(name.endswith(word) for word in _MAY_VANISH):
+    # Of a load, its field decides whether it may vanish: mechanics/packed.py refuses a body without mass.
+    if name.startswith("load.") or any(name.endswith(word) for word in _MAY_VANISH):
         if values.min() < 0.0:
             raise ValueError(f"{name} must be 0 or more, not {values.min():g}")
     elif values.min() <= 0.0:

@@ -1,23 +1,69 @@
 """Dry and viscous friction, semi-implicit: the one place in which friction is computed.
 
-The law is Coulomb's with Stribeck's rise towards standstill and a viscous part (Armstrong-Helouvry et al., Automatica
-30(7), 1994): F(v) = F_c + (F_s - F_c) exp(-(v/v_s)^2) + b |v|, against the motion.
+The static law is Coulomb's with Stribeck's rise towards standstill and viscous parts (Armstrong-Helouvry et al.,
+Automatica 30(7), 1994): F(v) = F_c + (F_s - F_c) exp(-(v/v_s)^2) + b |v| + c v^2, against the motion.
 
 Explicit Coulomb friction chatters around zero speed, because it is applied for a whole step in the direction of a
 speed that it would reverse within it. Here friction may at most stop the motion within the step: with v_free the speed
 that the step would reach without friction, the torque is -clip(J v_free / h, +-F).
+
+LuGre's law (Canudas de Wit et al., IEEE TAC 40(3), 1995) has bristles of deflection z between the surfaces:
+dz/dt = v - |v| z / z_ss(v), z_ss = (F_c + (F_s - F_c) exp(-(v/v_s)^2)) / s_0, F = s_0 z + s_1 dz/dt + b v + c |v| v.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from mechanics.compiled import stage
 
+# Damping ratio of the bristles: LuGre's canonical s_1 = sqrt(s_0) with a mass of 1 kg.
+BRISTLE_DAMPING = 0.5
+
+
+class FrictionModel(NamedTuple):
+    """Which parts of a load's friction a model of friction takes; a fan's drag is its load and always there."""
+
+    name: str
+    dry: bool
+    stribeck: bool
+    viscous: bool
+    bristles: bool
+    meaning: str
+
+
+FRICTION_MODELS = {
+    row.name: row
+    for row in (
+        FrictionModel("none", False, False, False, False, "no dry and no viscous friction of the load"),
+        FrictionModel("coulomb_viscous", True, False, True, False, "sliding friction at all speeds, and viscous"),
+        FrictionModel("stribeck", True, True, True, False, "break-away friction that falls to sliding friction"),
+        FrictionModel("lugre", True, True, True, True, "the same with bristles: pre-sliding, hysteresis, lag"),
+    )
+}
+
+
+def find_friction(name: str) -> FrictionModel:
+    """Return a model of friction by name; ValueError lists the names there are."""
+    if name not in FRICTION_MODELS:
+        raise ValueError(f"no friction is named {name!r}; there are {', '.join(FRICTION_MODELS)}")
+    return FRICTION_MODELS[name]
+
 
 @stage
-def friction_torque(v, other, J, h, coulomb, breakaway, stribeck, viscous):
-    """Return the friction torque [N*m] of one step.
+def dry_friction(speed, coulomb, breakaway, stribeck):
+    """Return sliding or break-away friction at a speed of 0 or more [N*m]."""
+    # Beyond six times Stribeck's speed the rise is below 1e-15 of itself.
+    if breakaway != coulomb and speed < 6.0 * stribeck:
+        x = speed / stribeck
+        return coulomb + (breakaway - coulomb) * math.exp(-x * x)
+    return coulomb
+
+
+@stage
+def friction_torque(v, other, J, h, coulomb, breakaway, stribeck, viscous, drag):
+    """Return the friction torque [N*m] of one step by the static law.
 
     Args:
         v: Speed at the step's start [rad/s].
@@ -28,22 +74,78 @@ def friction_torque(v, other, J, h, coulomb, breakaway, stribeck, viscous):
         breakaway: Friction at standstill F_s [N*m].
         stribeck: Speed v_s over which it falls to F_c [rad/s].
         viscous: Coefficient b [N*m*s/rad].
+        drag: Coefficient c [N*m*s^2/rad^2].
     """
     mobility = h / J  # speed gained per torque in one step
     v_free = v + mobility * other
     v_mid = 0.5 * abs(v + v_free)
-    limit = coulomb
-    # Beyond six times Stribeck's speed the rise is below 1e-15 of itself.
-    if breakaway != coulomb and v_mid < 6.0 * stribeck:
-        x = v_mid / stribeck
-        limit += (breakaway - coulomb) * math.exp(-x * x)
-    if viscous != 0.0:
-        # With the mean speed of the step, itself reduced by friction: second order, and stable for any b.
+    limit = dry_friction(v_mid, coulomb, breakaway, stribeck)
+    if viscous != 0.0 or drag != 0.0:
+        # With the mean speed of the step, itself reduced by friction: second order, and stable for any b and c.
         v_mean = max(v_mid - 0.5 * mobility * limit, 0.0)
-        limit += viscous * v_mean / (1.0 + 0.5 * mobility * viscous)
-    torque = v_free / mobility
+        if drag != 0.0:
+            # The positive root of v + m/2 (b v + c v^2) = v_mean.
+            damped = 1.0 + 0.5 * mobility * viscous
+            v_mean = 2.0 * v_mean / (damped + math.sqrt(damped * damped + 2.0 * mobility * drag * v_mean))
+            limit += (viscous + drag * v_mean) * v_mean
+        else:
+            limit += viscous * v_mean / (1.0 + 0.5 * mobility * viscous)
+    torque = v * J / h + other
     if torque > limit:
         return -limit
     if torque < -limit:
         return limit
     return -torque
+
+
+@stage
+def bristle_torque(v, other, J, h, z, s_0, s_1, coulomb, breakaway, stribeck, viscous, drag):
+    """Return LuGre's friction torque [N*m] of one step, and the bristles' deflection [rad] at its end.
+
+    The step's mean speed u solves u = v + h/2J (other + F(u)); at that speed the bristles relax towards z_ss
+    exponentially, which is taken exactly, so that neither stiff bristles nor high speeds are unstable. `s_0`
+    [N*m/rad] and `s_1` [N*m*s/rad] are the bristles' stiffness and damping; the others as in `friction_torque`.
+    """
+    half = 0.5 * h / J
+    free = v + half * other
+    reach = half * (s_0 * abs(z) + breakaway + coulomb + s_1 * abs(z) / h) + 1e-12
+    low, high = min(free - reach, -1e-12), max(free + reach, 1e-12)
+    width = high - low
+    u, u_before, miss_before = v, v, 0.0
+    mean = 0.0
+    end = z
+    for turn in range(100):
+        x = h * s_0 * abs(u) / max(dry_friction(abs(u), coulomb, breakaway, stribeck), 1e-300)
+        if x < 1e-4:
+            decay, phi, psi = 1.0 - x + 0.5 * x * x, 1.0 - 0.5 * x + x * x / 6.0, 0.5 - x / 6.0
+        else:
+            decay = math.exp(-x)
+            phi = (1.0 - decay) / x
+            psi = (1.0 - phi) / x
+        # Mean force = constant + slope u, with x held.
+        constant = (s_0 * phi + s_1 * (decay - 1.0) / h) * z
+        slope = s_0 * h * psi + s_1 * phi + viscous + drag * abs(u)
+        mean = constant + slope * u
+        end = decay * z + h * phi * u
+        miss = u - free + half * mean
+        if miss > 0.0:
+            high = u
+        else:
+            low = u
+        following = (free - half * constant) / (1.0 + half * slope)
+        if turn > 0 and miss != miss_before:
+            # x held creeps where friction all but stops the motion; the secant does not.
+            secant = u - miss * (u - u_before) / (miss - miss_before)
+            if low < secant < high:
+                following = secant
+        if turn % 2 == 1:
+            if high - low > 0.5 * width:
+                following = 0.5 * (low + high)
+            width = high - low
+        if not low < following < high:
+            following = 0.5 * (low + high)
+        if abs(following - u) <= 1e-12 * (abs(u) + abs(following)) + 1e-18:
+            break
+        u_before, miss_before = u, miss
+        u = following
+    return -mean, end

@@ -13,58 +13,49 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mechanics.loads import Combination, Load, Parameter
+from mechanics.friction import BRISTLE_DAMPING, FrictionModel, find_friction
+from mechanics.load import Combination, Friction, Load, Parameter
+from mechanics.modal import corrections
+from mechanics.model import compile_packed, is_constrained, is_varying, motion_of, read_model
 from mechanics.stepping import Plant
 
 Floats = NDArray[np.float64]
 
 # Above this phase per step [rad] the discrete resonance cannot be put at the true one any more with good accuracy.
 MAX_PHASE_PER_STEP = 0.7
-_FRICTION_COLUMNS = {"coulomb": 1, "breakaway": 2, "stribeck": 3, "viscous": 4}
+# Columns of the frictions, contacts and rolls as the rows give them.
+FRICTION_COLUMNS = ("coulomb", "breakaway", "stribeck", "viscous", "drag", "bristle", "efficiency")
+CONTACT_COLUMNS = ("low", "high", "contact_stiffness", "contact_damping")
+ROLL_COLUMNS = ("start", "core", "thickness", "density")
+_BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos")
 _DISABLED = (
-    mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    | mujoco.mjtDisableBit.mjDSBL_CONTACT
-    | mujoco.mjtDisableBit.mjDSBL_GRAVITY
-    | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    mujoco.mjtDisableBit.mjDSBL_ACTUATION
     | mujoco.mjtDisableBit.mjDSBL_SENSOR
     | mujoco.mjtDisableBit.mjDSBL_WARMSTART
-    | mujoco.mjtDisableBit.mjDSBL_ISLAND
     | mujoco.mjtDisableBit.mjDSBL_MIDPHASE
     # MuJoCo resets a whole model when one copy diverges; stepping.py freezes that copy alone instead.
     | mujoco.mjtDisableBit.mjDSBL_AUTORESET
 )
-_MEMORY_PER_COPY = 2048  # bytes; 64 two-mass copies were seen to use 194 each
-_MEMORY_FIXED = 65536
-
-
-def compile_packed(load: Load, copies: int) -> mujoco.MjModel:
-    """Return a model of `copies` copies of the load; elements of copy k are named with the prefix `k/`."""
-    packed = mujoco.MjSpec()
-    packed.memory = _MEMORY_FIXED + _MEMORY_PER_COPY * copies
-    for k in range(copies):
-        child = mujoco.MjSpec.from_file(str(load.mjcf))
-        packed.attach(child, prefix=f"{k}/", frame=packed.worldbody.add_frame())
-    model = packed.compile()
-    if model.nq != model.nv:
-        raise ValueError(
-            f"load {load.name!r} has {model.nq // copies} coordinates for {model.nv // copies} degrees of freedom; "
-            "use hinge and slide joints only"
-        )
-    return model
+_DISABLED_UNCONSTRAINED = (
+    mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_ISLAND
+)
+_INTEGRATORS = {"leapfrog": mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "rk4": mujoco.mjtIntegrator.mjINT_RK4}
 
 
 class PackedLoad:
     """Copies of a load with parameters of their own, ready to be stepped by compiled code.
 
     Args:
-        load: The row.
+        load: The row, resolved (model.py).
         armature: Rotor inertia of each copy's axes [kg*m^2], shape (copies, axes).
         motor_friction: Of each copy's axes, shape (copies, axes, 4): coulomb, breakaway, stribeck, viscous.
         parameters: Parameter name -> values, shape (copies,); others keep the row's default.
         h: Physics step [s].
         integrator: "leapfrog" (implicitfast, staggered) or "rk4", the slower oracle.
+        friction: Model of the load's friction, a row of friction.py.
         template: Compiled model to copy instead of compiling again.
         first_machine: Number of copy 0, for messages.
+        weigh_every: Steps after which the inertias that friction sees are brought to the present position.
 
     Raises:
         ValueError: If a resonance is too fast for the step, or a parameter is unknown.
@@ -79,48 +70,85 @@ class PackedLoad:
         h: float,
         *,
         integrator: str = "leapfrog",
+        friction: str = "stribeck",
         template: mujoco.MjModel | None = None,
         first_machine: int = 0,
+        weigh_every: int = 1,
     ) -> None:
         self.load = load
         self.copies: int = armature.shape[0]
         self.num_axes: int = armature.shape[1]
         self.h = h
         self._first_machine = first_machine
+        self._weigh_every = weigh_every
+        if integrator not in _INTEGRATORS:
+            raise ValueError(f"no integrator is named {integrator!r}; there are {', '.join(_INTEGRATORS)}")
         self.staggered = integrator == "leapfrog"
-        self.model = compile_packed(load, self.copies) if template is None else _copy_model(template)
+        self._model_of_friction: FrictionModel = find_friction(friction)
+        self.model = compile_packed(load, self.copies) if template is None else copy.copy(template)
         self.num_dofs = self.model.nv // self.copies
-        self._set_options(integrator)
-        self._armature = np.array(armature)
-        self._joints = [self._joint_name(d) for d in range(self.num_dofs)]
-        self._axis_dof = np.array([self._joints.index(axis) for axis in load.axes])
-        # A joint's speed times its gear is the rotor's: the bearings' friction acts there.
-        self._gears = np.array(load.gears or (1.0,) * self.num_axes)
-        turning = [{axis: gear} for axis, gear in zip(load.axes, self._gears, strict=True)]
-        self._motions = turning + [f.motion for f in load.frictions]
-        self._friction = np.zeros((self.copies, len(self._motions), 5))
-        self._friction[:, : self.num_axes, 1:] = motor_friction
+        self.constrained = is_constrained(self.model)
+        # Runge-Kutta looks at everything anew, too: it is the oracle.
+        self.varying = not self.staggered or self.constrained or is_varying(read_model(load), bool(load.rolls))
+        self.model.opt.integrator = _INTEGRATORS[integrator]
+        self.model.opt.timestep = h
+        self.model.opt.disableflags = int(_DISABLED | (0 if self.constrained else _DISABLED_UNCONSTRAINED))
+        if load.rolls:
+            # MuJoCo takes the inertia of simple joints from a constant; a roll's grows.
+            self.model.dof_simplenum[:] = 0
+        self._joints = [
+            str(self.model.joint(int(self.model.dof_jntid[d])).name).removeprefix("0/") for d in range(self.num_dofs)
+        ]
+        # Rotor angle from joints: the bearings' friction acts on this motion.
+        turning = [
+            {name: gear * c for name, c in motion_of(self.model, joint, "0/").items()}
+            for joint, gear in zip(load.joints, load.gears, strict=True)
+        ]
+        # Friction on a rotor's own motion is computed in one with its bearing's, unless it has bristles.
+        self._merged = {} if self._model_of_friction.bristles else _proportional(turning, load.frictions)
+        apart = [row.motion for k, row in enumerate(load.frictions) if k not in self._merged]
+        self._motions = turning + apart + [row.motion for row in load.contacts]
+        self.num_frictions = self.num_axes + len(apart)
+        self._friction = np.zeros((self.copies, self.num_axes + len(load.frictions), len(FRICTION_COLUMNS)))
+        self._friction[:, :, FRICTION_COLUMNS.index("efficiency")] = 1.0
+        self._friction[:, : self.num_axes, :4] = motor_friction
         for k, row in enumerate(load.frictions, self.num_axes):
-            self._friction[:, k, 1:] = (row.coulomb, row.breakaway, row.stribeck, row.viscous)
+            self._friction[:, k] = [getattr(row, column) for column in FRICTION_COLUMNS]
+        rows = [(row.low, row.high, row.stiffness, row.damping) for row in load.contacts]
+        self._contact = np.tile(np.array(rows, float).reshape(-1, 4), (self.copies, 1, 1))
+        rolls = [[getattr(row, column) for column in ROLL_COLUMNS] for row in load.rolls]
+        self._roll = np.tile(np.array(rolls, float).reshape(-1, 4), (self.copies, 1, 1))
+        self._armature = np.array(armature)
         self._stiffness = self._by_copy(self.model.jnt_stiffness).copy()
         self._damping = self._by_copy(self.model.dof_damping).copy()
+        springs = any(p.field == "jnt_stiffness" for p in load.parameters) or bool(np.any(self._stiffness))
+        self._elastic = self.staggered and springs
+        self._passive_armature = self._by_copy(self.model.dof_armature).copy()
+        self.start = np.array(self.model.qpos0[: self.num_dofs])
+        for joint, position in load.start.items():
+            self.start[self._joints.index(joint)] = position
+        for parameter in load.parameters:
+            self._check_parameter(parameter)
         for name, values in parameters.items():
             self._store(self._parameter(name), np.asarray(values, float), slice(None))
         self.data = mujoco.MjData(self.model)
         self.plant = self._new_plant()
         self._apply()
+        self.reset(np.ones(self.copies, bool))
 
     # --- parameters -----------------------------------------------------------------------------------------------
     def get(self, name: str) -> Floats:
         """Return a parameter of every copy, shape (copies,)."""
         parameter = self._parameter(name)
-        if parameter.field in _FRICTION_COLUMNS:
-            return self._friction[:, self._friction_row(parameter), _FRICTION_COLUMNS[parameter.field]].copy()
-        if parameter.field in ("body_inertia", "body_mass"):
+        if parameter.field in _BODY_FIELDS:
             bodies = [self.model.body(f"{k}/{parameter.element}") for k in range(self.copies)]
+            if parameter.field == "body_ipos":
+                return np.array([np.linalg.norm(body.ipos) for body in bodies])
             return np.array([b.mass[0] if parameter.field == "body_mass" else b.inertia[0] for b in bodies])
-        array = self._stiffness if parameter.field == "jnt_stiffness" else self._damping
-        return array[:, self._joints.index(parameter.element)].copy()
+        if parameter.field == "gap":
+            low, high = (self._column(parameter, field) for field in ("low", "high"))
+            return np.asarray(high - low)
+        return self._column(parameter, parameter.field).copy()
 
     def set(self, name: str, values: Floats, where: NDArray[np.bool_]) -> None:
         """Set a parameter of the copies where the mask is true; ValueError leaves all as it was."""
@@ -152,18 +180,24 @@ class PackedLoad:
             self._armature[:] = before
             self._apply()
             raise
-        self._friction[:, : self.num_axes, 1:] = friction
+        self._friction[:, : self.num_axes, :4] = friction
         self._apply()
 
     def reset(self, where: NDArray[np.bool_]) -> None:
-        """Put the copies where the mask is true to rest at zero; a frozen one lives again."""
+        """Put the copies where the mask is true to rest at their start; a frozen one lives again."""
         for k in np.flatnonzero(where):
             dofs = slice(k * self.num_dofs, (k + 1) * self.num_dofs)
-            self.data.qpos[dofs] = self.model.qpos0[dofs]
+            self.data.qpos[dofs] = self.start
             self.data.qvel[dofs] = 0.0
             self.data.qfrc_applied[dofs] = 0.0
+            self.data.qacc_warmstart[dofs] = 0.0
+            self.plant.qvel_before[dofs] = 0.0
+            self.plant.bristle[k] = 0.0
+            self.plant.holding[k] = 0.0
+            self.plant.carried[k] = 0.0
             self.plant.diverged[k] = 0
             self.plant.load_torque[k] = 0.0
+            self.plant.clock[k] = 0.0
 
     def mass_matrix(self) -> Floats:
         """Return each copy's inertia matrix with the rotors', shape (copies, D, D), at the present position."""
@@ -174,21 +208,34 @@ class PackedLoad:
         index = np.arange(self.copies)
         return blocks[index, :, index, :]
 
+    @property
+    def armature(self) -> Floats:
+        """Rotor inertia of every axis [kg*m^2], shape (copies, axes)."""
+        return self._armature
+
+    def set_profile(self, at: Floats, torque: Floats, *, of_position: bool, period: float) -> None:
+        """Add a torque from a table to the load torque: `torque`, shape (copies, n), over `at`, shape (n,).
+
+        Args:
+            at: Time since now [s], or position of the first axis [rad or m]; increasing.
+            torque: On the load's disturbance [N*m or N].
+            of_position: Whether `at` is a position.
+            period: After which the table begins anew; 0 holds the last value.
+        """
+        self.plant.clock[:] = 0.0
+        self.plant.profile_now[:] = 0.0
+        self.plant = self.plant._replace(
+            profile_at=np.ascontiguousarray(at, float),
+            profile=np.ascontiguousarray(torque, float),
+            profile_of_position=of_position,
+            profile_period=float(period),
+        )
+
+    def joint_positions(self) -> Floats:
+        """Return the joints' positions [rad or m], shape (copies, D), half a step ago if staggered."""
+        return self._by_copy(self.data.qpos).copy()
+
     # --- inside ---------------------------------------------------------------------------------------------------
-    def _set_options(self, integrator: str) -> None:
-        integrators = {
-            "leapfrog": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-            "rk4": mujoco.mjtIntegrator.mjINT_RK4,
-        }
-        if integrator not in integrators:
-            raise ValueError(f"no integrator is named {integrator!r}; there are {', '.join(integrators)}")
-        self.model.opt.integrator = integrators[integrator]
-        self.model.opt.timestep = self.h
-        self.model.opt.disableflags = int(_DISABLED)
-
-    def _joint_name(self, dof: int) -> str:
-        return str(self.model.joint(int(self.model.dof_jntid[dof])).name).removeprefix("0/")
-
     def _by_copy(self, array: Floats) -> Floats:
         return array.reshape(self.copies, self.num_dofs)
 
@@ -199,59 +246,137 @@ class PackedLoad:
         names = ", ".join(p.name for p in self.load.parameters)
         raise ValueError(f"load {self.load.name!r} has no parameter {name!r}; it has {names}")
 
-    def _friction_row(self, parameter: Parameter) -> int:
-        return self.num_axes + tuple(f.name for f in self.load.frictions).index(parameter.element)
+    def _check_parameter(self, parameter: Parameter) -> None:
+        """Refuse a parameter that lives nowhere, with the places that there are."""
+        load, field = self.load, parameter.field
+        bodies = [str(self.model.body(k).name) for k in range(1, self.model.nbody)]
+        places = {
+            _BODY_FIELDS: [name.removeprefix("0/") for name in bodies if name.startswith("0/")],
+            ("jnt_stiffness", "dof_damping"): self._joints,
+            FRICTION_COLUMNS: [row.name for row in load.frictions],
+            (*CONTACT_COLUMNS, "gap"): [row.name for row in load.contacts],
+            ROLL_COLUMNS: [row.name for row in load.rolls],
+        }
+        for fields, names in places.items():
+            if field in fields and parameter.element in names:
+                return
+            if field in fields:
+                raise ValueError(
+                    f"load {load.name!r}: its parameter {parameter.name!r}, a {field}, names {parameter.element!r}; "
+                    f"there are {', '.join(names) or '(none)'}"
+                )
+        known = ", ".join(name for fields in places for name in fields)
+        raise ValueError(f"load {load.name!r}: its parameter {parameter.name!r} is no {field!r}; there are {known}")
+
+    def _column(self, parameter: Parameter, field: str) -> Floats:
+        """Return the view, shape (copies,), in which a parameter lives that is not a body's."""
+        element = parameter.element
+        if field in FRICTION_COLUMNS:
+            row = self.num_axes + [f.name for f in self.load.frictions].index(element)
+            return self._friction[:, row, FRICTION_COLUMNS.index(field)]
+        if field in CONTACT_COLUMNS:
+            return self._contact[:, [c.name for c in self.load.contacts].index(element), CONTACT_COLUMNS.index(field)]
+        if field in ROLL_COLUMNS:
+            return self._roll[:, [r.name for r in self.load.rolls].index(element), ROLL_COLUMNS.index(field)]
+        array = {"jnt_stiffness": self._stiffness, "dof_damping": self._damping}[field]
+        return array[:, self._joints.index(element)]
+
+    def check(self, name: str, values: Floats) -> None:
+        """Raise ValueError unless every value is one that the parameter can have."""
+        parameter = self._parameter(name)
+        label = f"{parameter.name} of load {self.load.name!r}"
+        if np.any(values < 0.0) or not np.all(np.isfinite(values)):
+            raise ValueError(f"{label} must be finite and not negative [{parameter.unit}], not {values.min():g}")
+        if parameter.field == "efficiency" and np.any((values <= 0.0) | (values > 1.0)):
+            raise ValueError(f"{label} must lie above 0 and up to 1, not {values.min():g}...{values.max():g}")
+        if parameter.field in _BODY_FIELDS and np.any(values <= 0.0):
+            raise ValueError(f"{label} must be above 0 {parameter.unit}")
 
     def _store(self, parameter: Parameter, values: Floats, where: slice | NDArray[np.bool_]) -> None:
-        if np.any(values < 0.0) or not np.all(np.isfinite(values)):
-            raise ValueError(
-                f"{parameter.name} of load {self.load.name!r} must be finite and not negative [{parameter.unit}], "
-                f"not {values.min():g}"
-            )
-        if parameter.field in _FRICTION_COLUMNS:
-            self._friction[where, self._friction_row(parameter), _FRICTION_COLUMNS[parameter.field]] = values
-        elif parameter.field in ("body_inertia", "body_mass"):
-            if np.any(values <= 0.0):
-                raise ValueError(f"{parameter.name} of load {self.load.name!r} must be above 0 {parameter.unit}")
+        self.check(parameter.name, values)
+        if parameter.field in _BODY_FIELDS:
             copies = np.arange(self.copies)[where]
             for k, value in zip(copies, np.broadcast_to(values, copies.shape), strict=True):
                 body = self.model.body(f"{k}/{parameter.element}")
-                (body.mass if parameter.field == "body_mass" else body.inertia)[:] = value
+                if parameter.field == "body_ipos":
+                    body.ipos[:] *= value / np.linalg.norm(body.ipos)
+                else:
+                    (body.mass if parameter.field == "body_mass" else body.inertia)[:] = value
+        elif parameter.field == "gap":
+            middle = 0.5 * (self._column(parameter, "low") + self._column(parameter, "high"))[where]
+            self._column(parameter, "low")[where] = middle - 0.5 * values
+            self._column(parameter, "high")[where] = middle + 0.5 * values
         else:
-            array = self._stiffness if parameter.field == "jnt_stiffness" else self._damping
-            array[where, self._joints.index(parameter.element)] = values
+            self._column(parameter, parameter.field)[where] = values
 
     def _new_plant(self) -> Plant:
-        shape = (self.copies, self.num_dofs)
+        copies, dofs, axes = self.copies, self.num_dofs, self.num_axes
+        frictions, contacts, elements = self.num_frictions, len(self.load.contacts), len(self._motions)
+        names = [row.name for row in self.load.contacts]
+        carries = np.full(axes + len(self.load.frictions), -1)
+        for k, row in enumerate(self.load.frictions):
+            if row.carries:
+                into = self._merged[k][0] if k in self._merged else axes + k
+                carries[into] = names.index(row.carries)
+        disturbance = self._combinations([self.load.disturbance])[0]
         return Plant(
             model_address=self.model._address,
             data_address=self.data._address,
             staggered=self.staggered,
+            varying=self.varying,
+            elastic=self._elastic,
             qpos=self.data.qpos,
             qvel=self.data.qvel,
             qfrc_applied=self.data.qfrc_applied,
+            qfrc_bias=self.data.qfrc_bias,
+            qfrc_passive=self.data.qfrc_passive,
+            qfrc_constraint=self.data.qfrc_constraint,
+            inertia=self.data.M,
+            inertia_start=self.model.M_rowadr.astype(np.int64),
+            inertia_count=self.model.M_rownnz.astype(np.int64),
+            inertia_column=self.model.M_colind.astype(np.int64),
+            dof_armature=self.model.dof_armature,
             qvel_before=np.zeros(self.model.nv),
-            axis_dof=self._axis_dof.astype(np.int64),
-            axis_gear=self._gears,
-            axis_inertia=np.zeros((self.copies, self.num_axes)),
-            axis_position=self._combinations(self.load.positions or [{axis: 1.0} for axis in self.load.axes]),
-            axis_kick=np.zeros((self.copies, self.num_axes, self.num_dofs)),
-            stiffness=np.zeros(shape),
-            compliance=np.zeros((self.copies, self.num_dofs, self.num_dofs)),
-            compliance_moment=np.zeros((self.copies, self.num_dofs, self.num_axes)),
-            stuck=np.zeros((self.copies, len(self._motions)), np.int64),
-            spring_zero=np.array(self.model.qpos_spring[: self.num_dofs]),
-            damping=np.zeros(shape),
-            friction_motion=self._combinations(self._motions),
-            friction_share=np.zeros((self.copies, len(self._motions), self.num_dofs)),
-            friction=np.zeros((self.copies, len(self._motions), 5)),
-            bumper_motion=self._combinations([stop.motion for stop in self.load.end_stops]),
-            bumper=np.tile(
-                np.array([stop[1:] for stop in self.load.end_stops], float).reshape(-1, 4), (self.copies, 1, 1)
+            ahead=np.zeros(self.model.nv),
+            weigh_every=self._weigh_every,
+            steps=np.zeros(1, np.int64),
+            scratch=np.zeros((dofs, dofs)),
+            total=np.zeros((copies, dofs)),
+            axis_motion=self._combinations(self._motions[:axes]),
+            axis_position=self._combinations(
+                list(self.load.positions) or [motion_of(self.model, joint, "0/") for joint in self.load.joints]
             ),
-            disturbance=self._combinations([self.load.disturbance])[0],
-            load_torque=np.zeros(self.copies),
-            diverged=np.zeros(self.copies, np.int64),
+            axis_start=self._combinations(self._motions[:axes]) @ self.start,
+            axis_kick=np.zeros((copies, axes, dofs)),
+            stiffness=np.zeros((copies, dofs, dofs)),
+            held=np.zeros((copies, dofs, dofs)),
+            held_moment=np.zeros((copies, dofs, axes)),
+            spring_zero=np.array(self.model.qpos_spring[:dofs]),
+            damping=np.zeros((copies, dofs)),
+            bias=np.zeros((copies, dofs)),
+            motion=self._combinations(self._motions),
+            share=np.zeros((copies, elements, dofs)),
+            mass=np.ones((copies, elements)),
+            friction=np.zeros((copies, frictions, 8)),
+            carries=carries[self._apart()].astype(np.int64),
+            bristle=np.zeros((copies, frictions)),
+            stuck=np.zeros((copies, frictions), np.int64),
+            holding=np.zeros((copies, frictions)),
+            contact=np.zeros((copies, contacts, 6)),
+            carried=np.zeros((copies, contacts)),
+            roll_dof=np.array([self._joints.index(row.joint) for row in self.load.rolls], np.int64),
+            roll=np.zeros((copies, len(self.load.rolls), 4)),
+            roll_armature=np.zeros((copies, len(self.load.rolls))),
+            disturbance=np.tile(disturbance, (copies, 1)),
+            load_torque=np.zeros(copies),
+            profile_at=np.zeros(0),
+            profile=np.zeros((copies, 0)),
+            profile_of_position=False,
+            profile_period=0.0,
+            profile_now=np.zeros(copies),
+            clock=np.zeros(copies),
+            brake=np.zeros((copies, axes)),
+            diverged=np.zeros(copies, np.int64),
         )
 
     def _combinations(self, motions: Sequence[Combination]) -> Floats:
@@ -259,61 +384,123 @@ class PackedLoad:
         rows = np.zeros((len(motions), self.num_dofs))
         for row, motion in zip(rows, motions, strict=True):
             for joint, coefficient in motion.items():
-                row[self._joints.index(joint)] = coefficient
+                row[self._joints.index(joint)] += coefficient
         return rows
 
     def _apply(self) -> None:
         """Bring parameters into MuJoCo's model and the plant: stiffness corrected, damping halved, inertias derived."""
-        self._by_copy(self.model.dof_armature)[:, self._axis_dof] = self._armature * self._gears**2
+        plant = self.plant
+        self._place_rotors()
         moving = (self.data.qpos.copy(), self.data.qvel.copy())
         mujoco.mj_setConst(self.model, self.data)
         # At the reference position, so that setting one copy cannot change the rounding of another.
-        self.data.qpos[:], self.data.qvel[:] = self.model.qpos0, 0.0
-        inverse = np.asarray(np.linalg.inv(self.mass_matrix()), np.float64)
+        self.data.qpos[:], self.data.qvel[:] = np.tile(self.start, self.copies), 0.0
+        inertia = self.mass_matrix()
+        plant.bias[:] = self._by_copy(self.data.qfrc_bias)
         self.data.qpos[:], self.data.qvel[:] = moving
-        phase = np.asarray(0.5 * self.h * np.sqrt(self._stiffness * np.einsum("cdd->cd", inverse)), np.float64)
-        if self.staggered and 2.0 * phase.max() > MAX_PHASE_PER_STEP:
-            worst, dof = np.unravel_index(int(phase.argmax()), phase.shape)
-            resonance = phase.max() / (np.pi * self.h)
-            limit = MAX_PHASE_PER_STEP / (2.0 * np.pi * self.h)
-            raise ValueError(
-                f"joint {self._joints[int(dof)]!r} of machine {self._first_machine + int(worst)} resonates at "
-                f"{resonance:.0f} Hz; the limit is {limit:.0f} Hz at a physics step of {self.h * 1e6:.0f} us; lower "
-                "its stiffness, raise its inertia or take more physics steps per millisecond"
-            )
-        # sin(x)/x: the leapfrog puts a resonance too high by x/sin(x); numpy's sinc has pi in it.
-        correction = np.sinc(phase / np.pi) ** 2 if self.staggered else np.ones_like(phase)
-        self.plant.stiffness[:] = self._stiffness * correction
-        self.plant.damping[:] = self._damping
-        self._apply_held_torque(phase, inverse)
-        self._by_copy(self.model.jnt_stiffness)[:] = self.plant.stiffness
+        plant.damping[:] = self._damping
+        if self.staggered:
+            found = corrections(inertia, self._stiffness, plant.axis_motion, self.h)
+            self._check_phase(found.phase, found.shapes)
+            plant.stiffness[:] = found.stiffness
+            plant.held[:] = found.held
+            plant.held_moment[:] = found.held_moment
+            plant.axis_kick[:] = found.kick
+        # The springs' force is the plant's, since the corrected one is no spring of a joint any more.
+        self._by_copy(self.model.jnt_stiffness)[:] = 0.0 if self.staggered else self._stiffness
         self._by_copy(self.model.dof_damping)[:] = self._damping * (0.5 if self.staggered else 1.0)
-        motion = self.plant.friction_motion
-        share = np.einsum("cde,fe->cfd", inverse, motion)
-        inertia = 1.0 / np.einsum("fd,cfd->cf", motion, share)
-        self.plant.friction_share[:] = share * inertia[:, :, None]
-        self.plant.friction[:] = self._friction
-        self.plant.friction[:, :, 0] = inertia
-        self.plant.axis_inertia[:] = inertia[:, : self.num_axes]
+        inverse = np.linalg.inv(inertia)
+        share = np.einsum("cde,fe->cfd", inverse, plant.motion)
+        plant.mass[:] = 1.0 / np.einsum("fd,cfd->cf", plant.motion, share)
+        plant.share[:] = share * plant.mass[:, :, None]
+        self._apply_frictions()
+        self._apply_contacts()
+        plant.roll[:] = self._roll
 
-    def _apply_held_torque(self, phase: Floats, inverse: Floats) -> None:
-        """Derive what makes torque that is held over a step, or changes within it, act as it does in continuous time.
+    def _place_rotors(self) -> None:
+        """Enter the rotors as armature of their joints or tendons, on the load's side of the gear."""
+        armature = self._by_copy(self.model.dof_armature)
+        armature[:] = self._passive_armature
+        for axis, (name, gear) in enumerate(zip(self.load.joints, self.load.gears, strict=True)):
+            values = self._armature[:, axis] * gear**2
+            if name in self._joints:
+                armature[:, self._joints.index(name)] = values
+            else:
+                for k, value in enumerate(values):
+                    self.model.tendon_armature[self.model.tendon(f"{k}/{name}").id] = value
+        for k, row in enumerate(self.load.rolls):
+            dof = self._joints.index(row.joint)
+            self.plant.roll_armature[:, k] = armature[:, dof]
+            start, core, _, density = self._roll[:, k].T
+            armature[:, dof] += 0.5 * np.pi * density * (np.maximum(start, core) ** 4 - core**4)
 
-        The leapfrog takes a step's torque as an impulse in its middle, which excites a resonance by 1/cos(x). Torque
-        held over the step excites it by sin(x)/x, and a first moment m of the torque in time moves the rotor by -m/J
-        less until the next step and shakes the resonance by m w, x = w h / 2. Solved for force and displacement this
-        gives the factors below.
-        """
-        turning = inverse[:, :, self._axis_dof] * self._gears
-        if not self.staggered:
-            return
-        diagonal = np.einsum("cdd->cd", inverse)[:, :, None]
-        self.plant.compliance[:] = (np.sinc(2.0 * phase / np.pi) - 1.0)[:, :, None] * inverse / diagonal
-        self.plant.compliance_moment[:] = (2.0 * phase / self.h * np.sin(phase))[:, :, None] * turning / diagonal
-        stretch = 1.0 / np.sinc(phase / np.pi) - 1.0
-        kick = turning + np.einsum("cde,ce,cea->cda", inverse, stretch, turning / diagonal)
-        self.plant.axis_kick[:] = np.swapaxes(kick, 1, 2)
+    def _apart(self) -> list[int]:
+        """Return which frictions the plant has a row for: the axes' bearings, and those that are not merged in one."""
+        loads = range(len(self.load.frictions))
+        return [*range(self.num_axes), *(self.num_axes + k for k in loads if k not in self._merged)]
+
+    def _apply_frictions(self) -> None:
+        chosen, plant = self._model_of_friction, self.plant
+        column = {name: self._friction[:, :, k] for k, name in enumerate(FRICTION_COLUMNS)}
+        # The motors' bearings keep theirs: it is theirs to be without friction.
+        loads = np.arange(self._friction.shape[1]) >= self.num_axes
+        coulomb = np.where(loads & (not chosen.dry), 0.0, column["coulomb"])
+        risen = np.where(loads & (not chosen.stribeck), column["coulomb"], column["breakaway"])
+        breakaway = np.where(loads & (not chosen.dry), 0.0, np.maximum(risen, coulomb))
+        viscous = np.where(loads & (not chosen.viscous), 0.0, column["viscous"])
+        losses = 1.0 / column["efficiency"] - 1.0
+        rows = np.stack([coulomb, breakaway, column["stribeck"], viscous, column["drag"], losses], axis=-1)
+        for k, (axis, scale) in self._merged.items():
+            # A force F(v) on a motion that is `scale` of the rotor's is a torque of scale F(scale v) there.
+            row, turning = rows[:, self.num_axes + k], rows[:, axis]
+            powers = np.array([1.0, 1.0, 0.0, 2.0, 3.0, 1.0])
+            turning += row * scale**powers * np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
+            turning[:, 2] = row[:, 2] / scale
+        rows = rows[:, self._apart()]
+        plant.friction[:, :, :5] = rows[:, :, :5]
+        plant.friction[:, :, 7] = rows[:, :, 5]
+        bristle = column["bristle"][:, self._apart()]
+        bristled = loads[self._apart()] & chosen.bristles & (bristle > 0.0)
+        stiffness = np.where(bristled, rows[:, :, 1] / np.where(bristled, bristle, 1.0), 0.0)
+        plant.friction[:, :, 5] = stiffness
+        plant.friction[:, :, 6] = 2.0 * BRISTLE_DAMPING * np.sqrt(stiffness * plant.mass[:, : self.num_frictions])
+
+    def _apply_contacts(self) -> None:
+        plant, stiffness = self.plant, self._contact[:, :, 2]
+        plant.contact[:, :, :4] = self._contact
+        phase = 0.5 * self.h * np.sqrt(stiffness / plant.mass[:, self.num_frictions :])
+        if self.staggered:
+            # As in modal.py, for the mode that the spring has while it is pressed.
+            plant.contact[:, :, 2] *= np.sinc(phase / np.pi) ** 2
+            plant.contact[:, :, 4] = np.sinc(2.0 * phase / np.pi) - 1.0
+            plant.contact[:, :, 5] = 2.0 * phase / self.h * np.sin(phase)
+        if phase.size and 2.0 * phase.max() > MAX_PHASE_PER_STEP:
+            worst, k = np.unravel_index(int(phase.argmax()), phase.shape)
+            self._refuse(f"contact {self.load.contacts[int(k)].name!r}", int(worst), float(phase.max()))
+
+    def _check_phase(self, phase: Floats, shapes: Floats) -> None:
+        if 2.0 * phase.max() > MAX_PHASE_PER_STEP:
+            worst, mode = np.unravel_index(int(phase.argmax()), phase.shape)
+            # The joint whose spring takes most of that mode's energy.
+            dof = int(np.argmax(self._stiffness[worst] * shapes[worst, :, mode] ** 2))
+            self._refuse(f"joint {self._joints[dof]!r}", int(worst), float(phase.max()))
+
+    def _refuse(self, what: str, copy_: int, phase: float) -> None:
+        raise ValueError(
+            f"{what} of machine {self._first_machine + copy_} resonates at {phase / (np.pi * self.h):.0f} Hz; the "
+            f"limit is {MAX_PHASE_PER_STEP / (2.0 * np.pi * self.h):.0f} Hz at a physics step of {self.h * 1e6:.0f} "
+            "us; lower its stiffness, raise its inertia or take more physics steps per millisecond"
+        )
 
 
-def _copy_model(model: mujoco.MjModel) -> mujoco.MjModel:
-    return copy.copy(model)
+def _proportional(turning: Sequence[Combination], frictions: Sequence[Friction]) -> dict[int, tuple[int, float]]:
+    """Return the frictions that act on an axis's own motion, at most one each: index -> axis, motion per rotor's."""
+    found: dict[int, tuple[int, float]] = {}
+    for k, row in enumerate(frictions):
+        for axis, motion in enumerate(turning):
+            if set(motion) != set(row.motion) or any(axis == taken for taken, _ in found.values()):
+                continue
+            scales = [row.motion[joint] / motion[joint] for joint in motion]
+            if max(scales) - min(scales) <= 1e-12 * abs(scales[0]):
+                found[k] = (axis, abs(scales[0]))
+    return found

@@ -11,7 +11,7 @@ import pytest
 
 from drive_env import EmulatedDrives, motion, response
 from drive_env.firmware import cycle
-from drive_env.firmware.record import get_lanes
+from drive_env.firmware.record import LANES, get_lanes
 from mechanics import stepping
 from mechanics.compiled import cached
 from mechanics.loads import LOADS
@@ -32,7 +32,7 @@ ORACLE_SUBSTEPS = 4  # 10 us: 100 steps per ms
 @cached(FOLDER)
 def step_load(plant, torque, moment, h):
     """Step one copy through mean torques and first moments (n,); return angle and speed of the rotor, every qvel."""
-    dofs = plant.stiffness.shape[1]
+    dofs = plant.damping.shape[1]
     theta, omega, reaction, position = np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1)
     motion_ = np.zeros((torque.shape[0], 2 + dofs))
     for n in range(torque.shape[0]):
@@ -263,7 +263,7 @@ def test_halving_the_physics_step_changes_no_verdict(load):
 
 # --- prediction within a window ---------------------------------------------------------------------------------------
 @cached(FOLDER, Path(cycle.__file__).parent)
-def windows(records, plant, rates, scratch, num_axes, count):
+def windows(records, plant, rates, scratch, count):
     """Run windows; return rotor angle and speed of axis 0 as its ticks predict them and as the mechanics has them."""
     out = np.zeros((count, 4))
     for n in range(count):
@@ -271,7 +271,7 @@ def windows(records, plant, rates, scratch, num_axes, count):
             cycle.window(records[block], rates)
         out[n, 0] = records[0].theta_m[0]
         out[n, 1] = records[0].omega_m[0]
-        cycle.mechanics_window(records, plant, rates, scratch, num_axes)
+        cycle.mechanics_window(records, plant, rates, scratch)
         out[n, 2] = records[0].theta_m[0]
         out[n, 3] = records[0].omega_m[0]
     return out
@@ -283,7 +283,7 @@ def predicted_and_true(load, **parameters):
     drives.write("Target torque", 3000)
     drives.advance(0.001)
     group = drives._groups[0]
-    out = windows(drives._records, group.load.plant, group._rates, np.zeros((7, 1)), 1, 250)
+    out = windows(drives._records, group.load.plant, group._rates, np.zeros((7, LANES)), 250)
     assert get_lanes(drives._records, "omega_m", 1)[0] > 50  # it did turn
     return out
 

@@ -67,7 +67,7 @@ def run_axes(records, plant, rates, scratch, num_axes, cycles, sums):
                         sums[CHOPPER, axis] += drive.chopper[lane] * u / drive.chopper_resistance[lane] * mean_u * dt
                         sums[IDLE, axis] += drive.idle_current[lane] * mean_u * dt
                         torque[axis] += drive.tau_m[lane] / rates.ticks
-            mechanics_window(records, plant, rates, scratch, num_axes)
+            mechanics_window(records, plant, rates, scratch)
             # Work by the mean velocity over the step.
             for axis in range(num_axes):
                 sums[SHAFT, axis] += torque[axis] * (records[axis // LANES].theta_m[axis % LANES] - theta[axis])
@@ -105,7 +105,7 @@ def balance(drives, duration):
     sums = np.zeros((6, drives.num_axes))
     group = drives._groups[0]
     rates = rates_of(drives.device, 1)
-    scratch = np.zeros((7, drives.num_axes))
+    scratch = np.zeros((7, 8 * len(drives._records)))
     run_axes(drives._records, group.load.plant, rates, scratch, drives.num_axes, round(duration / rates.period), sums)
     magnetic, kinetic, turned, capacitor = stored() - before
     return Balance(*sums, magnetic, kinetic, drives.machine.load_torque * turned, capacitor)

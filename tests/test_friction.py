@@ -56,7 +56,7 @@ def test_steady_speed_needs_the_torque_of_the_law(v):
     """Held at speed v by a torque of F(v), the friction of a step is F(v); the step's mean speed blurs it little."""
     J = J_M + J_L
     torque = math.copysign(law(v), v)
-    found = friction_torque(v, torque, J, H, COULOMB, BREAKAWAY, STRIBECK, VISCOUS)
+    found = friction_torque(v, torque, J, H, COULOMB, BREAKAWAY, STRIBECK, VISCOUS, 0.0)
     # The law is taken up to h F / 2J from v: half of what the step would gain without friction.
     shift = 0.5 * H * law(v) / J
     dry = lambda speed: law(speed) - VISCOUS * speed  # noqa: E731
@@ -77,7 +77,7 @@ def test_speed_settles_where_the_law_meets_the_torque(v):
 
 
 def test_friction_vanishes_where_all_its_parameters_do():
-    assert friction_torque(3.0, 0.01, 1e-5, H, 0.0, 0.0, 1.0, 0.0) == 0.0
+    assert friction_torque(3.0, 0.01, 1e-5, H, 0.0, 0.0, 1.0, 0.0, 0.0) == 0.0
 
 
 # --- sticking ---------------------------------------------------------------------------------------------------------
@@ -212,7 +212,7 @@ def test_each_friction_acts_on_its_own_body():
 )
 def test_friction_never_gives_energy(v, other, J, h, coulomb, rise, stribeck, viscous):
     """It opposes the speed that the step would reach, and stops it at most."""
-    torque = friction_torque(v, other, J, h, coulomb, coulomb + rise, stribeck, viscous)
+    torque = friction_torque(v, other, J, h, coulomb, coulomb + rise, stribeck, viscous, 0.0)
     v_free = v + h * other / J
     v_end = v_free + h * torque / J
     slack = 1e-12 * (abs(v_free) + 1e-9)
@@ -232,7 +232,7 @@ def test_a_coasting_machine_never_gains_energy(v0, v1, coulomb, rise, viscous):
     """Two masses left to themselves; the shaft's energy is taken at the speed's time, qpos moved half a step back."""
     load = machine("two_mass", coulomb=coulomb, breakaway=coulomb + rise, viscous=viscous)
     load.data.qvel[:] = (v0, v1)
-    k = float(load.plant.stiffness[0, 1])
+    k = float(load.plant.stiffness[0, 1, 1])
     start = 0.5 * (J_M + 1e-9) * v0**2 + 0.5 * J_L * (v0 + v1) ** 2
     for _ in range(40):
         run(load, np.zeros(25))

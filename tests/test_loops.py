@@ -124,7 +124,7 @@ def excite(records, plant, rates, scratch, num_axes, level, demand, out):
             out[k, 5, axis] = drive.i_q[lane]
             out[k, 6, axis] = drive.omega_m[lane]
             out[k, 7, axis] = drive.omega_ref[lane]
-        mechanics_window(records, plant, rates, scratch, num_axes)
+        mechanics_window(records, plant, rates, scratch)
 
 
 # --- the form, against an independent implementation in the chip's own numbers ------------------------------------

@@ -9,7 +9,8 @@ from drive_env import EmulatedDrives, motion
 from mechanics import loads
 from mechanics.compiled import cached
 from mechanics.loads import LOADS, find_load
-from mechanics.packed import PackedLoad, compile_packed
+from mechanics.model import compile_packed, motion_of
+from mechanics.packed import PackedLoad
 from mechanics.stepping import step
 
 H = 200e-6
@@ -23,9 +24,9 @@ FRICTIONLESS = {"coulomb": 0.0, "breakaway": 0.0, "viscous": 0.0}
 @cached(Path(loads.__file__).parent)
 def step_plant(plant, torque, h, qpos, qvel):
     """Step all copies through torques (n, C); write every qpos and qvel, shape (n, C D)."""
-    theta, omega, reaction, position, moment = np.zeros((5, torque.shape[1]))
+    rows = np.zeros((5, torque.shape[1]))
     for n in range(torque.shape[0]):
-        step(plant, torque[n], moment, h, theta, omega, reaction, position)
+        step(plant, torque[n], rows[0], h, rows[1], rows[2], rows[3], rows[4])
         qpos[n] = plant.qpos
         qvel[n] = plant.qvel
 
@@ -271,8 +272,8 @@ def test_machine_set_reaches_the_mechanics():
 def state(load):
     return [load.get(p.name).tolist() for p in load.load.parameters] + [
         np.array(field).tolist()
-        for field in (load.plant.stiffness, load.plant.damping, load.plant.friction, load.plant.friction_share,
-                      load.plant.axis_inertia, load.model.jnt_stiffness, load.model.dof_damping,
+        for field in (load.plant.stiffness, load.plant.damping, load.plant.friction, load.plant.share,
+                      load.plant.mass, load.model.jnt_stiffness, load.model.dof_damping,
                       load.model.dof_armature, load.data.qpos, load.data.qvel)
     ]  # fmt: skip
 
@@ -355,10 +356,10 @@ def test_a_machine_parameter_that_cannot_be_is_refused(name, value):
 
 
 def test_names_that_do_not_exist_are_answered_with_those_that_do():
-    with pytest.raises(ValueError, match=r"no load is named 'three_mass'; there are .*inertia, .*two_mass"):
-        find_load("three_mass")
-    with pytest.raises(ValueError, match=r"no load is named 'three_mass'; there are .*inertia, .*two_mass"):
-        EmulatedDrives(load="three_mass")
+    with pytest.raises(ValueError, match=r"no load is named 'four_mass'; there are .*inertia, .*two_mass"):
+        find_load("four_mass")
+    with pytest.raises(ValueError, match=r"no load is named 'four_mass'; there are .*inertia, .*two_mass"):
+        EmulatedDrives(load="four_mass")
     load = machines("two_mass")
     with pytest.raises(ValueError, match=r"no parameter 'mass'; it has inertia, stiffness, damping, coulomb"):
         load.set("mass", np.ones(1), np.ones(1, bool))
@@ -376,9 +377,11 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do():
 @pytest.mark.parametrize("name", sorted(LOADS))
 @pytest.mark.parametrize("copies", [1, 3])
 def test_a_packed_model_holds_every_copy_by_name(name, copies):
-    model = compile_packed(LOADS[name], copies)
-    single = compile_packed(LOADS[name], 1)
+    load = LOADS[name]
+    model = compile_packed(load, copies)
+    single = compile_packed(load, 1)
     assert model.nq == model.nv == copies * single.nv
     for k in range(copies):
-        for axis in LOADS[name].axes:
-            assert model.joint(f"{k}/{axis}").qposadr[0] // single.nv == k
+        for axis in load.joints:
+            for joint in motion_of(model, axis, f"{k}/"):  # a tendon is made of joints
+                assert model.joint(f"{k}/{joint}").qposadr[0] // single.nv == k

@@ -158,7 +158,7 @@ def test_show_config_prints_the_experiment_with_its_comments_and_reads_back(tmp_
     (["sweep", "extra"], "unexpected extra argument"),
     (["sweep", "--config", "none.toml"], "drive-tune: cannot read the experiment none.toml: No such file"),
     (["sweep", "--motor", "abc"], "drive-tune: no motor is named 'abc'; there are class_1kw, class_20w"),
-    (["sweep", "--load", "abc"], "drive-tune: no load is named 'abc'; there are belt, inertia, two_mass"),
+    (["sweep", "--load", "abc"], "drive-tune: no load is named 'abc'; there are arm, ball_screw, belt, cart_pendulum"),
     (["sweep", "--device", "abc"], "drive-tune: no device is named 'abc'; there are tmcm1636"),
     (["sweep", "--seed", "-1"], "drive-tune: seed = -1 lies outside"),
     (["sweep", "--out", "full"], "drive-tune: the folder full is not empty; choose another --out or remove it"),

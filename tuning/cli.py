@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import warnings
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -120,6 +121,14 @@ def _run_with_progress(sweep: Any, experiment: Any, console: Any) -> Any:
         TimeElapsedColumn(),
     )
 
+    said: set[str] = set()
+
+    def say(message: Warning | str, *_: object, **__: object) -> None:
+        """Show a warning, of a machine that its motor cannot move, as a line and once."""
+        if str(message) not in said:
+            said.add(str(message))
+            console.print(f"note: {message}", highlight=False)
+
     def stop(*_: object) -> None:
         # Not by an exception: raised while the compiler calls back into Python it would be printed and lost. Nothing
         # has been written yet.
@@ -129,7 +138,8 @@ def _run_with_progress(sweep: Any, experiment: Any, console: Any) -> Any:
 
     before = signal.signal(signal.SIGINT, stop)
     try:
-        with Progress(*columns, console=console) as progress:
+        with Progress(*columns, console=console) as progress, warnings.catch_warnings():
+            warnings.showwarning = say
             task = progress.add_task(texts["compiling"], total=1.0)
             return sweep.run(
                 experiment, lambda what, share: progress.update(task, description=texts[what], completed=share)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drive_env import EmulatedDrives, motion
 from drive_env.drives import Trace
+from mechanics.loads import find_load
 from tuning import metrics, provenance
 from tuning.experiment import Experiment, Resolved, label, resolve
 from tuning.experiment import load_experiment as load_experiment
@@ -130,7 +131,8 @@ def run(experiment: Experiment, progress: Progress | None = None, num_threads: i
     _compile(experiment)
     points = experiment.points()
     samples = round(experiment.excitation.duration / experiment.excitation.sampling_period)
-    size = int(np.clip(MAX_SAMPLES // samples, 64, MAX_MACHINES))
+    axes = find_load(experiment.load).num_axes
+    size = int(np.clip(MAX_SAMPLES // (samples * axes), 64, MAX_MACHINES))
     batches = [points[first : first + size] for first in range(0, len(points), size)]
     parts: list[dict[str, NDArray[Any]]] = []
     best: tuple[float, Recording] | None = None
@@ -146,14 +148,17 @@ def run(experiment: Experiment, progress: Progress | None = None, num_threads: i
             recording, fault = _record(drives, experiment, resolved, batch, report_batch)
             wall += time.perf_counter() - started
             columns = _evaluate(experiment, recording) | {"fault": fault}
-            columns["diverged"] = np.asarray(columns["diverged"] | drives.machine.diverged)
+            columns["diverged"] = np.asarray(columns["diverged"] | np.repeat(drives.machine.diverged, axes))
         simulated += experiment.excitation.duration * len(batch)
         done += len(batch)
+        # All axes of a machine have the point's gains; it is as good as its worst axis.
+        worst = np.argmax(_score(columns).reshape(-1, axes), axis=1) + np.arange(len(batch)) * axes
+        columns = {name: values[worst] for name, values in columns.items()}
         parts.append(columns)
         ranked = _score(columns)
         k = int(np.argmin(ranked))
         if best is None or ranked[k] < best[0]:
-            best = (float(ranked[k]), recording.point(k))
+            best = (float(ranked[k]), recording.point(int(worst[k])))
     assert best is not None, "an experiment has at least one point"
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return _ranked(experiment, resolved, points, joined, best[1], simulated, wall)
@@ -191,7 +196,7 @@ def _record(
     motion.enable(drives, mode="pv")
     drives.write((0x6083, 0), resolved.acceleration)
     for column, entry in enumerate(resolved.entries):
-        drives.write((entry.index, entry.sub), points[:, column])
+        drives.write((entry.index, entry.sub), np.repeat(points[:, column], drives.num_axes // len(points)))
     traces: list[Trace] = []
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)  # a flag of the table

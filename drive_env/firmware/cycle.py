@@ -34,6 +34,9 @@ _SOURCES = (Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
 # How a played or written value acts on a field.
 REAL, INTEGER, CONTROLWORD, MODE, SET_POINT = 0, 1, 2, 3, 4
 
+# Modes of a holding brake.
+BRAKE_OPEN, BRAKE_CLOSED, BRAKE_WITH_STAGE = 0, 1, 2
+
 # Time constant of the speed that decides whether the motor rotates [s]: encoder noise must not light bit 14.
 ACTIVITY_TIME = 0.02
 
@@ -187,31 +190,60 @@ def sample_row(reals, integers, samples, kinds, offsets, row, first_axis, num_ax
 
 
 @stage
-def mechanics_window(records, plant, rates, motion, num_axes):
-    """Step the load through one window and bring the rotors to where it has them; `motion` is scratch (7, axes)."""
+def mechanics_window(records, plant, rates, motion):
+    """Step the load through one window and bring the rotors to where it has them.
+
+    `motion` is scratch, shape (7, lanes of all blocks): whole blocks are copied, since that vectorises.
+    """
     torque, moment, theta, omega = motion[0], motion[1], motion[2], motion[3]
     reaction, total, position = motion[4], motion[5], motion[6]
     h = rates.window / rates.substeps
-    for axis in range(num_axes):
-        total[axis] = 0.0
+    blocks = records.shape[0]
     for s in range(rates.substeps):
-        for axis in range(num_axes):
-            torque[axis] = records[axis // LANES].tau_window[s, axis % LANES]
-            moment[axis] = records[axis // LANES].moment_window[s, axis % LANES]
+        for block in range(blocks):
+            drive = records[block]
+            for lane in range(LANES):
+                torque[block * LANES + lane] = drive.tau_window[s, lane]
+            for lane in range(LANES):
+                moment[block * LANES + lane] = drive.moment_window[s, lane]
         stepping.step(plant, torque, moment, h, theta, omega, reaction, position)
-        for axis in range(num_axes):
-            total[axis] += reaction[axis]
-    axes_per_copy = plant.axis_dof.shape[0]
-    for axis in range(num_axes):
-        drive = records[axis // LANES]
-        lane = axis % LANES
-        drive.theta_m[lane] = theta[axis]
-        drive.omega_m[lane] = omega[axis]
-        drive.load_position[lane] = position[axis]
-        drive.tau_reaction_before[lane] = drive.tau_reaction[lane]
-        drive.tau_reaction[lane] = total[axis] / rates.substeps
-        if plant.diverged[axis // axes_per_copy] == 1 and drive.diverged[lane] == 0:
-            halt_diverged(drive, lane)
+        for axis in range(blocks * LANES):
+            total[axis] = reaction[axis] if s == 0 else total[axis] + reaction[axis]
+    for block in range(blocks):
+        drive = records[block]
+        first = block * LANES
+        for lane in range(LANES):
+            drive.theta_m[lane] = theta[first + lane]
+        for lane in range(LANES):
+            drive.omega_m[lane] = omega[first + lane]
+        for lane in range(LANES):
+            drive.load_position[lane] = position[first + lane]
+        for lane in range(LANES):
+            drive.tau_reaction_before[lane] = drive.tau_reaction[lane]
+        for lane in range(LANES):
+            drive.tau_reaction[lane] = total[first + lane] / rates.substeps
+    axes_per_copy = plant.axis_motion.shape[0]
+    for copy in range(plant.diverged.shape[0]):
+        if plant.diverged[copy] == 1:
+            for axis in range(copy * axes_per_copy, (copy + 1) * axes_per_copy):
+                if records[axis // LANES].diverged[axis % LANES] == 0:
+                    halt_diverged(records[axis // LANES], axis % LANES)
+
+
+@stage
+def meet(records, plant):
+    """Once per millisecond: brakes close and open, and the rotors learn what they turn, where that changes."""
+    copies, axes = plant.brake.shape
+    brake, mass, varying = plant.brake, plant.mass, plant.varying
+    for copy in range(copies):
+        for axis in range(axes):
+            drive = records[(copy * axes + axis) // LANES]
+            lane = (copy * axes + axis) % LANES
+            mode = drive.brake_mode[lane]
+            closed = mode == BRAKE_CLOSED or (mode == BRAKE_WITH_STAGE and drive.stage_on[lane] == 0.0)
+            brake[copy, axis] = drive.brake_torque[lane] if closed else 0.0
+            if varying:
+                drive.J_rotor[lane] = mass[copy, axis]
 
 
 @stage
@@ -243,7 +275,7 @@ def halt_diverged(drive, lane):
 
 @cached(*_SOURCES)
 def run(
-    records, reals, integers, plant, rates, motion, first_axis, num_axes, cycles,
+    records, reals, integers, plant, rates, motion, first_axis, num_axes, start, cycles,
     play_values, play_kinds, play_offsets, samples, sample_kinds, sample_offsets, every,
 ):  # fmt: skip
     """Run one group of machines for whole communication cycles.
@@ -256,10 +288,11 @@ def run(
         integers: The same memory as 32-bit integers, shape (blocks, integers per record).
         plant: The group's mechanics.
         rates: Periods.
-        motion: Scratch, shape (7, axes).
+        motion: Scratch, shape (7, 8 blocks).
         first_axis: Number of the group's first axis in play and samples.
         num_axes: Axes of the group.
-        cycles: Communication cycles to run.
+        start: Cycle to begin with.
+        cycles: Cycle to end before.
         play_values: SI values, shape (cycles, objects, all axes).
         play_kinds: REAL, INTEGER, CONTROLWORD, MODE or SET_POINT, shape (objects,).
         play_offsets: Index of lane 0 in `reals` or `integers`, shape (objects,).
@@ -268,16 +301,17 @@ def run(
         sample_offsets: Like play_offsets.
         every: Cycles per sample.
     """
-    for cycle in range(cycles):
+    for cycle in range(start, cycles):
         play_row(records, reals, integers, play_values, play_kinds, play_offsets, cycle, first_axis, num_axes)
         if cycle % every == 0:
             sample_row(reals, integers, samples, sample_kinds, sample_offsets, cycle // every, first_axis, num_axes)
         for block in range(records.shape[0]):
             supervise(records[block], rates)
+        meet(records, plant)
         for _ in range(rates.windows):
             for block in range(records.shape[0]):
                 window(records[block], rates)
-            mechanics_window(records, plant, rates, motion, num_axes)
+            mechanics_window(records, plant, rates, motion)
 
 
 @cached(*_SOURCES)

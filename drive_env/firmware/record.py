@@ -154,6 +154,8 @@ PARAMETERS = (
     Field("cogging_order", "f8", "1/rev", "periods per turn"),
     Field("cogging_phase", "f8", "rad", ""),
     Field("J_rotor", "f8", "kg*m^2", "inertia that the rotor feels at once: its own and what is rigidly on it", 1.0),
+    Field("brake_torque", "f8", "N*m", "of the holding brake on the shaft", 0.0),
+    Field("brake_mode", "f8", "", "0 open, 1 closed, 2 closed while the stage is off", 0.0),
 )
 
 # What changes while the drive runs; a machine that is reset starts from the initial values.

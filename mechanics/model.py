@@ -1,0 +1,268 @@
+"""From a load's MJCF to MuJoCo models: what it lacks is named, what it means is found, copies are put side by side."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from mechanics.load import Combination, Friction, Load
+
+Floats = NDArray[np.float64]
+
+# Copies in one model. mj_step per copy: 1154 ns alone, 318 in 8, 204 in 64, 199 in 128 (two-mass shaft); a multiple of
+# 8, so that every group of machines but the last fills its drives' records.
+COPIES_PER_MODEL = 64
+# Copies that may touch things are told apart by MuJoCo's 32 contact bits.
+CONTACT_BITS = 32
+# MuJoCo's solver works on all copies at once and stops by a tolerance of all: 4e-13 was seen in 0.6 s of motion.
+CONSTRAINED_PACKING_BOUND = 1e-9
+_MEMORY_PER_COPY = 2048  # bytes; 64 two-mass copies were seen to use 194 each
+_MEMORY_PER_CONSTRAINED_COPY = 400_000
+_MEMORY_FIXED = 65536
+_SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
+
+
+def read_model(load: Load) -> mujoco.MjModel:
+    """Return the load's model alone, as its file has it.
+
+    Raises:
+        ValueError: If there is no such file, MuJoCo cannot read it, or it has other joints than hinges and slides.
+    """
+    return _checked(load, _spec(load).compile)
+
+
+def resolve(load: Load) -> Load:
+    """Return the load with its joints found and everything it names checked against its model.
+
+    Raises:
+        ValueError: With the joints and tendons that there are.
+    """
+    model = read_model(load)
+    joints = load.joints or _joints_of_actuators(model) or (_joint_names(model) if model.njnt == 1 else ())
+    there = (
+        f"the model has the joints {', '.join(_joint_names(model)) or '(none)'} and the fixed tendons "
+        f"{', '.join(_fixed_tendons(model)) or '(none)'}"
+    )
+    if not joints:
+        raise ValueError(f"load {load.name!r} does not say which joints its drives turn; {there}")
+    for name in joints:
+        if name not in _joint_names(model) and name not in _fixed_tendons(model):
+            raise ValueError(f"load {load.name!r} has no joint or fixed tendon {name!r}; {there}")
+    if len(set(joints)) < len(joints):
+        raise ValueError(f"load {load.name!r} names a joint twice: {', '.join(joints)}; a joint takes one drive")
+    if isinstance(load.gear, tuple) and len(load.gear) != len(joints):
+        raise ValueError(f"load {load.name!r} has {len(joints)} driven joints and {len(load.gear)} gears")
+    gears = load.gear if isinstance(load.gear, tuple) else (float(load.gear),) * len(joints)
+    if not all(np.isfinite(gear) and gear != 0.0 for gear in gears):
+        raise ValueError(f"load {load.name!r}: a gear must be finite and not 0, not {load.gear}")
+    named: list[tuple[str, Combination]] = [("disturbance", load.disturbance), ("start", load.start)]
+    named += [(f"friction {row.name!r}", row.motion) for row in load.frictions]
+    named += [(f"contact {row.name!r}", row.motion) for row in load.contacts]
+    named += [(f"roll {row.name!r}", {row.joint: 1.0}) for row in load.rolls]
+    named += [("position", motion) for motion in load.positions]
+    for what, motion in named:
+        for name in motion:
+            if name not in _joint_names(model):
+                raise ValueError(f"load {load.name!r}: its {what} names the joint {name!r}; {there}")
+    contacts = [row.name for row in load.contacts]
+    for row in load.frictions:
+        if row.carries and row.carries not in contacts:
+            raise ValueError(
+                f"load {load.name!r}: its friction {row.name!r} carries the contact {row.carries!r}; the contacts are "
+                f"{', '.join(contacts) or '(none)'}"
+            )
+    for field in ("positions", "travel"):
+        rows = getattr(load, field)
+        if rows and len(rows) != len(joints):
+            raise ValueError(f"load {load.name!r} has {len(joints)} axes and {len(rows)} {field}; give one per axis")
+    return dataclasses.replace(
+        load,
+        joints=joints,
+        gear=gears,
+        disturbance=load.disturbance or _motion(model, joints[0]),
+        frictions=load.frictions + _joint_friction(model),
+        start=load.start or _keyframe(model),
+        packing_bound=load.packing_bound or (CONSTRAINED_PACKING_BOUND if is_constrained(model) else 0.0),
+    )
+
+
+def copies_per_model(load: Load) -> int:
+    """Return how many machines one model may hold."""
+    model = read_model(load)
+    if not is_constrained(model) or not _bits(model):
+        return COPIES_PER_MODEL
+    return max(CONTACT_BITS // _bits(model) // 8 * 8, 8)
+
+
+def compile_packed(load: Load, copies: int) -> mujoco.MjModel:
+    """Return a model of `copies` copies of the load; elements of copy k are named with the prefix `k/`."""
+    single = read_model(load)
+    packed = mujoco.MjSpec()
+    constrained = is_constrained(single)
+    packed.memory = _MEMORY_FIXED + (_MEMORY_PER_CONSTRAINED_COPY if constrained else _MEMORY_PER_COPY) * copies
+    packed.option = _spec(load).option
+    bits = _bits(single)
+    for k in range(copies):
+        child = _spec(load)
+        for actuator in list(child.actuators):
+            child.delete(actuator)
+        for key in list(child.keys):
+            child.delete(key)
+        for name in load.joints:
+            # The rotor enters later, in place of what the file may have.
+            for joint in child.joints:
+                if joint.name == name:
+                    joint.armature = 0.0
+            for tendon in child.tendons:
+                if tendon.name == name:
+                    tendon.armature = 0.0
+        for joint in child.joints:
+            joint.frictionloss = 0.0  # friction.py's, see _joint_friction
+        for geom in child.geoms:
+            geom.contype = _signed(geom.contype << k * bits)
+            geom.conaffinity = _signed(geom.conaffinity << k * bits)
+        packed.attach(child, prefix=f"{k}/", frame=packed.worldbody.add_frame())
+    return _checked(load, packed.compile)
+
+
+def is_constrained(model: mujoco.MjModel) -> bool:
+    """Return whether MuJoCo's constraint solver has something to do: loops, limits, friction losses, contacts."""
+    touching = np.any((model.geom_contype != 0) | (model.geom_conaffinity != 0))
+    return bool(
+        model.neq
+        or np.any(model.jnt_limited)
+        or np.any(model.tendon_limited)
+        or np.any(model.tendon_frictionloss > 0.0)
+        or model.npair
+        or touching
+    )
+
+
+def is_varying(model: mujoco.MjModel, rolls: bool) -> bool:
+    """Return whether inertia or gravity change with the position; found by looking at random positions."""
+    if rolls:
+        return True
+    data = mujoco.MjData(model)
+    generator = np.random.default_rng(0)
+    seen = []
+    for k in range(5):
+        span = np.where(model.jnt_type == _HINGE, np.pi, 1.0)
+        low, high = model.jnt_range.T
+        ranged = high > low
+        share = generator.random(model.nq) if k else np.zeros(model.nq)
+        spread = np.where(ranged, low + share * (high - low), (2.0 * share - 1.0) * span)
+        data.qpos[:] = spread if k else model.qpos0
+        data.qvel[:] = 0.0
+        mujoco.mj_forward(model, data)
+        full = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full)
+        seen.append(np.concatenate([full.ravel(), data.qfrc_bias]))
+    found = np.array(seen)
+    scale = np.concatenate(
+        [np.sqrt(np.outer(np.diag(full), np.diag(full))).ravel(), np.abs(found[:, -model.nv :]).max(0)]
+    )
+    return bool(np.any(np.ptp(found, axis=0) > 1e-4 * scale + 1e-12))
+
+
+def motion_of(model: mujoco.MjModel, name: str, prefix: str = "") -> Combination:
+    """Return a joint or fixed tendon as a combination of joints, their names without the prefix."""
+    found = _motion(model, prefix + name)
+    return {joint.removeprefix(prefix): coefficient for joint, coefficient in found.items()}
+
+
+# --- inside -----------------------------------------------------------------------------------------------------------
+def _spec(load: Load) -> mujoco.MjSpec:
+    if not Path(load.mjcf).is_file():
+        raise ValueError(f"there is no model file {str(load.mjcf)!r}")
+    try:
+        return mujoco.MjSpec.from_file(str(load.mjcf))
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read {str(load.mjcf)!r}: {' '.join(str(error).split())}") from error
+
+
+def _checked(load: Load, compile_: object) -> mujoco.MjModel:
+    try:
+        model = compile_()  # type: ignore[operator]
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot compile load {load.name!r}: {' '.join(str(error).split())}") from error
+    wrong = ~np.isin(model.jnt_type, (_SLIDE, _HINGE))
+    if np.any(wrong):
+        names = ", ".join(repr(model.joint(int(k)).name) for k in np.flatnonzero(wrong))
+        raise ValueError(
+            f"load {load.name!r} has free or ball joints ({names}); drives turn hinge and slide joints, and a copy's "
+            "coordinates must be its degrees of freedom: weld such a body or give it three hinges"
+        )
+    if model.nv == 0:
+        raise ValueError(f"load {load.name!r} has no joint, so there is nothing that a drive could turn")
+    return model
+
+
+def _joint_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    return tuple(model.joint(k).name for k in range(model.njnt))
+
+
+def _fixed_tendons(model: mujoco.MjModel) -> tuple[str, ...]:
+    names = []
+    for k in range(model.ntendon):
+        first = model.tendon_adr[k]
+        kinds = model.wrap_type[first : first + model.tendon_num[k]]
+        if np.all(kinds == int(mujoco.mjtWrap.mjWRAP_JOINT)):
+            names.append(model.tendon(k).name)
+    return tuple(names)
+
+
+def _motion(model: mujoco.MjModel, name: str) -> Combination:
+    if name in _joint_names(model):
+        return {name: 1.0}
+    tendon = model.tendon(name).id
+    first, count = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
+    return {model.joint(int(model.wrap_objid[k])).name: float(model.wrap_prm[k]) for k in range(first, first + count)}
+
+
+def _joints_of_actuators(model: mujoco.MjModel) -> tuple[str, ...]:
+    names = []
+    for k in range(model.nu):
+        target = int(model.actuator_trnid[k, 0])
+        if model.actuator_trntype[k] == int(mujoco.mjtTrn.mjTRN_JOINT):
+            names.append(model.joint(target).name)
+        elif model.actuator_trntype[k] == int(mujoco.mjtTrn.mjTRN_TENDON):
+            names.append(model.tendon(target).name)
+    return tuple(dict.fromkeys(names))
+
+
+def _joint_friction(model: mujoco.MjModel) -> tuple[Friction, ...]:
+    """Return the joints' friction losses as rows: dry friction is friction.py's, never the solver's as well."""
+    rows = []
+    for k in range(model.njnt):
+        loss = float(model.dof_frictionloss[model.jnt_dofadr[k]])
+        if loss > 0.0:
+            name = model.joint(k).name
+            rows.append(Friction(name, {name: 1.0}, coulomb=loss, breakaway=loss))
+    return tuple(rows)
+
+
+def _keyframe(model: mujoco.MjModel) -> Combination:
+    if model.nkey == 0:
+        return {}
+    return {model.joint(k).name: float(model.key_qpos[0, k]) for k in range(model.njnt)}
+
+
+def _signed(bits: int) -> int:
+    """Return 32 bits as the signed integer that MuJoCo takes."""
+    return bits - (1 << CONTACT_BITS) if bits >> (CONTACT_BITS - 1) else bits
+
+
+def _bits(model: mujoco.MjModel) -> int:
+    """Return how many contact bits the model uses."""
+    used = int(np.bitwise_or.reduce(model.geom_contype | model.geom_conaffinity)) if model.ngeom else 0
+    bits = used.bit_length()
+    if bits > CONTACT_BITS // 8:
+        raise ValueError(
+            f"the model uses contact bit {bits - 1}; copies of it are told apart by contact bits, so that it may use "
+            f"bits 0 to {CONTACT_BITS // 8 - 1} of contype and conaffinity only"
+        )
+    return bits
