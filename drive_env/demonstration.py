@@ -217,7 +217,7 @@ def _load_torque(row: Demonstration, drives: EmulatedDrives) -> float:
 
     packed = drives._groups[0].load
     # The disturbance's speed per speed of each rotor; the axis that feels it most.
-    lever = np.abs(way(packed).joints @ packed.plant.disturbance[0])
+    lever = np.abs(way(packed).joints @ packed.plant.disturbance[:, 0])
     return -LOAD_SHARE * drives.motor.rated_torque / float(lever.max())
 
 

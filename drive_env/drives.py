@@ -360,7 +360,7 @@ class EmulatedDrives:
 
     def _refresh_inertia(self) -> None:
         axes = self.load.num_axes
-        inertia = np.concatenate([group.load.plant.mass[:, :axes].reshape(-1) for group in self._groups])
+        inertia = np.concatenate([group.load.plant.mass[:axes].T.reshape(-1) for group in self._groups])
         set_lanes(self._records, "J_rotor", inertia)
 
     def _axis_mask(self, where: Mask | None) -> Mask:

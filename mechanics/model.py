@@ -142,30 +142,17 @@ def is_constrained(model: mujoco.MjModel) -> bool:
     )
 
 
-def is_varying(model: mujoco.MjModel, rolls: bool) -> bool:
+def is_varying(model: mujoco.MjModel) -> bool:
     """Return whether inertia or gravity change with the position; found by looking at random positions."""
-    if rolls:
-        return True
-    data = mujoco.MjData(model)
-    generator = np.random.default_rng(0)
-    seen = []
-    for k in range(5):
-        span = np.where(model.jnt_type == _HINGE, np.pi, 1.0)
-        low, high = model.jnt_range.T
-        ranged = high > low
-        share = generator.random(model.nq) if k else np.zeros(model.nq)
-        spread = np.where(ranged, low + share * (high - low), (2.0 * share - 1.0) * span)
-        data.qpos[:] = spread if k else model.qpos0
-        data.qvel[:] = 0.0
-        mujoco.mj_forward(model, data)
-        full = np.zeros((model.nv, model.nv))
-        mujoco.mj_fullM(model, data, full)
-        seen.append(np.concatenate([full.ravel(), data.qfrc_bias]))
-    found = np.array(seen)
-    scale = np.concatenate(
-        [np.sqrt(np.outer(np.diag(full), np.diag(full))).ravel(), np.abs(found[:, -model.nv :]).max(0)]
-    )
-    return bool(np.any(np.ptp(found, axis=0) > 1e-4 * scale + 1e-12))
+    return _changes(model, 1e-4, 0.0)
+
+
+def is_constant(model: mujoco.MjModel) -> bool:
+    """Return whether nothing at all changes but the force of the joints' own springs and dampers.
+
+    Found by looking at random positions and speeds.
+    """
+    return not _changes(model, 1e-9, 1.0)
 
 
 def motion_of(model: mujoco.MjModel, name: str, prefix: str = "") -> Combination:
@@ -175,6 +162,31 @@ def motion_of(model: mujoco.MjModel, name: str, prefix: str = "") -> Combination
 
 
 # --- inside -----------------------------------------------------------------------------------------------------------
+def _changes(model: mujoco.MjModel, tolerance: float, speed: float) -> bool:
+    """Return whether inertias and forces change by more than a share; speeds of about `speed` [rad/s or m/s]."""
+    data = mujoco.MjData(model)
+    generator = np.random.default_rng(0)
+    seen = []
+    largest = np.zeros(model.nv)
+    for k in range(5):
+        span = np.where(model.jnt_type == _HINGE, np.pi, 1.0)
+        low, high = model.jnt_range.T
+        ranged = high > low
+        share = generator.random(model.nq) if k else np.zeros(model.nq)
+        spread = np.where(ranged, low + share * (high - low), (2.0 * share - 1.0) * span)
+        data.qpos[:] = spread if k else model.qpos0
+        data.qvel[:] = speed * (2.0 * share - 1.0)
+        mujoco.mj_forward(model, data)
+        full = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, data, full)
+        simple = model.jnt_stiffness * (data.qpos - model.qpos_spring) + model.dof_damping * data.qvel
+        others = data.qfrc_passive + simple if speed else np.zeros(model.nv)
+        largest = np.maximum(largest, np.abs(data.qfrc_bias) + (np.abs(simple) if speed else 0.0))
+        seen.append(np.concatenate([full.ravel(), data.qfrc_bias, others]))
+    scale = np.concatenate([np.sqrt(np.outer(np.diag(full), np.diag(full))).ravel(), largest, largest])
+    return bool(np.any(np.ptp(np.array(seen), axis=0) > tolerance * scale + 1e-12))
+
+
 def _spec(load: Load) -> mujoco.MjSpec:
     if not Path(load.mjcf).is_file():
         raise ValueError(f"there is no model file {str(load.mjcf)!r}")

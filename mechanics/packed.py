@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from mechanics.friction import BRISTLE_DAMPING, FrictionModel, find_friction
 from mechanics.load import Combination, Friction, Load, Parameter
 from mechanics.modal import corrections
-from mechanics.model import compile_packed, is_constrained, is_varying, motion_of, read_model
-from mechanics.stepping import Plant
+from mechanics.model import compile_packed, is_constant, is_constrained, is_varying, motion_of, read_model
+from mechanics.plant import Plant
 
 Floats = NDArray[np.float64]
 
@@ -88,8 +88,13 @@ class PackedLoad:
         self.model = compile_packed(load, self.copies) if template is None else copy.copy(template)
         self.num_dofs = self.model.nv // self.copies
         self.constrained = is_constrained(self.model)
+        single = read_model(load)
         # Runge-Kutta looks at everything anew, too: it is the oracle.
-        self.varying = not self.staggered or self.constrained or is_varying(read_model(load), bool(load.rolls))
+        self._looking = not self.staggered or self.constrained or is_varying(single)
+        self._constant = not self._looking and is_constant(single)
+        # Rolls grow slowly and change nothing but their own inertia; where something else does, all is looked at.
+        self._looking |= bool(load.rolls) and not self._constant
+        self.varying = self._looking or bool(load.rolls)
         self.model.opt.integrator = _INTEGRATORS[integrator]
         self.model.opt.timestep = h
         self.model.opt.disableflags = int(_DISABLED | (0 if self.constrained else _DISABLED_UNCONSTRAINED))
@@ -193,7 +198,7 @@ class PackedLoad:
             self.data.qacc_warmstart[dofs] = 0.0
             self.plant.qvel_before[dofs] = 0.0
             self.plant.bristle[k] = 0.0
-            self.plant.holding[k] = 0.0
+            self.plant.holding[:, k] = 0.0
             self.plant.carried[k] = 0.0
             self.plant.diverged[k] = 0
             self.plant.load_torque[k] = 0.0
@@ -324,6 +329,8 @@ class PackedLoad:
             data_address=self.data._address,
             staggered=self.staggered,
             varying=self.varying,
+            looking=self._looking,
+            constant=self._constant,
             elastic=self._elastic,
             qpos=self.data.qpos,
             qvel=self.data.qvel,
@@ -340,34 +347,40 @@ class PackedLoad:
             ahead=np.zeros(self.model.nv),
             weigh_every=self._weigh_every,
             steps=np.zeros(1, np.int64),
-            scratch=np.zeros((dofs, dofs)),
-            total=np.zeros((copies, dofs)),
+            triangle=np.zeros((dofs, dofs, copies)),
+            lane=np.zeros((8, copies)),
+            position=np.zeros((dofs, copies)),
+            speed=np.zeros((dofs, copies)),
+            reached=np.zeros((dofs, copies)),
+            applied=np.zeros((dofs, copies)),
+            total=np.zeros((dofs, copies)),
             axis_motion=self._combinations(self._motions[:axes]),
             axis_position=self._combinations(
                 list(self.load.positions) or [motion_of(self.model, joint, "0/") for joint in self.load.joints]
             ),
             axis_start=self._combinations(self._motions[:axes]) @ self.start,
-            axis_kick=np.zeros((copies, axes, dofs)),
-            stiffness=np.zeros((copies, dofs, dofs)),
-            held=np.zeros((copies, dofs, dofs)),
-            held_moment=np.zeros((copies, dofs, axes)),
+            axis_kick=np.zeros((axes, dofs, copies)),
+            stiffness=np.zeros((dofs, dofs, copies)),
+            held=np.zeros((dofs, dofs, copies)),
+            held_moment=np.zeros((dofs, axes, copies)),
             spring_zero=np.array(self.model.qpos_spring[:dofs]),
-            damping=np.zeros((copies, dofs)),
-            bias=np.zeros((copies, dofs)),
+            damping=np.zeros((dofs, copies)),
+            bias=np.zeros((dofs, copies)),
             motion=self._combinations(self._motions),
-            share=np.zeros((copies, elements, dofs)),
-            mass=np.ones((copies, elements)),
-            friction=np.zeros((copies, frictions, 8)),
+            share=np.zeros((elements, dofs, copies)),
+            mass=np.ones((elements, copies)),
+            friction=np.zeros((frictions, 8, copies)),
             carries=carries[self._apart()].astype(np.int64),
             bristle=np.zeros((copies, frictions)),
-            stuck=np.zeros((copies, frictions), np.int64),
-            holding=np.zeros((copies, frictions)),
-            contact=np.zeros((copies, contacts, 6)),
+            stuck=np.zeros((frictions, copies), np.int64),
+            holding=np.zeros((frictions, copies)),
+            contact=np.zeros((contacts, 6, copies)),
             carried=np.zeros((copies, contacts)),
             roll_dof=np.array([self._joints.index(row.joint) for row in self.load.rolls], np.int64),
             roll=np.zeros((copies, len(self.load.rolls), 4)),
             roll_armature=np.zeros((copies, len(self.load.rolls))),
-            disturbance=np.tile(disturbance, (copies, 1)),
+            roll_inertia=np.zeros((copies, len(self.load.rolls))),
+            disturbance=np.repeat(disturbance[:, None], copies, axis=1),
             load_torque=np.zeros(copies),
             profile_at=np.zeros(0),
             profile=np.zeros((copies, 0)),
@@ -375,7 +388,7 @@ class PackedLoad:
             profile_period=0.0,
             profile_now=np.zeros(copies),
             clock=np.zeros(copies),
-            brake=np.zeros((copies, axes)),
+            brake=np.zeros((axes, copies)),
             diverged=np.zeros(copies, np.int64),
         )
 
@@ -396,26 +409,29 @@ class PackedLoad:
         # At the reference position, so that setting one copy cannot change the rounding of another.
         self.data.qpos[:], self.data.qvel[:] = np.tile(self.start, self.copies), 0.0
         inertia = self.mass_matrix()
-        plant.bias[:] = self._by_copy(self.data.qfrc_bias)
+        plant.bias[:] = self._by_copy(self.data.qfrc_bias).T
         self.data.qpos[:], self.data.qvel[:] = moving
-        plant.damping[:] = self._damping
+        plant.damping[:] = self._damping.T
         if self.staggered:
             found = corrections(inertia, self._stiffness, plant.axis_motion, self.h)
             self._check_phase(found.phase, found.shapes)
-            plant.stiffness[:] = found.stiffness
-            plant.held[:] = found.held
-            plant.held_moment[:] = found.held_moment
-            plant.axis_kick[:] = found.kick
+            plant.stiffness[:] = _copies_last(found.stiffness)
+            plant.held[:] = _copies_last(found.held)
+            plant.held_moment[:] = _copies_last(found.held_moment)
+            plant.axis_kick[:] = _copies_last(found.kick)
         # The springs' force is the plant's, since the corrected one is no spring of a joint any more.
         self._by_copy(self.model.jnt_stiffness)[:] = 0.0 if self.staggered else self._stiffness
         self._by_copy(self.model.dof_damping)[:] = self._damping * (0.5 if self.staggered else 1.0)
         inverse = np.linalg.inv(inertia)
-        share = np.einsum("cde,fe->cfd", inverse, plant.motion)
-        plant.mass[:] = 1.0 / np.einsum("fd,cfd->cf", plant.motion, share)
-        plant.share[:] = share * plant.mass[:, :, None]
+        share = np.einsum("cde,fe->fdc", inverse, plant.motion)
+        plant.mass[:] = 1.0 / np.einsum("fd,fdc->fc", plant.motion, share)
+        plant.share[:] = share * plant.mass[:, None]
         self._apply_frictions()
         self._apply_contacts()
         plant.roll[:] = self._roll
+        dofs = plant.roll_dof
+        wound = self._by_copy(self.model.dof_armature)[:, dofs] - plant.roll_armature
+        plant.roll_inertia[:] = inertia[:, dofs, dofs] - wound
 
     def _place_rotors(self) -> None:
         """Enter the rotors as armature of their joints or tendons, on the load's side of the gear."""
@@ -457,25 +473,25 @@ class PackedLoad:
             turning += row * scale**powers * np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
             turning[:, 2] = row[:, 2] / scale
         rows = rows[:, self._apart()]
-        plant.friction[:, :, :5] = rows[:, :, :5]
-        plant.friction[:, :, 7] = rows[:, :, 5]
+        plant.friction[:, :5] = _copies_last(rows[:, :, :5])
+        plant.friction[:, 7] = rows[:, :, 5].T
         bristle = column["bristle"][:, self._apart()]
         bristled = loads[self._apart()] & chosen.bristles & (bristle > 0.0)
         stiffness = np.where(bristled, rows[:, :, 1] / np.where(bristled, bristle, 1.0), 0.0)
-        plant.friction[:, :, 5] = stiffness
-        plant.friction[:, :, 6] = 2.0 * BRISTLE_DAMPING * np.sqrt(stiffness * plant.mass[:, : self.num_frictions])
+        plant.friction[:, 5] = stiffness.T
+        plant.friction[:, 6] = 2.0 * BRISTLE_DAMPING * np.sqrt(stiffness.T * plant.mass[: self.num_frictions])
 
     def _apply_contacts(self) -> None:
-        plant, stiffness = self.plant, self._contact[:, :, 2]
-        plant.contact[:, :, :4] = self._contact
-        phase = 0.5 * self.h * np.sqrt(stiffness / plant.mass[:, self.num_frictions :])
+        plant, stiffness = self.plant, self._contact[:, :, 2].T
+        plant.contact[:, :4] = _copies_last(self._contact)
+        phase = 0.5 * self.h * np.sqrt(stiffness / plant.mass[self.num_frictions :])
         if self.staggered:
             # As in modal.py, for the mode that the spring has while it is pressed.
-            plant.contact[:, :, 2] *= np.sinc(phase / np.pi) ** 2
-            plant.contact[:, :, 4] = np.sinc(2.0 * phase / np.pi) - 1.0
-            plant.contact[:, :, 5] = 2.0 * phase / self.h * np.sin(phase)
+            plant.contact[:, 2] *= np.sinc(phase / np.pi) ** 2
+            plant.contact[:, 4] = np.sinc(2.0 * phase / np.pi) - 1.0
+            plant.contact[:, 5] = 2.0 * phase / self.h * np.sin(phase)
         if phase.size and 2.0 * phase.max() > MAX_PHASE_PER_STEP:
-            worst, k = np.unravel_index(int(phase.argmax()), phase.shape)
+            k, worst = np.unravel_index(int(phase.argmax()), phase.shape)
             self._refuse(f"contact {self.load.contacts[int(k)].name!r}", int(worst), float(phase.max()))
 
     def _check_phase(self, phase: Floats, shapes: Floats) -> None:
@@ -491,6 +507,10 @@ class PackedLoad:
             f"limit is {MAX_PHASE_PER_STEP / (2.0 * np.pi * self.h):.0f} Hz at a physics step of {self.h * 1e6:.0f} "
             "us; lower its stiffness, raise its inertia or take more physics steps per millisecond"
         )
+
+
+def _copies_last(array: Floats) -> Floats:
+    return np.moveaxis(array, 0, -1)
 
 
 def _proportional(turning: Sequence[Combination], frictions: Sequence[Friction]) -> dict[int, tuple[int, float]]:

@@ -71,7 +71,7 @@ def shaft_load(load: PackedLoad) -> ShaftLoad:
     """Return what the shafts see when each axis turns alone, passive joints at rest and backlash taken up."""
     plant, turning = load.plant, way(load).joints
     frictions = plant.motion[: load.num_frictions]
-    breakaway = np.einsum("cf,fa->ca", plant.friction[:, :, 1], np.abs(frictions @ turning.T))
+    breakaway = np.einsum("fc,fa->ca", plant.friction[:, 1], np.abs(frictions @ turning.T))
     model, data = load.model, mujoco.MjData(load.model)
     generator = np.random.default_rng(0)
     gravity, inertia = np.zeros_like(breakaway), np.zeros_like(breakaway)

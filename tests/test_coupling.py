@@ -32,7 +32,7 @@ ORACLE_SUBSTEPS = 4  # 10 us: 100 steps per ms
 @cached(FOLDER)
 def step_load(plant, torque, moment, h):
     """Step one copy through mean torques and first moments (n,); return angle and speed of the rotor, every qvel."""
-    dofs = plant.damping.shape[1]
+    dofs = plant.damping.shape[0]
     theta, omega, reaction, position = np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1)
     motion_ = np.zeros((torque.shape[0], 2 + dofs))
     for n in range(torque.shape[0]):

@@ -245,7 +245,7 @@ def account(name, h, friction, *, stops=False, pressed=False):
     if stops:
         load = dataclasses.replace(load, start=twin.near_the_stops())
     machine = PackedLoad(load, np.full((1, axes), J_M), np.zeros((1, axes, 4)), {}, h, friction=friction)
-    mass = machine.plant.mass[0].copy()
+    mass = machine.plant.mass[:, 0].copy()
     n = round(0.4 / h)
     t = (np.arange(n) + 0.5) * h
     start = machine.start.copy()
@@ -362,7 +362,7 @@ def test_what_each_motion_weighs_follows_the_pose(name, start):
     run(machine, np.zeros((1, axes)))
     rows = [*twin.axes, *(twin.row(row.motion) for row in (*load.frictions, *load.contacts))]
     inverse = np.linalg.inv(twin.inertia(machine.start))
-    for found, share, row in zip(machine.plant.mass[0], machine.plant.share[0], rows, strict=True):
+    for found, share, row in zip(machine.plant.mass[:, 0], machine.plant.share[:, :, 0], rows, strict=True):
         weight = 1.0 / (row @ inverse @ row)
         assert found == pytest.approx(weight, rel=1e-9)
         np.testing.assert_allclose(share, weight * inverse @ row, rtol=1e-9, atol=1e-12)

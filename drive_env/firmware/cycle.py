@@ -233,7 +233,7 @@ def mechanics_window(records, plant, rates, motion):
 @stage
 def meet(records, plant):
     """Once per millisecond: brakes close and open, and the rotors learn what they turn, where that changes."""
-    copies, axes = plant.brake.shape
+    axes, copies = plant.brake.shape
     brake, mass, varying = plant.brake, plant.mass, plant.varying
     for copy in range(copies):
         for axis in range(axes):
@@ -241,9 +241,9 @@ def meet(records, plant):
             lane = (copy * axes + axis) % LANES
             mode = drive.brake_mode[lane]
             closed = mode == BRAKE_CLOSED or (mode == BRAKE_WITH_STAGE and drive.stage_on[lane] == 0.0)
-            brake[copy, axis] = drive.brake_torque[lane] if closed else 0.0
+            brake[axis, copy] = drive.brake_torque[lane] if closed else 0.0
             if varying:
-                drive.J_rotor[lane] = mass[copy, axis]
+                drive.J_rotor[lane] = mass[axis, copy]
 
 
 @stage
@@ -273,7 +273,7 @@ def halt_diverged(drive, lane):
     fsa.update_statusword(drive, lane, 0)
 
 
-@cached(*_SOURCES)
+@cached(*_SOURCES, allocates=False)
 def run(
     records, reals, integers, plant, rates, motion, first_axis, num_axes, start, cycles,
     play_values, play_kinds, play_offsets, samples, sample_kinds, sample_offsets, every,
@@ -314,7 +314,7 @@ def run(
             mechanics_window(records, plant, rates, motion)
 
 
-@cached(*_SOURCES)
+@cached(*_SOURCES, allocates=False)
 def run_drives_alone(records, rates, cycles):
     """Run the drives without mechanics, rotors driven by their predicted torque balance; the benchmark's bound."""
     for _ in range(cycles):
@@ -325,7 +325,7 @@ def run_drives_alone(records, rates, cycles):
                 window(records[block], rates)
 
 
-@cached(*_SOURCES)
+@cached(*_SOURCES, allocates=False)
 def write_events(records, kind, values, where):
     """Process writes of the controlword or the mode for the axes where the mask is true."""
     for axis in range(values.shape[0]):
@@ -337,7 +337,7 @@ def write_events(records, kind, values, where):
                 write_mode(drive, axis % LANES, values[axis])
 
 
-@cached(*_SOURCES)
+@cached(*_SOURCES, allocates=False)
 def power_on(records, where):
     """Start the drive's firmware anew on the axes where the mask is true: transitions 0 and 1, encoder at zero.
 
