@@ -226,8 +226,6 @@ def _motion(model: mujoco.MjModel, name: str) -> Combination:
     return {model.joint(int(model.wrap_objid[k])).name: float(model.wrap_prm[k]) for k in range(first, first + count)}
 
 
-
-
 def _actuators(model: mujoco.MjModel) -> dict[str, float]:
     """Return the joints and tendons that actuators turn, each with the actuator's gear."""
     joint, tendon = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_TENDON)
