@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from drive_env.envs import register
+
 if TYPE_CHECKING:
     from drive_env import motion as motion
     from drive_env.can_drives import CanDrives as CanDrives
@@ -23,6 +25,8 @@ _HOMES = {
     "SafetyError": "safety",
     "Trace": "drives",
 }
+
+register()
 
 
 def __getattr__(name: str) -> Any:

@@ -31,6 +31,7 @@ from drive_env.firmware.fsa import State
 from drive_env.firmware.modes import MODES
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.group import Channels, channels
+from drive_env.lane_image import LaneImage
 from drive_env.process_image import SCALES, SPECIAL_UNITS, ProcessImage, Row
 
 Integers = NDArray[np.int64]
@@ -59,6 +60,7 @@ class LiveDictionary:
         self._records = records
         self.num_axes = num_axes
         self._scale_changes = 0
+        self._image: LaneImage | None = None  # of what a restart restores
         self._values: dict[tuple[int, int], Integers | str] = {}
         self._stored = self._commission(preset)
 
@@ -83,8 +85,20 @@ class LiveDictionary:
 
     def restart(self, axes: Mask) -> None:
         """Restore the stored values of the axes where the mask is true, and start their firmware anew."""
-        for key in sorted(self._stored, key=lambda key: key != POSITION_SCALER):
-            self._restore(self.entries.find(key), self._stored[key], axes)
+        before = self._context()
+        if self._image is None:
+            self._image = self._stored_image()
+        self._image.restore(axes)
+        chosen = np.flatnonzero(axes)
+        for key, raw in self._stored.items():
+            values = self._values.get(key)
+            if isinstance(values, np.ndarray):
+                values[chosen] = raw[chosen]
+        after = self._context()
+        if np.any(before.position_scaler != after.position_scaler) or np.any(
+            before.encoder_steps != after.encoder_steps
+        ):
+            self._scale_changes += 1
         cycle.power_on(self._records, axes)
 
     @property
@@ -104,6 +118,7 @@ class LiveDictionary:
         """Set what a restart restores on one axis; the values are those of objects that exist, within their range."""
         for key, raw in values.items():
             self._stored[key][axis] = raw
+        self._image = None
 
     def write_checked(self, entry: Entry, raw: int, axis: int) -> None:
         """Write an object of one axis that was checked before."""
@@ -142,7 +157,9 @@ class LiveDictionary:
     def _row(self, entry: Entry) -> Row:
         binding = self.device.bindings[entry.index, entry.sub]
         factor = np.broadcast_to(units.UNITS[binding.unit].factor(self._context()), (self.num_axes,))
-        return Row(entry, binding, np.array(factor, float), (entry.index, entry.sub) in units.WRAPPING)
+        assert entry.low is not None and entry.high is not None, "only numbers are bound"
+        wraps = (entry.index, entry.sub) in units.WRAPPING
+        return Row(entry, binding, np.array(factor, float), wraps, entry.low, entry.high)
 
     def recordable(self, entry: Entry) -> Binding | None:
         """Return the binding of an entry whose value changes by itself, None of one that only a write changes."""
@@ -208,6 +225,17 @@ class LiveDictionary:
         else:
             self._set_value(entry, raw, where)
 
+    def _stored_image(self) -> LaneImage:
+        """Return the fields that `_restore` would set from what is stored, converted by the scales that are stored."""
+        steps = next(key for key, binding in self.device.bindings.items() if binding.field == "encoder_steps")
+        context = self._context()._replace(
+            position_scaler=self._stored[POSITION_SCALER].astype(float), encoder_steps=self._stored[steps].astype(float)
+        )
+        bound = [key for key in self._stored if key in self.device.bindings]
+        rows = [self.device.bindings[key] for key in bound if self.entries.find(key).access not in ("ro", "const")]
+        values = [self._from_od(row, self._stored[row.index, row.sub], context) for row in rows]
+        return LaneImage(self._records, [(row.field, row.part) for row in rows], np.array(values))
+
     def _is_bound(self, entry: Entry) -> bool:
         return (entry.index, entry.sub) in self.device.bindings
 
@@ -240,12 +268,13 @@ class LiveDictionary:
         assert low is not None and high is not None, "only numbers are bound"
         return units.to_od(binding.unit, value, self._context(), low, high)
 
-    def _from_od(self, binding: Binding, raw: NDArray[Any]) -> Floats:
+    def _from_od(self, binding: Binding, raw: NDArray[Any], context: units.Context | None = None) -> Floats:
+        scales = self._context() if context is None else context
         if binding.unit == "position window":
-            return units.window_from_od(raw, self._context())
+            return units.window_from_od(raw, scales)
         if binding.unit == "position limit":
-            return units.limit_from_od(raw, self._context())
-        return units.from_od(binding.unit, raw, self._context())
+            return units.limit_from_od(raw, scales)
+        return units.from_od(binding.unit, raw, scales)
 
     def _check(self, entry: Entry, raw: Integers, where: Mask) -> None:
         self._check_value(entry, raw[where])

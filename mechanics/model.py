@@ -229,7 +229,7 @@ def _motion(model: mujoco.MjModel, name: str) -> Combination:
 def _actuators(model: mujoco.MjModel) -> dict[str, float]:
     """Return the joints and tendons that actuators turn, each with the actuator's gear."""
     joint, tendon = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_TENDON)
-    gears = {}
+    gears: dict[str, float] = {}
     for k in range(model.nu):
         target = int(model.actuator_trnid[k, 0])
         if model.actuator_trntype[k] in (joint, tendon):
