@@ -4,15 +4,29 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from drive_env.envs import register
+
 if TYPE_CHECKING:
     from drive_env import motion as motion
+    from drive_env.can_drives import CanDrives as CanDrives
     from drive_env.dictionary.access import ObjectAccessError as ObjectAccessError
     from drive_env.drives import EmulatedDrives as EmulatedDrives
     from drive_env.drives import Trace as Trace
+    from drive_env.master.bounds import Limits as Limits
+    from drive_env.safety import SafetyError as SafetyError
 
-__all__ = ["EmulatedDrives", "ObjectAccessError", "Trace", "motion"]
+__all__ = ["CanDrives", "EmulatedDrives", "Limits", "ObjectAccessError", "SafetyError", "Trace", "motion"]
 
-_HOMES = {"EmulatedDrives": "drives", "Trace": "drives", "ObjectAccessError": "dictionary.access"}
+_HOMES = {
+    "CanDrives": "can_drives",
+    "EmulatedDrives": "drives",
+    "Limits": "master.bounds",
+    "ObjectAccessError": "dictionary.access",
+    "SafetyError": "safety",
+    "Trace": "drives",
+}
+
+register()
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Entry points of the commands of other packages: here, since `drive_env` alone is a name that nobody else uses."""
+"""Entry points of the commands: here, since `drive_env` alone is a name that nobody else uses."""
 
 from __future__ import annotations
 
@@ -17,5 +17,17 @@ def drive_tune() -> None:
         print(f"drive-tune: {error}", file=sys.stderr)
         sys.exit(USER_ERROR)
     from tuning.cli import main
+
+    main()
+
+
+def drive_env() -> None:
+    """Run `drive-env`, if the package that Python finds is ours."""
+    try:
+        check_own("drive_env", "mechanics")
+    except ForeignPackageError as error:
+        print(f"drive-env: {error}", file=sys.stderr)
+        sys.exit(USER_ERROR)
+    from drive_env.cli import main
 
     main()

@@ -25,6 +25,7 @@ from drive_env.machine import Machines
 from drive_env.misfit import warn_of_misfits
 from drive_env.motors import find_motor
 from drive_env.parameters import apply_to_records, check_parameter, draw_parameters, parameter_table
+from drive_env.process_image import ProcessImage
 from mechanics.load import Load
 from mechanics.loads import find_load
 from mechanics.model import compile_packed, copies_per_model
@@ -35,6 +36,8 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SWITCHES = ("left", "right", "home")  # bits of 60FDh
+
+MOST_IMAGES = 64  # calls of record that are kept prepared: more than any loop makes in turn
 
 BRAKE_TORQUE = 2.0  # of the motor's rated torque, usual for holding brakes
 
@@ -141,6 +144,7 @@ class EmulatedDrives:
         set_lanes(self._records, "brake_torque", np.full(self.num_axes, BRAKE_TORQUE * self.motor.rated_torque))
         self._now = 0  # cycles since the beginning
         self._schedule: list[tuple[int, str, Floats, Mask]] = []
+        self._images: dict[tuple[ObjectName | None, ...], ProcessImage] = {}  # of calls of record
         warn_of_misfits([group.load for group in self._groups], self.motor)
         self.machine = Machines(self)
         preset = {} if motor is None else self.device.preset(motor)
@@ -200,12 +204,21 @@ class EmulatedDrives:
         every = self._cycles(period)
         if every < 1:
             raise ValueError(f"period must be at least {self._cycle:g} s, not {period:g} s")
+        play = play or {}
+        call = (*objects, None, *play)
+        image = self._images.get(call)
+        if image is not None and image.scale_changes == self._objects.scale_changes:
+            values = np.empty((cycles, len(play), self.num_axes))
+            if image.play(play, values):
+                samples = np.empty((-(-cycles // every), len(image.keys), self.num_axes))
+                self._run(cycles, values, image.played, samples, image.sampled, every)
+                return self._trace(image.read(samples), len(samples), every)
         known = self._objects.entries
         entries = [known.find(name) for name in objects]
         bindings = {(e.index, e.sub): self._objects.recordable(e) for e in entries}
         live = {key: binding for key, binding in bindings.items() if binding is not None}
         sampled = channels([(b.field, b.part) for b in live.values()]) if live else NOTHING
-        values, played = self._objects.plan_play(play or {}, cycles)
+        values, played = self._objects.plan_play(play, cycles)
         rows = -(-cycles // every)
         samples = np.empty((rows, len(live), self.num_axes))
         self._run(cycles, values, played, samples, sampled, every)
@@ -215,7 +228,14 @@ class EmulatedDrives:
         for key in bindings:
             if key not in result:
                 result[key] = np.broadcast_to(self._objects.read(key), (rows, self.num_axes))
-        return Trace(np.arange(rows, dtype=np.float64) * (every * self._cycle), result, known)
+        prepared = self._objects.process_image(objects, list(play))
+        if prepared is not None and len(self._images) < MOST_IMAGES:
+            self._images[call] = prepared
+        return self._trace(result, rows, every)
+
+    def _trace(self, values: dict[tuple[int, int], Integers], rows: int, every: int) -> Trace:
+        t = np.arange(rows, dtype=np.float64) * (every * self._cycle)
+        return Trace(t, values, self._objects.entries)
 
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis."""
@@ -350,6 +370,30 @@ class EmulatedDrives:
             raise
         self._refresh_inertia()
 
+    def _apply_parameters(self, values: Mapping[str, Floats], machines: Mask) -> None:
+        """Bring several true parameters into records and mechanics, and remember them; a refusal leaves a mixture."""
+        axes_per_machine = self.load.num_axes
+        axes = np.repeat(machines, axes_per_machine)
+        self._parameters |= values
+        mechanical = [
+            name
+            for name, value in values.items()
+            if not apply_to_records(
+                self._records, self.device, self.motor, name, np.repeat(value, axes_per_machine), axes
+            )
+        ]
+        if not mechanical:
+            return
+        loads = [name.removeprefix("load.") for name in mechanical if name.startswith("load.")]
+        for group in self._groups:
+            group.load.set_all(
+                {name: self._parameters[f"load.{name}"][group.machines] for name in loads},
+                machines[group.machines],
+                self._armature()[group.machines],
+                self._bearings()[group.machines],
+            )
+        self._refresh_inertia()
+
     def _apply_to_loads(self, name: str, machines: Mask) -> None:
         values = self._parameters[name]
         for group in self._groups:
@@ -417,6 +461,8 @@ class EmulatedDrives:
                 job.result()
 
     def _report_divergence(self) -> None:
+        if not any(group.load.plant.diverged.any() for group in self._groups):
+            return
         diverged = self.machine.diverged
         new = np.flatnonzero(diverged & ~self._reported)
         self._reported = diverged

@@ -5,8 +5,8 @@ Reading and writing check type, access, range and state exactly as the bus does;
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +31,8 @@ from drive_env.firmware.fsa import State
 from drive_env.firmware.modes import MODES
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.group import Channels, channels
+from drive_env.lane_image import LaneImage
+from drive_env.process_image import SCALES, SPECIAL_UNITS, ProcessImage, Row
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -39,6 +41,7 @@ Mask = NDArray[np.bool_]
 _EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
 POSITION_SCALER = (0x2058, 0)
+MODE_OF_OPERATION = (0x6060, 0)
 
 
 class LiveDictionary:
@@ -56,6 +59,8 @@ class LiveDictionary:
         self.entries: ObjectDictionary = device.new_dictionary()
         self._records = records
         self.num_axes = num_axes
+        self._scale_changes = 0
+        self._image: LaneImage | None = None  # of what a restart restores
         self._values: dict[tuple[int, int], Integers | str] = {}
         self._stored = self._commission(preset)
 
@@ -80,9 +85,81 @@ class LiveDictionary:
 
     def restart(self, axes: Mask) -> None:
         """Restore the stored values of the axes where the mask is true, and start their firmware anew."""
-        for key in sorted(self._stored, key=lambda key: key != POSITION_SCALER):
-            self._restore(self.entries.find(key), self._stored[key], axes)
+        before = self._context()
+        if self._image is None:
+            self._image = self._stored_image()
+        self._image.restore(axes)
+        chosen = np.flatnonzero(axes)
+        for key, raw in self._stored.items():
+            values = self._values.get(key)
+            if isinstance(values, np.ndarray):
+                values[chosen] = raw[chosen]
+        after = self._context()
+        if np.any(before.position_scaler != after.position_scaler) or np.any(
+            before.encoder_steps != after.encoder_steps
+        ):
+            self._scale_changes += 1
         cycle.power_on(self._records, axes)
+
+    @property
+    def records(self) -> NDArray[np.void]:
+        """The axes' records."""
+        return self._records
+
+    def unbound(self, entry: Entry) -> Integers | str:
+        """Return the values of an object that no field of the record is, one per axis, not a copy; or its text."""
+        return self._values[entry.index, entry.sub]
+
+    def stored(self, axis: int) -> dict[tuple[int, int], int]:
+        """Return what a restart restores on one axis."""
+        return {key: int(raw[axis]) for key, raw in self._stored.items()}
+
+    def store(self, axis: int, values: Mapping[tuple[int, int], int]) -> None:
+        """Set what a restart restores on one axis; the values are those of objects that exist, within their range."""
+        for key, raw in values.items():
+            self._stored[key][axis] = raw
+        self._image = None
+
+    def write_checked(self, entry: Entry, raw: int, axis: int) -> None:
+        """Write an object of one axis that was checked before."""
+        where = np.zeros(self.num_axes, bool)
+        where[axis] = True
+        self._write(entry, np.full(self.num_axes, raw, np.int64), where)
+
+    @property
+    def scale_changes(self) -> int:
+        """How often the scale of positions has been written, on whatever axis."""
+        return self._scale_changes
+
+    def process_image(self, sampled: Sequence[ObjectName], played: Sequence[ObjectName]) -> ProcessImage | None:
+        """Return what a call of `record` needs when it repeats, None if an object needs the long way.
+
+        The call was made before, so that everything was found that could be refused but values.
+        """
+        entries = [self.entries.find(name) for name in sampled]
+        inputs = [self.entries.find(name) for name in played]
+        for entry in entries + inputs:
+            binding = self.device.bindings.get((entry.index, entry.sub))
+            if binding is None or binding.unit in SPECIAL_UNITS:
+                return None
+        if any(allowed_values(self.device, entry) is not None for entry in inputs):
+            return None
+        outputs = list({(entry.index, entry.sub): entry for entry in entries}.values())
+        rows, sources = [self._row(entry) for entry in outputs], [self._row(entry) for entry in inputs]
+        if any(row.binding.field in SCALES for row in sources):
+            return None
+        into = channels(
+            [(row.binding.field, row.binding.part) for row in sources], [_EVENTS[row.binding.event] for row in sources]
+        )
+        out_of = channels([(row.binding.field, row.binding.part) for row in rows])
+        return ProcessImage((into, sources), (out_of, rows), self._scale_changes)
+
+    def _row(self, entry: Entry) -> Row:
+        binding = self.device.bindings[entry.index, entry.sub]
+        factor = np.broadcast_to(units.UNITS[binding.unit].factor(self._context()), (self.num_axes,))
+        assert entry.low is not None and entry.high is not None, "only numbers are bound"
+        wraps = (entry.index, entry.sub) in units.WRAPPING
+        return Row(entry, binding, np.array(factor, float), wraps, entry.low, entry.high)
 
     def recordable(self, entry: Entry) -> Binding | None:
         """Return the binding of an entry whose value changes by itself, None of one that only a write changes."""
@@ -148,6 +225,17 @@ class LiveDictionary:
         else:
             self._set_value(entry, raw, where)
 
+    def _stored_image(self) -> LaneImage:
+        """Return the fields that `_restore` would set from what is stored, converted by the scales that are stored."""
+        steps = next(key for key, binding in self.device.bindings.items() if binding.field == "encoder_steps")
+        context = self._context()._replace(
+            position_scaler=self._stored[POSITION_SCALER].astype(float), encoder_steps=self._stored[steps].astype(float)
+        )
+        bound = [key for key in self._stored if key in self.device.bindings]
+        rows = [self.device.bindings[key] for key in bound if self.entries.find(key).access not in ("ro", "const")]
+        values = [self._from_od(row, self._stored[row.index, row.sub], context) for row in rows]
+        return LaneImage(self._records, [(row.field, row.part) for row in rows], np.array(values))
+
     def _is_bound(self, entry: Entry) -> bool:
         return (entry.index, entry.sub) in self.device.bindings
 
@@ -180,43 +268,31 @@ class LiveDictionary:
         assert low is not None and high is not None, "only numbers are bound"
         return units.to_od(binding.unit, value, self._context(), low, high)
 
-    def _from_od(self, binding: Binding, raw: NDArray[Any]) -> Floats:
+    def _from_od(self, binding: Binding, raw: NDArray[Any], context: units.Context | None = None) -> Floats:
+        scales = self._context() if context is None else context
         if binding.unit == "position window":
-            return units.window_from_od(raw, self._context())
+            return units.window_from_od(raw, scales)
         if binding.unit == "position limit":
-            return units.limit_from_od(raw, self._context())
-        return units.from_od(binding.unit, raw, self._context())
+            return units.limit_from_od(raw, scales)
+        return units.from_od(binding.unit, raw, scales)
 
     def _check(self, entry: Entry, raw: Integers, where: Mask) -> None:
         self._check_value(entry, raw[where])
         key = (entry.index, entry.sub)
         if key in self.device.write_states:
-            needed = State[self.device.write_states[key]]
             states = get_lanes(self._records, "fsa", self.num_axes)[where]
-            wrong = states[states != needed]
-            if wrong.size:
-                raise ObjectAccessError(
-                    WRONG_STATE,
-                    f"{entry.label} can only be written in {_state_name(needed)}; the drive is in "
-                    f"{_state_name(State(int(wrong[0])))}",
-                )
-        if key == (0x6060, 0) and self.device.refuses_same_mode:
+            for state in np.unique(states):
+                check_state(self.device, entry, int(state))
+        if key == MODE_OF_OPERATION and self.device.refuses_same_mode:
             same = raw[where] == get_lanes(self._records, "mode", self.num_axes)[where]
             if np.any(same):
-                raise ObjectAccessError(
-                    WRONG_STATE,
-                    f"{entry.label} is {raw[where][same][0]} already, and this drive refuses the same mode twice; "
-                    "read 6061h first",
-                )
+                refuse_same_mode(entry, int(raw[where][same][0]))
 
     def _check_value(self, entry: Entry, raw: Integers) -> None:
-        key = (entry.index, entry.sub)
-        if key in self.device.unsupported:
-            raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} has no service behind it in this emulator")
-        if key in self.device.allowed_values:
-            check_allowed(entry, raw, self.device.allowed_values[key])
-        if key == (0x6060, 0):
-            check_allowed(entry, raw, tuple(mode.number for mode in MODES))
+        check_supported(self.device, entry)
+        allowed = allowed_values(self.device, entry)
+        if allowed is not None:
+            check_allowed(entry, raw, allowed)
 
     def _write(self, entry: Entry, raw: Integers, where: Mask) -> None:
         key = (entry.index, entry.sub)
@@ -251,12 +327,46 @@ class LiveDictionary:
 
     def _set_field(self, entry: Entry, raw: Integers, where: Mask) -> None:
         binding = self.device.bindings[entry.index, entry.sub]
+        if binding.field in SCALES:
+            self._scale_changes += 1
         set_lanes(self._records, binding.field, self._from_od(binding, raw), where, binding.part)
 
     def _set_value(self, entry: Entry, raw: Integers, where: Mask) -> None:
         key = (entry.index, entry.sub)
         before = self._values.get(key)
         self._values[key] = raw.copy() if before is None else np.where(where, raw, before)
+
+
+# --- what the device allows, the same for a set of axes and for the one axis of a node --------------------------------
+def check_supported(device: Device, entry: Entry) -> None:
+    """Raise 08000020h for an object whose write would need a service that is not there."""
+    if (entry.index, entry.sub) in device.unsupported:
+        raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} has no service behind it in this emulator")
+
+
+def allowed_values(device: Device, entry: Entry) -> tuple[int, ...] | None:
+    """Return the few values that an object knows, None if it takes its whole range."""
+    if (entry.index, entry.sub) == MODE_OF_OPERATION:
+        return tuple(mode.number for mode in MODES)
+    return device.allowed_values.get((entry.index, entry.sub))
+
+
+def check_state(device: Device, entry: Entry, state: int) -> None:
+    """Raise 08000022h for an object that cannot be written while the drive is in this state."""
+    needed = State[device.write_states[entry.index, entry.sub]]
+    if state != needed:
+        raise ObjectAccessError(
+            WRONG_STATE,
+            f"{entry.label} can only be written in {_state_name(needed)}; the drive is in {_state_name(State(state))}",
+        )
+
+
+def refuse_same_mode(entry: Entry, mode: int) -> NoReturn:
+    """Raise 08000022h: the mode is what it is already."""
+    raise ObjectAccessError(
+        WRONG_STATE,
+        f"{entry.label} is {mode} already, and this drive refuses the same mode twice; read 6061h first",
+    )
 
 
 def _state_name(state: State) -> str:

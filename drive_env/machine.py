@@ -5,12 +5,14 @@ A task may use it to make a world, never to act; `drives.machine` is None on a r
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.firmware.record import STATE, get_lanes, set_lanes
+from drive_env.lane_image import LaneImage
 from drive_env.parameters import check_parameter
 
 if TYPE_CHECKING:
@@ -27,6 +29,7 @@ class Machines:
 
     def __init__(self, drives: EmulatedDrives) -> None:
         self._drives = drives
+        self._rest: LaneImage | None = None  # state of a machine at rest
 
     @property
     def parameters(self) -> dict[str, Floats]:
@@ -223,6 +226,46 @@ class Machines:
         drives._apply_parameter(name, values, mask)
         drives._parameters[name] = values
 
+    def set_all(self, values: Mapping[str, ArrayLike], where: Mask | None = None) -> None:
+        """Set several true parameters [SI] at once; bad input changes nothing.
+
+        Only the machine that results must be one that can be, not those on the way to it; and a machine's inertias
+        are derived once, which is what `set` spends its time with.
+
+        Args:
+            values: Parameter -> one value, or one per machine.
+            where: Machines.
+
+        Raises:
+            ValueError: As in `set`.
+        """
+        drives = self._drives
+        mask = self._mask(where)
+        new: dict[str, Floats] = {}
+        for name, value in values.items():
+            if name not in drives._parameters:
+                raise ValueError(f"machines have no parameter {name!r}; they have {', '.join(drives._parameters)}")
+            check_parameter(name, self._per_machine(value, name)[mask])
+            new[name] = np.where(mask, self._per_machine(value, name), drives._parameters[name])
+        before = {name: drives._parameters[name] for name in new}
+        try:
+            drives._apply_parameters(new, mask)
+        except ValueError:
+            drives._apply_parameters(before, mask)
+            raise
+
+    def seed_noise(self, seeds: ArrayLike, where: Mask | None = None) -> None:
+        """Give machines another noise from their next reset on: whole numbers 1...2^32 - 1, shape (num_machines,)."""
+        mask = self._mask(where)
+        chosen = np.asarray(seeds, float)
+        if chosen.shape != mask.shape or np.any((chosen < 1.0) | (chosen >= 2.0**32)):
+            raise ValueError(f"noise takes {len(mask)} seeds of 1...{2**32 - 1}, one per machine")
+        axes = self._drives.num_axes // self._drives.num_machines
+        # As when machines are drawn: every axis has a noise of its own.
+        apart = np.repeat(chosen, axes) + np.tile(np.arange(axes), len(mask))
+        every = np.repeat(mask, axes)
+        self._drives._noise_seeds[every] = (np.mod(apart, 2.0**32 - 1.0) + 1.0)[every]
+
     def reset(self, where: Mask | None = None) -> None:
         """Put machines to rest at zero and switch their drives on anew; a diverged machine lives again."""
         mask = self._mask(where)
@@ -230,9 +273,11 @@ class Machines:
         for group in drives._groups:
             group.load.reset(mask[group.machines])
         axes = np.repeat(mask, drives.num_axes // drives.num_machines)
-        for field in STATE:
-            for part in range(field.depth):
-                set_lanes(drives._records, field.name, np.full(drives.num_axes, field.initial), axes, part)
+        if self._rest is None:
+            parts = [(field, part) for field in STATE for part in range(field.depth)]
+            initial = np.array([[field.initial] for field, _ in parts])
+            self._rest = LaneImage(drives._records, [(field.name, part) for field, part in parts], initial)
+        self._rest.restore(axes)
         set_lanes(drives._records, "random", drives._noise_seeds, axes)
         for live, nominal in (("R_s", "R_nominal"), ("psi_m", "psi_nominal")):
             set_lanes(drives._records, live, get_lanes(drives._records, nominal, drives.num_axes), axes)

@@ -23,6 +23,9 @@ FAULT_BIT = (0x08, 0x08)  # fault or fault reaction active
 TARGET_REACHED = (0x0400, 0x0400)
 SET_POINT_ACKNOWLEDGED = (0x1000, 0x1000)
 SET_POINT_TAKEN_BACK = (0x1000, 0x0000)
+# Homing: bits 13 (error), 12 (attained) and 10 (at rest); 13 stays 0 on drives that do not support it.
+HOMING_BITS = 0x3400
+HOMED, HOMING_UNDER_WAY = 0x1400, (0x0000, 0x1000)
 
 STEP = 0.001  # time between two looks at the statusword [s]
 
@@ -170,3 +173,36 @@ def move_to(
     """
     start_move(drives, position, relative=relative, where=where)
     wait_for(drives, TARGET_REACHED, timeout, "target reached", where)
+
+
+def home(drives: Drives, where: Mask | None = None, timeout: float = 60.0) -> None:
+    """Run the homing method of 6098h and wait until home is attained; the axes are enabled, in hm, afterwards.
+
+    Raises:
+        RuntimeError: If an axis gives up, or ends in fault.
+        TimeoutError: If home is not attained within `timeout` [s].
+    """
+    axes = np.ones(drives.num_axes, bool) if where is None else where
+    enable(drives, mode="hm", where=where)
+    drives.write(0x6040, 0x0F, where=where)  # bit 4 must rise
+    drives.write(0x6040, 0x1F, where=where)
+    waited = 0.0
+    while True:
+        drives.advance(2 * STEP)  # the first look comes after the drive has begun
+        waited += 2 * STEP
+        status = drives.read(0x6041)
+        fault = axes & (status & FAULT_BIT[0] == FAULT_BIT[1])
+        bits = status & HOMING_BITS
+        failed = axes & ~fault & (bits != HOMED) & ~np.isin(bits, HOMING_UNDER_WAY)
+        if fault.any() or failed.any():
+            axis = int(np.flatnonzero(fault | failed)[0])
+            what = "is in fault while homing; see emergencies()" if fault[axis] else "gave up homing"
+            raise RuntimeError(
+                f"axis {axis} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
+            )
+        if not np.any(axes & (bits != HOMED)):
+            break
+        if waited >= timeout:
+            axis = int(np.flatnonzero(axes & (bits != HOMED))[0])
+            raise TimeoutError(f"axis {axis} did not attain home in {timeout:g} s: statusword {status[axis]:04X}h")
+    drives.write(0x6040, 0x0F, where=where)

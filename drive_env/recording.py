@@ -99,6 +99,12 @@ class Recorder:
             trace = self.drives.record(_RECORDED, CYCLE)
             self._rows.append(np.array([trace[name][0, self._axes] for name in _RECORDED], np.float64))
 
+    def look(self) -> None:
+        """Remember how things stand now, as one communication cycle, while someone else lets time pass."""
+        self._joints.append(self.drives.machine.joint_positions[self._machine])
+        self._load_torque.append(float(self.drives.machine.load_torque[self._machine]))
+        self._rows.append(np.array([self.drives.read(name)[self._axes] for name in _RECORDED], np.float64))
+
     def mark(self, text: str) -> None:
         """Remember what happens from now on; it is shown beside the machine."""
         self._events.append((self.now, text))

@@ -99,7 +99,8 @@ class Load:
         mjcf: The MuJoCo model: the load's masses, without rotors. Hinge and slide joints only.
         joints: The joints, or fixed tendons, that the drives turn, in the order of the axes. Of a model without an
             answer here, its actuators' are taken, or its only joint.
-        gear: Rotor angle per unit of each axis's joint [1 or rad/m]: one for all or one each.
+        gear: Rotor angle per unit of each axis's joint [1 or rad/m]: one for all or one each. Where the joints are the
+            actuators', theirs.
         name: For messages; the file's by default.
         disturbance: The motion on which the external load torque (force) acts; the first joint by default. A load
             with a roll is pulled at its web instead.

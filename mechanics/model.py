@@ -42,7 +42,7 @@ def resolve(load: Load) -> Load:
         ValueError: With the joints and tendons that there are.
     """
     model = read_model(load)
-    joints = load.joints or _joints_of_actuators(model) or (_joint_names(model) if model.njnt == 1 else ())
+    joints = load.joints or tuple(_actuators(model)) or (_joint_names(model) if model.njnt == 1 else ())
     there = (
         f"the model has the joints {', '.join(_joint_names(model)) or '(none)'} and the fixed tendons "
         f"{', '.join(_fixed_tendons(model)) or '(none)'}"
@@ -57,6 +57,9 @@ def resolve(load: Load) -> Load:
     if isinstance(load.gear, tuple) and len(load.gear) != len(joints):
         raise ValueError(f"load {load.name!r} has {len(joints)} driven joints and {len(load.gear)} gears")
     gears = load.gear if isinstance(load.gear, tuple) else (float(load.gear),) * len(joints)
+    if not load.joints and load.gear == 1.0:
+        # MuJoCo's gear of an actuator is what ours is: the rotor's angle per unit of its joint.
+        gears = tuple(_actuators(model).get(name, 1.0) for name in joints)
     if not all(np.isfinite(gear) and gear != 0.0 for gear in gears):
         raise ValueError(f"load {load.name!r}: a gear must be finite and not 0, not {load.gear}")
     named: list[tuple[str, Combination]] = [("disturbance", load.disturbance), ("start", load.start)]
@@ -235,15 +238,16 @@ def _motion(model: mujoco.MjModel, name: str) -> Combination:
     return {model.joint(int(model.wrap_objid[k])).name: float(model.wrap_prm[k]) for k in range(first, first + count)}
 
 
-def _joints_of_actuators(model: mujoco.MjModel) -> tuple[str, ...]:
-    names = []
+def _actuators(model: mujoco.MjModel) -> dict[str, float]:
+    """Return the joints and tendons that actuators turn, each with the actuator's gear."""
+    joint, tendon = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_TENDON)
+    gears: dict[str, float] = {}
     for k in range(model.nu):
         target = int(model.actuator_trnid[k, 0])
-        if model.actuator_trntype[k] == int(mujoco.mjtTrn.mjTRN_JOINT):
-            names.append(model.joint(target).name)
-        elif model.actuator_trntype[k] == int(mujoco.mjtTrn.mjTRN_TENDON):
-            names.append(model.tendon(target).name)
-    return tuple(dict.fromkeys(names))
+        if model.actuator_trntype[k] in (joint, tendon):
+            turned = model.joint(target) if model.actuator_trntype[k] == joint else model.tendon(target)
+            gears.setdefault(turned.name, float(model.actuator_gear[k, 0]))
+    return gears
 
 
 def _joint_friction(model: mujoco.MjModel) -> tuple[Friction, ...]:

@@ -188,6 +188,32 @@ class PackedLoad:
         self._friction[:, : self.num_axes, :4] = friction
         self._apply()
 
+    def set_all(
+        self, parameters: Mapping[str, Floats], where: NDArray[np.bool_], armature: Floats, friction: Floats
+    ) -> None:
+        """Set parameters of the copies where the mask is true, and all motors as `set_motor` does, at once.
+
+        ValueError leaves all as it was.
+        """
+        if np.any(armature <= 0.0) or np.any(friction < 0.0):
+            raise ValueError(
+                f"rotor inertia must be above 0 and friction not negative; the least are {armature.min():g} kg*m^2 "
+                f"and {friction.min():g}"
+            )
+        before = {name: self.get(name) for name in parameters}
+        motors = self._armature.copy(), self._friction[:, : self.num_axes, :4].copy()
+        try:
+            for name, values in parameters.items():
+                self._store(self._parameter(name), np.asarray(values, float)[where], where)
+            self._armature[:], self._friction[:, : self.num_axes, :4] = armature, friction
+            self._apply()
+        except ValueError:
+            for name, values in before.items():
+                self._store(self._parameter(name), values, slice(None))
+            self._armature[:], self._friction[:, : self.num_axes, :4] = motors
+            self._apply()
+            raise
+
     def reset(self, where: NDArray[np.bool_]) -> None:
         """Put the copies where the mask is true to rest at their start; a frozen one lives again."""
         for k in np.flatnonzero(where):

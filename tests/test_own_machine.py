@@ -144,6 +144,13 @@ def test_the_model_s_actuators_say_what_is_driven(file, actuators, joints):
     assert find_load(Load(file(two(actuators)), joints="x")).joints == ("x",)
 
 
+def test_an_actuator_s_gear_is_the_drive_s_unless_one_is_given(file):
+    path = file(two('<motor joint="turn" gear="-20"/><motor joint="x"/>'))
+    assert find_load(path).gears == (-20.0, 1.0)
+    assert find_load(Load(path, gear=3.0)).gears == (3.0, 3.0)
+    assert find_load(Load(path, joints=("turn",))).gears == (1.0,)
+
+
 THERE = r"the model has the joints x, turn and the fixed tendons belt"
 
 

@@ -6,7 +6,7 @@ import importlib
 import tomllib
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import ObjectDictionary
@@ -30,6 +30,56 @@ class Emergency(NamedTuple):
 
     code: int
     extra: tuple[int, ...]
+
+
+class AxisOffset(NamedTuple):
+    """A range of indices of axis 0, and the step from each to the same object of the next axis."""
+
+    first: int
+    last: int
+    step: int
+
+
+class CanopenBehaviour(NamedTuple):
+    """What a device does on a CANopen bus; times in s.
+
+    Attributes:
+        sdo_timeout: Time after which the server gives a transfer up.
+        inhibit_unit: Unit of a TPDO's inhibit time.
+        event_unit: Unit of a TPDO's event timer.
+        error_behaviour: Value of 1029h -> NMT state that the node enters, or "stay".
+        objects: Role -> object, of what belongs to the module and not to an axis.
+        save_signature: What 1010h wants to be written.
+        load_signature: What 1011h wants to be written.
+        bootloader_signature: What the bootloader's object wants to be written.
+        store_groups: Sub-index of 1010h and 1011h -> sections that it stores and restores.
+    """
+
+    sdo_timeout: float
+    inhibit_unit: float
+    event_unit: float
+    error_behaviour: dict[int, str]
+    objects: dict[str, tuple[int, int]]
+    save_signature: int
+    load_signature: int
+    bootloader_signature: int
+    store_groups: dict[int, tuple[str, ...]]
+
+
+class MasterHints(NamedTuple):
+    """What a master must know of a device besides its EDS; times in s.
+
+    Attributes:
+        rpdo_type: Transmission type of an RPDO that waits for SYNC.
+        current_limit: Object that limits the current, in the unit of 6077h.
+        timeout: Longest wait for an answer.
+        timeouts: Index -> longest wait, of objects that take longer.
+    """
+
+    rpdo_type: int
+    current_limit: tuple[int, int]
+    timeout: float
+    timeouts: dict[int, float]
 
 
 class Device(NamedTuple):
@@ -60,10 +110,21 @@ class Device(NamedTuple):
     emergencies: dict[str, Emergency]
     stage: dict[str, StageParameter]
     presets: Path
+    axis_offsets: tuple[AxisOffset, ...]
+    canopen: CanopenBehaviour
+    master: MasterHints
 
     def new_dictionary(self, node_id: int = 1) -> ObjectDictionary:
         """Return the object dictionary of a node of this device."""
         return ObjectDictionary(self.eds, node_id)
+
+    def locate(self, index: int) -> tuple[int, int]:
+        """Return the axis that an object belongs to, and the index of the same object of axis 0."""
+        for offset in self.axis_offsets:
+            axis, above = divmod(index - offset.first, offset.step)
+            if 0 <= axis < self.num_axes and offset.first + above <= offset.last:
+                return axis, offset.first + above
+        return 0, index
 
     def preset(self, motor: str) -> dict[str, int]:
         """Return the commissioning preset of a motor: object name -> raw value, in the order of writing."""
@@ -113,6 +174,32 @@ def find_device(name: str) -> Device:
         emergencies={n: Emergency(e["code"], tuple(e["bytes"])) for n, e in data["emergencies"].items()},
         stage={n: StageParameter(**row) for n, row in data["stage"].items()},
         presets=folder / "presets",
+        axis_offsets=tuple(AxisOffset(**row) for row in data["axis_offsets"]),
+        canopen=_canopen(data["canopen"]),
+        master=_master(data["master"]),
+    )
+
+
+def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
+    return CanopenBehaviour(
+        sdo_timeout=data["sdo_timeout"],
+        inhibit_unit=data["inhibit_unit"],
+        event_unit=data["event_unit"],
+        error_behaviour={int(value): state for value, state in data["error_behaviour"].items()},
+        objects={role: _key(text) for role, text in data["objects"].items()},
+        save_signature=data["save_signature"],
+        load_signature=data["load_signature"],
+        bootloader_signature=data["bootloader_signature"],
+        store_groups={int(sub): tuple(sections) for sub, sections in data["store_groups"].items()},
+    )
+
+
+def _master(data: dict[str, Any]) -> MasterHints:
+    return MasterHints(
+        rpdo_type=data["rpdo_type"],
+        current_limit=_key(data["current_limit"]),
+        timeout=data["timeout"],
+        timeouts={int(index, 16): time for index, time in data["timeouts"].items()},
     )
 
 

@@ -11,16 +11,27 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
 
 # Abort codes of CiA 301 (table 22 of version 4.2).
+TOGGLE_NOT_ALTERNATED = 0x05030000
+PROTOCOL_TIMED_OUT = 0x05040000
+UNKNOWN_COMMAND = 0x05040001
+UNSUPPORTED_ACCESS = 0x06010000
 WRITE_ONLY = 0x06010001
 READ_ONLY = 0x06010002
 NO_SUCH_OBJECT = 0x06020000
+CANNOT_BE_MAPPED = 0x06040041
+PDO_LENGTH_EXCEEDED = 0x06040042
+INCOMPATIBLE_PARAMETER = 0x06040043
+HARDWARE_ERROR = 0x06060000
 WRONG_TYPE = 0x06070010
+TOO_LONG = 0x06070012
+TOO_SHORT = 0x06070013
 NO_SUCH_SUB_INDEX = 0x06090011
 VALUE_RANGE = 0x06090030
 VALUE_TOO_HIGH = 0x06090031
 VALUE_TOO_LOW = 0x06090032
 CANNOT_BE_STORED = 0x08000020
 WRONG_STATE = 0x08000022
+NO_DATA = 0x08000024
 
 
 class ObjectAccessError(Exception):
@@ -97,15 +108,20 @@ def check_allowed(entry: Entry, raw: NDArray[np.int64], allowed: tuple[int, ...]
         )
 
 
-def _check_range(entry: Entry, raw: NDArray[Any]) -> None:
-    if raw.size == 0 or entry.low is None or entry.high is None:
+def check_limits(entry: Entry, raw: int) -> None:
+    """Raise 06090031h or 06090032h unless one integer is within the entry's range."""
+    if entry.low is None or entry.high is None:
         return
-    if int(raw.max()) > entry.high:
-        raise ObjectAccessError(
-            VALUE_TOO_HIGH, f"{entry.label} cannot be {int(raw.max())}; its highest is {entry.high}"
-        )
-    if int(raw.min()) < entry.low:
-        raise ObjectAccessError(VALUE_TOO_LOW, f"{entry.label} cannot be {int(raw.min())}; its lowest is {entry.low}")
+    if raw > entry.high:
+        raise ObjectAccessError(VALUE_TOO_HIGH, f"{entry.label} cannot be {raw}; its highest is {entry.high}")
+    if raw < entry.low:
+        raise ObjectAccessError(VALUE_TOO_LOW, f"{entry.label} cannot be {raw}; its lowest is {entry.low}")
+
+
+def _check_range(entry: Entry, raw: NDArray[Any]) -> None:
+    if raw.size:
+        check_limits(entry, int(raw.max()))
+        check_limits(entry, int(raw.min()))
 
 
 def _describe(raw: NDArray[Any]) -> str:

@@ -24,14 +24,11 @@ from drive_env.dictionary.access import (
 ObjectName: TypeAlias = int | tuple[int, int] | str
 
 # Width [bits], least and greatest value of each integer type of CiA 301.
+_WIDTHS = (8, 16, 24, 32, 40, 48, 56, 64)
 INTEGER_TYPES = {
     datatypes.BOOLEAN: (1, 0, 1),
-    datatypes.INTEGER8: (8, -(2**7), 2**7 - 1),
-    datatypes.INTEGER16: (16, -(2**15), 2**15 - 1),
-    datatypes.INTEGER32: (32, -(2**31), 2**31 - 1),
-    datatypes.UNSIGNED8: (8, 0, 2**8 - 1),
-    datatypes.UNSIGNED16: (16, 0, 2**16 - 1),
-    datatypes.UNSIGNED32: (32, 0, 2**32 - 1),
+    **{getattr(datatypes, f"INTEGER{bits}"): (bits, -(2 ** (bits - 1)), 2 ** (bits - 1) - 1) for bits in _WIDTHS},
+    **{getattr(datatypes, f"UNSIGNED{bits}"): (bits, 0, 2**bits - 1) for bits in _WIDTHS},
 }
 
 
@@ -49,6 +46,7 @@ class Entry:
     default: int | str
     unit: str
     pdo_mappable: bool
+    signed: bool = False
 
     @property
     def label(self) -> str:
@@ -56,26 +54,31 @@ class Entry:
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
+def read_eds(path: Path, node_id: int = 1) -> canopen.ObjectDictionary:
+    """Return python-canopen's model of an EDS; a file that is not UTF-8 is read as cp1252, which many vendors' are."""
+    raw = path.read_bytes()
+    try:
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError:
+        text = raw.decode("cp1252")
+    source = io.StringIO(text)
+    source.name = str(path)
+    return canopen.import_od(source, node_id)
+
+
 class ObjectDictionary:
     """All entries of a device, from its EDS.
 
     Args:
-        path: The EDS; a file that is not UTF-8 is read as cp1252, which many vendors' are.
+        path: The EDS.
         node_id: For defaults that depend on it.
     """
 
     def __init__(self, path: Path, node_id: int = 1) -> None:
         self.path = path
-        raw = path.read_bytes()
-        try:
-            text = raw.decode("utf-8")
-        except UnicodeDecodeError:
-            text = raw.decode("cp1252")
-        source = io.StringIO(text)
-        source.name = str(path)
         self._entries: dict[tuple[int, int], Entry] = {}
         self._names: dict[str, tuple[int, int]] = {}
-        for item in canopen.import_od(source, node_id).values():
+        for item in read_eds(path, node_id).values():
             if isinstance(item, ODVariable):
                 self._add(item, item.name)
             else:
@@ -124,14 +127,25 @@ class ObjectDictionary:
         default: int | str
         if kind is None:
             bits = low = high = None
+            signed = False
             default = str(variable.default or "")
         else:
             bits, low, high = kind
+            signed = low < 0
             low = low if variable.min is None else int(variable.min)
             high = high if variable.max is None else int(variable.max)
             default = int(variable.default or 0)
         key = (variable.index, variable.subindex)
         self._entries[key] = Entry(
-            *key, name, bits, variable.access_type, low, high, default, variable.unit, bool(variable.pdo_mappable)
+            *key,
+            name,
+            bits,
+            variable.access_type,
+            low,
+            high,
+            default,
+            variable.unit,
+            bool(variable.pdo_mappable),
+            signed,
         )
         self._names[name.casefold()] = key

@@ -6,6 +6,7 @@ the nearest integer and saturates at the range of the entry's type, as a convert
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,8 +20,8 @@ TWO_PI = 2.0 * np.pi
 class Context(NamedTuple):
     """What factors depend on, one value per axis or one for all."""
 
-    position_scaler: Floats  # [inc/rev], 2058h
-    encoder_steps: Floats  # [1/rev], 2080h:02
+    position_scaler: Floats | float  # [inc/rev], 2058h
+    encoder_steps: Floats | float  # [1/rev], 2080h:02
     current_lsb: float  # [A] per LSB of the current loop
 
 
@@ -113,3 +114,46 @@ def window_to_od(window: NDArray[Any], context: Context) -> NDArray[np.int64]:
     """Return 6067h of a position window [rad]; inf is FFFFFFFFh."""
     raw = to_od("inc", np.where(np.isinf(window), 0.0, window), context, 0, NO_WINDOW - 1)
     return np.where(np.isinf(window), NO_WINDOW, raw)
+
+
+# --- the same for one value, in plain floats: a fieldbus node converts a few values a thousand times a second ---------
+def factor_of_one(unit: str, context: Context) -> float:
+    """Return SI per drive unit of one axis, whose context holds plain floats; a scale of 0 gives inf, as above."""
+    try:
+        return float(UNITS["inc" if unit in ("position window", "position limit") else unit].factor(context))
+    except ZeroDivisionError:
+        return math.inf
+
+
+def one_from_od(unit: str, raw: int, factor: float) -> float:
+    """Return the SI value of one integer on the wire."""
+    if unit == "position window" and raw == NO_WINDOW:
+        return math.inf
+    if unit == "position limit" and raw in (2**31 - 1, -(2**31)):
+        return math.inf if raw > 0 else -math.inf
+    return raw * factor
+
+
+def one_to_od(unit: str, value: float, factor: float, low: int, high: int) -> int:
+    """Return the integer on the wire of one SI value: rounded, saturated at low and high; nan gives 0."""
+    if unit == "position window":
+        if math.isinf(value):
+            return NO_WINDOW
+        high = NO_WINDOW - 1
+    elif unit == "position limit" and math.isinf(value):
+        return 2**31 - 1 if value > 0.0 else -(2**31)
+    quotient = value / factor
+    if quotient != quotient:
+        return 0
+    if math.isinf(quotient):
+        return 0 if unit == "1/65536 turn" else high if quotient > 0.0 else low
+    raw = round(quotient)
+    if unit == "1/65536 turn":
+        raw = (raw + 32768) % 65536 - 32768
+    return low if raw < low else high if raw > high else raw
+
+
+def one_wrapped(value: float, factor: float) -> int:
+    """Return the increments of one SI value, wrapped as a counter of 32 bits; what is no number gives 0."""
+    quotient = value / factor
+    return (round(quotient) + 2**31) % 2**32 - 2**31 if math.isfinite(quotient) else 0

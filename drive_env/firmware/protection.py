@@ -7,10 +7,13 @@ fault reaction of 605Eh, a limit of travel stops the axis and stays enabled, a w
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
+import mechanics.compiled
 from drive_env.firmware import alignment, fsa, inputs
-from mechanics.compiled import stage
+from drive_env.firmware.record import LANES
+from mechanics.compiled import cached, stage
 
 CUT, STOP, LIMIT, WARN = 0, 1, 2, 3
 
@@ -45,6 +48,8 @@ CAUSES = (
     Cause("negative_software_limit", LIMIT, 0x20, 0x0),
     Cause("positive_limit_switch", LIMIT, 0x20, 0x0),
     Cause("negative_limit_switch", LIMIT, 0x20, 0x0),
+    # From outside the axis (`trip`): its network was stopped or lost.
+    Cause("communication_error", STOP, 0x10, 0x0),
 )
 (
     _RESET,
@@ -66,6 +71,7 @@ CAUSES = (
     NEGATIVE_SOFTWARE,
     POSITIVE_SWITCH,
     NEGATIVE_SWITCH,
+    COMMUNICATION,
 ) = range(len(CAUSES))
 GENERIC_ERROR = 0x01  # bit 0 of 1001h is set with every error
 BLOCKS_NEGATIVE, BLOCKS_POSITIVE = 1, 2
@@ -222,6 +228,25 @@ def protect(drive, lane, dt):
                 fsa.fault(drive, lane, cut)
         if push_emergency:
             fsa.push_emergency(drive, lane, cause)
+
+
+@cached(Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
+def trip(records, first_axis, num_axes, cause):
+    """Take axes that are in operation enabled into fault, with the reaction of a cause that is outside of them.
+
+    Whoever knows the cause tells it: no emergency is queued. Returns how many axes were taken.
+    """
+    taken = 0
+    for axis in range(first_axis, first_axis + num_axes):
+        drive = records[axis // LANES]
+        lane = axis % LANES
+        if drive.fsa[lane] != fsa.ENABLED:
+            continue
+        drive.fault[lane] = cause + 1
+        drive.error_register[lane] |= GENERIC_ERROR | _REGISTER[cause]
+        fsa.fault(drive, lane, _CUTS & (1 << cause) != 0)
+        taken += 1
+    return taken
 
 
 @stage

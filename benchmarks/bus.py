@@ -1,0 +1,144 @@
+"""Figures of the bus: SDO per second in-process and through the hub, PDO latency, lateness of the 1 kHz cycle."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import can
+
+from drive_env import EmulatedDrives
+from drive_env.bus.world import World
+from drive_env.canopen.frames import Frame
+
+SECONDS = 5.0  # of 1 kHz SYNC
+TRANSFERS = 2000
+READ_STATUSWORD = bytes.fromhex("40 41 60 00 00 00 00 00")
+SERVE = "import typer; from drive_env.tools.serve import serve; typer.run(serve)"
+
+
+def sdo_in_process() -> float:
+    """Return expedited uploads per second, called function to function."""
+    world = World()
+    world.add(EmulatedDrives(load="belt", num_threads=1), [1])
+    world.power_on()
+    answers = []
+    world.listeners.append(lambda ended: answers.append(ended.frame))
+    request = Frame(0x601, READ_STATUSWORD)
+    start = time.perf_counter()
+    for _ in range(TRANSFERS):
+        world.receive(request)
+    seconds = time.perf_counter() - start
+    world.close()
+    assert sum(frame.can_id == 0x581 for frame in answers) == TRANSFERS
+    return TRANSFERS / seconds
+
+
+@contextmanager
+def served(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], can.BusABC]]:
+    """Serve in a process of its own; yield the process and a stock python-can client."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", SERVE, "--load", "belt", "--port", "0", "--stats", *arguments],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    try:
+        for line in process.stdout:
+            if match := re.search(r'channel="(socket://[^"]+)"', line):
+                break
+        else:
+            raise RuntimeError("drive-env serve ended before it served")
+        with can.Bus(interface="slcan", channel=match[1], sleep_after_open=0) as bus:
+            yield process, bus
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def send(bus: can.BusABC, can_id: int, data: bytes = b"") -> None:
+    bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+
+def wait_for(bus: can.BusABC, can_id: int, timeout: float = 1.0) -> bytes:
+    """Return the data of the next frame with an identifier; TimeoutError if none comes in time [s]."""
+    end = time.perf_counter() + timeout
+    while time.perf_counter() < end:
+        message = bus.recv(timeout)
+        if message is not None and message.arbitration_id == can_id:
+            return bytes(message.data)
+    raise TimeoutError(f"no frame {can_id:03X} within {timeout:g} s")
+
+
+def sdo_through_hub(*arguments: str) -> float:
+    """Return expedited uploads per second by a stock python-can client of the hub."""
+    with served(*arguments) as (_, bus):
+        for _ in range(100):
+            send(bus, 0x601, READ_STATUSWORD)
+            wait_for(bus, 0x581)
+        start = time.perf_counter()
+        for _ in range(TRANSFERS):
+            send(bus, 0x601, READ_STATUSWORD)
+            wait_for(bus, 0x581)
+        return TRANSFERS / (time.perf_counter() - start)
+
+
+def write(bus: can.BusABC, index: int, sub: int, value: int, size: int) -> None:
+    request = bytes([0x23 | (4 - size) << 2]) + index.to_bytes(2, "little") + bytes([sub])
+    send(bus, 0x601, request + value.to_bytes(4, "little"))
+    if wait_for(bus, 0x581)[0] != 0x60:
+        raise RuntimeError(f"{index:04X}h:{sub:02X} cannot be written")
+
+
+def real_time() -> dict[str, float]:
+    """Return lateness of the server's cycles and time from SYNC to the second TPDO, as a python-can master sees it.
+
+    SYNC, two RPDO and two TPDO each millisecond, all synchronous.
+    """
+    with served() as (process, bus):
+        for index, kind in ((0x1400, 0), (0x1401, 0), (0x1800, 1), (0x1801, 1)):
+            write(bus, index, 2, kind, 1)
+        send(bus, 0x000, b"\x01\x01")
+        latency = []
+        missed = 0
+        start = time.perf_counter()
+        for cycle in range(round(SECONDS * 1000)):
+            due = start + cycle * 0.001
+            while time.perf_counter() < due:  # a master's sleep would be late itself
+                pass
+            send(bus, 0x201, b"\x00\x00")
+            send(bus, 0x301, b"\x00\x00\x00")
+            sent = time.perf_counter()
+            send(bus, 0x080)
+            try:
+                wait_for(bus, 0x281, 0.05)
+                latency.append(time.perf_counter() - sent)
+            except TimeoutError:
+                missed += 1
+        process.terminate()
+        output = process.stdout.read() if process.stdout else ""
+    figures = re.search(r"p50 ([\d.]+) ms, p99 ([\d.]+) ms, max ([\d.]+) ms", output)
+    assert figures is not None, output
+    latency.sort()
+    return {
+        "lateness of 1 ms cycles, p50 [ms]": float(figures[1]),
+        "lateness of 1 ms cycles, p99 [ms]": float(figures[2]),
+        "lateness of 1 ms cycles, max [ms]": float(figures[3]),
+        "SYNC to second TPDO, p50 [ms]": 1e3 * latency[len(latency) // 2],
+        "SYNC to second TPDO, p99 [ms]": 1e3 * latency[len(latency) * 99 // 100],
+        "cycles without their TPDO": float(missed),
+    }
+
+
+def figures() -> dict[str, float]:
+    """Return all figures of the bus."""
+    return {
+        "SDO/s, in-process": sdo_in_process(),
+        "SDO/s, hub, lockstep": sdo_through_hub("--lockstep"),
+        "SDO/s, hub, real time (1 Mbit/s)": sdo_through_hub(),
+        **real_time(),
+    }

@@ -1,0 +1,148 @@
+"""Figures of the environments: Tracking in lanes and alone, its share of a training's time, its memory.
+
+What is compared is measured in turn, so that a slower moment of the machine slows both.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from drive_env.envs.lanes import OneLane
+from drive_env.envs.tracking import Tracking
+
+LANES = 64
+MANY_LANES = 1024
+ROUNDS = 12
+MEMORY = (
+    "import re, sys, numpy as np; from pathlib import Path; from drive_env.envs.tracking import Tracking;"
+    "n = int(sys.argv[1]); lanes = Tracking(n, num_threads=1); lanes.reset(seed=0);"
+    "[lanes.step(np.zeros((n, 1), np.float32)) for _ in range(5)];"
+    "print(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1])"
+)
+
+
+def times_in_turn(functions: list[Callable[[], Any]], calls: int) -> list[float]:
+    """Return the shortest time of a call of each function [s]."""
+    best = [float("inf")] * len(functions)
+    for _ in range(ROUNDS):
+        for k, function in enumerate(functions):
+            start = time.perf_counter()
+            for _ in range(calls):
+                function()
+            best[k] = min(best[k], (time.perf_counter() - start) / calls)
+    return best
+
+
+def random_steps(lanes: Tracking) -> Callable[[], Any]:
+    """Return a function that takes one step with random actions."""
+    given = np.random.default_rng(0).uniform(-1, 1, (256, *(lanes.action_space.shape or ()))).astype(np.float32)
+    count = iter(range(10**9))
+    return lambda: lanes.step(given[next(count) % 256])
+
+
+def vectorised(num_envs: int, threads: tuple[int, ...], calls: int) -> dict[str, float]:
+    """Return env-steps/s, whole episodes with their resets included, and overhead over bare `advance`."""
+    found: dict[str, float] = {}
+    sets = [Tracking(num_envs, num_threads=count) for count in threads]
+    functions: list[Callable[[], Any]] = []
+    for lanes in sets:
+        lanes.reset(seed=0)
+        functions += [random_steps(lanes), lambda drives=lanes.drives: drives.advance(0.001)]
+    times = times_in_turn(functions, calls)
+    whole = []
+    for lanes, step in zip(sets, functions[::2], strict=True):
+        lanes.reset(seed=0)
+        episode = lanes.config.steps + 1
+        rounds = 3 if num_envs == LANES else 1
+        whole.append(min(times_in_turn_once(step, episode) for _ in range(rounds)))
+    for k, count in enumerate(threads):
+        name = f"Tracking, two_mass, {num_envs} lanes, {count} thread{'s' if count > 1 else ''}"
+        found[f"{name}: env-steps/s"] = num_envs / times[2 * k]
+        found[f"{name}: env-steps/s with autoreset"] = num_envs / whole[k]
+        found[f"{name}: overhead over advance"] = times[2 * k] / times[2 * k + 1] - 1.0
+    if len(threads) > 1:
+        found[f"Tracking, two_mass, {num_envs} lanes: two threads over one"] = times[0] / times[2]
+    for lanes in sets:
+        lanes.close()
+    return found
+
+
+def times_in_turn_once(function: Callable[[], Any], calls: int) -> float:
+    """Return the mean time of a call [s]."""
+    start = time.perf_counter()
+    for _ in range(calls):
+        function()
+    return (time.perf_counter() - start) / calls
+
+
+def alone() -> dict[str, float]:
+    """Return steps/s of the single environment, and of bare `advance` of its drives."""
+    env = OneLane(Tracking(1, autoreset_mode="Disabled", num_threads=1, duration=1e6 / 1000))
+    env.reset(seed=0)
+    action = np.zeros(1, np.float32)
+    drives = env.lanes.drives  # type: ignore[attr-defined]
+    step, advance = times_in_turn([lambda: env.step(action), lambda: drives.advance(0.001)], 300)
+    env.close()
+    return {"Tracking, single Env.step/s": 1.0 / step, "Tracking, single, bare advance/s": 1.0 / advance}
+
+
+def share_of_training() -> dict[str, float]:
+    """Return the environment's share of the wall time of SB3's PPO with its default network; nothing without SB3."""
+    if find_spec("stable_baselines3") is None:
+        return {}
+    from stable_baselines3 import PPO
+
+    from drive_env.envs.stable_baselines import LanesVecEnv
+
+    env = LanesVecEnv(Tracking(LANES, num_threads=1, autoreset_mode="SameStep"))
+    spent = 0.0
+    step_wait = env.step_wait
+
+    def timed() -> Any:
+        nonlocal spent
+        start = time.perf_counter()
+        found = step_wait()
+        spent += time.perf_counter() - start
+        return found
+
+    env.step_wait = timed  # type: ignore[method-assign]
+    model = PPO("MlpPolicy", env, n_steps=256, batch_size=2048, device="cpu", seed=0)
+    start = time.perf_counter()
+    model.learn(256 * LANES * 3)
+    wall = time.perf_counter() - start
+    env.close()
+    return {"PPO on 64 lanes: the environment's share of wall time": spent / wall}
+
+
+def memory() -> dict[str, float]:
+    """Return the largest memory of a process with many lanes, and of one with a single lane [MB]; on Linux alone."""
+    if sys.platform != "linux":
+        return {}
+    found = {}
+    for lanes in (1, MANY_LANES):
+        run = subprocess.run([sys.executable, "-c", MEMORY, str(lanes)], capture_output=True, text=True, check=True)
+        found[f"memory of a process, {lanes} lanes [MB]"] = int(run.stdout) / 1024
+    return found
+
+
+def figures() -> dict[str, float]:
+    """Return all figures of the environments."""
+    return {
+        **vectorised(LANES, (1,), 200),
+        **vectorised(MANY_LANES, (1, 2), 20),
+        **alone(),
+        **share_of_training(),
+        **memory(),
+    }
+
+
+if __name__ == "__main__":
+    for name, figure in figures().items():
+        print(f"{name:75} {figure:12,.3f}")

@@ -1,0 +1,72 @@
+"""Any python-can interface as the way to the masters, the in-process "virtual" one for tests among them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Hashable, Iterator
+
+import can
+
+from drive_env.bus.transport import Incoming
+from drive_env.bus.wire import Transmission
+from drive_env.canopen.frames import Frame
+
+MAX_FRAMES = 256  # taken at a turn, so that a flood does not keep time from passing
+
+logger = logging.getLogger(__name__)
+
+
+class CanPort:
+    """A python-can bus on which the nodes live beside others.
+
+    Args:
+        bus: An open bus; it is closed by `close`.
+    """
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        self.lost = 0  # frames that the interface did not take
+
+    def wait(self, timeout: float, waiting: Callable[[Hashable], int]) -> Iterator[Incoming]:
+        """Return the frames that have come, after at most `timeout` [s].
+
+        Raises:
+            can.CanError: If the interface fails.
+        """
+        for _ in range(MAX_FRAMES):
+            message = self._bus.recv(timeout)
+            if message is None:
+                return
+            timeout = 0.0
+            if message.is_error_frame or message.is_fd:
+                continue
+            length = message.dlc if message.is_remote_frame else None
+            data = b"" if message.is_remote_frame else bytes(message.data)
+            frame = Frame(message.arbitration_id, data, message.is_remote_frame, length)
+            yield Incoming(frame, self, message.is_extended_id)
+
+    def deliver(self, ended: Transmission) -> None:
+        """Send a frame of the nodes; one that came from this side is there already."""
+        if ended.sender is self:
+            return
+        frame = ended.frame
+        message = can.Message(
+            arbitration_id=frame.can_id,
+            is_extended_id=ended.extended,
+            is_remote_frame=frame.rtr,
+            dlc=frame.dlc,
+            data=frame.data or None,
+        )
+        try:
+            self._bus.send(message)
+        except can.CanError as error:  # a full buffer, or nobody there to acknowledge
+            self.lost += 1
+            if self.lost == 1:
+                logger.warning("the interface did not take frame %s: %s", frame, error)
+
+    def flush(self) -> None:
+        """Do nothing: frames have left already."""
+
+    def close(self) -> None:
+        """Close the bus."""
+        self._bus.shutdown()

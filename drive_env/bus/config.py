@@ -1,0 +1,167 @@
+"""A bus from a TOML file: which drives with which loads, their nodes, bit rate and faults. Every key has a default."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from drive_env.bus.faults import Faults
+from drive_env.bus.wire import BIT_RATE, Wire
+from drive_env.bus.world import World
+
+FACTORY = "none"  # as a motor: the drive is not commissioned
+
+
+class BusConfigError(ValueError):
+    """A bus that cannot be: one line with key, value, limit and remedy."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """One emulated machine: device, load, motor and the identifiers of its nodes.
+
+    `motor` "none" leaves the drives with their factory values. `parameters` are true machine parameters [SI] that
+    replace defaults, as those of EmulatedDrives; `ideal` takes a stage, encoder and bearings without faults.
+    """
+
+    device: str = "tmcm1636"
+    load: str = "two_mass"
+    motor: str = "qbl4208"
+    nodes: tuple[int, ...] = (1,)
+    ideal: bool = False
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Bus:
+    """All of a bus.
+
+    `bit_rate` [bit/s]; `seed` of everything random; `store` the folder in which the nodes keep what is saved in them,
+    relative to the file; `machines` the machines; `faults` what disturbs the wire.
+    """
+
+    bit_rate: int = BIT_RATE
+    seed: int = 0
+    store: str | None = None
+    machines: tuple[Machine, ...] = (Machine(),)
+    faults: Faults = field(default_factory=Faults)
+
+
+def load_bus(path: Path) -> Bus:
+    """Return the bus that a file describes.
+
+    Raises:
+        BusConfigError: For a file that cannot be read or a key or value that cannot be.
+    """
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BusConfigError(f"cannot read the bus {path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BusConfigError(f"{path} is no TOML file: {error}") from None
+    values = _values(str(path), data, Bus)
+    if not values.get("machines"):
+        raise BusConfigError(f"{path}: there are no machines; add a table [[machines]] as in examples/bus.toml")
+    if values.get("store") is not None:
+        values["store"] = str(path.parent / values["store"])
+    return Bus(**values)
+
+
+def build_world(bus: Bus, *, lockstep: bool, own_wire: bool = True) -> World:
+    """Return the world of a bus, its nodes not switched on yet.
+
+    Args:
+        bus: What it is made of.
+        lockstep: Time advances by SYNC.
+        own_wire: Frames take the time of the modelled wire; not so on an interface that has a wire of its own.
+
+    Raises:
+        BusConfigError: If it cannot be.
+    """
+    from drive_env.drives import EmulatedDrives
+
+    if bus.seed < 0:
+        raise BusConfigError(f"seed = {bus.seed} must be 0 or more")
+    try:
+        wire = Wire(bus.bit_rate, instant=lockstep or not own_wire, faults=bus.faults, seed=bus.seed)
+        world = World(lockstep=lockstep, wire=wire)
+        store = None if bus.store is None else _folder(Path(bus.store))
+        for k, row in enumerate(bus.machines):
+            motor = None if row.motor == FACTORY else row.motor
+            drives = EmulatedDrives(
+                row.device, row.load, motor, seed=bus.seed, first_machine=k, ideal=row.ideal,
+                parameters=row.parameters, num_threads=1,
+            )  # fmt: skip
+            world.add(drives, row.nodes, store)
+    except (ValueError, OSError) as error:
+        raise BusConfigError(str(error)) from None
+    return world
+
+
+def _folder(path: Path) -> Path:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BusConfigError(f"the store {path} cannot be: {error.strerror}; choose another folder") from None
+    return path
+
+
+# Keys that are more than one value: how each is read.
+def _machines(where: str, value: Any) -> tuple[Machine, ...]:
+    if not isinstance(value, list):
+        raise BusConfigError(f"{where} must be tables [[machines]], not {value!r}")
+    return tuple(Machine(**_values(f"{where}[{k}]", row, Machine)) for k, row in enumerate(value))
+
+
+def _faults(where: str, value: Any) -> Faults:
+    try:
+        return Faults(**_values(where, value, Faults))
+    except BusConfigError:
+        raise
+    except ValueError as error:
+        raise BusConfigError(str(error)) from None
+
+
+def _whole_numbers(where: str, value: Any) -> tuple[int, ...]:
+    if not isinstance(value, list) or any(type(one) is not int for one in value):
+        raise BusConfigError(f"{where} = {value!r} must be a list of whole numbers, as [1, 2]")
+    return tuple(value)
+
+
+def _numbers(where: str, value: Any) -> dict[str, float]:
+    if not isinstance(value, dict):
+        raise BusConfigError(f"{where} = {value!r} must be a table of numbers")
+    return {key: _scalar(f"{where}.{key}", one, float) for key, one in value.items()}
+
+
+_READERS = {
+    "machines": _machines, "faults": _faults, "nodes": _whole_numbers, "only": _whole_numbers, "parameters": _numbers,
+}  # fmt: skip
+_SCALARS: dict[str, type] = {"str": str, "str | None": str, "int": int, "float": float, "bool": bool}
+_MEANINGS: dict[type, str] = {str: "a text", int: "a whole number", float: "a number", bool: "true or false"}
+
+
+def _values(where: str, table: Any, kind: type) -> dict[str, Any]:
+    """Return a table's values by the fields of a dataclass."""
+    if not isinstance(table, dict):
+        raise BusConfigError(f"{where} = {table!r} must be a table")
+    known = {f.name: f for f in fields(kind)}
+    result = {}
+    for key, value in table.items():
+        if key not in known:
+            raise BusConfigError(f"{where}: key {key!r} is unknown; there are {', '.join(known)}")
+        place = f"{where}: {key}"
+        reader = _READERS.get(key)
+        result[key] = reader(place, value) if reader else _scalar(place, value, _SCALARS[str(known[key].type)])
+    return result
+
+
+def _scalar(where: str, value: Any, kind: type) -> Any:
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind:
+        raise BusConfigError(f"{where} = {value!r} must be {_MEANINGS[kind]}")
+    return value

@@ -1,0 +1,48 @@
+"""How the wire is disturbed on purpose."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Shares of frames, 0 to 1, that meet a fault; each frame draws for each fault by the wire's seed.
+
+    Attributes:
+        drop: Nobody receives the frame; it takes its time on the bus all the same.
+        delay: The sender holds the frame back, and what it sends after it, for up to `delay_max` [s].
+        duplicate: The frame is sent twice, as CAN does when the last bit of end of frame is disturbed.
+        reorder: The sender's next frame goes first; if none comes within 1 ms, nothing has happened.
+        corrupt: Every receiver finds the CRC wrong: an error frame, and the frame is sent again. This is what a
+            disturbed CAN bus does. It costs time only, up to a share of one in nine; beyond that error counters rise
+            until the sender is bus-off.
+        corrupt_undetected: One to three bits of the data are other ones and the CRC fits. CAN makes this next to
+            impossible (every error of up to five bits is found); it is for masters that must survive anything.
+        delay_max: Longest delay [s].
+        only: Identifiers that faults meet; empty for all.
+    """
+
+    drop: float = 0.0
+    delay: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    corrupt: float = 0.0
+    corrupt_undetected: float = 0.0
+    delay_max: float = 0.005
+    only: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name == "only":
+                continue
+            if field.name == "delay_max":
+                if not 0.0 <= value < math.inf:
+                    raise ValueError(f"faults: delay_max = {value!r} must be a time of 0 s or more")
+            elif not 0.0 <= value <= 1.0:
+                raise ValueError(f"faults: {field.name} = {value!r} must be a share of all frames, 0 to 1")
+
+    def __bool__(self) -> bool:
+        return any((self.drop, self.delay, self.duplicate, self.reorder, self.corrupt, self.corrupt_undetected))

@@ -1,0 +1,156 @@
+"""The slcan protocol (Lawicel's ASCII commands), adapter's side: lines to frames, frames to lines.
+
+python-can's slcan interface waits for no answer and reads each answer as a turn without a frame. Commands are answered
+all the same, as Lawicel's manual says; frames sent are not (nor does a CANable answer them), or every frame of a
+burst would cost the client a turn.
+"""
+
+from __future__ import annotations
+
+import re
+
+from drive_env.canopen.frames import Frame
+
+OK, BELL = b"\r", b"\a"
+MAX_LINE = 64  # bytes; the longest command, an extended frame with eight bytes, has 26
+BIT_RATES = {b"0": 10_000, b"1": 20_000, b"2": 50_000, b"3": 100_000, b"4": 125_000, b"5": 250_000, b"6": 500_000,
+             b"7": 750_000, b"8": 1_000_000, b"9": 83_300}  # fmt: skip
+VERSION = b"V1013\r"  # hardware 1.0, software 1.3
+SERIAL_NUMBER = b"NDE01\r"
+CLOCK = 8_000_000  # Hz, of the SJA1000's bit timing registers
+
+_STANDARD = re.compile(rb"[tr]([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
+_EXTENDED = re.compile(rb"[TR]([01][0-9A-Fa-f]{7})([0-8])((?:[0-9A-Fa-f]{2})*)")
+# Commands that need nothing of this adapter: acceptance filters, polling, serial speed, start-up, data bit rate.
+_ACCEPTED = re.compile(rb"[Mm][0-9A-Fa-f]{8}|[XQW][0-2]|U[0-6]|[AP]|Y[0-9]")
+
+
+def parse_frame(line: bytes) -> tuple[Frame, bool]:
+    """Return the frame of a line t, T, r or R, and whether it is extended.
+
+    Raises:
+        ValueError: If the line is no frame of classical CAN.
+    """
+    extended = line[:1] in (b"T", b"R")
+    match = (_EXTENDED if extended else _STANDARD).fullmatch(line)
+    if match is None:
+        raise ValueError(f"{line[:MAX_LINE]!r} is no frame")
+    can_id, length, data = int(match[1], 16), int(match[2]), bytes.fromhex(match[3].decode())
+    if line[:1] in (b"r", b"R"):
+        if data:
+            raise ValueError(f"{line!r}: a remote frame has no data")
+        return Frame(can_id, b"", rtr=True, dlc=length), extended
+    if len(data) != length:
+        raise ValueError(f"{line!r}: {length} bytes are announced, {len(data)} follow")
+    return Frame(can_id, data), extended
+
+
+def format_frame(frame: Frame, extended: bool = False, timestamp_ms: int | None = None) -> bytes:
+    """Return the line of a frame, with a time stamp [ms, 0 to 59,999] if one is given."""
+    length = (frame.dlc or 0) if frame.rtr else len(frame.data)
+    kind = (b"R" if extended else b"r") if frame.rtr else (b"T" if extended else b"t")
+    can_id = b"%08X" % frame.can_id if extended else b"%03X" % frame.can_id
+    stamp = b"" if timestamp_ms is None else b"%04X" % (timestamp_ms % 60_000)
+    return b"%b%b%d%b%b\r" % (kind, can_id, length, frame.data.hex().upper().encode(), stamp)
+
+
+class Channel:
+    """An adapter's channel as its client has set it.
+
+    Attributes:
+        bit_rate: [bit/s].
+        is_open: It takes part in the bus.
+        listen_only: It sends nothing.
+        time_stamps: Frames come with the time of their reception.
+        overrun: A frame could not be delivered; set from outside, read and forgotten by the command F.
+        refused: It was to be opened with another bit rate than the bus has.
+
+    Args:
+        bit_rate: Of the bus [bit/s].
+    """
+
+    def __init__(self, bit_rate: float) -> None:
+        self._bus_bit_rate = bit_rate
+        self.bit_rate = bit_rate
+        self.is_open = False
+        self.listen_only = False
+        self.time_stamps = False
+        self.overrun = False
+        self.refused = False
+        self._line = b""
+        self._overlong = False
+
+    def feed(self, data: bytes) -> tuple[list[tuple[Frame, bool]], bytes]:
+        """Take bytes of the client; return its frames, each extended or not, and the answer to its commands."""
+        frames: list[tuple[Frame, bool]] = []
+        answer = bytearray()
+        *lines, rest = (self._line + data).replace(b"\n", b"\r").split(b"\r")
+        for line in lines:
+            answer += BELL if self._overlong else self._take(line, frames)
+            self._overlong = False
+        if len(rest) > MAX_LINE:  # never a command: forget it up to its end
+            self._overlong, rest = True, b""
+        self._line = b"" if self._overlong else rest
+        return frames, bytes(answer)
+
+    def format(self, frame: Frame, extended: bool, time: float) -> bytes:
+        """Return the line by which the client learns of a frame received at `time` [s]."""
+        return format_frame(frame, extended, int(time * 1e3) if self.time_stamps else None)
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _take(self, line: bytes, frames: list[tuple[Frame, bool]]) -> bytes:
+        kind = line[:1]
+        if kind in (b"t", b"T", b"r", b"R"):
+            try:
+                frame = parse_frame(line)
+            except ValueError:
+                return BELL
+            if not self.is_open or self.listen_only:
+                return BELL
+            frames.append(frame)
+            return b""
+        return self._command(kind, line[1:])
+
+    def _command(self, kind: bytes, argument: bytes) -> bytes:
+        if kind == b"":  # an empty line; python-can sends one for "no data bit rate"
+            return b""
+        if kind in (b"O", b"L", b"C") and not argument:
+            return self._open(listen_only=kind == b"L") if kind != b"C" else self._close()
+        if kind in (b"S", b"s"):
+            return self._set_bit_rate(kind, argument)
+        if kind in (b"V", b"v") and not argument:
+            return VERSION
+        if kind == b"N" and not argument:
+            return SERIAL_NUMBER
+        if kind == b"F" and not argument and self.is_open:
+            flags, self.overrun = (0x08 if self.overrun else 0), False
+            return b"F%02X\r" % flags
+        if kind == b"Z" and argument in (b"0", b"1") and not self.is_open:
+            self.time_stamps = argument == b"1"
+            return OK
+        return OK if _ACCEPTED.fullmatch(kind + argument) else BELL
+
+    def _open(self, listen_only: bool) -> bytes:
+        # A controller with another bit rate understands nothing and would destroy every frame: it stays closed.
+        if self.bit_rate != self._bus_bit_rate:
+            self.refused = True
+            return BELL
+        self.is_open, self.listen_only = True, listen_only
+        return OK
+
+    def _close(self) -> bytes:
+        self.is_open = False
+        return OK
+
+    def _set_bit_rate(self, kind: bytes, argument: bytes) -> bytes:
+        if self.is_open:
+            return BELL
+        if kind == b"S" and argument in BIT_RATES:
+            self.bit_rate = BIT_RATES[argument]
+        elif kind == b"s" and re.fullmatch(rb"[0-9A-Fa-f]{4}", argument):
+            btr0, btr1 = bytes.fromhex(argument.decode())
+            quanta = 3 + (btr1 & 0x0F) + (btr1 >> 4 & 0x07)
+            self.bit_rate = CLOCK / ((btr0 & 0x3F) + 1) / quanta
+        else:
+            return BELL
+        return OK

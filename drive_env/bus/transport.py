@@ -1,0 +1,33 @@
+"""What carries frames between a world and its masters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable
+from typing import NamedTuple, Protocol
+
+from drive_env.bus.wire import Transmission
+from drive_env.canopen.frames import Frame
+
+
+class Incoming(NamedTuple):
+    """A frame from a master: what it is, whose it is, and whether its identifier has 29 bits."""
+
+    frame: Frame
+    sender: Hashable
+    extended: bool
+
+
+class Transport(Protocol):
+    """A hub, or a python-can interface."""
+
+    def wait(self, timeout: float, waiting: Callable[[Hashable], int]) -> Iterable[Incoming]:
+        """Return the frames that have come, after at most `timeout` [s]."""
+
+    def deliver(self, ended: Transmission) -> None:
+        """Take a frame of the bus for all masters but its sender."""
+
+    def flush(self) -> None:
+        """Send what was taken."""
+
+    def close(self) -> None:
+        """End it."""

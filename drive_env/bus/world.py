@@ -1,0 +1,241 @@
+"""A world: emulated machines, the nodes of their drives, one bus and one time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+from drive_env.axis import Port
+from drive_env.bus.wire import Transmission, Wire
+from drive_env.canopen.frames import IDENTIFIER, SYNC, Frame
+from drive_env.canopen.node import Node
+from drive_env.drives import EmulatedDrives
+
+CYCLE = 0.001  # s: the communication cycle
+SYNC_OBJECT = (0x1005, 0)
+TRANSMIT_BUFFER = 64  # frames of a node that wait for the bus; ours, since no manual says. More are lost.
+MAX_NODE_ID = 127
+
+
+class BusNode(Protocol):
+    """What a world asks of a node; drive_env/canopen/node.py says what each call means."""
+
+    def receive(self, frame: Frame, now: float) -> None:
+        """Take a frame of the bus."""
+
+    def before_cycle(self, now: float) -> None:
+        """Prepare for a communication cycle."""
+
+    def after_cycle(self, now: float) -> None:
+        """Send what a communication cycle has brought."""
+
+    def error_passive(self, now: float) -> None:
+        """Learn that its controller has become error passive."""
+
+    def overrun(self, now: float, buffer: str) -> None:
+        """Learn that frames were lost in the "transmit" buffer."""
+
+    def bus_off(self, now: float) -> None:
+        """Learn that its controller has left the bus."""
+
+    def bus_on(self, now: float) -> None:
+        """Learn that its controller is back."""
+
+    def power_on(self, now: float) -> None:
+        """Boot."""
+
+
+class World:
+    """Nodes and their drives on one bus.
+
+    In lockstep each SYNC from outside lets one communication cycle pass and nothing else does; frames take no time.
+    They are looked at one by one: what a frame sets off is sent before the next is looked at, so a master that sends
+    SYNC, SYNC and an SDO request knows by the answer that both cycles are over. Otherwise time is what `run_until`
+    says, and frames take the time that the wire says.
+
+    Attributes:
+        nodes: Node identifier -> node.
+        drives: All emulated drives, each a set with its nodes.
+        listeners: Called with each frame that everybody received, also its own sender.
+        time: Time since the world began [s].
+        cycles: Communication cycles that have passed.
+
+    Args:
+        lockstep: Time advances by SYNC.
+        wire: The bus; by default one of 1 Mbit/s without faults, instant in lockstep.
+    """
+
+    def __init__(self, *, lockstep: bool = True, wire: Wire | None = None) -> None:
+        self.lockstep = lockstep
+        self.wire = wire if wire is not None else Wire(instant=lockstep)
+        self.nodes: dict[int, BusNode] = {}
+        self.drives: list[EmulatedDrives] = []
+        self.listeners: list[Callable[[Transmission], None]] = []
+        self.time = 0.0
+        self.cycles = 0
+        self._sync_objects: list[Port] = []  # 1005h of each node
+        self._on: set[int] = set()
+        self._overflowed: set[int] = set()
+        self._off: dict[int, float] = {}  # node identifier -> when its controller is back [s]
+
+    def add(self, drives: EmulatedDrives, node_ids: Sequence[int], store: Path | None = None) -> list[Node]:
+        """Put drives on the bus, one node per device, and return the nodes.
+
+        Args:
+            drives: The drives; machines of several one-axis devices have as many nodes as axes.
+            node_ids: Identifiers 1 to 127 in the order of the axes.
+            store: Folder of the nodes' stored values; without one they live as long as the world.
+
+        Raises:
+            ValueError: For identifiers that are taken, out of range, or too few or too many; for a bit rate of the wire
+                that the device does not have.
+        """
+        per_node = drives.device.num_axes
+        needed = drives.num_axes // per_node
+        if len(node_ids) != needed:
+            raise ValueError(
+                f"{drives.num_machines} machine(s) with load {drives.load.name!r} and {drives.device.name} have "
+                f"{needed} node(s); {len(node_ids)} node identifier(s) were given"
+            )
+        nodes: list[Node] = []
+        for k, node_id in enumerate(node_ids):
+            path = None if store is None else store / f"node-{node_id}-{drives.device.name}.json"
+
+            def make(send: Callable[[Frame], None], k: int = k, path: Path | None = path) -> Node:
+                bit_rate = round(self.wire.bit_rate)
+                nodes.append(Node(node_ids[k], drives, k * per_node, send=send, store=path, bit_rate=bit_rate))
+                return nodes[-1]
+
+            self.attach(node_id, make)
+            self._sync_objects.append(nodes[-1].dictionary.port(*SYNC_OBJECT))
+        self.drives.append(drives)
+        return nodes
+
+    def attach(self, node_id: int, make: Callable[[Callable[[Frame], None]], BusNode]) -> None:
+        """Put a node on the bus that `make` returns when handed the function by which it sends."""
+        if not 1 <= node_id <= MAX_NODE_ID:
+            raise ValueError(f"node {node_id} is out of range; identifiers are 1 to {MAX_NODE_ID}")
+        if node_id in self.nodes:
+            raise ValueError(f"node {node_id} is on the bus already; give each its own identifier, 1 to {MAX_NODE_ID}")
+        self.nodes[node_id] = make(lambda frame: self._send(node_id, frame))
+
+    def power_on(self) -> None:
+        """Switch on all nodes that are off; in lockstep they have booted afterwards."""
+        for node_id in [node_id for node_id in self.nodes if node_id not in self._on]:
+            self._on.add(node_id)
+            self.nodes[node_id].power_on(self.time)
+        if self.lockstep:
+            self._settle()
+
+    def receive(self, frame: Frame, sender: Hashable = "master", *, extended: bool = False) -> None:
+        """Take a frame from outside, at the world's time.
+
+        Args:
+            frame: The frame.
+            sender: Whose it is; the frames of one sender keep their order.
+            extended: It has a 29-bit identifier; no node sees it.
+        """
+        self.wire.send(frame, sender, self.time, extended)
+        if self.lockstep:
+            self._settle()
+            # A SYNC that the wire loses lets time pass all the same: it is the nodes that miss it.
+            if not extended and self._is_sync(frame):
+                self.cycle()
+                self._settle()
+
+    def run_until(self, now: float, begins: Callable[[float], None] | None = None, early: float = 0.0) -> None:
+        """Let everything happen in its order that is due until `now` [s]; not in lockstep.
+
+        Args:
+            now: New time of the world [s].
+            begins: Called as a communication cycle begins, with the time when it was due [s].
+            early: What is due within this time [s] after `now` happens already.
+        """
+        until = now + early
+        while True:
+            cycle, event = self.next_cycle, self.wire.next_event()
+            if event <= until and event <= cycle:
+                self.time = max(self.time, event)
+                self._pass_on(self.wire.take(event))
+            elif cycle <= until:
+                if begins is not None:
+                    begins(cycle)
+                self.cycle()
+            else:
+                break
+        self.time = max(self.time, now)
+
+    @property
+    def next_cycle(self) -> float:
+        """When the next communication cycle ends [s]."""
+        return (self.cycles + 1) * CYCLE
+
+    def next_event(self) -> float:
+        """Return when `run_until` has something to do next [s]."""
+        return min(self.next_cycle, self.wire.next_event())
+
+    def cycle(self) -> None:
+        """Let one communication cycle of 1 ms pass."""
+        for node_id in [node_id for node_id, back in self._off.items() if back <= self.time]:
+            del self._off[node_id]
+            self.nodes[node_id].bus_on(self.time)
+        for node_id in [i for i in self._overflowed if self.wire.waiting(("node", i)) < TRANSMIT_BUFFER // 2]:
+            self._overflowed.remove(node_id)
+            self.nodes[node_id].overrun(self.time, "transmit")
+        for node in self.nodes.values():
+            node.before_cycle(self.time)
+        for drives in self.drives:
+            drives.advance(CYCLE)
+        self.cycles += 1
+        self.time = self.cycles * CYCLE
+        for node in self.nodes.values():
+            node.after_cycle(self.time)
+
+    def load(self) -> float:
+        """Return the share of time in which the bus was busy."""
+        return self.wire.statistics.load(self.wire.bit_rate, self.time)
+
+    def close(self) -> None:
+        """End the drives."""
+        for drives in self.drives:
+            drives.close()
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _send(self, node_id: int, frame: Frame) -> None:
+        sender = ("node", node_id)
+        if self.wire.waiting(sender) < TRANSMIT_BUFFER:
+            self.wire.send(frame, sender, self.time)
+        else:  # the node is told once there is room for its emergency
+            self._overflowed.add(node_id)
+            self.wire.statistics.lost += 1
+
+    def _is_sync(self, frame: Frame) -> bool:
+        """Return whether a frame is SYNC, with or without a counter, to the nodes (1005h can be changed)."""
+        if frame.rtr or len(frame.data) > 1:
+            return False
+        if not self._sync_objects:
+            return frame.can_id == SYNC
+        return any(frame.can_id == int(port.read()) & IDENTIFIER for port in self._sync_objects)
+
+    def _settle(self) -> None:
+        """Carry frames until none is ready at this time."""
+        while (ended := self.wire.take(self.time)) is not None:
+            self._pass_on(ended)
+
+    def _pass_on(self, ended: Transmission | None) -> None:
+        if ended is None:
+            return
+        sender = ended.sender[1] if isinstance(ended.sender, tuple) and ended.sender[0] == "node" else None
+        if ended.outcome == "received":
+            if not ended.extended:
+                for node_id, node in self.nodes.items():
+                    if node_id != sender:
+                        node.receive(ended.frame, self.time)
+            for listener in self.listeners:
+                listener(ended)
+        elif sender is not None and ended.outcome == "error passive":
+            self.nodes[sender].error_passive(self.time)
+        elif sender is not None and ended.outcome == "bus off":
+            self._off[sender] = self.time + self.wire.recovery_time
+            self.nodes[sender].bus_off(self.time)

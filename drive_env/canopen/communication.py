@@ -1,0 +1,245 @@
+"""The objects that belong to the module and not to an axis: 1000h to 1FFFh, bit rate, node ID, boot loader.
+
+Each write is checked by the rule of its object before it changes anything; whoever owns the service behind an object is
+told that it changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+
+from drive_env.axis import Port
+from drive_env.canopen import frames, mapping
+from drive_env.devices import Device
+from drive_env.dictionary.access import (
+    INCOMPATIBLE_PARAMETER,
+    VALUE_RANGE,
+    WRONG_STATE,
+    ObjectAccessError,
+    check_limits,
+)
+from drive_env.dictionary.entries import Entry, ObjectDictionary
+
+Key = tuple[int, int]
+
+SYNC_ID = 0x1005
+ERROR_HISTORY = 0x1003
+ERROR_REGISTER = 0x1001
+GUARD_TIME = 0x100C
+LIFE_TIME_FACTOR = 0x100D
+STORE = 0x1010
+RESTORE = 0x1011
+EMERGENCY_ID = 0x1014
+EMERGENCY_INHIBIT = 0x1015
+CONSUMER_HEARTBEAT = 0x1016
+PRODUCER_HEARTBEAT = 0x1017
+ERROR_BEHAVIOUR = 0x1029
+RPDO = range(0x1400, 0x1600)
+RPDO_MAPPING = range(0x1600, 0x1800)
+TPDO = range(0x1800, 0x1A00)
+TPDO_MAPPING = range(0x1A00, 0x1C00)
+PDO = range(0x1400, 0x1C00)
+TO_MAPPING = 0x200  # from a PDO's communication parameter to its mapping
+
+
+@cache
+def _factory(path: Path, node_id: int) -> dict[Key, int | str]:
+    return {(entry.index, entry.sub): entry.default for entry in ObjectDictionary(path, node_id)}
+
+
+class ModuleObjects:
+    """Values of the module's objects.
+
+    Args:
+        device: Whose they are.
+        entries: Its dictionary.
+        changed: Told the index of an object that was written.
+    """
+
+    def __init__(self, device: Device, entries: ObjectDictionary, changed: Callable[[int], None]) -> None:
+        self._device = device
+        self._entries = entries
+        self._changed = changed
+        self._own = set(device.canopen.objects.values())
+        factory = _factory(entries.path, 1)
+        self._values: dict[Key, int | str] = {key: factory[key] for key in self._own}
+        # Objects whose value comes from a service, and those whose write is a command that stores no value.
+        self.readers: dict[Key, Callable[[], int]] = {}
+        self.commands: dict[Key, Callable[[int], None]] = {}
+
+    def owns(self, entry: Entry) -> bool:
+        """Return whether an object is the module's."""
+        return 0x1000 <= entry.index <= 0x1FFF or (entry.index, entry.sub) in self._own
+
+    def restore(self, node_id: int, stored: Mapping[Key, int]) -> None:
+        """Give the communication objects the values of a node that starts: the stored ones, else the factory's."""
+        factory = self.factory(node_id)
+        for entry in self._entries:
+            if 0x1000 <= entry.index <= 0x1FFF:
+                key = (entry.index, entry.sub)
+                self._values[key] = stored.get(key, factory[key])
+
+    def factory(self, node_id: int) -> Mapping[Key, int | str]:
+        """Return the factory's values of all objects, of the axes too; COB-IDs follow the node ID."""
+        return _factory(self._entries.path, node_id)
+
+    def set(self, role: str, raw: int | str) -> None:
+        """Set an object of the module by the role that the device's data gives it."""
+        self._values[self._device.canopen.objects[role]] = raw
+
+    def value(self, index: int, sub: int = 0) -> int:
+        """Return a number; 0 of an object that this device does not have."""
+        raw: int | str = self._values.get((index, sub), 0)
+        assert isinstance(raw, int), "a text is no number"
+        return raw
+
+    def role(self, role: str) -> int:
+        """Return the number in the object that has a role."""
+        return self.value(*self._device.canopen.objects[role])
+
+    def port(self, entry: Entry) -> Port:
+        """Return the way to one of these objects."""
+        key = (entry.index, entry.sub)
+        values = self._values
+        read: Callable[[], int | str] = self.readers.get(key) or (lambda: values[key])
+        if key in self.commands:
+            command = self.commands[key]
+            return Port(entry, read, lambda raw: check_limits(entry, raw), command)
+        check = _rule(entry.index)
+
+        def write(raw: int) -> None:
+            values[key] = raw | frames.NO_REMOTE if _is_pdo_id(entry) else raw
+            self._changed(entry.index)
+
+        def checked(raw: int) -> None:
+            check_limits(entry, raw)
+            allowed = self._device.allowed_values.get(key)
+            if allowed is not None and raw not in allowed:
+                known = ", ".join(str(value) for value in allowed)
+                raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {raw}; it knows {known}")
+            if check is not None:
+                check(self, entry, raw)
+
+        return Port(entry, read, checked, write)
+
+    def find(self, index: int, sub: int) -> Entry:
+        """Return an entry of the device's dictionary; 06020000h or 06090011h if there is none."""
+        return self._entries.find((index, sub))
+
+    def has(self, index: int) -> bool:
+        """Return whether the device has an object."""
+        return (index, 0) in self._values
+
+    def subs(self, index: int) -> list[int]:
+        """Return the sub-indices above 0 of an object."""
+        return [entry.sub for entry in self._entries if entry.index == index and entry.sub > 0]
+
+
+# --- rules ------------------------------------------------------------------------------------------------------------
+Rule = Callable[[ModuleObjects, Entry, int], None]
+
+
+def _is_pdo_id(entry: Entry) -> bool:
+    return entry.sub == 1 and (entry.index in RPDO or entry.index in TPDO)
+
+
+def _check_bits(entry: Entry, raw: int, allowed: int) -> None:
+    if raw & ~allowed:
+        raise ObjectAccessError(
+            VALUE_RANGE, f"{entry.label} cannot be {raw:08X}h: bits {raw & ~allowed:08X}h are not supported"
+        )
+
+
+def _check_identifier(objects: ModuleObjects, entry: Entry, raw: int) -> None:
+    """Check an object of which bit 31 switches the service off (CiA 301: 1014h, 1400h, 1800h)."""
+    before = objects.value(entry.index, entry.sub)
+    if (before | raw) & frames.INVALID == 0 and (before ^ raw) & frames.IDENTIFIER:
+        raise ObjectAccessError(
+            WRONG_STATE, f"{entry.label} is in use with {before & frames.IDENTIFIER:03X}h; set its bit 31 before"
+        )
+    if raw & frames.INVALID == 0 and frames.is_restricted(raw & frames.IDENTIFIER):
+        raise ObjectAccessError(
+            VALUE_RANGE, f"{entry.label} cannot be {raw & frames.IDENTIFIER:03X}h, which CiA 301 reserves"
+        )
+
+
+def _check_sync_id(objects: ModuleObjects, entry: Entry, raw: int) -> None:
+    # Bit 30 would make the device produce SYNC, at a period that it has no object for (1006h).
+    _check_bits(entry, raw, frames.IDENTIFIER)
+    if frames.is_restricted(raw):
+        raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {raw:03X}h, which CiA 301 reserves")
+
+
+def _check_emergency_id(objects: ModuleObjects, entry: Entry, raw: int) -> None:
+    _check_bits(entry, raw, frames.INVALID | frames.IDENTIFIER)
+    _check_identifier(objects, entry, raw)
+
+
+def _check_consumer(objects: ModuleObjects, entry: Entry, raw: int) -> None:
+    if entry.sub == 0 or raw & 0xFFFF == 0:
+        return
+    for sub in objects.subs(entry.index):
+        other = objects.value(entry.index, sub)
+        if sub != entry.sub and other & 0xFFFF and (other ^ raw) >> 16 & 0xFF == 0:
+            raise ObjectAccessError(
+                INCOMPATIBLE_PARAMETER, f"{entry.label}: node {raw >> 16 & 0xFF} is watched by sub-index {sub} already"
+            )
+
+
+def _check_pdo(objects: ModuleObjects, entry: Entry, raw: int) -> None:
+    if entry.sub == 1:
+        # Bit 30 reads 1; writing 0 is accepted, since many masters do.
+        _check_bits(entry, raw, frames.INVALID | frames.NO_REMOTE | frames.IDENTIFIER)
+        _check_identifier(objects, entry, raw)
+    elif entry.sub == 3 and objects.value(entry.index, 1) & frames.INVALID == 0:
+        # CiA 301: the inhibit time shall not be changed while the PDO exists.
+        raise ObjectAccessError(WRONG_STATE, f"{entry.label} is in use; set bit 31 of the PDO's COB-ID before")
+
+
+def _check_mapping(objects: ModuleObjects, entry: Entry, raw: int) -> None:
+    is_on = objects.value(entry.index - TO_MAPPING, 1) & frames.INVALID == 0
+    mapping.check_may_change(entry, is_on, objects.value(entry.index, 0))
+    transmit = entry.index in TPDO_MAPPING
+    if entry.sub == 0:
+        raws = [objects.value(entry.index, sub) for sub in range(1, raw + 1)]
+        mapping.check_mapping(entry, raws, transmit, objects.find)
+    elif raw != 0:  # an empty entry, as the factory's are
+        mapping.check_mappable(entry, raw, transmit, objects.find)
+
+
+_RULES: tuple[tuple[range, Rule], ...] = (
+    (range(SYNC_ID, SYNC_ID + 1), _check_sync_id),
+    (range(EMERGENCY_ID, EMERGENCY_ID + 1), _check_emergency_id),
+    (range(CONSUMER_HEARTBEAT, CONSUMER_HEARTBEAT + 1), _check_consumer),
+    (RPDO, _check_pdo),
+    (TPDO, _check_pdo),
+    (RPDO_MAPPING, _check_mapping),
+    (TPDO_MAPPING, _check_mapping),
+)
+
+
+def _rule(index: int) -> Rule | None:
+    return next((rule for indices, rule in _RULES if index in indices), None)
+
+
+# --- commands and bit rates -------------------------------------------------------------------------------------------
+def known_bit_rate(device: Device, bit_rate: int) -> int:
+    """Return a bit rate [bit/s] as 2704h counts it [kbit/s]; ValueError if the device does not have it."""
+    known = device.allowed_values.get(device.canopen.objects["bit_rate"])
+    if known is not None and bit_rate not in [1000 * rate for rate in known]:
+        rates = ", ".join(str(1000 * rate) for rate in known)
+        raise ValueError(f"{device.name} has no bit rate of {bit_rate} bit/s; it has {rates}")
+    return bit_rate // 1000
+
+
+def signed_command(signature: int, code: int, action: Callable[[], None]) -> Callable[[int], None]:
+    """Return a command that acts only on the right signature."""
+
+    def command(raw: int) -> None:
+        if raw != signature:
+            raise ObjectAccessError(code, f"{raw:08X}h is not the signature {signature:08X}h")
+        action()
+
+    return command

@@ -1,0 +1,71 @@
+"""PDO mapping: what an entry of 1600h...17FFh and 1A00h...1BFFh means, and the rule by which it is changed.
+
+The rule is the manual's (sections 3.1.18 and 3.1.20): switch the PDO off (bit 31 of its COB-ID), set the number of
+entries to 0, write entries, set their number, switch the PDO on. What breaks it is refused with the codes that CiA 301
+has for mapping: 06010000h, 06020000h, 06040041h, 06040042h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from drive_env.dictionary.access import (
+    CANNOT_BE_MAPPED,
+    NO_SUCH_OBJECT,
+    PDO_LENGTH_EXCEEDED,
+    UNSUPPORTED_ACCESS,
+    ObjectAccessError,
+)
+from drive_env.dictionary.entries import Entry
+
+MAX_BITS = 64
+# Characters of `struct` by width [bits], unsigned and signed: what travels in a PDO is whole bytes.
+LAYOUT = {8: ("B", "b"), 16: ("H", "h"), 32: ("I", "i"), 64: ("Q", "q")}
+
+
+def parse(raw: int) -> tuple[int, int, int]:
+    """Return index, sub-index and length [bits] of a mapping entry."""
+    return raw >> 16, raw >> 8 & 0xFF, raw & 0xFF
+
+
+def check_may_change(entry: Entry, is_on: bool, count: int) -> None:
+    """Raise 06010000h for a change of a mapping while its PDO is on, or of an entry while the mapping is in use."""
+    if is_on:
+        raise ObjectAccessError(
+            UNSUPPORTED_ACCESS, f"{entry.label} is in use; set bit 31 of the PDO's COB-ID before changing its mapping"
+        )
+    if entry.sub != 0 and count != 0:
+        raise ObjectAccessError(
+            UNSUPPORTED_ACCESS, f"{entry.label} is one of {count} in use; set sub-index 0 to 0 before"
+        )
+
+
+def check_mappable(entry: Entry, raw: int, transmit: bool, find: Callable[[int, int], Entry]) -> Entry:
+    """Return the object that a mapping entry names.
+
+    Raises:
+        ObjectAccessError: 06020000h if there is no such object, 06040041h if a PDO of this direction cannot carry it.
+    """
+    index, sub, bits = parse(raw)
+    try:
+        mapped = find(index, sub)
+    except ObjectAccessError as error:
+        code = NO_SUCH_OBJECT if error.abort_code == NO_SUCH_OBJECT else CANNOT_BE_MAPPED
+        raise ObjectAccessError(code, f"{entry.label} cannot map {index:04X}h:{sub:02X}: {error}") from error
+    wrong_way = "wo" if transmit else "ro"
+    if not mapped.pdo_mappable or mapped.access in (wrong_way, "const") or mapped.bits not in LAYOUT:
+        raise ObjectAccessError(CANNOT_BE_MAPPED, f"{entry.label} cannot map {mapped.label}, {mapped.access}")
+    if mapped.bits != bits:
+        raise ObjectAccessError(
+            CANNOT_BE_MAPPED, f"{entry.label}: {mapped.label} has {mapped.bits} bits, not {bits}; write the object's"
+        )
+    return mapped
+
+
+def check_mapping(entry: Entry, raws: Sequence[int], transmit: bool, find: Callable[[int, int], Entry]) -> None:
+    """Raise 06020000h, 06040041h or 06040042h unless these entries together make a PDO; written to sub-index 0."""
+    bits = sum(check_mappable(entry, raw, transmit, find).bits or 0 for raw in raws)
+    if bits > MAX_BITS:
+        raise ObjectAccessError(
+            PDO_LENGTH_EXCEEDED, f"{entry.label}: {len(raws)} entries make {bits} bits; a PDO carries {MAX_BITS}"
+        )

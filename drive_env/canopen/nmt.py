@@ -1,0 +1,50 @@
+"""The NMT slave: states, commands, and which services live in which state (CiA 301, 7.3.2)."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+
+class State(IntEnum):
+    """NMT state; the number is what heartbeat and guarding send."""
+
+    INITIALISING = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+
+class Command(IntEnum):
+    """Command specifier of an NMT frame."""
+
+    START = 1
+    STOP = 2
+    ENTER_PRE_OPERATIONAL = 128
+    RESET_NODE = 129
+    RESET_COMMUNICATION = 130
+
+
+class Services(NamedTuple):
+    """A row of CiA 301, table 37: what works in a state; NMT and error control work in all three."""
+
+    sdo: bool
+    pdo: bool
+    emergency: bool
+
+
+SERVICES = {
+    State.INITIALISING: Services(sdo=False, pdo=False, emergency=False),
+    State.PRE_OPERATIONAL: Services(sdo=True, pdo=False, emergency=True),
+    State.OPERATIONAL: Services(sdo=True, pdo=True, emergency=True),
+    State.STOPPED: Services(sdo=False, pdo=False, emergency=False),
+}
+
+_COMMANDS = {int(command): command for command in Command}
+
+
+def parse_command(data: bytes, node_id: int) -> Command | None:
+    """Return the command that an NMT frame has for this node: to all (0) or to it alone; None if there is none."""
+    if len(data) != 2 or data[1] not in (0, node_id):
+        return None
+    return _COMMANDS.get(data[0])

@@ -1,0 +1,492 @@
+"""One CANopen node: frames come in, frames go out, and the drives behind it are the axes of one device.
+
+Here the services meet: which of them live in which NMT state, what a reset brings back, what an error does. Each
+service is a file of its own and knows nothing of the others. A node reads no clock: every call brings the time.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Hashable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from drive_env.axis import Axis, QueuedEmergency
+from drive_env.canopen import communication, frames, nmt
+from drive_env.canopen.communication import ModuleObjects, known_bit_rate, signed_command
+from drive_env.canopen.emergency import CONDITIONS, Condition, EmergencyProducer, ErrorHistory
+from drive_env.canopen.error_control import HeartbeatConsumer, HeartbeatProducer, NodeGuarding, consumers
+from drive_env.canopen.frames import Frame
+from drive_env.canopen.nmt import Command, State
+from drive_env.canopen.node_dictionary import NodeDictionary
+from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
+from drive_env.canopen.sdo import SdoServer
+from drive_env.canopen.store import Section, Store
+from drive_env.dictionary.access import (
+    CANNOT_BE_STORED,
+    HARDWARE_ERROR,
+    VALUE_RANGE,
+    ObjectAccessError,
+    check_limits,
+)
+from drive_env.drives import EmulatedDrives
+from drive_env.firmware.protection import CAUSES, CUT, STOP
+
+logger = logging.getLogger(__name__)
+
+COMMUNICATION_ERROR, APPLICATION_ERROR = 1, 2  # sub-indices of 1029h
+FAULT_RESET = 0  # row of CAUSES
+
+
+class Node:
+    """A CANopen slave in front of the axes of one emulated device.
+
+    It is off until `power_on`.
+
+    Args:
+        node_id: Number on the bus, 1...127; one that the store holds replaces it.
+        drives: The emulated drives.
+        first_axis: Number of the device's first axis among the drives'.
+        send: Takes every frame that the node sends.
+        store: The file that is its non-volatile memory; without one it lasts as long as the node.
+        bit_rate: That of the bus [bit/s], and the node's own while it has stored none. With another one stored the node
+            is mute and deaf, as its controller understands nothing. None: the factory's, and whatever is stored fits.
+
+    Raises:
+        ValueError: For a number that no node can have, axes that the drives do not have, a bit rate that the device
+            does not know, or a file that holds something else.
+
+    Attributes:
+        node_id: Number on the bus, as it is now.
+        state: NMT state.
+        drives: The emulated drives.
+        first_axis: Number of the device's first axis among them.
+        dictionary: All objects by index and sub-index.
+    """
+
+    def __init__(
+        self,
+        node_id: int,
+        drives: EmulatedDrives,
+        first_axis: int = 0,
+        *,
+        send: Callable[[Frame], None],
+        store: Path | None = None,
+        bit_rate: int | None = None,
+    ) -> None:
+        device = drives.device
+        if not 1 <= node_id <= 127:
+            raise ValueError(f"node {node_id} cannot be: CANopen numbers nodes 1 to 127")
+        if not 0 <= first_axis <= drives.num_axes - device.num_axes:
+            raise ValueError(
+                f"first_axis={first_axis}: {device.name} has {device.num_axes} of the {drives.num_axes} axes there "
+                f"are; use 0 to {drives.num_axes - device.num_axes}"
+            )
+        self._bus_bit_rate = None if bit_rate is None else known_bit_rate(device, bit_rate)
+        self.node_id = self._given_id = node_id
+        self.state = State.INITIALISING
+        self.drives = drives
+        self.first_axis = first_axis
+        self._device = device
+        self._objects = drives._objects
+        self._send = send
+        self._now = 0.0
+        self._is_online = False
+        self._leaves_for_bootloader = False
+        self._axes = [Axis(self._objects, first_axis + k) for k in range(device.num_axes)]
+        self._mask = np.zeros(drives.num_axes, bool)
+        self._mask[first_axis : first_axis + device.num_axes] = True
+
+        entries = self._objects.entries
+        self._module = ModuleObjects(device, entries, self._configure)
+        self._add_services()
+        self.dictionary = NodeDictionary(device, entries, self._module, self._axes)
+        self._store = Store(store, device.name)
+        self._check_store(store)
+        self._prepare_restart()
+        self._restore_bus()
+        self._module.restore(self.node_id, {})
+
+        self._sdo = SdoServer(self.dictionary.port, device.canopen.sdo_timeout)
+        self._emergency = EmergencyProducer(self._transmit)
+        self._conditions: dict[Hashable, Condition] = {}
+        self._heartbeat = HeartbeatProducer()
+        self._guarding = NodeGuarding()
+        self._consumers: list[HeartbeatConsumer] = []
+        indices = sorted({entry.index for entry in entries})
+        port = self.dictionary.port
+        self._rpdos = [ReceivePdo(i, self._module, port) for i in indices if i in communication.RPDO]
+        units = device.canopen.inhibit_unit, device.canopen.event_unit
+        self._tpdos = [TransmitPdo(i, self._module, port, *units) for i in indices if i in communication.TPDO]
+        self._pdos = {pdo.index: pdo for pdo in (*self._rpdos, *self._tpdos)}
+        self._handlers: dict[int, tuple[Callable[[bytes, float], None], ...]] = {}
+
+    # --- the interface --------------------------------------------------------------------------------------------
+    @property
+    def bit_rate(self) -> int:
+        """Bit rate [kbit/s] of its controller."""
+        return self._module.role("active_bit_rate")
+
+    def power_on(self, now: float) -> None:
+        """Switch the device on, or off and on: stored values, boot-up, pre-operational."""
+        self._now = now
+        self._reset_application(now)
+
+    def receive(self, frame: Frame, now: float) -> None:
+        """Take a frame of the bus at time `now` [s]; whatever it holds, nothing is raised."""
+        self._now = now
+        if not self._is_online:
+            return
+        if frame.rtr:  # the device supports remote frames for guarding alone
+            if frame.can_id == frames.ERROR_CONTROL + self.node_id and self._heartbeat.period == 0.0:
+                self._transmit(Frame(frame.can_id, self._guarding.answer(self.state, now)))
+                self._conditions.pop("guarding", None)
+            return
+        for handler in self._handlers.get(frame.can_id, ()):
+            handler(frame.data, now)
+
+    def before_cycle(self, now: float) -> None:
+        """Do what is due before the drives advance by one communication cycle that begins at `now` [s].
+
+        A lost master so stops the drives in the cycle that begins.
+        """
+        self._now = now
+        if not self._is_online:
+            return
+        for consumer in self._consumers:
+            if consumer.is_lost(now):
+                self._lose("heartbeat", consumer.node_id, now)
+        if self._guarding.is_lost(now):
+            self._lose("guarding", 0, now)
+
+    def after_cycle(self, now: float) -> None:
+        """Do what is due after it: emergencies, event-driven PDOs, timers, heartbeat; the cycle ended at `now` [s]."""
+        self._now = now
+        if not self._is_online:
+            return
+        for axis in self._axes:
+            for emergency in axis.take_emergencies():
+                self._tell_of(axis, emergency, now)
+        self._flush(now)
+        if nmt.SERVICES[self.state].pdo:
+            for pdo in self._event_tpdos:
+                data = pdo.on_cycle(now)
+                if data is not None and pdo.can_id is not None:
+                    self._transmit(Frame(pdo.can_id, data))
+        if self._heartbeat.is_due(now):
+            self._transmit(Frame(frames.ERROR_CONTROL + self.node_id, bytes((self.state,))))
+        abort = self._sdo.expire(now)
+        if abort is not None:
+            self._transmit(Frame(frames.SDO_RESPONSE + self.node_id, abort))
+
+    # --- conditions of the CAN controller -------------------------------------------------------------------------
+    def bus_off(self, now: float) -> None:
+        """Take the node off the bus, as a controller with too many errors does: the drive stops and is disabled."""
+        self._now = now
+        if not self._is_online:
+            return
+        self._is_online = False
+        for axis in self._axes:
+            axis.trip()
+        self._react(COMMUNICATION_ERROR)
+
+    def bus_on(self, now: float) -> None:
+        """Let the controller recover from bus-off; the node tells it as soon as its NMT state allows."""
+        self._now = now
+        if self._is_online or self.state is State.INITIALISING:
+            return
+        self._is_online = True
+        self._raise("bus_off_recovered", now)
+
+    def overrun(self, now: float, buffer: str = "controller") -> None:
+        """Tell it that frames were lost in a buffer: "controller", "transmit" or "receive"."""
+        self._now = now
+        self._raise(f"{buffer}_overflow", now)
+
+    def error_passive(self, now: float) -> None:
+        """Tell it that its controller has become error passive."""
+        self._now = now
+        self._raise("error_passive", now)
+
+    # --- resets ---------------------------------------------------------------------------------------------------
+    def _reset_application(self, now: float) -> None:
+        """Start the module anew: bit rate and node ID that were stored, the axes' stored values, then communication."""
+        self._restore_bus()
+        self._is_online = self._bus_bit_rate in (None, self.bit_rate)
+        if not self._is_online:
+            logger.warning(
+                "node %d has %d kbit/s stored and is off the bus, which has %d kbit/s; give the bus the node's bit "
+                "rate, or the node another store",
+                self.node_id, self.bit_rate, self._bus_bit_rate,
+            )  # fmt: skip
+        self._objects.restart(self._mask)
+        self._reset_communication(now)
+
+    def _restore_bus(self) -> None:
+        """Let bit rate and node ID that were stored become the active ones; never stored, they are the given ones."""
+        objects, bus = self._device.canopen.objects, self._store.sections.get("bus")
+        factory = self._module.factory(self._given_id)
+        for role, given in (("bit_rate", self._bus_bit_rate), ("node_id", self._given_id)):
+            key = objects[role]
+            raw = given if bus is None and given is not None else (bus or {}).get(key, factory[key])
+            self._module.set(role, raw)
+            self._module.set(f"active_{role}", raw)
+        self.node_id = self._module.role("active_node_id")
+
+    def _reset_communication(self, now: float) -> None:
+        """Bring the communication objects back, send the boot-up message and become pre-operational."""
+        self.state = State.INITIALISING
+        self._leaves_for_bootloader = False
+        self._sdo.close()
+        self._emergency.clear()
+        self._conditions.clear()
+        self._guarding.reset()
+        self._module.restore(self.node_id, self._store.sections.get("communication", {}))
+        for pdo in self._pdos.values():
+            pdo.configure()
+        for index in (
+            communication.EMERGENCY_ID,
+            communication.CONSUMER_HEARTBEAT,
+            communication.GUARD_TIME,
+            communication.PRODUCER_HEARTBEAT,
+        ):
+            self._configure(index)
+        self._transmit(Frame(frames.ERROR_CONTROL + self.node_id, bytes((State.INITIALISING,))))
+        self._heartbeat.postpone(now)
+        self.state = State.PRE_OPERATIONAL
+
+    def _configure(self, index: int) -> None:
+        """Let the service behind a communication object take over what was written."""
+        module = self._module
+        if index in (communication.EMERGENCY_ID, communication.EMERGENCY_INHIBIT):
+            raw = module.value(communication.EMERGENCY_ID)
+            can_id = None if raw & frames.INVALID else raw & frames.IDENTIFIER
+            self._emergency.configure(can_id, module.value(communication.EMERGENCY_INHIBIT) * 1e-4)
+        elif index == communication.CONSUMER_HEARTBEAT:
+            self._consumers = consumers([module.value(index, sub) for sub in module.subs(index)])
+        elif index == communication.PRODUCER_HEARTBEAT:
+            self._heartbeat.configure(module.value(index) * 1e-3)
+        elif index in (communication.GUARD_TIME, communication.LIFE_TIME_FACTOR):
+            life = module.value(communication.GUARD_TIME) * 1e-3 * module.value(communication.LIFE_TIME_FACTOR)
+            self._guarding.configure(life)
+        elif index in communication.PDO:
+            is_mapping = index in communication.RPDO_MAPPING or index in communication.TPDO_MAPPING
+            self._pdos[index - communication.TO_MAPPING if is_mapping else index].configure()
+        self._connect()
+
+    def _connect(self) -> None:
+        """Work out which services take which identifier; several may share one."""
+        table: dict[int, list[Callable[[bytes, float], None]]] = {
+            frames.NMT: [self._on_nmt],
+            frames.SDO_REQUEST + self.node_id: [self._on_sdo],
+        }
+        table.setdefault(self._module.value(communication.SYNC_ID) & frames.IDENTIFIER, []).append(self._on_sync)
+        for consumer in self._consumers:
+            handler = partial(self._on_heartbeat, consumer)
+            table.setdefault(frames.ERROR_CONTROL + consumer.node_id, []).append(handler)
+        for pdo in self._rpdos:
+            if pdo.can_id is not None:
+                table.setdefault(pdo.can_id, []).append(partial(self._on_rpdo, pdo))
+        self._handlers = {can_id: tuple(handlers) for can_id, handlers in table.items()}
+        self._sync_rpdos = [pdo for pdo in self._rpdos if pdo.can_id is not None and pdo.is_synchronous]
+        on = [pdo for pdo in self._tpdos if pdo.can_id is not None]
+        self._sync_tpdos = [pdo for pdo in on if pdo.is_synchronous]
+        self._event_tpdos = [pdo for pdo in on if not pdo.is_synchronous]
+
+    # --- services -------------------------------------------------------------------------------------------------
+    def _on_nmt(self, data: bytes, now: float) -> None:
+        command = nmt.parse_command(data, self.node_id)
+        if command is Command.START:
+            self._enter(State.OPERATIONAL)
+        elif command is Command.STOP:
+            self._enter(State.STOPPED, is_commanded=True)
+        elif command is Command.ENTER_PRE_OPERATIONAL:
+            self._enter(State.PRE_OPERATIONAL)
+            self._flush(now)
+        elif command is Command.RESET_NODE:
+            self._reset_application(now)
+        elif command is Command.RESET_COMMUNICATION:
+            self._reset_communication(now)
+
+    def _enter(self, state: State, *, is_commanded: bool = False) -> None:
+        if state is self.state:
+            return
+        self.state = state
+        for received in self._rpdos:
+            received.forget()
+        if state is State.OPERATIONAL:
+            for sent in self._tpdos:
+                sent.start()
+        elif state is State.STOPPED:
+            self._sdo.close()
+            # The one link between the two automata (manual, section 2.2). A stop after an error has been told already.
+            tripped = [axis.trip() for axis in self._axes]
+            if any(tripped) and is_commanded:
+                self._raise("communication_error", self._now)
+
+    def _on_sdo(self, data: bytes, now: float) -> None:
+        if not nmt.SERVICES[self.state].sdo:
+            return
+        answer = self._sdo.request(data, now)
+        if answer is not None:
+            self._transmit(Frame(frames.SDO_RESPONSE + self.node_id, answer))
+        if self._leaves_for_bootloader:
+            # The boot loader does not speak CANopen, and under it no firmware drives the motor: until power-on.
+            self._is_online = False
+            self.state = State.INITIALISING
+            self._objects.restart(self._mask)
+
+    def _on_sync(self, data: bytes, now: float) -> None:
+        # CiA 301: without or with a counter. This device's table of emergencies has none for another length (8240h).
+        if len(data) > 1 or not nmt.SERVICES[self.state].pdo:
+            return
+        for received in self._sync_rpdos:
+            self._judge(received, received.latch(), now)
+        for sent in self._sync_tpdos:
+            sample = sent.on_sync()
+            if sample is not None and sent.can_id is not None:
+                self._transmit(Frame(sent.can_id, sample))
+
+    def _on_rpdo(self, pdo: ReceivePdo, data: bytes, now: float) -> None:
+        if nmt.SERVICES[self.state].pdo:
+            self._judge(pdo, pdo.receive(data), now)
+
+    def _on_heartbeat(self, consumer: HeartbeatConsumer, data: bytes, now: float) -> None:
+        if len(data) == 1:
+            consumer.receive(now)
+            self._conditions.pop(("heartbeat", consumer.node_id), None)
+
+    # --- errors ---------------------------------------------------------------------------------------------------
+    def _judge(self, pdo: ReceivePdo, condition: str | None, now: float) -> None:
+        """Tell of a PDO that could not be processed, once until a good one comes (CiA 301: once per error event)."""
+        if condition is not None:
+            self._raise(condition, now, pdo.index)
+        elif pdo.index in self._conditions:
+            del self._conditions[pdo.index]
+
+    def _lose(self, service: str, node_id: int, now: float) -> None:
+        self._raise("heartbeat_lost", now, "guarding" if service == "guarding" else (service, node_id))
+        self._react(COMMUNICATION_ERROR)
+
+    def _raise(self, name: str, now: float, key: Hashable = None) -> None:
+        """Tell of a condition of the bus, unless it is known already."""
+        condition = CONDITIONS[name]
+        key = name if key is None else key
+        if self._conditions.get(key) is condition:
+            return
+        if condition.lasts:
+            self._conditions[key] = condition
+        emergency = self._device.emergencies[name]
+        self._emergency.push(emergency, self._error_register() | condition.error_register)
+        self._history.add(emergency.code)
+        self._flush(now)
+
+    def _tell_of(self, axis: Axis, queued: QueuedEmergency, now: float) -> None:
+        """Pass an axis' emergency on, with the error register of its moment, and react to a fault."""
+        cause = CAUSES[queued.row]
+        if queued.row == FAULT_RESET:
+            self._conditions.clear()
+        register = queued.error_register | self._error_register(without=axis)
+        emergency = self._device.emergencies[cause.name]
+        self._emergency.push(emergency, register)
+        self._history.add(emergency.code, self._axes.index(axis))
+        if cause.reaction in (CUT, STOP) and queued.row != FAULT_RESET:
+            self._flush(now)
+            self._react(APPLICATION_ERROR)
+
+    def _react(self, error_class: int) -> None:
+        """Do what 1029h says of an error that is detected in operational."""
+        if self.state is not State.OPERATIONAL:
+            return
+        raw = self._module.value(communication.ERROR_BEHAVIOUR, error_class)
+        target = self._device.canopen.error_behaviour.get(raw, "stay")
+        if target != "stay":
+            self._enter(State[target])
+
+    def _error_register(self, without: Axis | None = None) -> int:
+        register = 0
+        for axis in self._axes:
+            if axis is not without:
+                register |= axis.error_register
+        for condition in self._conditions.values():
+            register |= condition.error_register
+        return register
+
+    def _flush(self, now: float) -> None:
+        if self._is_online and nmt.SERVICES[self.state].emergency:
+            self._emergency.flush(now)
+
+    def _transmit(self, frame: Frame) -> None:
+        if self._is_online:
+            self._send(frame)
+
+    # --- store, restore, boot loader ------------------------------------------------------------------------------
+    def _add_services(self) -> None:
+        """Put the services behind the objects whose value they are, or whose write commands them."""
+        module, canopen = self._module, self._device.canopen
+        module.readers[communication.ERROR_REGISTER, 0] = self._error_register
+        for sub, names in canopen.store_groups.items():
+            save, load = partial(self._save, names), partial(self._load, names)
+            module.commands[communication.STORE, sub] = signed_command(canopen.save_signature, CANNOT_BE_STORED, save)
+            module.commands[communication.RESTORE, sub] = signed_command(canopen.load_signature, CANNOT_BE_STORED, load)
+        for role, signature, code, action in (
+            ("store_bus", canopen.save_signature, CANNOT_BE_STORED, partial(self._save, ("bus",))),
+            ("bootloader", canopen.bootloader_signature, VALUE_RANGE, self._leave_for_bootloader),
+        ):
+            if role in canopen.objects:
+                module.commands[canopen.objects[role]] = signed_command(signature, code, action)
+        subs = module.subs(communication.ERROR_HISTORY)
+        self._history = ErrorHistory(len(subs))
+        if subs:
+            for sub in (0, *subs):
+                module.readers[communication.ERROR_HISTORY, sub] = partial(self._history.read, sub)
+            module.commands[communication.ERROR_HISTORY, 0] = self._history.write
+
+    def _leave_for_bootloader(self) -> None:
+        self._leaves_for_bootloader = True
+
+    def _save(self, names: tuple[str, ...]) -> None:
+        """Save sections as they are now; what has its factory value follows the factory, so COB-IDs the node ID."""
+        factory = self._module.factory(self.node_id)
+        changed: dict[str, Section] = {name: {} for name in names}
+        for entry in self.dictionary.entries:
+            name = self.dictionary.section(entry)
+            if name in changed:
+                key = (entry.index, entry.sub)
+                raw = self.dictionary.port(*key).read()
+                assert isinstance(raw, int), "a parameter is a number"
+                if name == "bus" or raw != factory[key]:
+                    changed[name][key] = raw
+        self._commit(changed)
+
+    def _load(self, names: tuple[str, ...]) -> None:
+        """Bring sections back to the factory's values, from the next reset on."""
+        self._commit({name: {} for name in names})
+
+    def _commit(self, changed: dict[str, Section]) -> None:
+        try:
+            self._store.save(changed)
+        except OSError as error:
+            raise ObjectAccessError(HARDWARE_ERROR, f"the parameters cannot be stored: {error}") from error
+        self._prepare_restart()
+
+    def _prepare_restart(self) -> None:
+        """Tell the axes what a restart restores."""
+        values: list[dict[tuple[int, int], int]] = [{} for _ in self._axes]
+        for entry in self.dictionary.entries:
+            section = self._store.sections.get(self.dictionary.section(entry) or "")
+            if section is not None and not self._module.owns(entry) and isinstance(entry.default, int):
+                axis, base = self._device.locate(entry.index)
+                values[axis][base, entry.sub] = section.get((entry.index, entry.sub), entry.default)
+        for served, stored in zip(self._axes, values, strict=True):
+            self._objects.store(served.number, stored)
+
+    def _check_store(self, path: Path | None) -> None:
+        for section in self._store.sections.values():
+            for (index, sub), raw in section.items():
+                try:
+                    check_limits(self._module.find(index, sub), raw)
+                except ObjectAccessError as error:
+                    raise ValueError(f"{path} does not fit {self._device.name}: {error}; delete it") from error

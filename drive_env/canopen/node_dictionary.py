@@ -1,0 +1,64 @@
+"""The whole object dictionary of a node: the module's objects and those of each axis, by the index of the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from drive_env.axis import Axis, Port
+from drive_env.canopen.communication import ModuleObjects
+from drive_env.devices import Device
+from drive_env.dictionary.entries import Entry, ObjectDictionary
+
+
+class NodeDictionary:
+    """Ports of all objects.
+
+    Args:
+        device: Whose dictionary it is.
+        entries: What its EDS says.
+        module: Objects of the module.
+        axes: The axes, in order.
+    """
+
+    def __init__(self, device: Device, entries: ObjectDictionary, module: ModuleObjects, axes: Sequence[Axis]) -> None:
+        self.entries = entries
+        self._device = device
+        self._module = module
+        self._axes = axes
+        self._ports: dict[tuple[int, int], Port] = {}
+
+    def port(self, index: int, sub: int) -> Port:
+        """Return the way to an object.
+
+        Raises:
+            ObjectAccessError: 06020000h if there is no such object, 06090011h if it has no such sub-index.
+        """
+        port = self._ports.get((index, sub))
+        if port is None:
+            port = self._ports[index, sub] = self._make(self.entries.find((index, sub)))
+        return port
+
+    def section(self, entry: Entry) -> str | None:
+        """Return the section of the store that a parameter belongs to; None of what is no parameter.
+
+        What a receive PDO can carry is a command or a set-point: a drive that found an old one after power-on would
+        act on it.
+        """
+        roles = self._device.canopen.objects
+        if (entry.index, entry.sub) in (roles.get("bit_rate"), roles.get("node_id")):
+            return "bus"
+        is_command = (entry.index, entry.sub) in self._module.commands
+        if entry.access != "rw" or entry.bits is None or entry.pdo_mappable or is_command:
+            return None
+        if 0x1000 <= entry.index <= 0x1FFF:
+            return "communication"
+        axis, base = self._device.locate(entry.index)
+        return "profile" if base >= 0x6000 else f"motor {axis}"
+
+    def _make(self, entry: Entry) -> Port:
+        if self._module.owns(entry):
+            return self._module.port(entry)
+        axis, base = self._device.locate(entry.index)
+        if base == entry.index:
+            return self._axes[axis].port(entry)
+        return self._axes[axis].port(self.entries.find((base, entry.sub)))._replace(entry=entry)

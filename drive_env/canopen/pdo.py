@@ -1,0 +1,172 @@
+"""Process data: receive PDOs that write objects, transmit PDOs that send them (CiA 301, 7.2.2)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+from drive_env.axis import Port
+from drive_env.canopen import frames, mapping
+from drive_env.canopen.communication import TO_MAPPING, ModuleObjects
+from drive_env.dictionary.access import ObjectAccessError
+
+LAST_SYNCHRONOUS = 240  # transmission types 0...240; 254 and 255 are driven by events
+EPSILON = 1e-6  # s: times are sums of cycles
+
+# An RPDO takes effect as a whole: set-points first, then the mode, then the controlword, whatever their order in it. A
+# controlword that starts a move so finds the target of the same frame.
+_RANK = {"": 0, "set_point": 0, "mode": 1, "controlword": 2}
+
+
+class Pdo:
+    """What both directions have in common: identifier, transmission type and the mapped objects.
+
+    Args:
+        index: Index of its communication parameter.
+        objects: The module's objects.
+        port: Finds an object by index and sub-index.
+    """
+
+    def __init__(self, index: int, objects: ModuleObjects, port: Callable[[int, int], Port]) -> None:
+        self.index = index
+        self._objects = objects
+        self._port = port
+        self.configure()
+
+    def configure(self) -> None:
+        """Take over what the objects say."""
+        objects, index = self._objects, self.index
+        cob_id = objects.value(index, 1)
+        self.can_id = None if cob_id & frames.INVALID else cob_id & frames.IDENTIFIER
+        self.transmission_type = objects.value(index, 2)
+        count = objects.value(index + TO_MAPPING, 0)
+        mapped = [mapping.parse(objects.value(index + TO_MAPPING, sub)) for sub in range(1, count + 1)]
+        self._ports = [self._port(mapped_index, mapped_sub) for mapped_index, mapped_sub, _ in mapped]
+        letters = [mapping.LAYOUT[port.entry.bits or 0][port.entry.signed] for port in self._ports]
+        self._layout = struct.Struct("<" + "".join(letters))
+
+    @property
+    def is_synchronous(self) -> bool:
+        """Whether it belongs to SYNC."""
+        return self.transmission_type <= LAST_SYNCHRONOUS
+
+
+class ReceivePdo(Pdo):
+    """A PDO that the drive receives."""
+
+    def configure(self) -> None:
+        """Take over what the objects say; what waits for SYNC is forgotten."""
+        super().configure()
+        self._waiting: bytes | None = None
+        order = sorted(range(len(self._ports)), key=lambda k: _RANK[self._ports[k].event])
+        self._plan = [(k, self._ports[k]) for k in order]
+        self._modes = [(k, port) for k, port in self._plan if port.event == "mode"]
+
+    def receive(self, data: bytes) -> str | None:
+        """Take a frame; return the condition that it makes, None if it is good."""
+        if len(data) != self._layout.size:
+            return "pdo_too_short" if len(data) < self._layout.size else "pdo_too_long"
+        if self.is_synchronous:
+            self._waiting = data
+            return None
+        return self._apply(data)
+
+    def latch(self) -> str | None:
+        """Let what came since the last SYNC take effect; return the condition that it makes."""
+        if self._waiting is None:
+            return None
+        data, self._waiting = self._waiting, None
+        return self._apply(data)
+
+    def forget(self) -> None:
+        """Forget what waits for SYNC."""
+        self._waiting = None
+
+    def _apply(self, data: bytes) -> str | None:
+        values = self._layout.unpack(data)
+        plan = self._plan
+        # Masters repeat the mode in every frame: what it is already is no write, which some drives would refuse.
+        if self._modes:
+            repeated = [k for k, port in self._modes if values[k] == port.read()]
+            if repeated:
+                plan = [(k, port) for k, port in plan if k not in repeated]
+        try:
+            for k, port in plan:
+                port.check(values[k])
+        except ObjectAccessError:
+            return "pdo_not_accepted"
+        for k, port in plan:
+            port.write(values[k])
+        return None
+
+
+class TransmitPdo(Pdo):
+    """A PDO that the drive sends.
+
+    Event-driven ones (254, 255) are sent when a mapped value has changed since the last look, once per communication
+    cycle, and when their event timer ends; so is one when the node becomes operational, since then nobody knows its
+    values. Synchronous ones are sampled at SYNC: type n at every n-th, type 0 if a value has changed since the last.
+    """
+
+    def __init__(
+        self,
+        index: int,
+        objects: ModuleObjects,
+        port: Callable[[int, int], Port],
+        inhibit_unit: float,
+        event_unit: float,
+    ) -> None:
+        self._inhibit_unit, self._event_unit = inhibit_unit, event_unit
+        super().__init__(index, objects, port)
+
+    def configure(self) -> None:
+        """Take over what the objects say."""
+        super().configure()
+        self._readers = [port.read for port in self._ports]
+        self._inhibit = self._objects.value(self.index, 3) * self._inhibit_unit
+        self._period = self._objects.value(self.index, 5) * self._event_unit
+        self.start()
+
+    def start(self) -> None:
+        """Begin anew, as on entering operational."""
+        self._seen: bytes | None = None
+        self._is_due = False
+        self._sent_at: float | None = None
+        self._syncs = 0
+
+    def on_sync(self) -> bytes | None:
+        """Return the data to send at this SYNC, None if there is nothing to send."""
+        if not self.is_synchronous or not self._readers:
+            return None
+        if self.transmission_type == 0:
+            data = self._sample()
+            changed, self._seen = data != self._seen, data
+            return data if changed else None
+        self._syncs += 1
+        if self._syncs < self.transmission_type:
+            return None
+        self._syncs = 0
+        return self._sample()
+
+    def on_cycle(self, now: float) -> bytes | None:
+        """Return the data to send after a communication cycle that ended at `now` [s]."""
+        if self.is_synchronous or not self._readers:
+            return None
+        data = self._sample()
+        if data != self._seen:
+            self._seen = data
+            self._is_due = True
+        if self._sent_at is not None:
+            waited = now - self._sent_at + EPSILON
+            if self._period > 0.0 and waited >= self._period:
+                self._is_due = True
+            if waited < self._inhibit:
+                return None
+        if not self._is_due:
+            return None
+        self._is_due = False
+        self._sent_at = now
+        return data
+
+    def _sample(self) -> bytes:
+        return self._layout.pack(*[read() for read in self._readers])

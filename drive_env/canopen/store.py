@@ -1,0 +1,90 @@
+"""The node's non-volatile memory: sections of parameters in a file that is always whole.
+
+A section that is there holds every value of its group that differs from nothing: what it does not name is at its
+factory value. A section that is not there was never saved or restored.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+Key = tuple[int, int]
+Section = dict[Key, int]
+FORMAT = 1
+
+
+class Store:
+    """Sections of a device, in a file if there is a path.
+
+    Args:
+        path: The file; it need not exist.
+        device: Name of the device, which the file must be of.
+
+    Raises:
+        ValueError: If the file is none that this class wrote for this device.
+    """
+
+    def __init__(self, path: Path | None, device: str) -> None:
+        self._path = path
+        self._device = device
+        self.sections: dict[str, Section] = {}
+        if path is not None and path.exists():
+            self.sections = _parse(path, device)
+
+    def save(self, changed: Mapping[str, Section]) -> None:
+        """Replace sections; all of them are saved or, if the file cannot be written, none.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        sections = {**self.sections, **changed}
+        if self._path is not None:
+            content = {
+                "format": FORMAT,
+                "device": self._device,
+                "sections": {
+                    name: {f"{index:04X}:{sub}": raw for (index, sub), raw in sorted(section.items())}
+                    for name, section in sorted(sections.items())
+                },
+            }
+            write_whole(self._path, json.dumps(content, indent=1) + "\n")
+        self.sections = sections
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file so that whoever kills the process or the power finds the old content or the new, never a mixture."""
+    new = path.with_name(path.name + ".new")
+    with new.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
+    if os.name == "posix":  # elsewhere folders cannot be opened, and renaming is durable by itself
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def _parse(path: Path, device: str) -> dict[str, Section]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != FORMAT or content["device"] != device:
+            raise ValueError(f"it is of format {content['format']} and of a {content['device']}")
+        return {
+            str(name): {_key(text): int(raw) for text, raw in section.items()}
+            for name, section in content["sections"].items()
+        }
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path} holds no parameters of a {device} ({error}); give another file, or delete it to start afresh"
+        ) from error
+
+
+def _key(text: str) -> Key:
+    index, sub = text.split(":")
+    return int(index, 16), int(sub)

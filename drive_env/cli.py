@@ -1,0 +1,62 @@
+"""The command `drive-env`: it only puts together what lies in `tools`, one file per command or family."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from drive_env.tools.get import get, set_object
+from drive_env.tools.jog import jog
+from drive_env.tools.log import log, replay
+from drive_env.tools.monitor import monitor
+from drive_env.tools.options import INTERRUPTED
+from drive_env.tools.parameters import backup, commission, diff, restore
+from drive_env.tools.render import render
+from drive_env.tools.scan import scan
+from drive_env.tools.scope import scope
+from drive_env.tools.serve import serve
+
+app = typer.Typer(
+    name="drive-env",
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+PANELS = {
+    "Drives on a bus": (
+        ("scan", scan),
+        ("get", get),
+        ("set", set_object),
+        ("monitor", monitor),
+        ("scope", scope),
+        ("jog", jog),
+    ),
+    "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
+    "Frames": (("log", log), ("replay", replay)),
+    "Emulated drives": (("serve", serve), ("render", render)),
+}
+for panel, commands in PANELS.items():
+    for name, function in commands:
+        app.command(name, rich_help_panel=panel)(function)
+
+
+@app.callback()
+def drive_env() -> None:
+    """Servo drives: real ones and emulated ones, over CAN.
+
+    Interface and channel may stand in DRIVE_ENV_INTERFACE and DRIVE_ENV_CHANNEL. Exit codes: 0 done, 1 the drive or
+    the bus said no (or differs), 2 a mistake in the command, 130 Ctrl-C.
+    """
+
+
+def main() -> None:
+    """Run the command; Ctrl-C ends it with 130."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        print("drive-env: interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)

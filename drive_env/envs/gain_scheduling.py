@@ -1,0 +1,520 @@
+"""`ServoDrive/GainScheduling-v0`: gains change on line while a motion programme with changing payload runs."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from drive_env import motion
+from drive_env.envs.bus_delays import BusDelays
+from drive_env.envs.configuration import configured
+from drive_env.envs.lanes import Info, Lanes, Stepped, check_choice
+from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
+from drive_env.envs.pictures import Pictures
+from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
+from drive_env.gains import FITTED_RULE, RAW_MAX, rule_gains, small_time_constants, write_gains
+from drive_env.motors import find_motor
+from mechanics.loads import find_load
+from mechanics.shaft import one, shaft_load, way
+
+if TYPE_CHECKING:
+    from mechanics.load import Load
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+CYCLE = 0.001  # s, communication cycle
+STEPS = (0.005, 0.020)  # s, shortest and longest time between two sets of gains
+MODES = ("csp", "csv")
+# What can be scheduled: the integers of 2041h are computed from R and L, and are no part of it.
+GAINS = {"velocity_p": (0x2042, 1), "velocity_i": (0x2042, 2), "position_p": (0x2043, 1)}
+BASES = ("rule", "present")
+PAYLOADS = ("load.payload", "load.mass", "load.inertia")  # which "auto" takes: the first there is
+NO_PAYLOAD = "none"
+ROUGH = 0.03  # increment of current from sample to sample, of rated: DESIGN's score counts it so
+
+POSITION, VELOCITY, CURRENT, STATUSWORD = (0x6064, 0), (0x606C, 0), (0x6077, 0), (0x6041, 0)
+TARGETS = {"csp": (0x607A, 0), "csv": (0x60FF, 0)}
+LAG = 0.2  # share of the top speed whose lag is the error scale in csp
+INCREMENTS_PER_TURN = (0x2058, 0)
+
+# Entries of an axis before its gains: name, unit, low, high.
+ENTRIES = (
+    ("error", "of the error scale", -20.0, 20.0),
+    ("error_rms", "of the error scale, over the step", 0.0, 20.0),
+    ("error_peak", "of the error scale, over the step", 0.0, 20.0),
+    ("velocity", "of the programme's top speed", -4.0, 4.0),
+    ("velocity_demand", "of the programme's top speed", -2.0, 2.0),
+    ("next_velocity_demand", "of the programme's top speed, a step ahead", -2.0, 2.0),
+    ("acceleration_demand", "of the programme's top acceleration", -2.0, 2.0),
+    ("next_acceleration_demand", "of the programme's top acceleration, a step ahead", -2.0, 2.0),
+    ("current", "of rated, mean over the step", -8.0, 8.0),
+    ("current_rms", "of rated, over the step", 0.0, 8.0),
+    ("current_increment", "of rated, RMS from sample to sample over the step", 0.0, 4.0),
+)
+
+
+WEIGHTS = {"tracking": 1.0, "smoothness": 0.3, "trip": 20.0}
+
+
+@dataclass(frozen=True)
+class GainSchedulingConfig:
+    """Configuration of GainScheduling.
+
+    load, device, motor, friction: As `EmulatedDrives` takes them.
+    mode: "csp" (position) or "csv" (velocity).
+    excitation: The programme: "moves" from point to point, or "sine".
+    step: Time between two sets of gains [s], 5 to 20 ms, whole milliseconds.
+    duration: Of an episode [s].
+    gains: Which gains the agent sets: velocity_p, velocity_i, position_p.
+    base: What an action of 0 means: "rule", the fitted rule's gains for the nominal machine, or "present", those that
+        the drives hold when the environment is made; on a bus it is always these.
+    span: ln of the largest factor on a gain.
+    payload: Parameter of the load that changes; "auto" takes its payload, mass or inertia, "none" changes nothing.
+    payload_low, payload_high: Range of its factor on the nominal value; None is the load's own.
+    payload_every: Mean time between two changes [s].
+    distributions: The machines, as `randomisation.Distributions` takes them; None is the load's shipped set,
+        {"parameters": {}} the nominal machine in every episode.
+    stage: Of its curriculum, 0...1.
+    weights: Of the reward's terms; those left out keep theirs.
+    num_threads: As `EmulatedDrives` takes it.
+    """
+
+    load: Any = "belt"
+    device: str = "tmcm1636"
+    motor: str = "qbl4208"
+    friction: str = "stribeck"
+    mode: str = "csp"
+    excitation: str = "moves"
+    step: float = 0.010
+    duration: float = 2.0
+    gains: tuple[str, ...] = tuple(GAINS)
+    base: str = "rule"
+    span: float = 1.0
+    payload: str = "auto"
+    payload_low: float | None = None
+    payload_high: float | None = None
+    payload_every: float = 0.4
+    distributions: Any = None
+    stage: float = 1.0
+    weights: Mapping[str, float] = field(default_factory=dict)
+    num_threads: int | None = None
+
+    def __post_init__(self) -> None:
+        check_choice("mode", self.mode, MODES)
+        check_choice("excitation", self.excitation, EXCITATIONS)
+        check_choice("base", self.base, BASES)
+        if isinstance(self.gains, str) or not self.gains or len(set(self.gains)) != len(self.gains):
+            raise ValueError(f"gains must be different ones of {', '.join(GAINS)}, not {self.gains!r}")
+        object.__setattr__(self, "gains", tuple(self.gains))
+        for name in self.gains:
+            check_choice("a gain", name, tuple(GAINS))
+        for name in self.weights:
+            check_choice("a weight's name", name, tuple(WEIGHTS))
+        object.__setattr__(self, "weights", {**WEIGHTS, **self.weights})
+        cycles = self.step / CYCLE
+        if not STEPS[0] - 1e-9 <= self.step <= STEPS[1] + 1e-9 or abs(cycles - round(cycles)) > 1e-6:
+            raise ValueError(f"step must be {STEPS[0]:g}...{STEPS[1]:g} s in whole milliseconds, not {self.step:g} s")
+        for name in ("duration", "span", "payload_every"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} must be above 0 and finite, not {getattr(self, name):g}")
+        if self.duration < self.step:
+            raise ValueError(f"duration must be at least one step of {self.step:g} s, not {self.duration:g} s")
+        if not 0.0 <= self.stage <= 1.0:
+            raise ValueError(f"stage of the curriculum must lie in 0...1, not {self.stage:g}")
+
+
+class GainScheduling(Lanes):
+    """Gains that follow the machine: set every 5 to 20 ms, while a programme with changing payload runs.
+
+    An action is ln(gain / base) / span of each gain of each axis, -1 to 1, axis by axis. A gain is written by SDO
+    between two cycles, as it would be on a bus; the programme's set-points are played as PDOs.
+
+    An observation has for each axis, float32, from the samples of the last step as they have come over the bus:
+
+    | index | name | unit | low | high |
+    | --- | --- | --- | --- | --- |
+    | 0 | error: set-point less actual | of the error scale | -20 | 20 |
+    | 1 | error_rms, over the step | of the error scale | 0 | 20 |
+    | 2 | error_peak, over the step | of the error scale | 0 | 20 |
+    | 3 | velocity | of the programme's top speed | -4 | 4 |
+    | 4 | velocity_demand | of the programme's top speed | -2 | 2 |
+    | 5 | next_velocity_demand, a step ahead | of the programme's top speed | -2 | 2 |
+    | 6 | acceleration_demand | of the programme's top acceleration | -2 | 2 |
+    | 7 | next_acceleration_demand, a step ahead | of the programme's top acceleration | -2 | 2 |
+    | 8 | current, mean over the step | of rated | -8 | 8 |
+    | 9 | current_rms, over the step | of rated | 0 | 8 |
+    | 10 | current_increment, RMS from sample to sample | of rated | 0 | 4 |
+    | 11... | the last action's entries for this axis | 1 | -1 | 1 |
+
+    The error scale is what the fitted rule's gains would leave: in csp, where this drive has no feed-forward and lags
+    by v/k_v, at a fifth of the programme's top speed; in csv a/w_v at its top acceleration. What lies beyond its bounds
+    is cut off there.
+
+    Reward: the weighted sum of the terms, each in 0...1: tracking = 1/(1 + (error_rms/scale)^2), smoothness =
+    1/(1 + (current_increment/3 %)^2), the worst axis counting, less trip when the drive trips. `terminated`: a drive of
+    the lane tripped, or its machine left physics; `truncated`: the programme's time ran out.
+
+    `info`: "reward_terms" by name; "parameters", not on a bus, the true machine as it is now; "fault", the name of the
+    emergency that ended the episode, "diverged", or "".
+
+    Args:
+        num_envs: Lanes.
+        config: A `GainSchedulingConfig`, a table like it, or a TOML file.
+        drives: Drives to act on, `num_envs` machines of the configured load; emulated ones of the configuration by
+            default. On a bus an episode begins with a fault reset and a move back to the start.
+        autoreset_mode, render_mode: As `Lanes` takes them.
+        options: Fields of the configuration that replace its own.
+
+    Raises:
+        ValueError: For a value that is none, naming those that are.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        config: GainSchedulingConfig | Mapping[str, Any] | str | Path | None = None,
+        drives: Any = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        self.config = configured(GainSchedulingConfig, config, options)
+        row = find_load(self.config.load)
+        self._axes = row.num_axes
+        width = len(self.config.gains)
+        bounds = [[entry[k] for entry in ENTRIES] + [sign] * width for k, sign in ((2, -1.0), (3, 1.0))]
+        self._low, self._high = (np.tile(np.array(bound, np.float32), self._axes) for bound in bounds)
+        super().__init__(
+            num_envs,
+            Box(self._low, self._high, dtype=np.float32),
+            Box(-1.0, 1.0, (self._axes * width,), np.float32),
+            autoreset_mode=autoreset_mode,
+            render_mode=render_mode,
+        )
+        self._cycles = round(self.config.step / CYCLE)
+        self._steps = round(self.config.duration / self.config.step)
+        self._action: Floats = np.zeros(0)  # of every axis
+        self._payload, self._payload_range = self._find_payload(row)
+        self._pictures: Pictures | None = None
+        self._owned = drives is None
+        self.drives = self._new_drives() if drives is None else drives
+        try:
+            self._prepare(row)
+        except BaseException:
+            self._close_lanes()
+            raise
+
+    # --- Lanes ----------------------------------------------------------------------------------------------------
+    def _reset_lanes(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
+        for name in options:
+            check_choice("an option of reset", name, ("reset_mask",))
+        axes = np.repeat(mask, self._axes)
+        # First, so that it is the same on a bus, where no machine is drawn.
+        self._programme.draw(self.config.excitation, self.reach, self.rngs, mask)
+        if self._machines is not None:
+            self._machines.redraw(self.rngs, mask, self.config.stage)
+            self._plan_payloads(mask)
+        else:
+            self._bring_back(axes)
+        self._now[mask] = 0
+        self._action[axes] = 0.0
+        write_gains(self.drives, self.base_gains, where=axes)
+        position = self.drives.read(POSITION)
+        self._origin[axes] = position[axes]
+        self.drives.write(TARGETS[self.config.mode], self._origin if self.config.mode == "csp" else 0, where=axes)
+        motion.enable(self.drives, self.config.mode, where=axes)
+        first = self._set_points(np.zeros(1, np.int64))[0]
+        self._acting[mask] = first[mask]
+        if self._machines is not None:
+            at_rest = np.zeros((self.num_envs, 3 * self._axes))
+            self._bus.reset(self._machines.values, self.rngs, first, at_rest, mask)
+            gains = self._gains_of(self._action).reshape(self.num_envs, -1)
+            self._gain_bus.reset(self._machines.values, self.rngs, gains, at_rest, mask)
+        if self._pictures is not None:
+            self._pictures.begin(mask)
+        nothing = np.zeros((self._cycles, self.drives.num_axes))
+        return self._observe(nothing, nothing, nothing), self._tell(np.full(self.num_envs, "", object))
+
+    def _step_lanes(self, action: Any) -> Stepped:
+        chosen = np.clip(np.asarray(action, float).reshape(self._action.shape), -1.0, 1.0)
+        self._action = np.nan_to_num(chosen)
+        self._change_payloads()
+        targets = self._through_bus()
+        rows = self._run(targets)
+        error, velocity, current = self._measured(targets, rows)
+        self._now += 1
+        tripped = (rows[STATUSWORD] & motion.FAULT_BIT[0] != 0).any(axis=0)
+        fault = self._faults(tripped)
+        terminated = fault != ""
+        terms = self._terms(error, current, terminated)
+        reward = sum(weight * terms[name] for name, weight in self.config.weights.items())
+        seen = self._seen(error, velocity, current)
+        info = self._tell(fault) | {"reward_terms": terms}
+        return self._observe(*seen), np.asarray(reward, float), terminated, self._now >= self._steps, info
+
+    def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
+        if self._pictures is None:
+            self._pictures = Pictures(self.drives, self.num_envs, self.render_mode or "rgb_array")
+        return self._pictures.draw(lane)
+
+    def _close_lanes(self) -> None:
+        if self._pictures is not None:
+            self._pictures.close()
+        if self._owned:
+            self.drives.close()
+
+    # --- construction ---------------------------------------------------------------------------------------------
+    def _new_drives(self) -> Any:
+        from drive_env.drives import EmulatedDrives
+
+        c = self.config
+        return EmulatedDrives(c.device, c.load, c.motor, self.num_envs, friction=c.friction, num_threads=c.num_threads)
+
+    def _prepare(self, load: Load) -> None:
+        n, axes = self.num_envs, self.drives.num_axes
+        if axes != n * self._axes:
+            raise ValueError(
+                f"{n} lanes of load {load.name!r} with {self._axes} axes each need {n * self._axes} drives, not {axes}"
+            )
+        self._prepare_scales(load)
+        self._prepare_machines()
+        self._prepare_gains()
+        self._programme = Programme(n, self._steps * self._cycles, 2 * self._cycles, CYCLE)
+        self._bus, self._gain_bus = BusDelays(n), BusDelays(n)
+        self._now = np.zeros(n, np.int64)  # steps since the lane's reset
+        self._origin = np.zeros(axes, np.int64)
+        self._action = np.zeros((axes, len(self.config.gains)))
+        self._acting = np.zeros((n, self._axes), np.int64)
+
+    def _prepare_scales(self, load: Load) -> None:
+        """Set what the programme may ask for: half of what motor and travel give, with the heaviest payload."""
+        motor, alone = find_motor(self.config.motor), one(load)
+        shaft, turning = shaft_load(alone), way(alone)
+        self._nominal_inertia = motor.inertia + shaft.inertia[0]
+        heaviest = motor.inertia + self._payload_range[1] * shaft.inertia[0]
+        torque = np.maximum(motor.rated_torque - shaft.gravity[0] - shaft.friction[0], 0.3 * motor.rated_torque)
+        room = np.minimum(np.minimum(-turning.low, turning.high) * 0.8, 4.0 * 2.0 * np.pi)
+        self.reach = Reach(
+            distance=room, speed=np.full(self._axes, 0.4 * motor.rated_speed), acceleration=0.5 * torque / heaviest
+        )
+        device = self.drives.device
+        small = float(small_time_constants(device, device.stage["velocity_filter"].default))
+        w_v = FITTED_RULE.speed / small
+        lag = LAG * self.reach.speed / (FITTED_RULE.position * w_v)
+        scale = lag if self.config.mode == "csp" else self.reach.acceleration / w_v
+        self._error_scale = np.tile(scale, self.num_envs)
+        self._speed_scale = np.tile(self.reach.speed, self.num_envs)
+        self._acceleration_scale = np.tile(self.reach.acceleration, self.num_envs)
+        self._rated_current = motor.rated_current
+        self._per_rad = self.drives.read(INCREMENTS_PER_TURN) / (2.0 * np.pi)
+
+    def _find_payload(self, load: Load) -> tuple[str, tuple[float, float]]:
+        """Return which parameter changes, and the range of its factor."""
+        c = self.config
+        known = [f"load.{p.name}" for p in load.parameters]
+        name = next((n for n in PAYLOADS if n in known), NO_PAYLOAD) if c.payload == "auto" else c.payload
+        if name == NO_PAYLOAD:
+            return name, (1.0, 1.0)
+        check_choice("payload", name, ("auto", NO_PAYLOAD, *known))
+        row = load.parameters[known.index(name)]
+        low = row.low if c.payload_low is None else c.payload_low
+        high = row.high if c.payload_high is None else c.payload_high
+        if not 0.0 < low <= high < np.inf:
+            raise ValueError(f"payload_low and payload_high must be above 0 and in order, not {low:g} and {high:g}")
+        return name, (low, high)
+
+    def _prepare_machines(self) -> None:
+        machine, laws = self.drives.machine, self.config.distributions
+        self._machines: RandomMachines | None = None
+        if machine is None:
+            if laws is not None:
+                raise ValueError("distributions are of emulated machines; leave them out on a bus")
+            return
+        if laws is None:
+            laws = self.config.load if self.config.load in shipped() else {"parameters": {}}
+        self._machines = RandomMachines(self.drives, Distributions.load(laws))
+        self._parameters: dict[str, Floats] = {}
+        if self._payload != NO_PAYLOAD:
+            self._payload_default = machine.parameters[self._payload]
+        changes = max(1, round(self.config.duration / self.config.payload_every))
+        self._change_at = np.zeros((self.num_envs, changes), np.int64)
+        self._change_to = np.ones((self.num_envs, changes))
+
+    def _prepare_gains(self) -> None:
+        """Keep the five raw gains of every axis that an action of 0 means, shape (num_axes, 5)."""
+        drives = self.drives
+        if drives.machine is None or self.config.base == "present":
+            objects = ((0x2041, 1), (0x2041, 2), (0x2042, 1), (0x2042, 2), (0x2043, 1))
+            self.base_gains = np.stack([drives.read(name) for name in objects], axis=-1)
+        else:
+            motor = find_motor(self.config.motor)
+            self.base_gains = np.tile(rule_gains(drives.device, motor, self._nominal_inertia), (self.num_envs, 1))
+        columns = {"velocity_p": 2, "velocity_i": 3, "position_p": 4}
+        self._scheduled = self.base_gains[:, [columns[name] for name in self.config.gains]]
+
+    # --- a step ---------------------------------------------------------------------------------------------------
+    def _gains_of(self, action: Floats) -> Integers:
+        """Return raw gains, shape (num_axes, gains)."""
+        raw = np.rint(self._scheduled * np.exp(self.config.span * action))
+        return np.asarray(np.clip(raw, 1, RAW_MAX), np.int64)
+
+    def _set_points(self, cycles: Integers) -> Integers:
+        """Return set-points [drive units] of cycles from the lanes' present step on, (cycles, num_envs, axes)."""
+        position, velocity, _ = self._programme.rows(self._now * self._cycles, cycles, self.reach)
+        way, start = (position, self._origin) if self.config.mode == "csp" else (velocity, 0)
+        found: Integers = start + np.rint(way * self._per_rad).astype(np.int64)
+        return found.reshape(len(cycles), self.num_envs, self._axes)
+
+    def _through_bus(self) -> Integers:
+        """Return the set-points on which the drives act in each cycle of this step."""
+        sent = self._set_points(np.arange(1, self._cycles + 1))
+        if not self._bus.is_there:
+            return sent
+        return np.stack([self._bus.act(row) for row in sent]).astype(np.int64)
+
+    def _run(self, targets: Integers) -> dict[tuple[int, int], Integers]:
+        """Let the step pass; gains are written when they arrive, between two cycles."""
+        wanted = self._gains_of(self._action)
+        arriving = [wanted] * self._cycles
+        if self._gain_bus.is_there:
+            flat = wanted.reshape(self.num_envs, -1)
+            arriving = [self._gain_bus.act_unlatched(flat).reshape(wanted.shape) for _ in range(self._cycles)]
+        objects = (POSITION, VELOCITY, CURRENT, STATUSWORD)
+        played = targets.reshape(self._cycles, -1)
+        # A picture looks at every cycle.
+        apart = self._pictures is not None
+        begins = [k for k in range(self._cycles) if k == 0 or apart or np.any(arriving[k] != arriving[k - 1])]
+        traces = []
+        with warnings.catch_warnings():
+            # A machine that leaves physics ends its lane; who steps it is told so by `info`.
+            warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
+            for begin, end in zip(begins, [*begins[1:], self._cycles], strict=True):
+                for k, name in enumerate(self.config.gains):
+                    self.drives.write(GAINS[name], arriving[begin][:, k])
+                play = {TARGETS[self.config.mode]: played[begin:end]}
+                traces.append(self.drives.record(objects, (end - begin) * CYCLE, play=play))
+                if self._pictures is not None:
+                    self._pictures.look()
+        return {name: np.concatenate([trace[name] for trace in traces]) for name in objects}
+
+    def _measured(self, targets: Integers, rows: Mapping[tuple[int, int], Integers]) -> tuple[Floats, Floats, Floats]:
+        """Return error [rad or rad/s], velocity [rad/s] and current [A], each (cycles, num_axes).
+
+        A sample is compared with the set-point of the cycle before: that is where the drive had to be by then.
+        """
+        due = np.concatenate([self._acting[None], targets[:-1]])
+        self._acting = targets[-1]
+        velocity = np.asarray(rows[VELOCITY] / self._per_rad, float)
+        actual = rows[POSITION] if self.config.mode == "csp" else rows[VELOCITY]
+        error = np.asarray((due.reshape(self._cycles, -1) - actual) / self._per_rad, float)
+        return error, velocity, np.asarray(rows[CURRENT] * 1e-3, float)
+
+    def _seen(self, error: Floats, velocity: Floats, current: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return the same as they reach the master."""
+        if not self._bus.is_there:
+            return error, velocity, current
+        sampled = np.stack([error, velocity, current], 1).reshape(self._cycles, 3, self.num_envs, self._axes)
+        sent = sampled.transpose(0, 2, 1, 3).reshape(self._cycles, self.num_envs, -1)
+        came = np.stack([self._bus.observe(row) for row in sent]).reshape(self._cycles, self.num_envs, 3, self._axes)
+        arrived = came.astype(float).transpose(2, 0, 1, 3).reshape(3, self._cycles, -1)
+        return arrived[0], arrived[1], arrived[2]
+
+    def _observe(self, error: Floats, velocity: Floats, current: Floats) -> NDArray[np.float32]:
+        ahead = np.array([0, self._cycles])
+        _, speeds, accelerations = self._programme.rows(self._now * self._cycles, ahead, self.reach)
+        scaled = error / self._error_scale
+        amperes = current / self._rated_current
+        columns = [
+            scaled[-1],
+            _rms(scaled),
+            np.abs(scaled).max(axis=0),
+            velocity[-1] / self._speed_scale,
+            *(speeds / self._speed_scale),
+            *(accelerations / self._acceleration_scale),
+            amperes.mean(axis=0),
+            _rms(amperes),
+            _rms(np.diff(amperes, axis=0)),
+        ]
+        found = np.concatenate([np.stack(columns, axis=-1), self._action], axis=1).astype(np.float32)
+        return np.clip(np.nan_to_num(found.reshape(self.num_envs, -1)), self._low, self._high)
+
+    def _terms(self, error: Floats, current: Floats, terminated: Mask) -> dict[str, Floats]:
+        off = _rms(error / self._error_scale)
+        rough = _rms(np.diff(current, axis=0)) / self._rated_current / ROUGH
+        per_axis = {"tracking": 1.0 / (1.0 + off**2), "smoothness": 1.0 / (1.0 + rough**2)}
+        terms = {name: values.reshape(self.num_envs, -1).min(axis=1) for name, values in per_axis.items()}
+        return terms | {"trip": -1.0 * terminated}
+
+    def _faults(self, tripped: Mask) -> NDArray[np.object_]:
+        """Return the name of what ended each lane, "" where nothing did."""
+        names = np.full(self.num_envs, "", object)
+        if tripped.any():
+            names[tripped.reshape(self.num_envs, -1).any(axis=1)] = "unknown"
+            for message in self.drives.emergencies():
+                if tripped[message.axis] and message.code:
+                    names[message.axis // self._axes] = message.name
+        if self.drives.machine is not None:
+            names[self.drives.machine.diverged] = "diverged"
+        return names
+
+    def _tell(self, fault: NDArray[np.object_]) -> Info:
+        info: Info = {"fault": fault}
+        if self._machines is not None:
+            info["parameters"] = self._parameters
+        return info
+
+    # --- payload --------------------------------------------------------------------------------------------------
+    def _plan_payloads(self, mask: Mask) -> None:
+        assert self._machines is not None
+        low, high = self._payload_range
+        changes = self._change_at.shape[1]
+        for lane in map(int, np.flatnonzero(mask)):
+            chance = self.rngs[lane].random((2, changes))
+            self._change_at[lane] = np.floor((np.arange(changes) + chance[0]) / changes * self._steps)
+            self._change_to[lane] = low * (high / low) ** chance[1]
+        self._parameters = {name: values.copy() for name, values in self._machines.values.items()}
+
+    def _change_payloads(self) -> None:
+        """Give the lanes whose time has come another payload; one that cannot be stepped keeps the one it has."""
+        if self._machines is None or self._payload == NO_PAYLOAD:
+            return
+        due = self._change_at == self._now[:, None]
+        lanes = due.any(axis=1)
+        if not lanes.any():
+            return
+        last = self._change_at.shape[1] - 1 - due[:, ::-1].argmax(axis=1)
+        factors = np.take_along_axis(self._change_to, last[:, None], axis=1)[:, 0]
+        values = self._payload_default * factors
+        machine = self.drives.machine
+        try:
+            machine.set_all({self._payload: values}, lanes)
+        except ValueError:
+            for lane in np.flatnonzero(lanes):
+                one_lane = np.arange(self.num_envs) == lane
+                try:
+                    machine.set_all({self._payload: values}, one_lane)
+                except ValueError:
+                    lanes[lane] = False
+        self._parameters = self._parameters | {self._payload: np.where(lanes, values, self._parameters[self._payload])}
+
+    # --- on a bus -------------------------------------------------------------------------------------------------
+    def _bring_back(self, axes: Mask) -> None:
+        """Take real axes back to where the first programme began."""
+        if self._has_begun:
+            motion.enable(self.drives, "pp", where=axes)
+            motion.move_to(self.drives, self._origin, where=axes)
+
+
+def _rms(values: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))

@@ -1,0 +1,469 @@
+"""Gain tuning: commissioning as an episode, one trial of gains per step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+
+from drive_env.devices import find_device
+from drive_env.envs.configuration import configured
+from drive_env.envs.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
+from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Stepped, check_choice
+from drive_env.envs.pictures import Pictures
+from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
+from drive_env.gains import GAIN_OBJECTS, RAW_MAX, Gains, rule_gains, small_time_constants
+from drive_env.motors import find_motor
+from drive_env.positioning import TRIAL, plan_move, power_up, reach
+from drive_env.score import HiddenScore
+
+Integers = NDArray[np.int64]
+
+STEP = 0.7  # largest change of a gain's logarithm
+LOG_MAX = math.log(RAW_MAX)
+ALL_GAINS = Gains._fields
+RATIO_MAX = 100.0  # of a true parameter over its default
+
+
+class Row(NamedTuple):
+    """An entry of the observation: name, unit, bounds."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+IDENTIFIED = (
+    Row("ln of total inertia over three rotors", "1", -5.0, 7.0),
+    Row("dry friction", "rated current", 0.0, 5.0),
+    Row("viscous friction at rated speed", "rated current", 0.0, 5.0),
+    Row("constant load", "rated current", -5.0, 5.0),
+)
+PHASE = (
+    Row("ln t_s/t_0", "1", 0.0, 5.0),
+    Row("ln(1 + n/3 %)", "1", 0.0, 7.0),
+    Row("overshoot", "the move", 0.0, 5.0),
+    Row("ln of the following error's integral over the rule's", "1", -10.0, 10.0),
+    Row("stopped: it oscillated or tripped", "1", 0.0, 1.0),
+)
+COST = Row("ln J by measured terms, of the lane", "1", -10.0, 4.0)
+WAVE = Row("error of the move", "the move", -5.0, 5.0)
+LEFT = Row("trials left", "those of an episode", 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class GainTuningConfig:
+    """Configuration of GainTuning.
+
+    load, device, motor, friction: As `EmulatedDrives` takes them.
+    gains: Which gains the action changes: torque_p, torque_i, velocity_p, velocity_i, position_p.
+    trials: Of an episode.
+    distributions: The machines, as `randomisation.Distributions` takes them; None is the load's shipped set,
+        {"parameters": {}} the default machine in every episode.
+    stage: Of its curriculum, 0...1.
+    abort_cost: What a stopped trial takes from the reward.
+    waveform: Points of the last move's error that are observed besides, 0...250.
+    privileged: Whether the observation is a dict with the true machine beside it, for asymmetric critics.
+    travel: How far the rotors may turn from where they are, with the sign [rev]; None is the load's own.
+    num_threads: As `EmulatedDrives` takes it.
+    """
+
+    load: str = "two_mass"
+    device: str = "tmcm1636"
+    motor: str = "qbl4208"
+    friction: str = "stribeck"
+    gains: tuple[str, ...] = ("velocity_p", "velocity_i", "position_p")
+    trials: int = 10
+    distributions: Any = None
+    stage: float = 1.0
+    abort_cost: float = 0.05
+    waveform: int = 0
+    privileged: bool = False
+    travel: float | None = None
+    num_threads: int | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "gains", tuple(self.gains))
+        for name in self.gains:
+            check_choice("a gain", name, ALL_GAINS)
+        if not self.gains or len(set(self.gains)) != len(self.gains):
+            raise ValueError(f"gains must be different ones of {', '.join(ALL_GAINS)}, not {self.gains}")
+        if self.trials < 1:
+            raise ValueError(f"trials must be 1 or more, not {self.trials}")
+        if not 0 <= self.waveform <= TRIAL:
+            raise ValueError(f"waveform must be 0...{TRIAL} points, not {self.waveform}")
+        if not 0.0 <= self.stage <= 1.0:
+            raise ValueError(f"stage of the curriculum must lie in 0...1, not {self.stage:g}")
+        if not 0.0 <= self.abort_cost < math.inf:
+            raise ValueError(f"abort_cost must be 0 or more, not {self.abort_cost:g}")
+        if self.travel is not None and not 0.0 < abs(self.travel) < math.inf:
+            raise ValueError(f"travel must be finite and not 0, not {self.travel:g} rev")
+
+
+class GainTuning(Lanes):
+    """Lanes of `ServoDrive/GainTuning-v0`: find the gains of an unknown machine in a few trials.
+
+    An episode identifies the machine, starts at the fitted rule's gains and tries them; each step tries others: a
+    positioning move, the reversal and the gain probe (the move with velocity P x 1.5), 250 ms each. What oscillates or
+    trips is stopped within 50 ms, the drive is cleared, and the incumbent returns. The incumbent is the trial with the
+    least J by measured terms, the rule's included; it is the answer (`info["gains"]`).
+
+    Action, float32, one entry per gain of the configuration and axis of the machine, axis by axis: change of the
+    gain's natural logarithm from the incumbent, -0.7...0.7; gains are rounded and stay within 1...32767.
+
+    Observation, float32, for each axis of the machine, with G gains and W points of waveform:
+
+    | index | name | unit | low | high |
+    | --- | --- | --- | --- | --- |
+    | 0 | ln of total inertia over three rotors, identified | 1 | -5 | 7 |
+    | 1 | dry friction, identified | rated current | 0 | 5 |
+    | 2 | viscous friction at rated speed, identified | rated current | 0 | 5 |
+    | 3 | constant load, identified | rated current | -5 | 5 |
+    | 4 ... 4+G-1 | ln of the last trial's gain over the rule's | 1 | -10.4 | 10.4 |
+    | 4+G ... 4+2G-1 | ln of the incumbent's gain over the rule's | 1 | -10.4 | 10.4 |
+    | 4+2G ... +4 | of the last trial's move: ln t_s/t_0 | 1 | 0 | 5 |
+    | | ln(1 + n/3 %) | 1 | 0 | 7 |
+    | | overshoot | the move | 0 | 5 |
+    | | ln of the following error's integral over the rule's | 1 | -10 | 10 |
+    | | stopped: it oscillated or tripped | 1 | 0 | 1 |
+    | +5 ... +9, +10 ... +14 | the same of its reversal, and of its probe | | | |
+    | +15 | ln J of the last trial by measured terms, of the lane | 1 | -10 | 4 |
+    | +16 ... +31 | the 16 entries of the incumbent's trial | | | |
+    | W entries | error of the last trial's move, demand less actual | the move | -5 | 5 |
+
+    and, after the axes, one entry: the trials left, as a share of an episode's (0...1). With `privileged` it is a dict
+    of "observation" and "privileged": each true parameter's difference from its default, over the default's size.
+
+    The reward is the decrease of the incumbent's ln hidden J (drive_env/score.py), meant for a discount of 1, less
+    `abort_cost` for a trial that was stopped. On given drives there is no hidden J; it is that of ln J by measured
+    terms. The episode is `truncated` when its trials are used up, `terminated` if a given drive cannot be cleared.
+
+    `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (lanes, axes, 5) raw integers in the order of
+    `Gains`; "measured", its J by measured terms, and "hidden", hidden J; "trial_hidden", that of this step's trial;
+    "aborted"; "faults", names of the trial's emergencies, tuples; "parameters", the true machine. Of given drives
+    there is nothing hidden.
+
+    Args:
+        num_envs: Lanes.
+        config: A `GainTuningConfig`, a table like it, or a TOML file.
+        drives: Drives to tune as they are, `num_envs` machines, commissioned with gains that are stable; emulated ones
+            of the configuration by default, of which every trial begins at rest at zero. On a bus the safety envelope
+            stops all drives where one oscillates, with a SafetyError; `Limits(oscillation=False)` leaves that to the
+            trial, which stops the lane alone.
+        autoreset_mode, render_mode: As `Lanes` takes them.
+        options: Fields of the configuration that replace its own.
+
+    Raises:
+        ValueError: For a value that is none, naming those that are.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        config: GainTuningConfig | Mapping[str, Any] | str | Path | None = None,
+        drives: Any = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        self.config = configured(GainTuningConfig, config, options)
+        self.motor, self._device = find_motor(self.config.motor), find_device(self.config.device)
+        self._machines: RandomMachines | None = None
+        self._hidden: HiddenScore | None = None
+        self._pictures: Pictures | None = None
+        self._owned = drives is None
+        self.drives = self._new_drives(num_envs) if drives is None else drives
+        try:
+            axes, rest = divmod(self.drives.num_axes, max(num_envs, 1))
+            if rest or not axes:
+                raise ValueError(f"{self.drives.num_axes} axes cannot be shared by {num_envs} lanes")
+            self._axes = axes
+            if self._owned:
+                self._make_world(num_envs)
+            elif self.config.distributions is not None or self.config.privileged:
+                raise ValueError("given drives are taken as they are: leave distributions and privileged out")
+            super().__init__(num_envs, *self._spaces(), autoreset_mode=autoreset_mode, render_mode=render_mode)
+            self._prepare()
+        except BaseException:
+            self._close_lanes()
+            raise
+
+    # --- construction ---------------------------------------------------------------------------------------------
+    def _new_drives(self, num_envs: int) -> Any:
+        from drive_env.drives import EmulatedDrives
+
+        c = self.config
+        return EmulatedDrives(
+            c.device, c.load, c.motor, max(num_envs, 1), friction=c.friction, num_threads=c.num_threads
+        )
+
+    def _make_world(self, num_envs: int) -> None:
+        c = self.config
+        laws = c.distributions
+        if laws is None:
+            laws = c.load if c.load in shipped() else {"parameters": {}}
+        self._machines = RandomMachines(self.drives, Distributions.load(laws))
+        self._defaults = self.drives.machine.parameters
+        self._hidden = HiddenScore(c.device, c.load, c.motor, num_envs, num_threads=c.num_threads, friction=c.friction)
+
+    def _spaces(self) -> tuple[gymnasium.Space[Any], Box]:
+        c = self.config
+        count = len(c.gains)
+        log_gain = Row("ln of a gain over the rule's", "1", -LOG_MAX, LOG_MAX)
+        trial = [*PHASE * len(PHASES), COST]
+        axis = [*IDENTIFIED, *[log_gain] * (2 * count), *trial, *trial, *[WAVE] * c.waveform]
+        rows = [*axis * self._axes, LEFT]
+        low, high = (np.array([getattr(row, end) for row in rows], np.float32) for end in ("low", "high"))
+        self._low, self._high = low, high
+        observation: gymnasium.Space[Any] = Box(low, high, dtype=np.float32)
+        if c.privileged:
+            true = Box(-RATIO_MAX, RATIO_MAX, (len(self._defaults),), np.float32)
+            observation = gymnasium.spaces.Dict({"observation": observation, "privileged": true})
+        return observation, Box(-STEP, STEP, (self._axes * count,), np.float32)
+
+    def _prepare(self) -> None:
+        c, n, axes = self.config, self.num_envs, self.drives.num_axes
+        t_0 = 4.0 * float(small_time_constants(self._device, self._device.stage["velocity_filter"].default))
+        self._trials = Trials(self.drives, self.motor, self._axes, t_0, self._look)
+        self._columns = np.array([ALL_GAINS.index(name) for name in c.gains])
+        one = reach(c.load) if c.travel is None else np.full(self._axes, c.travel * 2.0 * math.pi)
+        self._reach = np.tile(one, n)
+        zero = np.zeros(axes)
+        self._identified = Identified(zero, zero, zero, zero)
+        self._move = plan_move(self.motor, zero + self.motor.inertia, 1.0, zero)
+        self._origin, self._direction = np.zeros(axes, np.int64), np.ones(axes, np.int64)
+        self._safe, self._rule, self._best, self._last = (np.ones((axes, len(ALL_GAINS)), np.int64) for _ in range(4))
+        self._best_is_stable = np.ones(axes, bool)
+        self._following = np.ones((len(PHASES), axes))  # the rule's
+        blank = np.zeros((axes, len(PHASE) * len(PHASES) + 1))
+        self._last_features, self._best_features = blank, blank.copy()
+        self._wave = np.zeros((axes, c.waveform))
+        self._measured, self._hidden_now = np.ones(n), np.ones(n)
+        self._left = np.zeros(n, np.int64)
+        self._noise, self._trial = np.ones(n), np.zeros(n)
+        self._parameters: dict[str, Floats] = {}
+
+    # --- an episode -----------------------------------------------------------------------------------------------
+    def _reset_lanes(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Any, Info]:
+        for name in options:
+            check_choice("an option of reset", name, ("reset_mask",))
+        drives, axes = self.drives, np.repeat(mask, self._axes)
+        if self._machines is not None:
+            self._machines.redraw(self.rngs, mask, self.config.stage)
+            for lane in np.flatnonzero(mask):
+                self._noise[lane] = self.rngs[lane].integers(1, 2**31)
+            self._trial[mask] = 0.0
+            self._parameters = drives.machine.parameters
+        if self._pictures is not None:
+            self._pictures.begin(mask)
+        self._begin_trial(mask)
+        self._safe = np.where(
+            axes[:, None], np.stack([drives.read(name) for name in GAIN_OBJECTS], axis=-1), self._safe
+        )
+        found, origin = self._trials.identify(self._reach, axes)
+        self._identified = Identified(*(np.where(axes, a, b) for a, b in zip(found, self._identified, strict=True)))
+        self._origin = np.where(axes, origin, self._origin)
+        self._direction = np.where(axes, 1, self._direction)
+        scaler = drives.read((0x2058, 0))
+        planned = plan_move(self.motor, self._identified.inertia, scaler, self._reach)
+        # Lanes outside the mask keep theirs: nothing of what it follows from has changed.
+        self._move = planned
+        supply = float(self.motor.voltage)
+        rule = rule_gains(self._device, self.motor, self._identified.inertia, supply=supply)
+        self._rule = np.where(axes[:, None], rule, self._rule)
+        self._best = np.where(axes[:, None], self._rule, self._best)
+        self._best_is_stable = np.where(axes, False, self._best_is_stable)
+        tried = self._try(self._rule, mask)
+        self._following = np.where(axes, tried.following, self._following)
+        measured = self._measure(self._rule, tried)
+        self._take(mask, self._rule, tried, measured)
+        self._left[mask] = self.config.trials
+        if self._hidden is not None:
+            self._hidden.set_machines(self._parameters, self._volts(), mask)
+            self._hidden.set_moves(self._move, mask)
+            hidden = self._hidden.set_reference(self._rule, mask).hidden
+            self._hidden_now = np.where(mask, hidden, self._hidden_now)
+        drives.emergencies()
+        return self._observe(), self._told()
+
+    def _step_lanes(self, action: Any) -> Stepped:
+        n = self.num_envs
+        active = self._left > 0
+        zero = np.zeros(n)
+        if not active.any():  # the step between the end of all episodes and their autoreset
+            return self._observe(), zero, np.zeros(n, bool), np.ones(n, bool), self._told()
+        change = np.nan_to_num(np.clip(np.asarray(action, float), -STEP, STEP)).reshape(-1, len(self._columns))
+        gains = self._best.copy()
+        chosen = gains[:, self._columns] * np.exp(change)
+        gains[:, self._columns] = np.clip(np.rint(chosen), 1, RAW_MAX).astype(np.int64)
+        tried = self._try(gains, active)
+        measured = self._measure(gains, tried)
+        better = active & (measured < self._measured)
+        before = self._measured.copy() if self._hidden is None else self._hidden_now.copy()
+        trial_hidden = None if self._hidden is None else self._hidden.score(gains).hidden
+        self._take(active, gains, tried, measured, better)
+        if trial_hidden is not None:
+            self._hidden_now = np.where(better, trial_hidden, self._hidden_now)
+        after = self._measured if self._hidden is None else self._hidden_now
+        aborted = active & tried.aborted.any(axis=0).reshape(n, -1).any(axis=1)
+        terms = {"tuning": np.log(before / after), "abort": -self.config.abort_cost * aborted}
+        self._left[active] -= 1
+        info = self._told()
+        info["reward_terms"] = terms
+        info["aborted"] = aborted
+        info["faults"] = self._faults()
+        if trial_hidden is not None:
+            info["trial_hidden"] = trial_hidden
+        dead = zero.astype(bool) if self._owned else active & self._dead()
+        return self._observe(), terms["tuning"] + terms["abort"], dead, self._left <= 0, info
+
+    # --- a trial --------------------------------------------------------------------------------------------------
+    def _begin_trial(self, mask: Mask) -> None:
+        """Bring the drives of a trial to where it begins: enabled, in pp; emulated machines at rest at zero.
+
+        An emulated trial begins anew so that it follows from machine, gains and the lane's noise alone, not from how
+        long other lanes were being reset meanwhile.
+        """
+        drives, axes = self.drives, np.repeat(mask, self._axes)
+        if self._machines is not None:
+            machine, values = drives.machine, self._machines.values
+            machine.seed_noise(self._noise + self._trial, mask)
+            self._trial[mask] += 1.0
+            machine.reset(mask)
+            winding, stage = machine.temperatures
+            new = (np.repeat(values[name], self._axes) for name in ("start.winding", "start.stage"))
+            machine.set_temperatures(*(np.where(axes, a, b) for a, b in zip(new, (winding, stage), strict=True)))
+            power_up(drives, axes)
+        else:
+            self._trials.recover(axes)
+
+    def _try(self, gains: Integers, mask: Mask) -> Trial:
+        axes = np.repeat(mask, self._axes)
+        self._begin_trial(mask)
+        fallback = np.where(self._best_is_stable[:, None], self._best, self._safe)
+        direction = np.ones_like(self._direction) if self._owned else self._direction
+        tried = self._trials.run(gains, fallback, self._move, self._origin, direction, axes)
+        if not self._owned:  # a trial ends where its move did, and the next one goes the other way
+            self._origin = np.where(axes, self._origin + self._direction * self._move.distance, self._origin)
+            self._direction = np.where(axes, -self._direction, self._direction)
+        return tried
+
+    def _measure(self, gains: Integers, tried: Trial) -> Floats:
+        """Return J by measured terms of the lanes: that of the worst axis."""
+        costs = measured_cost(tried.costs(softness(gains) / softness(self._rule)))
+        return np.asarray(costs.reshape(self.num_envs, -1).max(axis=1))
+
+    def _take(self, mask: Mask, gains: Integers, tried: Trial, measured: Floats, better: Mask | None = None) -> None:
+        """Keep a trial as the last one where the mask is true, and as the incumbent where it is better."""
+        better = mask if better is None else better
+        axes, best = np.repeat(mask, self._axes), np.repeat(better, self._axes)
+        self._last = np.where(axes[:, None], gains, self._last)
+        features = self._features(tried, measured)
+        self._last_features = np.where(axes[:, None], features, self._last_features)
+        if self.config.waveform:
+            at = np.linspace(0, TRIAL - 1, self.config.waveform).round().astype(int)
+            self._wave = np.where(axes[:, None], tried.error[at].T, self._wave)
+        self._best = np.where(best[:, None], gains, self._best)
+        self._best_features = np.where(best[:, None], features, self._best_features)
+        self._best_is_stable = np.where(best, ~tried.aborted[:2].any(axis=0), self._best_is_stable)
+        self._measured = np.where(better, measured, self._measured)
+
+    # --- what is told ---------------------------------------------------------------------------------------------
+    def _features(self, tried: Trial, measured: Floats) -> Floats:
+        terms = tried.terms
+        rows = np.stack(
+            [
+                np.log(terms.settling),
+                np.log1p(terms.noise / 0.03),
+                terms.overshoot,
+                np.log(tried.following / self._following),
+                tried.aborted.astype(float),
+            ],
+            axis=-1,
+        )
+        flat = rows.transpose(1, 0, 2).reshape(len(self._origin), -1)
+        return np.concatenate([flat, np.log(np.repeat(measured, self._axes))[:, None]], axis=1)
+
+    def _observe(self) -> Any:
+        found, motor = self._identified, self.motor
+        identified = np.stack(
+            [
+                np.log(np.maximum(found.inertia, 1e-12) / (3.0 * motor.inertia)),
+                found.coulomb / motor.rated_current,
+                found.viscous * motor.rated_speed / motor.rated_current,
+                found.offset / motor.rated_current,
+            ],
+            axis=-1,
+        )
+        rule = np.log(self._rule[:, self._columns])
+        last, best = (np.log(gains[:, self._columns]) - rule for gains in (self._last, self._best))
+        axes = np.concatenate([identified, last, best, self._last_features, self._best_features, self._wave], axis=1)
+        left = self._left[:, None] / self.config.trials
+        values = np.concatenate([axes.reshape(self.num_envs, -1), left], axis=1)
+        observation = np.clip(np.nan_to_num(values), self._low, self._high).astype(np.float32)
+        if not self.config.privileged:
+            return observation
+        true = np.stack(
+            [
+                (self._parameters[name] - default) / np.where(default == 0.0, 1.0, np.abs(default))
+                for name, default in self._defaults.items()
+            ],
+            axis=-1,
+        )
+        return {
+            "observation": observation,
+            "privileged": np.clip(true, -RATIO_MAX, RATIO_MAX).astype(np.float32),
+        }
+
+    def _told(self) -> Info:
+        n = self.num_envs
+        info: Info = {
+            "gains": self._best.reshape(n, self._axes, -1).copy(),
+            "measured": self._measured.copy(),
+        }
+        if self._hidden is not None:
+            info["hidden"] = self._hidden_now.copy()
+            info["parameters"] = self._parameters
+        return info
+
+    def _faults(self) -> NDArray[np.object_]:
+        found = np.empty(self.num_envs, object)
+        found[:] = [()] * self.num_envs
+        for message in self.drives.emergencies():
+            lane = message.axis // self._axes
+            if message.code and message.name not in found[lane]:
+                found[lane] = (*found[lane], message.name)
+        return found
+
+    def _look(self) -> None:
+        if self._pictures is not None:
+            self._pictures.look()
+
+    def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
+        if self._pictures is None:
+            self._pictures = Pictures(self.drives, self.num_envs, self.render_mode or "rgb_array")
+        return self._pictures.draw(lane)
+
+    def _dead(self) -> Mask:
+        return np.asarray(self._trials.down().reshape(self.num_envs, -1).any(axis=1))
+
+    def _volts(self) -> Floats:
+        return np.asarray(self.drives.machine.supply.reshape(self.num_envs, -1)[:, 0])
+
+    def _close_lanes(self) -> None:
+        if self._pictures is not None:
+            self._pictures.close()
+        if self._hidden is not None:
+            self._hidden.close()
+        if self._owned:
+            self.drives.close()

@@ -1,0 +1,310 @@
+"""What all environments share: many episodes side by side over one set of drives, and one of them as an Env.
+
+A lane is a machine with its drives and its episode. A lane's episode follows from its seed and its actions alone, so
+that it is the same among 1, 8 or 64 lanes and under any number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Info = dict[str, Any]
+Observation = Any  # an array with lanes first, or a dict of such arrays
+Stepped = tuple[Observation, Floats, Mask, Mask, Info]
+
+RENDER_MODES = ("rgb_array", "human")
+
+
+class Lanes(VectorEnv[Any, Any, Any]):
+    """Base of the vector environments.
+
+    A subclass gives `_reset_lanes` and `_step_lanes`; it may replace `_render_lane` and `_close_lanes`. Arrays that it
+    returns are handed out as they are: it must make new ones in each step.
+
+    In next-step mode the reset of an ended lane takes place after the others' step, so that an episode is the same in
+    every mode; the lane's action of that step is ignored, its reward is 0.
+
+    Args:
+        num_envs: Lanes.
+        observation_space: Of one lane.
+        action_space: Of one lane.
+        autoreset_mode: When an ended lane begins anew: "NextStep", "SameStep", or "Disabled": by
+            `reset(options={"reset_mask": ...})` alone.
+        render_mode: None, "rgb_array" or "human".
+
+    Raises:
+        ValueError: For a mode that is none, or less than one lane.
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        observation_space: gymnasium.Space[Any],
+        action_space: gymnasium.Space[Any],
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be 1 or more, not {num_envs}")
+        check_choice("render_mode", render_mode, (None, *RENDER_MODES))
+        self.num_envs = num_envs
+        self.single_observation_space = observation_space
+        self.single_action_space = action_space
+        self.observation_space = batch_space(observation_space, num_envs)
+        self.action_space = batch_space(action_space, num_envs)
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
+        self.render_mode = render_mode
+        self.metadata = {"render_modes": list(RENDER_MODES), "autoreset_mode": self.autoreset_mode}
+        self.rngs = [seeding.np_random()[0] for _ in range(num_envs)]
+        self._ended: Mask = np.zeros(num_envs, bool)
+        self._some_ended = False
+        self._has_begun = False
+
+    # --- what a subclass gives ------------------------------------------------------------------------------------
+    def _reset_lanes(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Observation, Info]:
+        """Begin an episode in the lanes where the mask is true, drawing from `rngs` of these lanes alone.
+
+        Returns:
+            Observations of all lanes, of which only the masked are used; and arrays with what is to be told of them.
+        """
+        raise NotImplementedError
+
+    def _step_lanes(self, action: Any) -> Stepped:
+        """Act in every lane; return observation, reward, terminated, truncated and info of all lanes."""
+        raise NotImplementedError
+
+    def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
+        raise NotImplementedError
+
+    def _close_lanes(self) -> None:
+        """Give back what is held."""
+
+    # --- gymnasium.vector.VectorEnv -------------------------------------------------------------------------------
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, Info]:
+        """Begin an episode in every lane, or in those of `options["reset_mask"]`.
+
+        Args:
+            seed: Of lane 0, the others follow by one; or one for each lane. None goes on with each lane's generator.
+            options: "reset_mask", shape (num_envs,), bool; others are the environment's.
+        """
+        options = dict(options or {})
+        mask = self._reset_mask(options.pop("reset_mask", None))
+        for lane, one in enumerate(self._seeds(seed)):
+            if one is not None and mask[lane]:
+                self.rngs[lane], self._np_random_seed = seeding.np_random(one)
+        observation, info = self._reset_lanes(mask, options)
+        self._ended = self._ended & ~mask
+        self._some_ended = bool(self._ended.any())
+        self._has_begun = True
+        return observation, info
+
+    def step(self, actions: Any) -> Stepped:
+        """Act in every lane; what follows the end of an episode is `autoreset_mode`'s.
+
+        Raises:
+            gymnasium.error.ResetNeeded: Before the first reset, or, with autoreset disabled, while a lane has ended.
+        """
+        if not self._has_begun:
+            raise gymnasium.error.ResetNeeded("call reset() before the first step()")
+        before = self._ended
+        if self._some_ended and self.autoreset_mode is AutoresetMode.DISABLED:
+            raise gymnasium.error.ResetNeeded(
+                f"lane {int(np.flatnonzero(before)[0])} has ended and autoreset is disabled; "
+                'call reset(options={"reset_mask": ended lanes})'
+            )
+        observation, reward, terminated, truncated, info = self._step_lanes(actions)
+        if self._some_ended:
+            begun, told = self._reset_lanes(before, {})
+            observation = merge(begun, observation, before)
+            info = merge_info(told, info, before)
+            reward[before] = 0.0
+            terminated[before] = truncated[before] = False
+        ended = terminated | truncated
+        self._some_ended = bool(ended.any())
+        self._ended = ended
+        if self._some_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
+            final, final_info = observation, info
+            begun, told = self._reset_lanes(ended, {})
+            observation = merge(begun, final, ended)
+            info = merge_info(told, final_info, ended)
+            info["final_obs"] = _rows(final, ended)
+            info["final_info"] = final_info
+            info["_final_obs"] = info["_final_info"] = ended
+            self._ended = np.zeros(self.num_envs, bool)
+            self._some_ended = False
+        return observation, reward, terminated, truncated, info
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Return a picture of every lane, uint8 of shape (height, width, 3); "human" shows lane 0 and returns None."""
+        if self.render_mode is None:
+            return None
+        if self.render_mode == "human":
+            self._render_lane(0)
+            return None
+        return tuple(self._render_lane(lane) for lane in range(self.num_envs))
+
+    def render_lane(self, lane: int) -> NDArray[np.uint8] | None:
+        """Return the picture of one lane; with "human", show it and return None."""
+        return None if self.render_mode is None else self._render_lane(lane)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Give drives and pictures back."""
+        self._close_lanes()
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _reset_mask(self, mask: Any) -> Mask:
+        if mask is None:
+            return np.ones(self.num_envs, bool)
+        chosen = np.asarray(mask)
+        if chosen.shape != (self.num_envs,) or chosen.dtype != bool or not chosen.any():
+            raise ValueError(
+                f"reset_mask must be a boolean array of shape ({self.num_envs},) that is true somewhere, not "
+                f"{chosen.dtype} {chosen.shape}"
+            )
+        if not self._has_begun and not chosen.all():
+            raise ValueError("the first reset must begin every lane; leave reset_mask out")
+        return chosen
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, (int, np.integer)):
+            return [int(seed) + lane for lane in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"{len(seed)} seeds do not fit {self.num_envs} lanes; give one number or one per lane")
+        return seed
+
+
+class OneLane(gymnasium.Env[Any, Any]):
+    """One lane as a gymnasium.Env: the same episode as lane 0 of any number of lanes with that seed.
+
+    Args:
+        lanes: Lanes with num_envs=1 and autoreset disabled.
+    """
+
+    def __init__(self, lanes: Lanes) -> None:
+        if lanes.num_envs != 1 or lanes.autoreset_mode is not AutoresetMode.DISABLED:
+            raise ValueError("a single environment needs num_envs=1 and autoreset_mode='Disabled'")
+        self.lanes = lanes
+        self.observation_space = lanes.single_observation_space
+        self.action_space = lanes.single_action_space
+        self.render_mode = lanes.render_mode
+        self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": 50}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Info]:
+        """Begin an episode."""
+        super().reset(seed=seed)
+        observation, info = self.lanes.reset(seed=seed, options=options)
+        return one_of(observation), one_of(info)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
+        """Act once."""
+        lanes = self.lanes
+        if lanes._some_ended or not lanes._has_begun:
+            raise gymnasium.error.ResetNeeded("the episode has ended or none has begun; call reset()")
+        observation, reward, terminated, truncated, info = lanes._step_lanes(_batch_of_one(action))
+        ended = bool(terminated[0]), bool(truncated[0])
+        if ended[0] or ended[1]:
+            lanes._ended = np.ones(1, bool)
+            lanes._some_ended = True
+        return one_of(observation), float(reward[0]), *ended, one_of(info)
+
+    def render(self) -> Any:
+        """Return the picture, uint8 of shape (height, width, 3); "human" shows it and returns None."""
+        return self.lanes.render_lane(0)
+
+    def close(self) -> None:
+        """Give drives and pictures back."""
+        self.lanes.close()
+
+
+# --- arrays with lanes first, and dicts of them -----------------------------------------------------------------------
+def merge(chosen: Observation, others: Observation, mask: Mask) -> Observation:
+    """Return `chosen` where the mask is true and `others` elsewhere; neither is changed."""
+    if isinstance(others, dict):
+        return {key: merge(chosen[key], others[key], mask) for key in others}
+    rows = np.array(others)
+    rows[mask] = chosen[mask]
+    return rows
+
+
+def merge_info(chosen: Info, others: Info, mask: Mask) -> Info:
+    """Return what is told of lanes: `chosen` where the mask is true; an entry of one side alone keeps its values.
+
+    Such an entry comes with a mask, its name behind an underscore, as Gymnasium has it.
+    """
+    merged: Info = {}
+    for key in [*others, *(key for key in chosen if key not in others)]:
+        if key.startswith("_"):
+            continue
+        side = chosen if key in chosen else others
+        if key in chosen and key in others:
+            inside = isinstance(side[key], dict)
+            merged[key] = (merge_info if inside else merge)(chosen[key], others[key], mask)
+        else:
+            merged[key] = side[key]
+        there = np.where(mask, _told(chosen, key, mask), _told(others, key, mask))
+        if not there.all():
+            merged[f"_{key}"] = there
+    return merged
+
+
+def one_of(tree: Any) -> Any:
+    """Return lane 0 of an array, or of a dict of arrays; of a masked entry only what is there."""
+    if not isinstance(tree, dict):
+        return tree[0]
+    if not any(key.startswith("_") for key in tree):
+        return {key: one_of(value) for key, value in tree.items()}
+    return {
+        key: one_of(value)
+        for key, value in tree.items()
+        if not key.startswith("_") and (f"_{key}" not in tree or tree[f"_{key}"][0])
+    }
+
+
+def check_choice(what: str, value: Any, valid: Sequence[Any]) -> None:
+    """Raise ValueError, naming the valid ones, unless a value is one of them."""
+    if value not in valid:
+        raise ValueError(f"{what} is one of {', '.join(repr(one) for one in valid)}, not {value!r}")
+
+
+def _told(info: Info, key: str, mask: Mask) -> Mask:
+    """Return of which lanes an entry tells."""
+    if key not in info:
+        return np.zeros(len(mask), bool)
+    there: Mask = info.get(f"_{key}", np.ones(len(mask), bool))
+    return there
+
+
+def _rows(tree: Observation, mask: Mask) -> NDArray[np.object_]:
+    """Return one observation per lane where the mask is true, None elsewhere: Gymnasium's final observations."""
+    rows = np.full(len(mask), None, object)
+    for lane in np.flatnonzero(mask):
+        rows[lane] = {k: v[lane] for k, v in tree.items()} if isinstance(tree, dict) else tree[lane]
+    return rows
+
+
+def _batch_of_one(action: Any) -> Any:
+    if isinstance(action, dict):
+        return {key: _batch_of_one(value) for key, value in action.items()}
+    return np.asarray(action)[None]
+
+
+def _autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    if isinstance(mode, AutoresetMode):
+        return mode
+    check_choice("autoreset_mode", mode, [one.value for one in AutoresetMode])
+    return AutoresetMode(mode)

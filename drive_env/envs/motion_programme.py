@@ -1,0 +1,101 @@
+"""Motion programmes, drawn per lane: smooth moves from point to point, or a sine, within what an axis can do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+EXCITATIONS = ("moves", "sine")
+# Of a move of least jerk, 10 s^3 - 15 s^4 + 6 s^5: peaks of speed and acceleration per distance.
+_PEAK_SPEED, _PEAK_ACCELERATION = 1.875, 5.7735
+_SHORTEST = 0.05  # s, a move
+_LONGEST_PAUSE = 0.15  # s between two moves
+_PACE = (0.5, 1.0)  # how hard a move is driven, of what the axis can do
+
+
+class Reach(NamedTuple):
+    """What a programme may ask of each axis of a machine, shape (axes,): [rad], [rad/s], [rad/s^2] at the rotor."""
+
+    distance: Floats
+    speed: Floats
+    acceleration: Floats
+
+
+class Programme:
+    """A programme for each lane: all axes of a lane move in unison, from rest at the start.
+
+    Args:
+        num_lanes: Lanes.
+        cycles: Length [cycles].
+        preview: Cycles that are known beyond it.
+        cycle: [s].
+    """
+
+    def __init__(self, num_lanes: int, cycles: int, preview: int, cycle: float) -> None:
+        self._cycle = cycle
+        # Place, speed and acceleration of every lane as shares of the axes' distance [1, 1/s, 1/s^2].
+        self._table = np.zeros((3, num_lanes, cycles + preview + 1))
+
+    def draw(self, excitation: str, reach: Reach, rngs: Sequence[np.random.Generator], where: Mask) -> None:
+        """Draw new programmes for the lanes where the mask is true."""
+        t = np.arange(self._table.shape[2], dtype=np.float64) * self._cycle
+        kind = {"moves": _moves, "sine": _sine}[excitation]
+        for lane in map(int, np.flatnonzero(where)):
+            self._table[:, lane] = kind(t, reach, rngs[lane])
+
+    def rows(self, start: Integers, cycles: Integers, reach: Reach) -> tuple[Floats, Floats, Floats]:
+        """Return position [rad], velocity [rad/s] and acceleration [rad/s^2], each (cycles, num_lanes * axes).
+
+        Args:
+            start: The lanes' present cycle, shape (num_lanes,).
+            cycles: Cycles from there on, shape (n,).
+            reach: What the axes can do.
+        """
+        last = self._table.shape[2] - 1
+        at = np.minimum(start[None, :] + cycles[:, None], last)
+        shares = self._table[:, np.arange(len(start))[None, :], at]
+        position, velocity, acceleration = (shares[..., None] * reach.distance).reshape(3, len(cycles), -1)
+        return position, velocity, acceleration
+
+
+def _quickest(distance: float, reach: Reach) -> float:
+    """Return the shortest time of a move over a share of the axes' distance [s]."""
+    way = distance * reach.distance
+    by_speed = _PEAK_SPEED * way / reach.speed
+    by_acceleration = np.sqrt(_PEAK_ACCELERATION * way / reach.acceleration)
+    return float(max(np.max(by_speed), np.max(by_acceleration), _SHORTEST))
+
+
+def _moves(t: Floats, reach: Reach, rng: np.random.Generator) -> Floats:
+    found = np.zeros((3, len(t)))
+    place, now = 0.0, float(rng.uniform(0.0, 0.05))
+    while now < t[-1]:
+        target, pace, pause = rng.uniform(-1.0, 1.0), rng.uniform(*_PACE), rng.uniform(0.0, _LONGEST_PAUSE)
+        way, duration = target - place, _quickest(abs(target - place), reach) / pace
+        s = np.clip((t - now) / duration, 0.0, 1.0)
+        found[0] += way * (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5)
+        found[1] += way / duration * 30.0 * s**2 * (1.0 - s) ** 2
+        found[2] += way / duration**2 * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
+        place, now = target, now + duration + pause
+    return found
+
+
+def _sine(t: Floats, reach: Reach, rng: np.random.Generator) -> Floats:
+    """Return 1/2 (1 - cos): from rest, and back to the start with every period."""
+    size, pace = rng.uniform(0.1, 1.0) * rng.choice((-1.0, 1.0)), rng.uniform(*_PACE)
+    way = 0.5 * abs(size) * reach.distance
+    w = pace * float(np.min(np.minimum(reach.speed / way, np.sqrt(reach.acceleration / way))))
+    return np.stack(
+        [
+            0.5 * size * (1.0 - np.cos(w * t)),
+            0.5 * size * w * np.sin(w * t),
+            0.5 * size * w * w * np.cos(w * t),
+        ]
+    )

@@ -1,0 +1,410 @@
+"""Domain randomisation as data: laws of a machine's parameters, supply, temperatures and bus, and drawing from them.
+
+A set of laws is a TOML file (`distributions/`, one for every load); a curriculum widens it from the default machine to
+the whole range. A machine depends on the generator that it is drawn with, and on nothing else: a parameter's share of
+chance belongs to its name, so that adding a law to a set changes no other parameter.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+import zlib
+from collections.abc import Mapping, Sequence
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from drive_env.drives import EmulatedDrives
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SHIPPED = Path(__file__).parent / "distributions"
+
+# What is drawn beside the parameters of `drives.machine`: unit and default, None where it is the drives' own.
+BESIDE: dict[str, tuple[str, float | None]] = {
+    "supply.voltage": ("V", None),
+    "start.winding": ("degC", 25.0),
+    "start.stage": ("degC", 25.0),
+    "bus.action_latency": ("communication cycles", 0.0),
+    "bus.observation_latency": ("communication cycles", 0.0),
+    "bus.jitter": ("communication cycles", 0.0),
+    "bus.lost_sync": ("1", 0.0),
+}
+
+LAWS = ("uniform", "loguniform", "normal", "choice")
+_KEYS = {"uniform": ("low", "high"), "loguniform": ("low", "high"), "normal": ("mean", "deviation"),
+         "choice": ("values",)}  # fmt: skip
+_OPTIONAL = {"uniform": (), "loguniform": (), "normal": ("low", "high"), "choice": ("weights",)}
+_TRIES = 20  # draws until a machine is one that can be stepped
+
+
+class Law(NamedTuple):
+    """How a parameter is distributed: absolute in its own unit, or as multiples of its default.
+
+    law: "uniform" or "loguniform" over low...high; "normal" with mean and deviation, cut off at low and high; "choice"
+        of values, with weights.
+    relative: Whether the numbers are multiples of the default.
+    """
+
+    law: str
+    relative: bool = False
+    low: float = -math.inf
+    high: float = math.inf
+    mean: float = 0.0
+    deviation: float = 0.0
+    values: tuple[float, ...] = ()
+    weights: tuple[float, ...] = ()
+
+    def value(self, share: float, default: float, width: float = 1.0) -> float:
+        """Return the value at a share of chance 0...1, drawn towards the default where width is below 1.
+
+        A width of 0 is the default, 1 the whole law; in between the distance from the default shrinks: its logarithm
+        under "loguniform", the probability of another value than the default under "choice".
+        """
+        scale = default if self.relative else 1.0
+        if self.law == "choice":
+            if share >= width or width <= 0.0:
+                return default
+            chances = np.cumsum(self.weights or np.ones(len(self.values)))
+            chosen = int(np.searchsorted(chances, share / width * chances[-1], side="right"))
+            return self.values[min(chosen, len(self.values) - 1)] * scale
+        if self.law == "loguniform":
+            drawn = scale * self.low * (self.high / self.low) ** share
+            if default > 0.0 and drawn > 0.0:
+                return float(default * (drawn / default) ** width)
+            return float(default + width * (drawn - default))
+        if self.law == "normal":
+            from scipy.special import ndtr, ndtri
+
+            low, high = (float(ndtr((edge - self.mean) / self.deviation)) for edge in (self.low, self.high))
+            drawn = self.mean + self.deviation * float(ndtri(low + share * (high - low)))
+            drawn = min(max(drawn, self.low), self.high)
+        else:
+            drawn = self.low + share * (self.high - self.low)
+        return default + width * (drawn * scale - default)
+
+    def table(self) -> dict[str, Any]:
+        """Return the law as a TOML table has it."""
+        found: dict[str, Any] = {"law": self.law}
+        for key in (*_KEYS[self.law], *_OPTIONAL[self.law]):
+            value = getattr(self, key)
+            if value != () and (not isinstance(value, float) or math.isfinite(value)):
+                found[key] = list(value) if isinstance(value, tuple) else value
+        return found | ({"of": "default"} if self.relative else {})
+
+
+class Curriculum(NamedTuple):
+    """When the ranges open: `stage` over training steps, and the part of it in which a group or parameter widens."""
+
+    steps: tuple[float, ...] = (0.0,)
+    stage: tuple[float, ...] = (1.0,)
+    opens: Mapping[str, tuple[float, float]] = {}
+
+    def stage_at(self, steps: float) -> float:
+        """Return the stage 0...1 after so many environment steps; between the points it is linear."""
+        return float(np.interp(steps, self.steps, self.stage))
+
+    def width(self, name: str, stage: float) -> float:
+        """Return how far a parameter's law is open at a stage, 0...1."""
+        start, end = self.opens.get(name, self.opens.get(name.split(".")[0], (0.0, 1.0)))
+        if stage >= end:
+            return 1.0
+        return max(0.0, (stage - start) / (end - start))
+
+
+class Distributions:
+    """Laws by the name of the parameter, and the curriculum that opens them.
+
+    Names are those of `drives.machine.parameters` and of `BESIDE`.
+    """
+
+    def __init__(self, laws: Mapping[str, Law], curriculum: Curriculum | None = None) -> None:
+        self.laws = dict(laws)
+        self.curriculum = curriculum or Curriculum()
+        self._marks = np.array([zlib.crc32(name.encode()) for name in self.laws], np.uint64)
+
+    @classmethod
+    def load(cls, source: str | Path | Mapping[str, Any] | Distributions) -> Distributions:
+        """Return a set of laws: a shipped one by its name (`shipped()`), a TOML file, or a table like one.
+
+        Tables: `include`, names of sets whose laws come first; `parameters`, name -> law; `curriculum` with `steps`
+        and `stage`, and `opens`, group or parameter -> [from, to] in stages. A law false takes an included one away.
+
+        Raises:
+            ValueError: For a set, law, key or number that is none, with those that are.
+        """
+        if isinstance(source, Distributions):
+            return source
+        if isinstance(source, Mapping):
+            return _from_table("the table of distributions", source, ())
+        if isinstance(source, Path) or str(source).endswith(".toml"):
+            path = Path(source)
+            if not path.is_file():
+                raise ValueError(f"there is no file {path} of distributions")
+            return _from_file(path, ())
+        return _shipped_set(str(source))
+
+    def draw(self, rng: np.random.Generator, defaults: Mapping[str, float], stage: float = 1.0) -> dict[str, float]:
+        """Draw one machine.
+
+        Args:
+            rng: Generator of the machine's lane; exactly one number is taken from it, whatever the set.
+            defaults: Default by name, as `drives.machine.parameters` has them; only these are drawn, and a law of
+                `BESIDE` that has no default here is left out.
+            stage: Stage of the curriculum, 0 (the defaults) to 1 (whole ranges).
+
+        Raises:
+            ValueError: For a stage out of range, or a law of a parameter that the machine does not have.
+        """
+        if not 0.0 <= stage <= 1.0:
+            raise ValueError(f"stage of the curriculum must lie in 0...1, not {stage:g}")
+        shares = shares_of_chance(np.uint64(rng.integers(0, 2**64, dtype=np.uint64)), self._marks)
+        drawn: dict[str, float] = {}
+        for (name, law), share in zip(self.laws.items(), shares, strict=True):
+            if name in defaults:
+                drawn[name] = law.value(float(share), float(defaults[name]), self.curriculum.width(name, stage))
+            elif name not in BESIDE:
+                raise ValueError(f"{name}: the machine has no such parameter; it has {', '.join(defaults)}")
+        return drawn
+
+    def to_toml(self) -> str:
+        """Return the set as TOML that `load` reads, included laws spelled out."""
+        lines = ["[parameters]"]
+        for name, law in self.laws.items():
+            lines.append(f'"{name}" = {{ {", ".join(f"{k} = {_toml(v)}" for k, v in law.table().items())} }}')
+        standard = Curriculum()
+        if self.curriculum != standard:
+            lines += ["", "[curriculum]", f"steps = {_toml(list(self.curriculum.steps))}",
+                      f"stage = {_toml(list(self.curriculum.stage))}"]  # fmt: skip
+            opens = ", ".join(f'"{name}" = {_toml(list(ends))}' for name, ends in self.curriculum.opens.items())
+            lines.append(f"opens = {{ {opens} }}")
+        return "\n".join(lines) + "\n"
+
+
+class RandomMachines:
+    """Emulated machines drawn anew, lane by lane.
+
+    Args:
+        drives: The emulated drives, as built: their machines' parameters are the defaults.
+        distributions: The laws.
+
+    Raises:
+        ValueError: If a law names a parameter that these machines do not have.
+    """
+
+    def __init__(self, drives: EmulatedDrives, distributions: Distributions) -> None:
+        self.distributions = distributions
+        self._drives = drives
+        machines = drives.num_machines
+        supply = drives.machine.supply.reshape(machines, -1)[:, 0]
+        self._defaults = drives.machine.parameters | {
+            name: supply if value is None else np.full(machines, value) for name, (_, value) in BESIDE.items()
+        }
+        unknown = [name for name in distributions.laws if name not in self._defaults]
+        if unknown:
+            raise ValueError(f"{unknown[0]}: {drives.load.name!r} has no such parameter; it has "
+                             f"{', '.join(self._defaults)}")  # fmt: skip
+        self.values = {name: values.copy() for name, values in self._defaults.items()}
+
+    def redraw(self, rngs: Sequence[np.random.Generator], where: Mask | None = None, stage: float = 1.0) -> None:
+        """Draw the machines where the mask is true, put them to rest and switch their drives on anew.
+
+        Afterwards `values` has the present value of everything by name, each of shape (num_machines,). A machine that
+        cannot be stepped (a resonance too fast) is drawn again with its own generator.
+
+        Raises:
+            ValueError: If none of many draws of a machine can be.
+        """
+        machine = self._drives.machine
+        mask = np.ones(self._drives.num_machines, bool) if where is None else np.asarray(where, bool)
+        noise = np.ones(len(mask))
+        for lane in map(int, np.flatnonzero(mask)):
+            noise[lane] = rngs[lane].integers(1, 2**32)
+            self._draw(lane, rngs[lane], stage)
+        machine.seed_noise(noise, mask)
+        try:
+            self._set(mask)
+        except ValueError:
+            for lane in map(int, np.flatnonzero(mask)):
+                self._set_one(lane, rngs[lane], stage)
+        # Supply before the reset, which charges the link from it; temperatures after: it sets them to 25 degC.
+        axes = np.repeat(mask, self._drives.num_axes // self._drives.num_machines)
+        machine.supply = np.where(axes, self._per_axis("supply.voltage"), machine.supply)
+        machine.reset(mask)
+        winding, power_stage = machine.temperatures
+        machine.set_temperatures(
+            np.where(axes, self._per_axis("start.winding"), winding),
+            np.where(axes, self._per_axis("start.stage"), power_stage),
+        )
+
+    def _draw(self, lane: int, rng: np.random.Generator, stage: float) -> None:
+        defaults = {name: float(values[lane]) for name, values in self._defaults.items()}
+        for name, value in self.distributions.draw(rng, defaults, stage).items():
+            self.values[name][lane] = value
+
+    def _set(self, mask: Mask) -> None:
+        drawn = [name for name in self.distributions.laws if name not in BESIDE]
+        self._drives.machine.set_all({name: self.values[name] for name in drawn}, mask)
+
+    def _set_one(self, lane: int, rng: np.random.Generator, stage: float) -> None:
+        one = np.arange(self._drives.num_machines) == lane
+        for attempt in range(_TRIES):
+            try:
+                self._set(one)
+            except ValueError as error:
+                if attempt == _TRIES - 1:
+                    raise ValueError(f"{_TRIES} draws in a row gave machines that cannot be: {error}") from error
+                self._draw(lane, rng, stage)
+            else:
+                return
+
+    def _per_axis(self, name: str) -> Floats:
+        return np.repeat(self.values[name], self._drives.num_axes // self._drives.num_machines)
+
+
+def shipped() -> list[str]:
+    """Return the names of the shipped sets."""
+    return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+@cache
+def _shipped_set(name: str) -> Distributions:
+    if name not in shipped():
+        raise ValueError(
+            f"no set of distributions is named {name!r}; there are {', '.join(shipped())}, or give a .toml"
+        )
+    return _from_file(SHIPPED / f"{name}.toml", ())
+
+
+def _from_file(path: Path, includers: tuple[str, ...]) -> Distributions:
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no TOML: {error}") from error
+    return _from_table(path.name, table, includers)
+
+
+def _from_table(where: str, table: Mapping[str, Any], includers: tuple[str, ...]) -> Distributions:
+    _check_keys(where, table, ("include", "parameters", "curriculum"))
+    laws: dict[str, Law] = {}
+    curriculum = Curriculum()
+    include = table.get("include", [])
+    for name in [include] if isinstance(include, str) else include:
+        if name in includers:
+            raise ValueError(f"{where}: {name!r} includes itself")
+        if name not in shipped():
+            raise ValueError(f"{where}: no set is named {name!r}; there are {', '.join(shipped())}")
+        other = _from_file(SHIPPED / f"{name}.toml", (*includers, name))
+        laws |= other.laws
+        curriculum = other.curriculum
+    for name, row in _mapping(f"{where}: parameters", table.get("parameters", {})).items():
+        if row is False:
+            laws.pop(name, None)
+        else:
+            laws[name] = _law(f"{where}: {name}", name, row)
+    if "curriculum" in table:
+        curriculum = _curriculum(f"{where}: curriculum", table["curriculum"])
+    return Distributions(laws, curriculum)
+
+
+def _law(where: str, name: str, row: Any) -> Law:
+    row = dict(_mapping(where, row))
+    kind = row.pop("law", None)
+    if kind not in LAWS:
+        raise ValueError(f"{where}: no law is named {kind!r}; there are {', '.join(LAWS)}")
+    of = row.pop("of", None)
+    if of not in (None, "default"):
+        raise ValueError(f'{where}: of = {of!r}; leave it out for absolute numbers, or write of = "default"')
+    _check_keys(where, row, (*_KEYS[kind], *_OPTIONAL[kind]))
+    missing = [key for key in _KEYS[kind] if key not in row]
+    if missing:
+        raise ValueError(f"{where}: a law {kind!r} needs {missing[0]!r}")
+    numbers = {key: _numbers(f"{where}: {key}", value) for key, value in row.items()}
+    law = Law(kind, of == "default", **numbers)
+    _check_law(where, law)
+    if name.startswith("bus.") and name not in BESIDE:
+        raise ValueError(f"{where}: a bus has no {name!r}; it has {', '.join(n for n in BESIDE if n[:4] == 'bus.')}")
+    return law
+
+
+def _check_law(where: str, law: Law) -> None:
+    if law.low > law.high:
+        raise ValueError(f"{where}: low {law.low:g} is above high {law.high:g}")
+    if law.law == "loguniform" and law.low <= 0.0:
+        raise ValueError(f"{where}: a law 'loguniform' needs a low above 0, not {law.low:g}")
+    if law.law == "normal" and law.deviation <= 0.0:
+        raise ValueError(f"{where}: deviation must be above 0, not {law.deviation:g}")
+    if law.law == "choice":
+        if not law.values:
+            raise ValueError(f"{where}: a law 'choice' needs at least one value")
+        if law.weights and (len(law.weights) != len(law.values) or min(law.weights) < 0.0 or sum(law.weights) <= 0.0):
+            raise ValueError(f"{where}: weights must be {len(law.values)} numbers, none negative, not all 0")
+
+
+def _curriculum(where: str, table: Any) -> Curriculum:
+    table = _mapping(where, table)
+    _check_keys(where, table, ("steps", "stage", "opens"))
+    steps = _numbers(f"{where}: steps", table.get("steps", [0]))
+    stage = _numbers(f"{where}: stage", table.get("stage", [1]))
+    if not isinstance(steps, tuple) or not isinstance(stage, tuple) or len(steps) != len(stage) or not steps:
+        raise ValueError(f"{where}: steps and stage must be arrays of the same length")
+    if any(b <= a for a, b in pairwise(steps)):
+        raise ValueError(f"{where}: steps must increase")
+    if min(stage) < 0.0 or max(stage) > 1.0:
+        raise ValueError(f"{where}: stage must lie in 0...1")
+    opens: dict[str, tuple[float, float]] = {}
+    for name, ends in _mapping(f"{where}: opens", table.get("opens", {})).items():
+        pair = _numbers(f"{where}: opens: {name}", ends)
+        if not isinstance(pair, tuple) or len(pair) != 2 or not 0.0 <= pair[0] < pair[1] <= 1.0:
+            raise ValueError(f"{where}: opens: {name} must be [from, to] with 0 <= from < to <= 1, not {ends}")
+        opens[name] = (pair[0], pair[1])
+    return Curriculum(steps, stage, opens)
+
+
+def _numbers(where: str, value: Any) -> Any:
+    """Return a finite number as a float, an array of them as a tuple."""
+    if isinstance(value, list | tuple):
+        return tuple(_numbers(where, item) for item in value)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{where} must be a finite number, not {value!r}")
+    return float(value)
+
+
+def _mapping(where: str, value: Any) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{where} must be a table, not {value!r}")
+    return value
+
+
+def _check_keys(where: str, table: Mapping[str, Any], known: Sequence[str]) -> None:
+    for key in table:
+        if key not in known:
+            raise ValueError(f"{where}: key {key!r} is unknown; there are {', '.join(known)}")
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_toml, value))}]"
+    return f'"{value}"' if isinstance(value, str) else repr(float(value))
+
+
+# --- chance -----------------------------------------------------------------------------------------------------------
+def shares_of_chance(key: np.uint64 | NDArray[np.uint64], marks: NDArray[np.uint64]) -> Floats:
+    """Return shares of chance in [0, 1) of keys with marks: splitmix64 of both (Steele, Lea, Flood 2014).
+
+    Whoever knows a key can have any of its chances, in any order: what one of them is asked for changes no other.
+    """
+    with np.errstate(over="ignore"):
+        z = key + marks * np.uint64(0x9E3779B97F4A7C15)
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z = z ^ (z >> np.uint64(31))
+    return np.asarray((z >> np.uint64(11)).astype(np.float64) * 2.0**-53)

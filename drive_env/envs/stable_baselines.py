@@ -1,0 +1,96 @@
+"""Lanes as a VecEnv of Stable-Baselines3, without copying: its arrays are the lanes' own.
+
+Needs stable-baselines3 (pip install stable-baselines3); nothing else in this package imports it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from drive_env.envs.lanes import Info, Lanes
+
+
+class LanesVecEnv(VecEnv):  # type: ignore[misc]
+    """Stable-Baselines3's view of lanes with autoreset mode "SameStep".
+
+    Observations, rewards and ends are handed over as they are; infos are dicts with "terminal_observation",
+    "TimeLimit.truncated", "fault" of lanes that ended, and empty otherwise.
+
+    Raises:
+        ValueError: For lanes of another autoreset mode, which SB3 does not know.
+    """
+
+    def __init__(self, lanes: Lanes) -> None:
+        if lanes.autoreset_mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(f"Stable-Baselines3 needs autoreset_mode='SameStep', not {lanes.autoreset_mode.value!r}")
+        self.lanes = lanes
+        self._actions: Any = None
+        super().__init__(lanes.num_envs, lanes.single_observation_space, lanes.single_action_space)
+
+    def reset(self) -> Any:
+        """Begin an episode in every lane, with the seeds and options given before."""
+        seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
+        options = self._options[0] if self._options and self._options[0] else None
+        observation, told = self.lanes.reset(seed=seeds, options=options)
+        self.reset_infos = [_of_lane(told, lane) for lane in range(self.num_envs)]
+        self._reset_seeds()
+        self._reset_options()
+        return observation
+
+    def step_async(self, actions: Any) -> None:
+        """Take the actions."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Any, Any, Any, list[Info]]:
+        """Act in every lane."""
+        observation, reward, terminated, truncated, info = self.lanes.step(self._actions)
+        ended = terminated | truncated
+        infos: list[Info] = [{} for _ in range(self.num_envs)]
+        if "final_obs" in info:
+            for lane in np.flatnonzero(ended):
+                infos[lane]["terminal_observation"] = info["final_obs"][lane]
+                infos[lane]["TimeLimit.truncated"] = bool(truncated[lane] and not terminated[lane])
+                fault = info["final_info"].get("fault")
+                if fault is not None and fault[lane] is not None:
+                    infos[lane]["fault"] = fault[lane]
+        return observation, reward.astype(np.float32), ended, infos
+
+    def close(self) -> None:
+        """Give drives and pictures back."""
+        self.lanes.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the lanes, once per lane asked for."""
+        return [getattr(self.lanes, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of the lanes."""
+        setattr(self.lanes, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call a method of the lanes once, and return its result once per lane asked for."""
+        result = getattr(self.lanes, method_name)(*method_args, **method_kwargs)
+        return [result] * len(list(self._get_indices(indices)))
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """Return that no lane is wrapped."""
+        return [False] * len(list(self._get_indices(indices)))
+
+    def get_images(self) -> Sequence[Any]:
+        """Return a picture of every lane."""
+        return list(self.lanes.render() or ())
+
+
+def _of_lane(info: Mapping[str, Any], lane: int) -> Info:
+    """Return what an info says of one lane."""
+    found: Info = {}
+    for key, value in info.items():
+        if key.startswith("_") or value is None or (f"_{key}" in info and not info[f"_{key}"][lane]):
+            continue
+        found[key] = _of_lane(value, lane) if isinstance(value, Mapping) else value[lane]
+    return found

@@ -1,0 +1,443 @@
+"""Tracking: the agent is the outer controller, at 500 Hz or 1 kHz, of drives in csp, csv or cst."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env import motion
+from drive_env.envs import tracking_cycle as cycle
+from drive_env.envs.configuration import configured
+from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Stepped, check_choice
+from drive_env.envs.pictures import Pictures
+from drive_env.envs.randomisation import Distributions, RandomMachines
+from drive_env.envs.trajectories import TRAJECTORIES, draw
+
+CYCLE = 0.001  # s, one communication cycle
+
+# Mode -> target object, offset object (CiA 402).
+OBJECTS = {"csp": (0x607A, 0x60B0), "csv": (0x60FF, 0x60B1), "cst": (0x6071, 0x60B2)}
+SAMPLED = (0x6041, 0x6064, 0x606C, 0x6077)
+POSITION_SCALER, MAXIMUM_CURRENT = 0x2058, 0x2003
+WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "effort": 0.05, "smoothness": 0.05, "trip": 10.0}
+RATES = (500, 1000)
+ACTIONS = ("direct", "offset")
+RETURN_SPEED = 0.25  # of the trajectory's, back to the start on a bus
+RESTARTS = 20  # tries to reset a fault on a bus before giving up
+RESTART_PAUSE = 0.1  # s between two: a DC link that braking has filled empties slowly
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is done with a load: the defaults of a configuration.
+
+    mode: csp, csv or cst.
+    trajectory: A row of trajectories.TRAJECTORIES.
+    amplitude: Of the trajectory, and the scale of positions [rev of the motor].
+    speed: Its highest, and the scale of velocities [rev/s].
+    joint: Number of the load's joint that a sensor of the master's own sees; None for no such sensor.
+    fall: Angle of that joint that ends the episode [rad].
+    """
+
+    mode: str
+    trajectory: str
+    amplitude: float
+    speed: float
+    joint: int | None = None
+    fall: float = np.inf
+
+
+TASKS = {
+    "two_mass": Task("cst", "moves", 2.0, 20.0),
+    "gantry": Task("csv", "moves", 3.0, 15.0),
+    "cart_pendulum": Task("csv", "moves", 5.0, 15.0, joint=1),
+    "inverted_pendulum": Task("csv", "hold", 5.0, 25.0, joint=1, fall=0.6),
+}
+OTHER = Task("cst", "moves", 1.0, 10.0)  # of every other load
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Configuration of Tracking; None takes the load's own (TASKS).
+
+    load, device, motor, friction: As `EmulatedDrives` takes them.
+    mode: "csp", "csv" or "cst".
+    action: "direct": the action is the target, of a full scale: current limit, 1.25 times speed or amplitude.
+        "offset": the target follows the profile, and the action is 60B0h, 60B1h or 60B2h besides, up to `offset` times
+        that full scale. The profile of cst is the current that the commissioned inertia needs.
+    offset: Share of full scale.
+    rate: Actions per second [Hz], 500 or 1000.
+    duration: Of an episode [s].
+    delay: From the drive's sample to the action's effect [communication cycles], 1 or more: an agent on a real bus
+        has one cycle to answer.
+    trajectory, amplitude [rev], speed [rev/s]: What is followed.
+    distributions: What is drawn anew in each episode, as `randomisation.Distributions` takes it; None: noise alone.
+    stage: Of its curriculum, 0...1.
+    weights: Of the reward's terms; those left out keep theirs.
+    num_threads: As `EmulatedDrives` takes it.
+    """
+
+    load: str = "two_mass"
+    device: str = "tmcm1636"
+    motor: str = "qbl4208"
+    friction: str = "stribeck"
+    mode: str | None = None
+    action: str = "direct"
+    offset: float = 0.3
+    rate: int = 1000
+    duration: float = 1.0
+    delay: int = 1
+    trajectory: str | None = None
+    amplitude: float | None = None
+    speed: float | None = None
+    distributions: Any = None
+    stage: float = 1.0
+    weights: Mapping[str, float] = field(default_factory=dict)
+    num_threads: int | None = None
+
+    def __post_init__(self) -> None:
+        task = TASKS.get(self.load, OTHER)
+        for name in ("mode", "trajectory", "amplitude", "speed"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, getattr(task, name))
+        check_choice("mode", self.mode, tuple(OBJECTS))
+        check_choice("action", self.action, ACTIONS)
+        check_choice("rate", self.rate, RATES)
+        check_choice("trajectory", self.trajectory, TRAJECTORIES)
+        for name in self.weights:
+            check_choice("a weight's name", name, tuple(WEIGHTS))
+        object.__setattr__(self, "weights", {**WEIGHTS, **self.weights})
+        for name in ("offset", "duration", "amplitude", "speed"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} must be above 0 and finite, not {getattr(self, name):g}")
+        if not 1 <= self.delay <= cycle.LONGEST_DELAY or self.delay != int(self.delay):
+            raise ValueError(f"delay is 1...{cycle.LONGEST_DELAY} communication cycles, not {self.delay}")
+        if not 0.0 <= self.stage <= 1.0:
+            raise ValueError(f"stage of the curriculum must lie in 0...1, not {self.stage:g}")
+
+    @property
+    def task(self) -> Task:
+        """What the load's row says."""
+        return TASKS.get(self.load, OTHER)
+
+    @property
+    def cycles(self) -> int:
+        """Communication cycles per action."""
+        return 1000 // self.rate
+
+    @property
+    def steps(self) -> int:
+        """Actions per episode."""
+        return max(1, round(self.duration * self.rate))
+
+
+class Tracking(Lanes):
+    """Lanes of `ServoDrive/Tracking-v0`: follow a trajectory, or stabilise what the load's row says.
+
+    Action, float32, one entry per axis of the machine, -1...1: share of full scale, see `TrackingConfig.action`.
+
+    Observation, float32, for each axis a = 0, 1, ... of the machine (8 entries each), of the drive's sample that the
+    agent has when it acts:
+
+    | index | name | unit | low | high |
+    | --- | --- | --- | --- | --- |
+    | 8a + 0 | reference - position actual value (6064h) | amplitude | -4 | 4 |
+    | 8a + 1 | reference velocity - velocity actual value (606Ch) | speed | -4 | 4 |
+    | 8a + 2 | position actual value, from the episode's start | amplitude | -4 | 4 |
+    | 8a + 3 | velocity actual value | speed | -4 | 4 |
+    | 8a + 4 | torque actual value (6077h) | current limit (2003h) | -2 | 2 |
+    | 8a + 5 | reference velocity | speed | -2 | 2 |
+    | 8a + 6 | reference velocity 10 ms later | speed | -2 | 2 |
+    | 8a + 7 | last action | 1 | -1 | 1 |
+
+    and, with a load whose row has a sensor (cart_pendulum, inverted_pendulum), after them:
+
+    | index | name | unit | low | high |
+    | --- | --- | --- | --- | --- |
+    | 8A + 0 | angle of the pendulum | rad | -pi | pi |
+    | 8A + 1 | its rate | rad/s | -50 | 50 |
+
+    The reward is the sum of weighted terms, each in 0...1 (`info["reward_terms"]`). `terminated`: a drive tripped, its
+    machine left physics, or the pole fell; `truncated`: time ran out. `info`: "reward_terms"; "parameters" of lanes
+    that begin, the true machine, not on a bus; "fault" of lanes that ended so, a name or several.
+
+    Args:
+        num_envs: Lanes.
+        config: A `TrackingConfig`, a table like it, or a TOML file.
+        drives: Drives to act on, `num_envs` machines; emulated ones of the configuration by default. Without machine
+            (on a bus) an episode begins with a fault reset and a move back to the start.
+        sensor: Returns the pendulum's angle of each lane [rad], shape (num_envs,); needed on a bus alone.
+        autoreset_mode, render_mode: As `Lanes` takes them.
+        options: Fields of the configuration that replace its own.
+
+    Raises:
+        ValueError: For a value that is none, naming those that are.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        config: TrackingConfig | Mapping[str, Any] | str | Path | None = None,
+        drives: Any = None,
+        sensor: Callable[[], ArrayLike] | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        self.config = configured(TrackingConfig, config, options)
+        self._owned = drives is None
+        self.drives = self._new_drives(num_envs) if drives is None else drives
+        try:
+            super().__init__(num_envs, *self._spaces(num_envs), autoreset_mode=autoreset_mode, render_mode=render_mode)
+            self._prepare(sensor)
+        except BaseException:
+            self._close_lanes()
+            raise
+
+    # --- construction ---------------------------------------------------------------------------------------------
+    def _new_drives(self, num_envs: int) -> Any:
+        from drive_env.drives import EmulatedDrives
+
+        config = self.config
+        return EmulatedDrives(
+            config.device,
+            config.load,
+            config.motor,
+            max(num_envs, 1),
+            friction=config.friction,
+            num_threads=config.num_threads,
+        )
+
+    def _spaces(self, num_envs: int) -> tuple[Box, Box]:
+        axes, rest = divmod(self.drives.num_axes, max(num_envs, 1))
+        if rest or not axes:
+            raise ValueError(f"{self.drives.num_axes} axes cannot be shared by {num_envs} lanes")
+        self._axes = axes
+        self._has_sensor = self.config.task.joint is not None
+        high = np.concatenate([np.tile(cycle.AXIS_HIGH, axes), cycle.LOAD_HIGH if self._has_sensor else []])
+        bound = high.astype(np.float32)
+        return Box(-bound, bound, dtype=np.float32), Box(-1.0, 1.0, (axes,), np.float32)
+
+    def _prepare(self, sensor: Callable[[], ArrayLike] | None) -> None:
+        config, drives, n = self.config, self.drives, self.num_envs
+        machine = getattr(drives, "machine", None)
+        self._machines = None
+        if machine is not None:
+            self._machines = RandomMachines(drives, Distributions.load(config.distributions or {"parameters": {}}))
+        elif config.distributions is not None:
+            raise ValueError("distributions are of emulated machines; leave them out on a bus")
+        self._sensor = sensor
+        if self._has_sensor and sensor is None:
+            if machine is None:
+                raise ValueError(
+                    f"{config.load} needs the pendulum's angle, which no drive measures: give sensor=, a function that "
+                    "returns it"
+                )
+            joint = config.task.joint
+            self._sensor = lambda: drives.machine.joint_positions[:, joint]
+        per_turn = drives.read(POSITION_SCALER).astype(float)
+        self._scales = np.empty((self.drives.num_axes, 4))
+        self._scales[:, 0] = config.amplitude * per_turn
+        self._scales[:, 1] = config.speed * per_turn
+        self._scales[:, 2] = drives.read(MAXIMUM_CURRENT)
+        full = {"csp": 1.25 * self._scales[:, 0], "csv": 1.25 * self._scales[:, 1], "cst": self._scales[:, 2]}
+        self._scales[:, 3] = full[str(config.mode)] * (1.0 if config.action == "direct" else config.offset)
+        self._per_turn = per_turn.reshape(n, -1)[:, 0]
+        target, offset = OBJECTS[str(config.mode)]
+        self._acting = target if config.action == "direct" else offset
+        self._following = None if config.action == "direct" else target
+        self._lanes = np.zeros(n, cycle.LANE)
+        self._pending = np.zeros((drives.num_axes, cycle.DEPTH), np.int64)
+        self._history = np.zeros((cycle.DEPTH, len(SAMPLED), drives.num_axes), np.int64)
+        length = config.steps * config.cycles + cycle.PREVIEW + 1
+        self._reference = np.zeros((n, 3, length))
+        self._bus = np.zeros((n, config.steps), np.uint8)
+        self._last = np.zeros((drives.num_axes, 2))
+        self._start = np.zeros(drives.num_axes, np.int64)
+        self._origin = np.zeros(drives.num_axes)
+        self._weights = np.array([config.weights[name] for name in cycle.TERMS])
+        self._angles = np.zeros(n)
+        self._kind = cycle.KINDS[str(config.mode), config.action == "direct"]
+        self._fall = config.task.fall
+        self._cycles = config.cycles
+        self._shape = (n, *(self.single_observation_space.shape or ()))
+        self._everywhere = np.ones(n, bool)
+        self._profile_scale = self._profile_scales()
+        self._pictures: Pictures | None = None
+
+    def _profile_scales(self) -> Floats:
+        """Return raw units of the target per unit of the reference's row: increments, pps, or mA per pps^2."""
+        config, drives = self.config, self.drives
+        if config.mode != "cst":
+            return np.ones(drives.num_axes)
+        from drive_env.motors import find_motor
+
+        motor = find_motor(config.motor)
+        inertia = cycle.COMMISSIONED_INERTIA * motor.inertia
+        return 1e3 * inertia / motor.torque_constant * 2.0 * np.pi / np.repeat(self._per_turn, self._axes)
+
+    # --- an episode -----------------------------------------------------------------------------------------------
+    def _reset_lanes(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
+        for name in options:
+            check_choice("an option of reset", name, ("reset_mask",))
+        axes = np.repeat(mask, self._axes)
+        if self._machines is not None:
+            self._machines.redraw(self.rngs, mask, self.config.stage)
+            motion.enable(self.drives, mode=self.config.mode, where=axes)
+        else:
+            self._return_to_start(axes)
+        self.drives.emergencies()
+        samples = np.stack([self.drives.read(name) for name in SAMPLED])
+        self._origin[axes] = samples[1][axes]
+        self._history[:, :, axes] = samples[:, axes]
+        neutral = samples[1] if self._acting == 0x607A else np.zeros(len(axes), np.int64)
+        self._pending[axes] = neutral[axes, None]
+        self._last[axes] = 0.0
+        self._draw_episodes(mask)
+        if self._sensor is not None:
+            self._angles = np.where(mask, np.asarray(self._sensor(), float), self._angles)
+            self._lanes["angle"][mask] = self._angles[mask]
+        if self._pictures is not None:
+            self._pictures.begin(mask)
+        observation = np.empty(self._shape, np.float32)
+        cycle.describe(self._lanes, self._history, self._reference, self._scales, self._origin, self._last,
+                       self._angles, observation, self.config.cycles, mask)  # fmt: skip
+        if self._machines is None:
+            return observation, {}
+        return observation, {"parameters": {name: values.copy() for name, values in self._machines.values.items()}}
+
+    def _step_lanes(self, action: Any) -> Stepped:
+        lanes = self._lanes
+        given = np.ascontiguousarray(action, np.float32).reshape(-1)
+        raw = np.empty((self._cycles, len(given)), np.int64)
+        target = np.empty_like(raw)
+        cycle.act(lanes, given, self._scales, self._origin, self._pending, self._bus, self._reference,
+                  self._profile_scale, self._last, raw, target, self._kind)  # fmt: skip
+        play = {self._acting: raw} if self._following is None else {self._following: target, self._acting: raw}
+        if self._sensor is not None:
+            self._angles = np.asarray(self._sensor(), float)
+        trace = self.drives.record(SAMPLED, self._cycles * CYCLE, play=play)
+        n = self.num_envs
+        observation = np.empty(self._shape, np.float32)
+        reward, terms = np.empty(n), np.empty((len(cycle.TERMS), n))
+        ended = np.empty((2, n), np.bool_)
+        some = cycle.observe(lanes, trace[SAMPLED[0]], trace[SAMPLED[1]], trace[SAMPLED[2]], trace[SAMPLED[3]],
+                             self._history, self._reference, self._scales, self._origin, self._last, self._angles,
+                             self._weights, self._bus, self._fall, self._everywhere, observation, reward, terms,
+                             ended)  # fmt: skip
+        info: Info = {"reward_terms": dict(zip(cycle.TERMS, terms, strict=True))}
+        if some:
+            info["fault"] = self._faults(ended[0])
+            info["_fault"] = ended[0]
+        if self._pictures is not None:
+            self._pictures.look()
+        return observation, reward, ended[0], ended[1], info
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _draw_episodes(self, mask: Mask) -> None:
+        """Draw trajectory and bus of the lanes that begin."""
+        config = self.config
+        bus: dict[str, Floats] = {} if self._machines is None else self._machines.values
+        for lane in np.flatnonzero(mask):
+            rng = self.rngs[lane]
+            length = self._reference.shape[2]
+            turns = draw(str(config.trajectory), rng, length, CYCLE, float(config.amplitude or 0.0),
+                         float(config.speed or 0.0))  # fmt: skip
+            self._reference[lane] = turns * self._per_turn[lane]
+            jitter = int(bus["bus.jitter"][lane]) if bus else 0
+            lost = float(bus["bus.lost_sync"][lane]) if bus else 0.0
+            chance = rng.random((2, config.steps)) if jitter or lost else None
+            self._bus[lane] = 0
+            if chance is not None:
+                self._bus[lane] = (chance[0] * (jitter + 1)).astype(np.uint8)
+                self._bus[lane][chance[1] < lost] = cycle.LOST
+            state = self._lanes[lane]
+            state["step"] = 0
+            state["steps"] = config.steps
+            late = float(bus["bus.action_latency"][lane]) if bus else 0.0
+            state["action_latency"] = min(config.delay - 1 + round(late), cycle.LONGEST_DELAY)
+            early = float(bus["bus.observation_latency"][lane]) if bus else 0.0
+            state["observation_latency"] = min(round(early), cycle.LONGEST_DELAY)
+
+    def _return_to_start(self, axes: Mask) -> None:
+        """Begin as one does with a real drive: nothing else moves while these axes go back to where they began."""
+        drives, mode = self.drives, str(self.config.mode)
+        for name in OBJECTS[mode]:
+            if name != 0x607A:
+                drives.write(name, 0)
+        for attempt in range(RESTARTS):
+            self._clear(axes)
+            try:
+                self._go_back(axes)
+            except RuntimeError:  # a drive that the episode left in haste may trip while it is caught
+                if attempt == RESTARTS - 1:
+                    raise
+            else:
+                return
+
+    def _go_back(self, axes: Mask) -> None:
+        drives, mode = self.drives, str(self.config.mode)
+        position = drives.read(0x6064)
+        if not self._has_begun:
+            self._start = position.copy()
+        away = axes & (np.abs(position - self._start) > self._scales[:, 0] * 1e-3)
+        if away.any():
+            motion.enable(drives, mode="pp", where=away)
+            speed = drives.read(0x6081)
+            drives.write(0x6081, np.rint(RETURN_SPEED * self._scales[:, 1]).astype(np.int64), where=away)
+            try:
+                motion.move_to(drives, self._start, where=away)
+            finally:
+                drives.write(0x6081, speed, where=away)
+        if mode == "csp":
+            drives.write(0x607A, drives.read(0x6064), where=axes)
+        motion.enable(drives, mode=mode, where=axes)
+
+    def _clear(self, axes: Mask) -> None:
+        """Reset faults of the drives that have one, when their causes are gone."""
+        drives = self.drives
+        for attempt in range(RESTARTS):
+            faulty = axes & (drives.read(0x6041) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1])
+            if not faulty.any():
+                return
+            try:
+                motion.reset_fault(drives, where=faulty, timeout=RESTART_PAUSE)
+                drives.advance(RESTART_PAUSE)
+            except TimeoutError:
+                if attempt == RESTARTS - 1:
+                    raise
+
+    def _faults(self, lanes: Mask) -> NDArray[np.object_]:
+        """Return what ended each lane: names of emergencies, "diverged", "fell", or "not enabled"."""
+        names: list[list[str]] = [[] for _ in range(self.num_envs)]
+        for message in self.drives.emergencies():
+            names[message.axis // self._axes].append(message.name)
+        machine = getattr(self.drives, "machine", None)
+        diverged = machine.diverged if machine is not None else np.zeros(self.num_envs, bool)
+        found = np.full(self.num_envs, None, object)
+        for lane in np.flatnonzero(lanes):
+            if diverged[lane]:
+                names[lane].append("diverged")
+            if self._lanes["fallen"][lane]:
+                names[lane].append("fell")
+            found[lane] = ", ".join(names[lane]) or "not enabled"
+        return found
+
+    def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
+        if self._pictures is None:
+            self._pictures = Pictures(self.drives, self.num_envs, str(self.render_mode))
+        return self._pictures.draw(lane)
+
+    def _close_lanes(self) -> None:
+        if getattr(self, "_pictures", None) is not None:
+            self._pictures.close()  # type: ignore[union-attr]
+        if self._owned:
+            self.drives.close()

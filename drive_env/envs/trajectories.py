@@ -1,0 +1,68 @@
+"""Trajectories to follow: position, velocity and acceleration of an episode, drawn with a lane's generator."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+TRAJECTORIES = ("hold", "moves", "sines")
+SINES = 3
+FREQUENCIES = (0.5, 5.0)  # Hz
+SOFT_START = 0.1  # s
+LONGEST_REST = 0.1  # s between two moves
+SHORTEST_MOVE = 0.05  # s
+PEAK_OF_MEAN = 1.875  # peak over mean velocity of a move of fifth order
+
+
+def draw(kind: str, rng: np.random.Generator, length: int, period: float, amplitude: float, speed: float) -> Floats:
+    """Return position [rev], velocity [rev/s], acceleration [rev/s^2], shape (3, length); it begins at rest at 0.
+
+    Args:
+        kind: "hold" stays; "moves" goes to random places and rests there; "sines" adds three sines.
+        rng: Where chance comes from.
+        length: Samples.
+        period: Of the samples [s].
+        amplitude: Largest position [rev].
+        speed: Largest velocity [rev/s].
+    """
+    if kind == "hold":
+        return np.zeros((3, length))
+    if kind == "moves":
+        return _moves(rng, length, period, amplitude, speed)
+    return _sines(rng, length, period, amplitude, speed)
+
+
+def _moves(rng: np.random.Generator, length: int, period: float, amplitude: float, speed: float) -> Floats:
+    found = np.zeros((3, length))
+    start = place = 0.0
+    t = np.arange(length) * period
+    while start < t[-1]:
+        target = rng.uniform(-amplitude, amplitude)
+        way = target - place
+        duration = max(PEAK_OF_MEAN * abs(way) / (speed * rng.uniform(0.3, 1.0)), SHORTEST_MOVE)
+        first, last = np.searchsorted(t, (start, start + duration))
+        x = (t[first:last] - start) / duration
+        found[0, first:last] = place + way * x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+        found[1, first:last] = way / duration * 30.0 * x**2 * (1.0 - x) ** 2
+        found[2, first:last] = way / duration**2 * 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x)
+        found[0, last:] = target
+        place = target
+        start += duration + rng.uniform(0.0, LONGEST_REST)
+    return found
+
+
+def _sines(rng: np.random.Generator, length: int, period: float, amplitude: float, speed: float) -> Floats:
+    t = np.arange(length) * period
+    low, high = np.log(FREQUENCIES)
+    omega = 2.0 * np.pi * np.exp(rng.uniform(low, high, SINES))[:, None]
+    phase = rng.uniform(0.0, 2.0 * np.pi, (SINES, 1))
+    share = rng.dirichlet(np.ones(SINES))[:, None] / omega
+    sines = np.sum(share * (np.sin(omega * t + phase) - np.sin(phase)), axis=0)
+    x = np.minimum(t / SOFT_START, 1.0)
+    position = sines * x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+    velocity = np.gradient(position, period) if length > 1 else np.zeros(length)
+    size = min(amplitude / max(np.abs(position).max(), 1e-9), speed / max(np.abs(velocity).max(), 1e-9))
+    position, velocity = position * size, velocity * size
+    return np.stack([position, velocity, np.gradient(velocity, period) if length > 1 else velocity])

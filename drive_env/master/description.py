@@ -1,0 +1,192 @@
+"""What the master knows of a device: its dictionary, data types, axes, time-outs and emergencies.
+
+A known device brings its own; any other CiA 402 drive is described by its EDS and CiA's defaults.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from canopen.objectdictionary import ODVariable, datatypes
+
+from drive_env.devices import AxisOffset, Device, MasterHints, find_device
+from drive_env.dictionary.access import WRONG_TYPE, ObjectAccessError
+from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName, read_eds
+
+Key = tuple[int, int]
+
+CYCLE = 0.001  # communication cycle where the device says nothing else [s]
+
+# CiA 402-2: the profile objects of the next axis lie 800h above; where a device shifts more, its data say so.
+PROFILE_OFFSET = 0x800
+CIA_402_OFFSETS = (AxisOffset(0x6000, 0x67FF, PROFILE_OFFSET),)
+
+# Communication emergencies of CiA 301 (table 26 of version 4.2), named where the device's own table has no row.
+EMERGENCY_NAMES = {
+    0x0000: "error_reset",
+    0x8110: "can_overrun",
+    0x8120: "can_error_passive",
+    0x8130: "heartbeat_lost",
+    0x8140: "bus_off_recovered",
+    0x8210: "pdo_too_short",
+    0x8220: "pdo_too_long",
+    0x6320: "pdo_data_refused",
+}
+
+
+# Of a drive that is known by its EDS alone. CiA 301: 0 to 240 wait for the next SYNC, and 1 is what every device with
+# synchronous RPDOs takes. CiA 402: maximum current 6073h, in the thousandths of 6077h. Stores and restores erase flash,
+# for which users of python-canopen report up to seconds.
+CIA_402 = MasterHints(rpdo_type=1, current_limit=(0x6073, 0), timeout=0.5, timeouts={0x1010: 10.0, 0x1011: 10.0})
+
+
+@dataclass
+class Description:
+    """A kind of device on the bus.
+
+    Attributes:
+        name: Name of the device, or of its EDS.
+        dictionary: Its entries, of axis 0 where there are more.
+        num_axes: Axes of one node.
+        device: The known device, or None.
+        hints: What else a master must know of it.
+        timeouts: Time-outs of objects that the user gave [s].
+        timeout: Time-out of the others that the user gave [s]; None takes the device's.
+        cycle: Communication cycle [s].
+    """
+
+    name: str
+    dictionary: ObjectDictionary
+    num_axes: int
+    device: Device | None
+    hints: MasterHints
+    timeout: float | None = None
+    timeouts: dict[Key, float] = field(default_factory=dict)
+    cycle: float = CYCLE
+    _types: dict[Key, ODVariable] = field(default_factory=dict)
+
+    @property
+    def answer_timeout(self) -> float:
+        """How long an answer may take where the object is not known to be slow [s]."""
+        return self.hints.timeout if self.timeout is None else self.timeout
+
+    def key(self, entry: Entry, axis: int) -> Key:
+        """Return index and sub-index of an entry for an axis of the node."""
+        offsets = CIA_402_OFFSETS if self.device is None else self.device.axis_offsets
+        for offset in offsets:
+            if offset.first <= entry.index <= offset.last:
+                return entry.index + axis * offset.step, entry.sub
+        return entry.index, entry.sub
+
+    def label(self, entry: Entry, axis: int) -> str:
+        """Return what a message calls the object of an axis."""
+        index, sub = self.key(entry, axis)
+        return f"{index:04X}h:{sub:02X} {entry.name}"
+
+    def patience(self, entry: Entry) -> float:
+        """Return how long an answer about this object may take [s]."""
+        own = self.timeouts.get((entry.index, entry.sub))
+        return own if own is not None else max(self.answer_timeout, self.hints.timeouts.get(entry.index, 0.0))
+
+    def encode(self, entry: Entry, value: int | str) -> bytes:
+        """Return the bytes of a value."""
+        if isinstance(value, str):
+            return value.encode("utf-8")
+        return int(value).to_bytes(self.size(entry), "little", signed=value < 0)
+
+    def decode(self, entry: Entry, data: bytes) -> Any:
+        """Return the integer, float or text of an object's bytes.
+
+        A device that answers with more bytes than the type has is forgiven; one that answers with fewer is not.
+        """
+        kind = self._types[entry.index, entry.sub].data_type
+        if kind in datatypes.INTEGER_TYPES or kind == datatypes.BOOLEAN:
+            size = self.size(entry)
+            if len(data) < size:
+                raise ObjectAccessError(
+                    WRONG_TYPE, f"{entry.label} has {size} bytes by the EDS, and {len(data)} came: {data.hex(' ')}"
+                )
+            return int.from_bytes(data[:size], "little", signed=entry.signed)
+        if kind in datatypes.FLOAT_TYPES:
+            return self._types[entry.index, entry.sub].decode_raw(data)
+        if kind == datatypes.VISIBLE_STRING:
+            return data.decode("utf-8", "replace").rstrip("\0")
+        return data.hex(" ")
+
+    def is_number(self, entry: Entry) -> bool:
+        """Return whether an object is an integer."""
+        kind = self._types[entry.index, entry.sub].data_type
+        return kind in datatypes.INTEGER_TYPES or kind == datatypes.BOOLEAN
+
+    def size(self, entry: Entry) -> int:
+        """Return the bytes that an integer object has."""
+        return max(1, len(self._types[entry.index, entry.sub]) // 8)
+
+    def emergency_name(self, code: int, extra: tuple[int, ...]) -> str:
+        """Return the name of an emergency by the device's table, by CiA 301's, or as its code."""
+        rows = {} if self.device is None else self.device.emergencies
+        for name, row in rows.items():
+            if (row.code, tuple(row.extra)) == (code, extra):
+                return name
+        same_code = [name for name, row in rows.items() if row.code == code]
+        if len(same_code) == 1:
+            return same_code[0]
+        return EMERGENCY_NAMES.get(code, f"emergency_{code:04X}h")
+
+    def has(self, name: ObjectName) -> bool:
+        """Return whether the dictionary has an object."""
+        try:
+            self.dictionary.find(name)
+        except ObjectAccessError:
+            return False
+        return True
+
+
+def describe(device: str | None, eds: str | Path | None) -> Description:
+    """Return the description of a known device by name, or of any other by its EDS.
+
+    Raises:
+        ValueError: For an unknown name, or a file that is no EDS of a drive.
+    """
+    if eds is None:
+        if device is None:
+            raise ValueError("give the name of a device, or the EDS of the drive")
+        known = find_device(device)
+        return Description(
+            known.name,
+            known.new_dictionary(),
+            known.num_axes,
+            known,
+            known.master,
+            cycle=1.0 / known.profile_rate,
+            _types=_read_types(known.eds),
+        )
+    path = Path(eds)
+    if not path.is_file():
+        raise ValueError(f"there is no EDS at {path}; give the path of the drive's .eds file")
+    try:
+        dictionary, types = ObjectDictionary(path), _read_types(path)
+    except Exception as error:  # the reader raises whatever the broken line leads to
+        raise ValueError(f"{path} cannot be read as an EDS: {error}; see whether CiA 306 allows that line") from error
+    axes = sum((0x6041 + PROFILE_OFFSET * axis, 0) in types for axis in range(8))
+    if axes == 0:
+        raise ValueError(f"{path} describes no CiA 402 drive: it has no statusword 6041h")
+    return Description(path.stem, dictionary, axes, None, CIA_402, _types=types)
+
+
+def _read_types(path: Path) -> dict[Key, ODVariable]:
+    types = {}
+    for item in read_eds(path).values():
+        for variable in [item] if isinstance(item, ODVariable) else item.values():
+            types[variable.index, variable.subindex] = variable
+    return types
+
+
+def check_timeout(timeout: float) -> float:
+    """Return a time-out [s]; ValueError for one that is not above 0 s or has no end."""
+    if not 0.0 < timeout < math.inf:
+        raise ValueError(f"a time-out of {timeout:g} s cannot be; give one above 0 s, e.g. 0.5")
+    return timeout

@@ -1,0 +1,108 @@
+"""When the next SYNC is due."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+MOST_FRAMES = 256  # taken in between two SYNCs; a bus of 1 Mbit/s carries about 8 in a millisecond
+Receive = Callable[[float], bool]  # waits so many seconds for a frame; whether one came
+
+
+class Timing(NamedTuple):
+    """How punctual the SYNCs of a run were: their number, those more than a cycle late, the worst lateness [s]."""
+
+    cycles: int
+    late: int
+    worst: float
+
+
+def _take_in(receive: Receive) -> None:
+    """Receive what has come, but not for ever where more comes than can be received."""
+    for _ in range(MOST_FRAMES):
+        if not receive(0.0):
+            return
+
+
+class Pace(Protocol):
+    """What a run of cycles asks of a pace."""
+
+    window: int  # SYNCs that may be out before their samples are in
+    time_waits: bool  # whether no time passes while no SYNC is sent
+    timing: Timing  # of the last run
+
+    def begin(self) -> None:
+        """Begin a run of cycles."""
+
+    def wait(self, receive: Receive) -> int:
+        """Wait until the next SYNC is due; return how many cycles were missed before it."""
+
+    def end(self, receive: Receive) -> None:
+        """Wait until the cycle of the last SYNC has passed."""
+
+
+class RealTimePace:
+    """One SYNC per communication cycle by the clock.
+
+    A SYNC that is more than a cycle late shifts those that follow: several at once would not make the motor faster,
+    only its set-points.
+
+    Args:
+        cycle: Communication cycle [s].
+    """
+
+    window = 64
+    time_waits = False
+
+    def __init__(self, cycle: float) -> None:
+        self._cycle = cycle
+        self._due = 0.0
+        self.timing = Timing(0, 0, 0.0)
+
+    def begin(self) -> None:
+        """Begin now, or a cycle after the last SYNC if that is later."""
+        self._due = max(self._due, time.perf_counter())
+        self.timing = Timing(0, 0, 0.0)
+
+    def wait(self, receive: Receive) -> int:
+        """Wait until the next SYNC is due, receiving meanwhile; return how many cycles were missed before it."""
+        self._pass_time(receive)
+        now = time.perf_counter()
+        lateness = now - self._due
+        late = lateness > self._cycle
+        self.timing = Timing(self.timing.cycles + 1, self.timing.late + late, max(self.timing.worst, lateness))
+        self._due = (now if late else self._due) + self._cycle
+        return int(lateness / self._cycle) if late else 0
+
+    def end(self, receive: Receive) -> None:
+        """Wait until the cycle of the last SYNC has passed."""
+        self._pass_time(receive)
+
+    def _pass_time(self, receive: Receive) -> None:
+        while (left := self._due - time.perf_counter()) > 0.0:
+            receive(left)
+        _take_in(receive)
+
+
+class LockstepPace:
+    """SYNCs as fast as the emulator answers; time passes by them alone."""
+
+    window = 16
+    time_waits = True
+
+    def __init__(self) -> None:
+        self.timing = Timing(0, 0, 0.0)
+
+    def begin(self) -> None:
+        """Begin."""
+        self.timing = Timing(0, 0, 0.0)
+
+    def wait(self, receive: Receive) -> int:
+        """Take in what has come; there is nothing to wait for, and nothing to miss."""
+        _take_in(receive)
+        self.timing = Timing(self.timing.cycles + 1, 0, 0.0)
+        return 0
+
+    def end(self, receive: Receive) -> None:
+        """Do nothing: no time passes without SYNC."""

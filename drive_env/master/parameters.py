@@ -1,0 +1,196 @@
+"""The parameters of a drive as a set: read, compared, and written all or none.
+
+A parameter is what stays: settings, not commands, not services. PDOs are remapped in the order that CiA 301 demands.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+from drive_env.canopen.frames import INVALID
+from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.entries import Entry
+from drive_env.master.errors import BusError
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+Key = tuple[int, int]
+
+# What can be written but is no parameter.
+COMMANDS = {
+    0x1010: "store: a service",
+    0x1011: "restore defaults: a service",
+    0x1F50: "program download: a service",
+    0x1F51: "program control: a service",
+    0x2706: "store bus settings: a service",
+    0x5FFF: "bootloader: a service",
+    0x2703: "digital outputs: a command",
+    0x6040: "controlword: a command",
+    0x6060: "modes of operation: a command",
+    0x6071: "target torque: a command",
+    0x607A: "target position: a command",
+    0x60B0: "position offset: a command",
+    0x60B1: "velocity offset: a command",
+    0x60B2: "torque offset: a command",
+    0x60FE: "digital outputs: a command",
+    0x60FF: "target velocity: a command",
+}
+# Kept in a backup, never restored: the node would be somebody else after its next reset, or mute.
+IDENTITY_OF_THE_NODE = {0x2704: "CAN bit rate", 0x2705: "node-ID"}
+_OPERATION_ENABLED = (0x6F, 0x27)
+_COMMUNICATION = (range(0x1400, 0x1600), range(0x1800, 0x1A00))
+_MAPPING_ABOVE = 0x200  # the mapping of a PDO lies so far above its communication parameter
+
+
+class Difference(NamedTuple):
+    """A parameter that is not as it should be; `found` is None where the drive does not have it."""
+
+    entry: Entry
+    wanted: int
+    found: int | None
+
+
+class RollbackError(BusError):
+    """A write failed and what was written before could not be taken back: the drive holds a mixture."""
+
+
+class NotRestoredError(BusError):
+    """A write failed; what was written before was taken back."""
+
+
+def parameters(drives: CanDrives) -> list[Entry]:
+    """Return the entries that are parameters of a drive."""
+    return [
+        entry
+        for entry in drives.description.dictionary
+        if entry.access in ("rw", "rwr", "rww") and entry.index not in COMMANDS and drives.description.is_number(entry)
+    ]
+
+
+def read_parameters(drives: CanDrives, axis: int = 0) -> dict[Key, int]:
+    """Return all parameters of an axis that the drive has; what it refuses to show is left out."""
+    found = {}
+    for entry in parameters(drives):
+        with contextlib.suppress(ObjectAccessError):
+            found[entry.index, entry.sub] = int(drives.read_axis(entry, axis))
+    return found
+
+
+def compare(drives: CanDrives, wanted: Mapping[Key, int], axis: int = 0) -> list[Difference]:
+    """Return where an axis differs from wanted values."""
+    differences = []
+    for key, value in wanted.items():
+        entry = drives.description.dictionary.find(key)
+        try:
+            found: int | None = int(drives.read_axis(entry, axis))
+        except ObjectAccessError:
+            found = None
+        if found != value:
+            differences.append(Difference(entry, value, found))
+    return differences
+
+
+def write_all_or_none(drives: CanDrives, wanted: Mapping[Key, int], axis: int = 0) -> list[Difference]:
+    """Write what differs, read everything back, and take it all back if anything fails; return what was changed.
+
+    Raises:
+        NotRestoredError: If the drive refused or holds something else than was written; it is as it was before.
+        RollbackError: If it could not be brought back; the message says what is left.
+    """
+    status = int(drives.read_axis(drives.description.dictionary.find(0x6041), axis))
+    if status & _OPERATION_ENABLED[0] == _OPERATION_ENABLED[1]:
+        raise NotRestoredError("the axis is enabled, and parameters are not exchanged under way; disable it first")
+    chosen = {key: value for key, value in wanted.items() if key[0] not in IDENTITY_OF_THE_NODE}
+    changes = compare(drives, chosen, axis)
+    absent = [change.entry.label for change in changes if change.found is None]
+    if absent:
+        raise NotRestoredError(f"the drive has no {', '.join(absent)}; nothing was written. Take them out of the file")
+    before = read_these(drives, [*chosen, *_pdos_of(drives, changes)], axis)
+    try:
+        _write(drives, {(c.entry.index, c.entry.sub): c.wanted for c in changes}, before, axis)
+        left = compare(drives, {**before, **chosen}, axis)
+        if left:
+            raise BusError("the drive does not hold what was written: " + _list(left))
+    except (ObjectAccessError, BusError, KeyboardInterrupt) as error:
+        _roll_back(drives, before, axis, error)
+    return changes
+
+
+def _roll_back(drives: CanDrives, before: Mapping[Key, int], axis: int, cause: BaseException) -> None:
+    why = str(cause) or type(cause).__name__
+    try:
+        now = read_these(drives, before, axis)
+        changed = {key: value for key, value in reversed(list(before.items())) if now[key] != value}
+        _write(drives, changed, now, axis)
+        left = compare(drives, before, axis)
+    except (ObjectAccessError, BusError) as error:
+        raise RollbackError(
+            f"{why}; and taking it back failed: {error}. The drive holds a mixture: restore the backup once it "
+            "answers, or reset the node, which brings back what it has stored"
+        ) from cause
+    if left:
+        raise RollbackError(
+            f"{why}; and these could not be taken back: {_list(left)}. Reset the node, which brings back what it has "
+            "stored"
+        ) from cause
+    raise NotRestoredError(f"{why}; everything was taken back, the drive is as it was") from cause
+
+
+def _pdos_of(drives: CanDrives, changes: list[Difference]) -> list[Key]:
+    """Return all that belongs to the PDOs that change: they are switched off for it, and emptied."""
+    bases = {_pdo_of(change.entry.index) for change in changes} - {None}
+    return [(entry.index, entry.sub) for entry in parameters(drives) if _pdo_of(entry.index) in bases]
+
+
+def read_these(drives: CanDrives, keys: Iterable[Key], axis: int) -> dict[Key, int]:
+    """Return objects of an axis as they are now."""
+    return {key: int(drives.read_axis(drives.description.dictionary.find(key), axis)) for key in keys}
+
+
+def _write(drives: CanDrives, changes: Mapping[Key, int], before: Mapping[Key, int], axis: int) -> None:
+    for key, value in _in_order(changes, before):
+        drives.write_axis(drives.description.dictionary.find(key), axis, value)
+
+
+def _in_order(changes: Mapping[Key, int], before: Mapping[Key, int]) -> Iterator[tuple[Key, int]]:
+    """Return the writes: as they come, but a PDO is switched off and emptied, then filled, then switched on."""
+    pdos: dict[int, None] = {}
+    for (index, sub), value in changes.items():
+        base = _pdo_of(index)
+        if base is None or (base, 1) not in before:
+            yield (index, sub), value
+        else:
+            pdos[base] = None
+    for base in pdos:
+        wanted = {key: changes.get(key, value) for key, value in before.items() if _pdo_of(key[0]) == base}
+        mapping = base + _MAPPING_ABOVE
+        cob_id, count = wanted[base, 1], wanted.get((mapping, 0), 0)
+        yield (base, 1), before[base, 1] | INVALID
+        for key, value in wanted.items():
+            if key[0] == base and key[1] != 1 and key in changes:
+                yield key, value
+        if (mapping, 0) in wanted:
+            yield (mapping, 0), 0
+            for sub in range(1, max((key[1] for key in wanted if key[0] == mapping), default=0) + 1):
+                if (mapping, sub) in wanted and (sub <= count or (mapping, sub) in changes):
+                    yield (mapping, sub), wanted[mapping, sub]
+            yield (mapping, 0), count
+        yield (base, 1), cob_id
+
+
+def _pdo_of(index: int) -> int | None:
+    """Return the index of the communication parameter of the PDO that an object belongs to."""
+    for area in _COMMUNICATION:
+        if index in area:
+            return index
+        if index - _MAPPING_ABOVE in area:
+            return index - _MAPPING_ABOVE
+    return None
+
+
+def _list(differences: list[Difference]) -> str:
+    shown = [f"{d.entry.label} is {d.found}, not {d.wanted}" for d in differences[:5]]
+    return ", ".join(shown) + (f" and {len(differences) - 5} more" if len(differences) > 5 else "")

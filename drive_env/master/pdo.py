@@ -1,0 +1,223 @@
+"""PDOs of one node: which there are, how objects are mapped to them, and how they were before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from drive_env.canopen.frames import EXTENDED, IDENTIFIER, INVALID, RPDO, TPDO
+from drive_env.dictionary.access import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
+from drive_env.dictionary.entries import Entry
+from drive_env.master.description import Description
+from drive_env.master.errors import BusError
+from drive_env.master.mapping import PDO_BITS, Slots, pack
+from drive_env.master.sdo import SdoClient
+
+SYNC_EVERY = 1  # transmission type of a TPDO: at each SYNC (CiA 301, table 74)
+
+
+class Direction(NamedTuple):
+    """RPDOs go into the drive, TPDOs come out of it."""
+
+    name: str
+    verb: str
+    communication: int  # index of PDO 1's communication parameter
+    mapping: int
+    identifiers: tuple[int, ...]  # default identifiers of PDO 1 to 4, without the node
+
+
+INTO_DRIVE = Direction("RPDO", "played", 0x1400, 0x1600, RPDO)
+OUT_OF_DRIVE = Direction("TPDO", "recorded", 0x1800, 0x1A00, TPDO)
+
+
+class Member(NamedTuple):
+    """An object in a PDO: of which axis of the node, at which byte, how many."""
+
+    entry: Entry
+    axis: int
+    start: int
+    size: int
+
+
+class Pdo(NamedTuple):
+    """A PDO in use: its identifier, its length in bytes, its members."""
+
+    label: str
+    can_id: int
+    length: int
+    members: tuple[Member, ...]
+
+
+class _Before(NamedTuple):
+    """A PDO as it was found."""
+
+    number: int
+    cob_id: int
+    kind: int
+    mapping: tuple[int, ...]
+
+
+def is_mappable(description: Description, entry: Entry, direction: Direction) -> bool:
+    """Return whether the EDS allows an object in PDOs of this direction."""
+    accesses = {"RPDO": ("rw", "wo", "rww"), "TPDO": ("rw", "ro", "rwr", "const")}[direction.name]
+    return bool(
+        entry.pdo_mappable and entry.bits and entry.bits % 8 == 0 and entry.access in accesses
+    ) and description.is_number(entry)
+
+
+def mappable_names(description: Description, direction: Direction) -> str:
+    """Return the mappable objects of a direction, as a message lists them."""
+    known = description.dictionary
+    return ", ".join(entry.label for entry in known if is_mappable(description, entry, direction)) or "none"
+
+
+def check_mappable(description: Description, entries: Sequence[Entry], direction: Direction) -> None:
+    """Raise ObjectAccessError 06040041h for an object that no PDO of this direction can carry."""
+    for entry in entries:
+        if not is_mappable(description, entry, direction):
+            raise ObjectAccessError(
+                CANNOT_BE_MAPPED,
+                f"{entry.label} cannot be {direction.verb}: {description.name} has it in no {direction.name}; it has "
+                f"{mappable_names(description, direction)}; read and write reach the others",
+            )
+
+
+def slots(description: Description, direction: Direction, axis: int) -> Slots:
+    """Return the PDOs that an axis may use: the node's, in equal shares."""
+    known = description.dictionary
+    indices = {entry.index for entry in known}
+    there = [
+        number
+        for number in range(0x200)
+        if direction.communication + number in indices and direction.mapping + number in indices
+    ]
+    share = len(there) // description.num_axes
+    mine = tuple(there[axis * share : (axis + 1) * share])
+    if not mine:
+        return Slots((), 0)
+    mapping = [entry for entry in known if entry.index == direction.mapping + mine[0]]
+    limit = next((entry.high for entry in mapping if entry.sub == 0), None)
+    entries = max((entry.sub for entry in mapping), default=0)
+    return Slots(mine, min(entries, PDO_BITS // 8, limit if limit else PDO_BITS))
+
+
+def plan(description: Description, entries: Sequence[Entry], direction: Direction) -> list[list[Entry]] | None:
+    """Return which entries each PDO of axis 0 takes, or None if they do not fit; other axes are alike."""
+    if not entries:
+        return []
+    return pack(entries, slots(description, direction, 0), keep_order=direction is INTO_DRIVE)
+
+
+def too_many(description: Description, entries: Sequence[Entry], direction: Direction) -> ObjectAccessError:
+    """Return the error for objects that do not fit into the PDOs."""
+    room = slots(description, direction, 0)
+    bits = sum(entry.bits or 0 for entry in entries)
+    return ObjectAccessError(
+        PDO_LENGTH_EXCEEDED,
+        f"{len(entries)} objects of {bits} bits do not fit: {description.name} has {len(room.numbers)} "
+        f"{direction.name}s for an axis, each with at most {room.entries} objects of {PDO_BITS} bits together; take "
+        f"fewer at a time of {mappable_names(description, direction)}",
+    )
+
+
+class PdoConfiguration:
+    """The PDOs of one node, configured over SDO and put back on demand.
+
+    Args:
+        node: Node-ID.
+        sdo: The node's SDO client.
+        description: What device it is.
+    """
+
+    def __init__(self, node: int, sdo: SdoClient, description: Description) -> None:
+        self._node = node
+        self._sdo = sdo
+        self._description = description
+        self._before: dict[tuple[str, int], _Before] = {}
+
+    def configure(self, groups: Sequence[Sequence[Entry]], direction: Direction) -> list[Pdo]:
+        """Map entries of all axes, each group to a PDO that goes with SYNC, and return these PDOs.
+
+        PDOs of this direction that carried a mapping of ours and are not needed any more are put back.
+
+        Raises:
+            ObjectAccessError: If the drive refuses; BusError if it gives the PDO no identifier.
+        """
+        pdos = []
+        used = set()
+        for axis in range(self._description.num_axes):
+            numbers = slots(self._description, direction, axis).numbers
+            for number, group in zip(numbers, groups, strict=False):
+                pdos.append(self._map(direction, number, axis, group))
+                used.add((direction.name, number))
+        for key in [key for key in self._before if key[0] == direction.name and key not in used]:
+            self._put_back(direction, self._before.pop(key))
+        return pdos
+
+    def restore(self) -> None:
+        """Put every PDO back as it was found."""
+        for (name, _), before in list(self._before.items()):
+            self._put_back(INTO_DRIVE if name == INTO_DRIVE.name else OUT_OF_DRIVE, before)
+        self._before.clear()
+
+    def forget(self) -> None:
+        """Forget what was found: the node was reset and has its own configuration again."""
+        self._before.clear()
+
+    def _map(self, direction: Direction, number: int, axis: int, group: Sequence[Entry]) -> Pdo:
+        label = f"{direction.name} {number + 1} of node {self._node}"
+        before = self._before.get((direction.name, number)) or self._look(direction, number)
+        self._before[direction.name, number] = before
+        can_id = before.cob_id & IDENTIFIER
+        if can_id == 0 and number < len(direction.identifiers):
+            can_id = direction.identifiers[number] + self._node
+        if can_id == 0 or before.cob_id & EXTENDED:
+            raise BusError(
+                f"{label} has no 11-bit identifier ({before.cob_id:08X}h in "
+                f"{direction.communication + number:04X}h:01); give it a free one with `drive-env set`"
+            )
+        members = []
+        start = 0
+        mapping = []
+        for entry in group:
+            index, sub = self._description.key(entry, axis)
+            size = (entry.bits or 0) // 8
+            mapping.append(index << 16 | sub << 8 | size * 8)
+            members.append(Member(entry, axis, start, size))
+            start += size
+        cob_id = before.cob_id & ~(INVALID | IDENTIFIER) | can_id
+        kind = self._description.hints.rpdo_type if direction is INTO_DRIVE else SYNC_EVERY
+        self._write_all(direction, number, cob_id, kind, mapping)
+        return Pdo(label, can_id, start, tuple(members))
+
+    def _look(self, direction: Direction, number: int) -> _Before:
+        communication, mapping = direction.communication + number, direction.mapping + number
+        count = self._read(mapping, 0)
+        return _Before(
+            number,
+            self._read(communication, 1),
+            self._read(communication, 2),
+            tuple(self._read(mapping, sub) for sub in range(1, count + 1)),
+        )
+
+    def _put_back(self, direction: Direction, before: _Before) -> None:
+        self._write_all(direction, before.number, before.cob_id, before.kind, before.mapping)
+
+    def _write_all(self, direction: Direction, number: int, cob_id: int, kind: int, mapping: Sequence[int]) -> None:
+        """Remap in the order that CiA 301 demands: off, no entries, entries, their number, on."""
+        communication = direction.communication + number
+        self._write(communication, 1, cob_id | INVALID, 4)
+        self._write(communication, 2, kind, 1)
+        self._write(direction.mapping + number, 0, 0, 1)
+        for sub, value in enumerate(mapping, 1):
+            self._write(direction.mapping + number, sub, value, 4)
+        self._write(direction.mapping + number, 0, len(mapping), 1)
+        self._write(communication, 1, cob_id, 4)
+
+    def _read(self, index: int, sub: int) -> int:
+        label = f"{index:04X}h:{sub:02X}"
+        return int.from_bytes(self._sdo.read(index, sub, label, self._description.answer_timeout), "little")
+
+    def _write(self, index: int, sub: int, value: int, size: int) -> None:
+        label = f"{index:04X}h:{sub:02X} = {value:X}h"
+        self._sdo.write(index, sub, value.to_bytes(size, "little"), label, self._description.answer_timeout)

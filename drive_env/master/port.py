@@ -1,0 +1,169 @@
+"""The master's port to a bus: frames go out, frames come in, and whoever waits for an identifier gets its data.
+
+There is no receiving thread: whoever waits receives, so a frame's way has no queue between threads in it. The bus
+(the kernel, the socket) keeps what arrives in the meantime.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import can
+
+from drive_env.master.errors import BusError, OpenError
+from drive_env.master.slcan_socket import SlcanSocket
+
+Handler = Callable[[bytes], None]
+
+INTERFACE_VARIABLE, CHANNEL_VARIABLE = "DRIVE_ENV_INTERFACE", "DRIVE_ENV_CHANNEL"
+MOST_FRAMES = 10_000
+SEND_TIMEOUT = 0.5  # [s]
+_LINE_TIME = 0.002  # for the rest of a frame that has begun to arrive (slcan: a line of text) [s]
+
+
+def open_bus(interface: str | None = None, channel: str | None = None, **options: Any) -> can.BusABC:
+    """Open a python-can bus.
+
+    Args:
+        interface: As python-can names it; from DRIVE_ENV_INTERFACE if not given, slcan for a channel `socket://...`.
+        channel: The channel; from DRIVE_ENV_CHANNEL if not given.
+        options: Whatever the interface takes besides, e.g. `bitrate`.
+
+    Raises:
+        OpenError: If it cannot be opened, with what to try.
+    """
+    channel = channel or os.environ.get(CHANNEL_VARIABLE)
+    interface = interface or os.environ.get(INTERFACE_VARIABLE)
+    if channel is None:
+        raise OpenError(
+            "no CAN channel is given; give interface and channel (--interface socketcan --channel can0, or --channel "
+            f"socket://127.0.0.1:PORT of `drive-env serve`), or set {INTERFACE_VARIABLE} and {CHANNEL_VARIABLE}"
+        )
+    over_tcp = channel.startswith("socket://")
+    if interface in (None, "slcan") and over_tcp and not options.keys() - {"bitrate"}:
+        return SlcanSocket(channel, options.get("bitrate"))
+    if interface is None:
+        if not over_tcp:
+            raise OpenError(
+                f"channel {channel!r} needs an interface: give one that python-can knows (socketcan, pcan, kvaser, "
+                f"slcan, ...), or set {INTERFACE_VARIABLE}"
+            )
+        interface = "slcan"
+    if over_tcp:
+        options.setdefault("sleep_after_open", 0.0)  # two seconds by default, for adapters that boot
+    try:
+        return can.Bus(interface=interface, channel=channel, **options)
+    except (can.CanError, OSError, ValueError, ImportError, TypeError) as error:
+        raise OpenError(
+            f"cannot open interface {interface!r}, channel {channel!r}: {error}; check that the adapter is plugged "
+            "in and up, or that `drive-env serve` runs at this address"
+        ) from error
+
+
+class Port:
+    """Sends and receives on a bus.
+
+    Args:
+        bus: An open python-can bus.
+        owned: Shut the bus down in `close`.
+    """
+
+    def __init__(self, bus: can.BusABC, owned: bool = True) -> None:
+        self._bus = bus
+        self._owned = owned
+        self._handlers: dict[int, Handler] = {}
+        self._sending = threading.Lock()  # the lifeline's thread sends, too
+        self._receiving = threading.Lock()
+        self._file = _file_number(bus)
+
+    def subscribe(self, can_id: int, handler: Handler | None) -> None:
+        """Have the data of every frame with this identifier handed to the handler; None ends that."""
+        if handler is None:
+            self._handlers.pop(can_id, None)
+        else:
+            self._handlers[can_id] = handler
+
+    def send(self, can_id: int, data: bytes = b"", *, remote: bool = False, length: int = 0) -> None:
+        """Send a frame.
+
+        Raises:
+            BusError: If the bus does not take it within half a second.
+        """
+        message = can.Message(
+            arbitration_id=can_id,
+            data=None if remote else data,
+            is_remote_frame=remote,
+            dlc=length if remote else len(data),
+            is_extended_id=False,
+        )
+        try:
+            with self._sending:
+                self._bus.send(message, SEND_TIMEOUT)
+        except (can.CanError, OSError) as error:
+            raise BusError(
+                f"the bus did not take frame {can_id:03X}h: {error}; check that another node acknowledges (power, "
+                "bit rate, termination), and that the adapter or the emulator is still there"
+            ) from error
+
+    def receive(self, timeout: float = 0.0) -> bool:
+        """Wait up to `timeout` [s] for a frame and hand it to its handler; False if none came.
+
+        Raises:
+            BusError: If the bus is gone.
+        """
+        try:
+            with self._receiving:
+                message = self._next(timeout)
+        except (can.CanError, OSError, ValueError) as error:
+            raise BusError(f"the bus is gone: {error}; open it again") from error
+        if message is None:
+            return False
+        if not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
+            handler = self._handlers.get(message.arbitration_id)
+            if handler is not None:
+                handler(bytes(message.data))
+        return True
+
+    def drain(self) -> None:
+        """Hand out what has arrived, without waiting (and without end, where more comes than can be received)."""
+        for _ in range(MOST_FRAMES):
+            if not self.receive():
+                return
+
+    def wait(self, done: Callable[[], bool], timeout: float) -> bool:
+        """Receive until `done()` or until `timeout` [s] has passed; return done()."""
+        deadline = time.monotonic() + timeout
+        while not done():
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                self.drain()
+                return done()
+            self.receive(left)
+        return True
+
+    def close(self) -> None:
+        """Close the bus if it is ours."""
+        if self._owned:
+            self._bus.shutdown()
+
+    def _next(self, timeout: float) -> can.Message | None:
+        if self._file is None:
+            return self._bus.recv(timeout)
+        # python-can's slcan sleeps in steps of a millisecond; the file tells at once.
+        if not select.select([self._file], [], [], timeout)[0]:
+            return None
+        return self._bus.recv(_LINE_TIME)
+
+
+def _file_number(bus: can.BusABC) -> int | None:
+    try:
+        number = bus.fileno()
+        select.select([number], [], [], 0.0)
+    except (NotImplementedError, AttributeError, OSError, ValueError, TypeError):
+        return None  # the virtual bus, adapters behind a vendor's library; serial ports on Windows
+    return number if number >= 0 else None

@@ -1,0 +1,116 @@
+"""Quantities as people write them: `1000 rpm`, `7 A`, `0.5 rev`; and the integers that a drive has instead.
+
+The EDS names the unit of each object (`Entry.unit`); positions and speeds count increments of a revolution.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import NamedTuple
+
+from drive_env.dictionary.entries import Entry
+
+
+class Unit(NamedTuple):
+    """A unit: what it measures, and how many of the dimension's own unit it is (rev, rev/s, rev/s^2, A, V, s)."""
+
+    dimension: str
+    factor: float
+
+
+UNITS = {
+    "rev": Unit("angle", 1.0),
+    "deg": Unit("angle", 1.0 / 360.0),
+    "rad": Unit("angle", 0.5 / math.pi),
+    "1/65536 rev": Unit("angle", 1.0 / 65536.0),
+    "rev/s": Unit("speed", 1.0),
+    "rpm": Unit("speed", 1.0 / 60.0),
+    "rad/s": Unit("speed", 0.5 / math.pi),
+    "deg/s": Unit("speed", 1.0 / 360.0),
+    "rev/s^2": Unit("acceleration", 1.0),
+    "rpm/s": Unit("acceleration", 1.0 / 60.0),
+    "rad/s^2": Unit("acceleration", 0.5 / math.pi),
+    "A": Unit("current", 1.0),
+    "mA": Unit("current", 1e-3),
+    "V": Unit("voltage", 1.0),
+    "0.1V": Unit("voltage", 0.1),
+    "s": Unit("time", 1.0),
+    "ms": Unit("time", 1e-3),
+    "100us": Unit("time", 1e-4),
+    "us": Unit("time", 1e-6),
+}
+# Units that follow the increments of a revolution.
+INCREMENTAL = {"inc": "angle", "pps": "speed", "pps^2": "acceleration"}
+SHOWN = {"angle": "rev", "speed": "rpm", "acceleration": "rev/s^2", "current": "A", "voltage": "V", "time": "s"}
+_QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*$")
+
+
+def find_unit(name: str, increments: float | None) -> Unit | None:
+    """Return a unit by name; `increments` per revolution, None where they are unknown."""
+    if name in INCREMENTAL:
+        return None if not increments else Unit(INCREMENTAL[name], 1.0 / increments)
+    return UNITS.get(name)
+
+
+def parse(text: str, entry: Entry, increments: float | None) -> int:
+    """Return the integer for an object that is written as text: a plain integer (also 0x...), or a quantity.
+
+    Args:
+        text: What was written.
+        entry: The object.
+        increments: Position increments per revolution, None where they are unknown.
+
+    Raises:
+        ValueError: For what is no number, or a unit that does not fit the object.
+    """
+    try:
+        return int(text, 0)
+    except ValueError:
+        pass
+    found = _QUANTITY.match(text)
+    if found is None:
+        raise ValueError(f"{text!r} is no number for {entry.label}; give an integer, or a number and a unit")
+    number, name = float(found[1]), found[2]
+    if not math.isfinite(number):
+        raise ValueError(_too_large(text, entry))
+    if name is None or name == entry.unit:
+        if number != int(number):
+            raise ValueError(f"{entry.label} takes integers{_counted(entry)}; {text} is none, choose {round(number)}")
+        return int(number)
+    own, given = find_unit(entry.unit, increments), find_unit(name, increments)
+    if own is None:
+        raise ValueError(f"{entry.label} has no unit that {name} could be turned into; give its integer")
+    if given is None or given.dimension != own.dimension:
+        fitting = [other for other, unit in UNITS.items() if unit.dimension == own.dimension]
+        raise ValueError(f"{entry.label} is no quantity in {name!r}; it takes {', '.join([entry.unit, *fitting])}")
+    count = number * given.factor / own.factor
+    if not math.isfinite(count):
+        raise ValueError(_too_large(text, entry))
+    return round(count)
+
+
+def parse_raw(text: str, entry: Entry) -> int:
+    """Return an integer that is written as such; ValueError for anything else."""
+    try:
+        return int(text, 0)
+    except ValueError:
+        raise ValueError(f"{text!r} is no integer for {entry.label}; --raw takes integers, as 1000 or 0x3E8") from None
+
+
+def show(raw: int, entry: Entry, increments: float | None) -> str:
+    """Return an integer with its unit and, where that helps, as a quantity: `1092267 pps (1000 rpm)`."""
+    text = f"{raw} {entry.unit}".rstrip()
+    unit = find_unit(entry.unit, increments)
+    if unit is None or SHOWN[unit.dimension] == entry.unit:
+        return text
+    shown = SHOWN[unit.dimension]
+    return f"{text} ({raw * unit.factor / UNITS[shown].factor:.6g} {shown})"
+
+
+def _too_large(text: str, entry: Entry) -> str:
+    return f"{text!r} is beyond any number; {entry.label} takes {entry.low} to {entry.high}{_counted(entry)}"
+
+
+def _counted(entry: Entry) -> str:
+    return f" in {entry.unit}" if entry.unit else ""

@@ -1,0 +1,128 @@
+"""The SDO client of one node: python-canopen's transfers on our port, with a time-out for each.
+
+What differs from python-canopen's client: the thread that waits also receives; answers that belong to an earlier
+transfer are passed over; an abort names its object.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable
+
+import canopen
+from canopen.sdo import SdoAbortedError, SdoCommunicationError
+from canopen.sdo.client import SdoClient as CanopenClient
+
+from drive_env.canopen.frames import SDO_REQUEST, SDO_RESPONSE
+from drive_env.master.errors import BusError, NoAnswerError, refused
+from drive_env.master.port import Port
+
+_ABORT = 0x80
+_INITIATE = (0x40, 0x60)  # upload and download responses that name their object, upper three bits
+_TIMED_OUT = 0x05040000
+
+
+class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not typed
+    """Reads and writes objects of a node.
+
+    Args:
+        port: The bus.
+        node: Node-ID.
+        alive: Called while an answer is waited for.
+    """
+
+    def __init__(self, port: Port, node: int, alive: Callable[[], None] = lambda: None) -> None:
+        super().__init__(SDO_REQUEST + node, SDO_RESPONSE + node, canopen.ObjectDictionary())
+        self._port = port
+        self._node = node
+        self._alive = alive
+        self._answers: list[bytes] = []
+        self._object = (0, 0)
+        self._timeout = 0.5
+        port.subscribe(SDO_RESPONSE + node, self._answers.append)
+
+    def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
+        """Return the bytes of an object; a lost frame is asked for once more.
+
+        Raises:
+            ObjectAccessError: With the abort code, if the drive refuses.
+            NoAnswerError: If it does not answer within twice `timeout` [s].
+        """
+        try:
+            return self._transfer(index, sub, None, f"the read of {label}", timeout)
+        except NoAnswerError:
+            return self._transfer(index, sub, None, f"the read of {label}", timeout)
+
+    def write(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
+        """Write the bytes of an object. It is not tried twice: a repeated write may mean something else.
+
+        Raises:
+            ObjectAccessError: With the abort code, if the drive refuses.
+            NoAnswerError: If it does not answer within `timeout` [s]; the drive may have taken the value or not.
+        """
+        self._transfer(index, sub, data, f"the write of {label}", timeout)
+
+    def _transfer(self, index: int, sub: int, data: bytes | None, what: str, timeout: float) -> bytes:
+        self._object = (index, sub)
+        self._timeout = timeout
+        where = f"node {self._node}"
+        self._port.drain()
+        self._answers.clear()
+        try:
+            if data is None:
+                return bytes(self.upload(index, sub))
+            self.download(index, sub, data)
+            return b""
+        except SdoAbortedError as error:
+            raise refused(where, what, int(error.code)) from None
+        except SdoCommunicationError as error:
+            if "No SDO response" not in str(error):
+                raise BusError(f"{where} answered {what} wrongly: {error}; is another master on the bus?") from None
+            raise NoAnswerError(
+                f"{where} did not answer {what} within {timeout:g} s; check power, bit rate and node-ID "
+                "(`drive-env scan`), and that the node is not stopped; a slow object takes timeouts={...}"
+            ) from None
+
+    # --- what python-canopen's transfers call -----------------------------------------------------------------------
+    def send_request(self, request: bytes) -> None:
+        """Send a request."""
+        self._port.send(self.rx_cobid, bytes(request))
+
+    def request_response(self, request: bytes) -> bytes:
+        """Send a request and return the answer to it."""
+        self.send_request(request)
+        try:
+            return self.read_response()
+        except SdoCommunicationError:
+            self.abort(_TIMED_OUT)
+            raise
+
+    def read_response(self) -> bytes:
+        """Return the next answer of this transfer."""
+        deadline = time.monotonic() + self._timeout
+        while True:
+            while self._answers:
+                answer = self._answers.pop(0)
+                if self._is_ours(answer):
+                    if answer[0] == _ABORT:
+                        raise SdoAbortedError(struct.unpack_from("<L", answer, 4)[0])
+                    return answer
+            left = deadline - time.monotonic()
+            if left <= 0.0 and not self._port.receive():
+                raise SdoCommunicationError("No SDO response received")
+            if left > 0.0:
+                self._port.receive(min(left, 0.05))
+            self._alive()
+
+    def abort(self, abort_code: int = 0x08000000) -> None:
+        """Abort the transfer."""
+        self.send_request(struct.pack("<BHBL", _ABORT, *self._object, abort_code))
+
+    def _is_ours(self, answer: bytes) -> bool:
+        if len(answer) != 8:
+            return False
+        index, sub = struct.unpack_from("<HB", answer, 1)
+        if answer[0] == _ABORT:
+            return (index, sub) in (self._object, (0, 0))  # some servers abort without naming the object
+        return answer[0] & 0xE0 not in _INITIATE or (index, sub) == self._object

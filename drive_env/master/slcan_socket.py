@@ -1,0 +1,135 @@
+"""The client of an slcan adapter over TCP, such as `drive-env serve`.
+
+python-can's own reads byte by byte with a system call or two for each: 475 us of processor time for a cycle with two
+TPDOs, where this one takes a quarter of it. It is a python-can bus all the same.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections import deque
+
+import can
+
+from drive_env.master.errors import OpenError
+
+CONNECT_TIMEOUT = 3.0  # [s]
+_CHUNK = 65536  # bytes
+
+
+class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed here
+    """A python-can bus over `socket://HOST:PORT`.
+
+    Args:
+        channel: The address.
+        bitrate: Bit rate to set [bit/s]; by default the adapter's.
+
+    Raises:
+        OpenError: For an address or a bit rate that is none, or nobody there.
+    """
+
+    def __init__(self, channel: str, bitrate: int | None = None) -> None:
+        if bitrate is not None and bitrate not in _BIT_RATES:
+            raise OpenError(f"bit rate {bitrate} bit/s is none of slcan's: {', '.join(map(str, _BIT_RATES))}")
+        self._socket = _connect(channel)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._frames: deque[can.Message] = deque()
+        self._rest = b""
+        self._closed = False
+        super().__init__(channel)
+        self.channel_info = f"slcan over {channel}"
+        if bitrate is not None:
+            self._write(b"C\r" + _BIT_RATES[bitrate])
+        self._write(b"O\r")
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send a frame.
+
+        Raises:
+            can.CanOperationError: If the other end is gone or takes nothing within `timeout` [s].
+        """
+        kind = ("R" if msg.is_extended_id else "r") if msg.is_remote_frame else ("T" if msg.is_extended_id else "t")
+        can_id = f"{msg.arbitration_id:08X}" if msg.is_extended_id else f"{msg.arbitration_id:03X}"
+        data = "" if msg.is_remote_frame else bytes(msg.data).hex().upper()
+        self._write(f"{kind}{can_id}{msg.dlc}{data}\r".encode(), timeout)
+
+    def shutdown(self) -> None:
+        """Close the connection."""
+        super().shutdown()
+        if not self._closed:
+            self._closed = True
+            self._socket.close()
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._frames:
+            self._read(timeout)
+        return (self._frames.popleft() if self._frames else None), False
+
+    def _read(self, timeout: float | None) -> None:
+        """Take in what is there, after waiting for something."""
+        if not select.select([self._socket], [], [], timeout)[0]:
+            return
+        try:
+            data = self._socket.recv(_CHUNK)
+        except OSError as error:
+            raise can.CanOperationError(f"the adapter at {self.channel_info} is gone: {error}") from error
+        if not data:
+            raise can.CanOperationError(f"{self.channel_info}: the other end closed the connection")
+        *lines, self._rest = (self._rest + data).split(b"\r")
+        now = time.time()
+        for line in lines:
+            message = _parse(line.strip(b"\a"), now)
+            if message is not None:
+                self._frames.append(message)
+
+    def _write(self, data: bytes, timeout: float | None = None) -> None:
+        try:
+            if not select.select([], [self._socket], [], timeout)[1]:
+                raise can.CanOperationError(f"{self.channel_info}: the other end takes nothing")
+            self._socket.sendall(data)
+        except OSError as error:
+            raise can.CanOperationError(f"{self.channel_info} is gone: {error}") from error
+
+
+_BIT_RATES = {
+    10_000: b"S0\r", 20_000: b"S1\r", 50_000: b"S2\r", 100_000: b"S3\r", 125_000: b"S4\r", 250_000: b"S5\r",
+    500_000: b"S6\r", 750_000: b"S7\r", 1_000_000: b"S8\r",
+}  # fmt: skip
+
+
+def _connect(channel: str) -> socket.socket:
+    host, _, port = channel.removeprefix("socket://").rpartition(":")
+    if not host or not port.isdigit():
+        raise OpenError(
+            f"{channel!r} is no address; write it as socket://127.0.0.1:PORT, as `drive-env serve` prints it"
+        )
+    try:
+        return socket.create_connection((host, int(port)), CONNECT_TIMEOUT)
+    except (OSError, OverflowError) as error:
+        raise OpenError(
+            f"nobody answers at {channel}: {error}; start `drive-env serve`, or correct --channel"
+        ) from error
+
+
+def _parse(line: bytes, now: float) -> can.Message | None:
+    """Return the frame of a line; answers to commands are none."""
+    if line[:1] not in (b"t", b"T", b"r", b"R"):
+        return None
+    extended, remote = line[:1] in (b"T", b"R"), line[:1] in (b"r", b"R")
+    digits = 8 if extended else 3
+    try:
+        length = int(line[1 + digits : 2 + digits], 16)
+        data = b"" if remote else bytes.fromhex(line[2 + digits : 2 + digits + 2 * length].decode())
+        can_id = int(line[1 : 1 + digits], 16)
+    except ValueError:
+        return None
+    return can.Message(
+        timestamp=now,
+        arbitration_id=can_id,
+        is_extended_id=extended,
+        is_remote_frame=remote,
+        dlc=length,
+        data=None if remote else data,
+    )

@@ -1,0 +1,133 @@
+"""The positioning move that trials are made of: planned for a machine, started on drives, and what it says.
+
+Every profile takes 60 ms and every trial 250 ms, so that all axes have the same windows, whatever they turn.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env import motion
+from drive_env.motors import Motor
+
+if TYPE_CHECKING:
+    from mechanics.load import Load
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+CYCLE = 0.001  # s
+# In communication cycles: the profile, the end of the window in which it settles, and the trial.
+PROFILE, SETTLED, TRIAL = 60, 150, 250
+QUIET = (PROFILE + SETTLED) // 2  # where the ripple is looked at from
+ACCELERATION_SHARE = 0.4  # of the rated torque
+SPEED_SHARE, TRAVEL_SHARE = 0.5, 0.4  # of the rated speed at the profile's peak, of what there is to go
+BAND, BAND_COUNTS = 0.01, 3.0  # of the move, and of the encoder: the larger is what counts as settled
+
+OPERATION_ENABLED = motion.OPERATION_ENABLED
+POSITION, VELOCITY, CURRENT, CURRENT_ERROR = 0x6064, 0x606C, 0x6077, (0x2041, 3)
+DEMAND, STATUS = 0x6062, 0x6041
+
+
+class Move(NamedTuple):
+    """A positioning move: 607Ah from rest at 0, 6081h and 6083h, and what it is in SI, each of shape (num_axes,)."""
+
+    distance: Integers  # inc, with its sign
+    velocity: Integers  # pps
+    acceleration: Integers  # pps^2
+    increments: Floats  # per radian
+    counts: float  # of the encoder per radian
+
+
+def plan_move(motor: Motor, inertia: ArrayLike, scaler: ArrayLike, reach: ArrayLike) -> Move:
+    """Return a triangular move of 60 ms with 0.4 of the rated torque, or less where speed or travel end before.
+
+    Args:
+        motor: The motor.
+        inertia: Total inertia at the rotor [kg*m^2], shape (num_axes,).
+        scaler: 2058h, increments per revolution.
+        reach: How far the rotor may go, with its sign [rad].
+    """
+    J, to = np.asarray(inertia, float), np.asarray(reach, float)
+    time = PROFILE * CYCLE
+    angle = ACCELERATION_SHARE * motor.rated_torque / J * time**2 / 4.0
+    angle = np.minimum(angle, SPEED_SHARE * motor.rated_speed * time / 2.0)
+    angle = np.copysign(np.minimum(angle, TRAVEL_SHARE * np.abs(to)), to)
+    increments = np.broadcast_to(np.asarray(scaler, float), angle.shape) / (2.0 * math.pi)
+    distance = np.rint(angle * increments).astype(np.int64)
+    # Rounded up: the profile ends in time.
+    acceleration = np.ceil(np.maximum(4.0 * np.abs(distance) / time**2, 1.0)).astype(np.int64)
+    velocity = np.ceil(2.0 * np.maximum(np.abs(distance), 1) / time).astype(np.int64) + 1
+    return Move(distance, velocity, acceleration, increments, motor.encoder_counts / (2.0 * math.pi))
+
+
+def reach(load: str | Path | Load) -> Floats:
+    """Return how far each rotor of a load may turn from the start, the longer way, with its sign [rad]."""
+    from mechanics.loads import find_load
+    from mechanics.shaft import one, way
+
+    found = way(one(find_load(load)))
+    return np.where(found.high >= -found.low, found.high, found.low)
+
+
+def power_up(drives: motion.Drives, where: Mask | None = None) -> None:
+    """Take drives from switch on disabled to pp, enabled, in as many milliseconds whatever becomes of them."""
+    motion.select_mode(drives, "pp", where)
+    for word in (0x06, 0x07, 0x0F):
+        drives.advance(CYCLE)
+        drives.write(0x6040, word, where=where)
+    drives.advance(2 * CYCLE)
+
+
+def write_profile(drives: motion.Drives, move: Move, where: Mask | None = None) -> None:
+    """Write the speed and the ramps of a move."""
+    drives.write(0x6081, move.velocity, where=where)
+    drives.write(0x6083, move.acceleration, where=where)
+    drives.write(0x6084, move.acceleration, where=where)
+
+
+def start(drives: motion.Drives, target: Integers, where: Mask | None = None) -> None:
+    """Set off for a position [inc]; an axis that is not enabled stays where it is."""
+    drives.write(0x607A, target, where=where)
+    drives.write(0x6040, 0x0F, where=where)  # bit 4 must rise
+    drives.write(0x6040, 0x1F, where=where)
+
+
+def move_terms(
+    position: Floats,
+    current: Floats,
+    move: Move,
+    t_0: ArrayLike,
+    rated_current: float,
+    target: Integers,
+    sign: Integers,
+) -> tuple[Floats, Floats, Floats]:
+    """Return t_s/t_0, n and os of a move, each of shape (num_axes,).
+
+    Args:
+        position: 6064h from the set-point on, one row per ms, shape (SETTLED or more, num_axes).
+        current: Demanded current [A], as long.
+        move: The move.
+        t_0: Four times the sum of the small time constants [s].
+        rated_current: Of the motor, peak i_q [A].
+        target: Where it goes [inc], shape (num_axes,).
+        sign: The direction, 1 or -1.
+    """
+    size = np.maximum(np.abs(move.distance), 1).astype(float)
+    width = np.maximum(BAND * size, BAND_COUNTS / move.counts * move.increments)
+    error = wrapped(target - position[:SETTLED])
+    settling = 1.0 + np.minimum(1.0, np.abs(error[PROFILE:]) / width).sum(axis=0) * CYCLE / np.asarray(t_0)
+    ripple = np.sqrt(np.mean(np.diff(current[QUIET:SETTLED], axis=0) ** 2, axis=0)) / rated_current
+    beyond = np.maximum((-error * sign).max(axis=0), 0.0) / size
+    return settling, ripple, beyond
+
+
+def wrapped(increments: Floats | Integers) -> Floats:
+    """Return differences of positions that wrap at 2^31, as they are."""
+    return (np.asarray(increments, float) + 2.0**31) % 2.0**32 - 2.0**31

@@ -1,0 +1,131 @@
+"""`drive-env get` and `drive-env set`: single objects, by index, index:sub-index or name."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from drive_env.tools.options import (
+    Bitrate,
+    Channel,
+    DeviceName,
+    DryRun,
+    Eds,
+    Interface,
+    Json,
+    Nodes,
+    Timeout,
+    axis_name,
+    axis_place,
+    connect,
+    errors_as_exit_codes,
+    fail,
+    increments_per_revolution,
+    object_name,
+    print_json,
+)
+
+REFUSED = 1
+Raw = Annotated[bool, typer.Option("--raw", help="Integers as the wire carries them, without units.")]
+
+
+def get(
+    objects: Annotated[list[str], typer.Argument(help="6041, 607D:1 (hexadecimal) or 'Velocity actual value'.")],
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    raw: Raw = False,
+    json: Json = False,
+) -> None:
+    """Read objects over SDO and show them with their units."""
+    with (
+        errors_as_exit_codes(),
+        connect(interface, channel, node, device, eds, bitrate=bitrate, timeout=timeout, safety=False) as drives,
+    ):
+        entries = [drives.description.dictionary.find(object_name(name)) for name in objects]
+        increments = [None] * drives.num_axes if raw else increments_per_revolution(drives)
+        rows = []
+        for entry in entries:
+            for axis, value in enumerate(drives.read((entry.index, entry.sub))):
+                rows.append((axis, entry, value, increments[axis]))
+        if json:
+            print_json([axis_place(drives, axis) | _row(*row) for axis, *row in rows])
+            return
+        for axis, entry, value, scale in rows:
+            print(f"{axis_name(drives, axis)}  {entry.label} = {_text(value, entry, scale, raw)}")
+
+
+def set_object(
+    name: Annotated[str, typer.Argument(metavar="OBJECT", help="2042:1 (hexadecimal) or 'Profile velocity'.")],
+    value: Annotated[str, typer.Argument(help="An integer, or a quantity: '1000 rpm', '7 A', '0.5 rev', '20 ms'.")],
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    raw: Raw = False,
+    json: Json = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Write an object over SDO, read it back and show what it is now.
+
+    Put -- before a negative value: drive-env set 60FF -- -1000.
+    """
+    from drive_env.master import quantities
+    from drive_env.master.parameters import COMMANDS
+
+    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "dry_run": dry_run, "safety": False}
+    with errors_as_exit_codes(), connect(interface, channel, node, device, eds, **options) as drives:
+        entry = drives.description.dictionary.find(object_name(name))
+        rows = []
+        increments = [None] * drives.num_axes if raw else increments_per_revolution(drives)
+        if not drives.description.is_number(entry):
+            drives.write((entry.index, entry.sub), value)
+            wanted: list[Any] = [value] * drives.num_axes
+        else:
+            wanted = [
+                quantities.parse_raw(value, entry) if raw else quantities.parse(value, entry, scale)
+                for scale in increments
+            ]
+            drives.write((entry.index, entry.sub), wanted)
+        readable = entry.access != "wo"
+        found = drives.read((entry.index, entry.sub)) if readable else wanted
+        for axis in range(drives.num_axes):
+            rows.append((axis, entry, found[axis], increments[axis]))
+        if json:
+            print_json([axis_place(drives, axis) | _row(*row) for axis, *row in rows])
+        else:
+            for axis, _, now, scale in rows:
+                print(f"{axis_name(drives, axis)}  {entry.label} = {_text(now, entry, scale, raw)}")
+        differs = readable and not dry_run and any(a != b for a, b in zip(found, wanted, strict=True))
+        # Stores and the like take a signature and read something else.
+        if differs and not COMMANDS.get(entry.index, "").endswith("a service"):
+            fail(f"{entry.label} does not read back as it was written ({wanted[0]})", REFUSED)
+
+
+def _row(entry: Any, value: Any, increments: float | None) -> dict[str, Any]:
+    from drive_env.master import quantities
+
+    row = {"index": f"{entry.index:04X}", "sub": entry.sub, "name": entry.name, "raw": value}
+    if not isinstance(value, str):
+        row["unit"] = entry.unit
+        row["text"] = quantities.show(int(value), entry, increments)
+    return row
+
+
+def _text(value: Any, entry: Any, increments: float | None, raw: bool) -> str:
+    from drive_env.master import quantities
+
+    if isinstance(value, str):
+        return str(value)
+    if raw or entry.bits is None:
+        return str(value)
+    text = quantities.show(int(value), entry, increments)
+    return text if entry.unit else f"{text} ({int(value) & (1 << entry.bits) - 1:X}h)"

@@ -1,0 +1,113 @@
+"""`drive-env jog`: turn an axis, by hand so to speak."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from drive_env.tools.options import (
+    Bitrate,
+    Channel,
+    DeviceName,
+    DryRun,
+    Eds,
+    Interface,
+    Json,
+    Timeout,
+    connect,
+    errors_as_exit_codes,
+    increments_per_revolution,
+    print_json,
+)
+
+Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
+TARGET_VELOCITY, PROFILE_VELOCITY, TARGET_POSITION, POSITION = 0x60FF, 0x6081, 0x607A, 0x6064
+ACCELERATION = 0x6083
+
+
+def jog(
+    speed: Annotated[str, typer.Argument(help="Speed: '100 rpm', '1 rev/s', or an integer of the drive's unit.")],
+    duration: Annotated[float, typer.Option("--for", help="How long, without --by [s].")] = 1.0,
+    by: Annotated[str | None, typer.Option(help="How far: '1 rev', '-90 deg', or increments; then it stops.")] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Node = 1,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    max_current: Annotated[
+        str | None, typer.Option(help="Quick-stop above this current; by default the drive's.")
+    ] = None,
+    json: Json = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Enable an axis, turn it for a while or by a distance, and switch it off again.
+
+    The safety envelope is on: Ctrl-C, a passed limit and a dead process all end in a quick stop. A negative speed
+    turns back: drive-env jog -- '-100 rpm'.
+    """
+    with errors_as_exit_codes():
+        from drive_env import motion
+        from drive_env.dictionary.access import check_limits
+        from drive_env.master import quantities
+        from drive_env.master.bounds import Limits
+        from drive_env.master.description import describe
+
+        known = describe(device, eds).dictionary
+        current = None if max_current is None else quantities.parse(max_current, known.find(0x6077), None)
+        if not 0.001 <= duration <= 3600.0:
+            raise ValueError(f"--for {duration:g} s must be at least 0.001 s and at most an hour")
+        options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "dry_run": dry_run}
+        with connect(interface, channel, [node], device, eds, safety=Limits(current=current), **options) as drives:
+            scale = increments_per_revolution(drives)[0]
+            velocity = quantities.parse(speed, known.find(TARGET_VELOCITY), scale)
+            if velocity == 0:
+                raise ValueError("a speed of 0 turns nothing; give one, e.g. '60 rpm'")
+            distance = None if by is None else quantities.parse(by, known.find(TARGET_POSITION), scale)
+            # Told before the axis is enabled.
+            check_limits(known.find(TARGET_VELOCITY), velocity)
+            check_limits(known.find(TARGET_POSITION), distance or 0)
+            if drives.description.has(ACCELERATION) and not dry_run and int(drives.read(ACCELERATION)[0]) == 0:
+                raise ValueError(
+                    "the drive's profile acceleration 6083h is 0, so nothing would move; set it "
+                    "(drive-env set 6083 '500 rev/s^2'), or commission the drive"
+                )
+            start = int(drives.read(POSITION)[0])
+            if distance is None:
+                _turn(motion, drives, velocity, round(duration, 3))
+            else:
+                _go(motion, drives, abs(velocity), distance)
+            motion.disable(drives)
+            drives.advance(0.1)
+            moved = int(drives.read(POSITION)[0]) - start
+            emergencies = [message._asdict() for message in drives.emergencies()]
+        if json:
+            print_json({"moved": moved, "start": start, "emergencies": emergencies})
+        else:
+            print(f"node {node} moved by {quantities.show(moved, known.find(POSITION), scale)}")
+            for message in emergencies:
+                print(f"emergency {message['code']:04X}h {message['name']}")
+
+
+def _turn(motion: Any, drives: Any, velocity: int, duration: float) -> None:
+    """Turn in pv, then let the drive brake with its own deceleration."""
+    motion.enable(drives, mode="pv")
+    drives.write(TARGET_VELOCITY, velocity)
+    drives.advance(duration)
+    drives.write(TARGET_VELOCITY, 0)
+    # Bit 10 in pv tells that the ramp has ended.
+    motion.wait_for(drives, motion.TARGET_REACHED, 10.0, "standstill")
+    drives.advance(0.05)
+
+
+def _go(motion: Any, drives: Any, velocity: int, distance: int) -> None:
+    """Move in pp, and give the drive its profile velocity back."""
+    before = int(drives.read(PROFILE_VELOCITY)[0])
+    drives.write(PROFILE_VELOCITY, velocity)
+    try:
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, distance, relative=True, timeout=10.0 + 2.0 * abs(distance) / velocity)
+    finally:
+        drives.write(PROFILE_VELOCITY, before)

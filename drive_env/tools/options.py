@@ -1,0 +1,157 @@
+"""What the commands of `drive-env` have in common: their options, how they connect, and how they end."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+    from drive_env.dictionary.entries import ObjectName
+
+REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
+
+Interface = Annotated[
+    str | None,
+    typer.Option(
+        "--interface", "-i", envvar="DRIVE_ENV_INTERFACE", help="python-can interface: socketcan, pcan, slcan, ..."
+    ),
+]
+Channel = Annotated[
+    str | None,
+    typer.Option(
+        "--channel",
+        "-c",
+        envvar="DRIVE_ENV_CHANNEL",
+        help="Channel: can0, or socket://127.0.0.1:PORT of `drive-env serve`.",
+    ),
+]
+Bitrate = Annotated[int | None, typer.Option(help="Bit rate [bit/s], where the interface sets it.")]
+Nodes = Annotated[list[int] | None, typer.Option("--node", "-n", help="Node-ID; may be repeated.", show_default="1")]
+DeviceName = Annotated[str, typer.Option("--device", help="Drive by name.")]
+Eds = Annotated[Path | None, typer.Option("--eds", help="EDS of any other CiA 402 drive, in place of --device.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the frames and send none.")]
+Timeout = Annotated[
+    float | None, typer.Option(help="Longest wait for an answer [s].", show_default="the device's, 0.5")
+]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
+
+_INDEX = re.compile(r"^(?:0x)?([0-9a-f]{4})h?(?:[:.]([0-9a-f]{1,2})h?)?$", re.IGNORECASE)
+
+
+def object_name(text: str) -> ObjectName:
+    """Return how the dictionary is asked for an object written as 6041, 0x6041, 607D:1 (hexadecimal) or name."""
+    found = _INDEX.match(text.strip())
+    if found is None:
+        return text
+    return int(found[1], 16), int(found[2] or "0", 16)
+
+
+def connect(
+    interface: str | None,
+    channel: str | None,
+    nodes: list[int] | None,
+    device: str,
+    eds: Path | None,
+    **others: Any,
+) -> CanDrives:
+    """Open drives with a command's options."""
+    from drive_env.can_drives import CanDrives
+
+    bitrate = others.pop("bitrate", None)
+    if bitrate is not None:
+        others["bitrate"] = bitrate
+    return CanDrives(device, eds=eds, interface=interface, channel=channel, nodes=nodes or (1,), **others)
+
+
+@contextmanager
+def errors_as_exit_codes() -> Iterator[None]:
+    """End with one red line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
+    from drive_env.dictionary.access import ObjectAccessError
+    from drive_env.master.errors import BusError, OpenError, RefusedError
+    from drive_env.safety import SafetyError
+
+    try:
+        yield
+    except (RefusedError, SafetyError) as error:
+        fail(error, REFUSED)
+    except OpenError as error:
+        fail(error, USER_ERROR)
+    except (BusError, TimeoutError) as error:
+        fail(error, REFUSED)
+    except (ObjectAccessError, ValueError) as error:
+        fail(error, USER_ERROR)
+    except RuntimeError as error:  # motion: an axis is in fault
+        if type(error) is not RuntimeError:
+            raise
+        fail(error, REFUSED)
+    except OSError as error:
+        fail(f"{error.filename}: {error.strerror}" if error.filename else error, USER_ERROR)
+    except KeyboardInterrupt:
+        fail("interrupted", INTERRUPTED)
+
+
+def fail(error: object, code: int) -> NoReturn:
+    """End the command with a red line."""
+    typer.secho(f"drive-env: {error}", fg=typer.colors.RED, err=True)
+    raise typer.Exit(code)
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON on one line."""
+    print(json.dumps(value, ensure_ascii=False, default=_plain))
+    sys.stdout.flush()
+
+
+def check_time(option: str, value: float | None) -> None:
+    """Raise ValueError for a time [s] that is not above 0, or not a number; None is any."""
+    if value is not None and not 0.0 < value < math.inf:
+        raise ValueError(f"{option} {value:g} s must be above 0 s")
+
+
+def ask(question: str, yes: bool) -> None:
+    """Go on if the user agrees, or end the command."""
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        fail(f"{question} Nobody is there to ask; say --yes", USER_ERROR)
+    if not typer.confirm(question):
+        fail("nothing was changed", REFUSED)
+
+
+def increments_per_revolution(drives: CanDrives) -> list[float | None]:
+    """Return the position increments of a revolution of every axis, None where the drive does not say."""
+    known = drives.description
+    for name in ("Position Scaler", (0x608F, 1)):  # of the TMCM-1636; encoder increments of CiA 402
+        if known.has(name):
+            return [float(value) or None for value in drives.read(name)]
+    return [None] * drives.num_axes
+
+
+def axis_name(drives: CanDrives, axis: int) -> str:
+    """Return what a line calls an axis: its node and, of a node with several, its number in the node."""
+    node, part = divmod(axis, drives.description.num_axes)
+    return f"node {drives.nodes[node]}" + (f" axis {part}" if drives.description.num_axes > 1 else "")
+
+
+def axis_place(drives: CanDrives, axis: int) -> dict[str, Any]:
+    """Return what JSON calls an axis, as `axis_name` does a line."""
+    node, part = divmod(axis, drives.description.num_axes)
+    return {"node": drives.nodes[node]} | ({"axis": part} if drives.description.num_axes > 1 else {})
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "item"):
+        return value.item()
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value)

@@ -1,0 +1,222 @@
+"""`drive-env scope`: objects at every SYNC, from a trigger on, as CSV and picture."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import typer
+
+from drive_env.tools.options import (
+    REFUSED,
+    Bitrate,
+    Channel,
+    DeviceName,
+    Eds,
+    Interface,
+    Json,
+    Nodes,
+    Timeout,
+    axis_name,
+    connect,
+    errors_as_exit_codes,
+    fail,
+    increments_per_revolution,
+    object_name,
+    print_json,
+)
+
+DEFAULT = ("6064", "606C", "6077")
+CHUNK = 0.05  # recorded at a time while the trigger is waited for [s]
+_TRIGGER = re.compile(r"^\s*(.+?)\s*(<=|>=|<|>|==|!=)\s*(.+?)\s*$")
+
+
+class Trigger(NamedTuple):
+    """A condition on an object: it fires where the condition begins to hold."""
+
+    entry: Any
+    relation: str
+    text: str
+
+
+def scope(
+    objects: Annotated[
+        list[str] | None, typer.Argument(help="Objects that can be mapped; by default position, velocity, current.")
+    ] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    duration: Annotated[float, typer.Option(help="How long to record from the trigger on [s].")] = 1.0,
+    trigger: Annotated[
+        str | None, typer.Option(help="Begin when this becomes true: '606C > 100 rpm', 'Statusword == 0x1637'.")
+    ] = None,
+    before: Annotated[float, typer.Option(help="How much to keep from before the trigger [s].")] = 0.05,
+    wait: Annotated[float, typer.Option(help="How long to wait for the trigger [s].")] = 30.0,
+    period: Annotated[float, typer.Option(help="Time between samples [s], whole milliseconds.")] = 0.001,
+    out: Annotated[Path, typer.Option(help="Files to write, without ending: OUT.csv and OUT.png.")] = Path("scope"),
+    json: Json = False,
+) -> None:
+    """Sample objects with SYNC, one sample per millisecond, and write CSV (raw integers) and PNG (in units).
+
+    It sends SYNC and maps TPDOs, which it puts back: no other master may send SYNC meanwhile.
+    """
+    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
+    with errors_as_exit_codes():
+        _check_times(duration=duration, before=before, wait=wait, period=period)
+        if not out.parent.is_dir():
+            raise ValueError(f"there is no folder {out.parent}; choose another --out")
+        with connect(interface, channel, node, device, eds, **options) as drives:
+            known = drives.description.dictionary
+            entries = [known.find(object_name(name)) for name in objects or DEFAULT]
+            condition = None if trigger is None else _parse(trigger, known)
+            scales = increments_per_revolution(drives)
+            rows, start = _record(drives, entries, condition, scales, duration, before, wait)
+            late, worst = drives.timing.late, drives.timing.worst
+            labels = [axis_name(drives, axis) for axis in range(drives.num_axes)]
+        every = round(period / 0.001)
+        t, rows = _thin(rows, start, every)
+        _write_csv(out.with_suffix(".csv"), entries, labels, t, rows)
+        _draw(out.with_suffix(".png"), entries, labels, scales, t, rows)
+        summary = {"samples": len(t), "csv": str(out.with_suffix(".csv")), "png": str(out.with_suffix(".png"))}
+        if json:
+            print_json(summary | {"late": late, "worst lateness": worst})
+        else:
+            print(f"{len(t)} samples written to {summary['csv']} and {summary['png']}")
+            if late:
+                print(f"{late} SYNCs were late, the worst by {1e3 * worst:.1f} ms: times are those of the SYNCs' grid")
+
+
+def _check_times(**times: float) -> None:
+    for name, value in times.items():
+        if not 0.0 <= value <= 3600.0 or (value == 0.0 and name in ("duration", "period")):
+            raise ValueError(f"--{name} {value:g} s must be above 0 s and at most an hour")
+        if name != "wait" and abs(value / 0.001 - round(value / 0.001)) > 1e-6:
+            raise ValueError(f"--{name} {value:g} s is no whole number of milliseconds; use {round(value, 3):g}")
+
+
+def _parse(text: str, known: Any) -> Trigger:
+    found = _TRIGGER.match(text)
+    if found is None:
+        raise ValueError(f"--trigger {text!r} is no condition; write it as '606C > 100 rpm'")
+    return Trigger(known.find(object_name(found[1])), found[2], found[3])
+
+
+def _fires(trigger: Trigger, values: Any, scales: list[float | None]) -> Any:
+    """Return in which rows the condition holds on any axis."""
+    import operator
+
+    import numpy as np
+
+    from drive_env.master.quantities import parse
+
+    relation = {
+        "<": operator.lt, ">": operator.gt, "<=": operator.le, ">=": operator.ge, "==": operator.eq, "!=": operator.ne,
+    }[trigger.relation]  # fmt: skip
+    level = np.array([parse(trigger.text, trigger.entry, scale) for scale in scales])
+    return relation(values, level).any(axis=1)
+
+
+def _record(
+    drives: Any,
+    entries: list[Any],
+    trigger: Trigger | None,
+    scales: list[float | None],
+    duration: float,
+    before: float,
+    wait: float,
+) -> tuple[dict[Any, Any], int]:
+    """Return rows of each entry, and the number of the row at which the trigger fired."""
+    import numpy as np
+
+    wanted = list(dict.fromkeys([*entries, trigger.entry] if trigger else entries))
+    names = [(entry.index, entry.sub) for entry in wanted]
+
+    def record(seconds: float) -> dict[Any, Any]:
+        trace = drives.record(names, round(seconds, 3))
+        return {entry: trace[name] for entry, name in zip(wanted, names, strict=True)}
+
+    if trigger is None:
+        return record(duration), 0
+    _fires(trigger, np.zeros((1, drives.num_axes), np.int64), scales)  # a wrong level is told before the wait
+    keep = round(before / 0.001)
+    rows: dict[Any, Any] = {entry: np.empty((0, drives.num_axes), np.int64) for entry in wanted}
+    held = True  # a condition that holds from the start must end first
+    for _ in range(max(1, round(wait / CHUNK))):
+        chunk = record(CHUNK)
+        holds = _fires(trigger, chunk[trigger.entry], scales)
+        first = np.flatnonzero(holds & ~np.concatenate([[held], holds[:-1]]))
+        held = bool(holds[-1])
+        old = len(rows[trigger.entry])
+        rows = {entry: np.concatenate([rows[entry], chunk[entry]]) for entry in wanted}
+        if first.size:
+            fired = old + int(first[0])
+            missing = fired + round(duration / 0.001) - len(rows[trigger.entry])
+            if missing > 0:
+                rest = record(missing * 0.001)
+                rows = {entry: np.concatenate([rows[entry], rest[entry]]) for entry in wanted}
+            begin = max(0, fired - keep)
+            end = fired + round(duration / 0.001)
+            return {entry: rows[entry][begin:end] for entry in entries}, fired - begin
+        if keep:
+            rows = {entry: rows[entry][-keep:] for entry in wanted}
+        else:
+            rows = {entry: rows[entry][:0] for entry in wanted}
+    fail(f"the trigger {trigger.entry.label} {trigger.relation} {trigger.text} did not fire within {wait:g} s", REFUSED)
+
+
+def _thin(rows: dict[Any, Any], start: int, every: int) -> tuple[Any, dict[Any, Any]]:
+    import numpy as np
+
+    count = len(next(iter(rows.values())))
+    chosen = np.arange(start % every, count, every)
+    return (chosen - start) * 0.001, {entry: values[chosen] for entry, values in rows.items()}
+
+
+def _write_csv(path: Path, entries: list[Any], labels: list[str], t: Any, rows: dict[Any, Any]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        header = ["t [s]"]
+        for entry in entries:
+            unit = f" [{entry.unit}]" if entry.unit else ""
+            header += [f"{entry.label}{unit}" + (f" ({label})" if len(labels) > 1 else "") for label in labels]
+        writer.writerow(header)
+        for k, time in enumerate(t):
+            writer.writerow([f"{time:.3f}", *(int(v) for entry in entries for v in rows[entry][k])])
+
+
+def _draw(
+    path: Path, entries: list[Any], labels: list[str], scales: list[float | None], t: Any, rows: dict[Any, Any]
+) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from drive_env.master.quantities import SHOWN, UNITS, find_unit
+
+    figure = Figure(figsize=(9.0, 1.2 + 1.9 * len(entries)), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(len(entries), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, entry in zip(panels, entries, strict=True):
+        shown = entry.unit
+        for axis, label in enumerate(labels):
+            unit = find_unit(entry.unit, scales[axis])
+            factor = 1.0
+            if unit is not None:
+                shown = SHOWN[unit.dimension]
+                factor = unit.factor / UNITS[shown].factor
+            panel.plot(t, rows[entry][:, axis] * factor, linewidth=1.2, drawstyle="steps-post", label=label)
+        panel.set_ylabel(shown)
+        panel.set_title(entry.label, fontsize="medium", loc="left")
+        panel.grid(alpha=0.3)
+        panel.margins(x=0)
+        if t[0] < 0.0:
+            panel.axvline(0.0, color="0.4", linewidth=0.8, linestyle="--")
+    if len(labels) > 1:
+        panels[0].legend(loc="upper right", fontsize="small", ncols=min(len(labels), 4))
+    panels[-1].set_xlabel("time from the trigger [s]" if t[0] < 0.0 else "time [s]")
+    figure.savefig(path, dpi=110)

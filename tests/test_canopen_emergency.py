@@ -1,0 +1,275 @@
+"""Emergencies, as transcripts: codes of table 303, error register, inhibit time, identifier, error behaviour."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from canopen_wire import Wire
+
+from drive_env import EmulatedDrives
+from drive_env.canopen.emergency import CONDITIONS, QUEUE
+from drive_env.canopen.nmt import State
+from drive_env.devices import find_device
+from drive_env.firmware import fsa
+from drive_env.firmware.protection import CAUSES
+
+
+@pytest.fixture(scope="module")
+def drives():
+    with EmulatedDrives(load="inertia", num_threads=1) as made:
+        yield made
+
+
+@pytest.fixture
+def wire(drives):
+    drives.machine.reset()
+    drives.machine.enable_input = True
+    yield Wire(drives)
+    drives.machine.enable_input = True
+
+
+def test_every_cause_and_condition_has_a_row_in_the_device():
+    assert set(find_device("tmcm1636").emergencies) == {cause.name for cause in CAUSES} | set(CONDITIONS)
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "extra"),
+    [  # table 303
+        ("pdo_not_accepted", 0x6320, (0, 255, 0, 0, 0)),
+        ("communication_error", 0x8100, (0, 255, 0, 0, 0)),
+        ("controller_overflow", 0x8110, (1, 255, 0, 0, 0)),
+        ("transmit_overflow", 0x8110, (2, 255, 0, 0, 0)),
+        ("receive_overflow", 0x8110, (3, 255, 0, 0, 0)),
+        ("error_passive", 0x8120, (0, 255, 0, 0, 0)),
+        ("heartbeat_lost", 0x8130, (0, 255, 0, 0, 0)),
+        ("bus_off_recovered", 0x8140, (0, 255, 0, 0, 0)),
+        ("pdo_too_short", 0x8210, (0, 255, 0, 0, 0)),
+        ("pdo_too_long", 0x8220, (0, 255, 0, 0, 0)),
+    ],
+)
+def test_codes_of_the_bus(name, code, extra):
+    assert tuple(find_device("tmcm1636").emergencies[name]) == (code, extra)
+
+
+def test_a_fault_and_its_reset(wire):
+    wire.enable()
+    wire.drives.machine.enable_input = False
+    wire.play("""
+        wait 1 ms
+        tx 085  41 54 81 00 FF 00 00 00   # shutdown switch; generic and manufacturer-specific
+        rx 605  40 01 10 00 00 00 00 00
+        tx 585  4F 01 10 00 81 00 00 00
+        wait 50 ms                        # once
+    """)
+    wire.drives.machine.enable_input = True
+    wire.play("""
+        wait 1 ms
+        rx 605  2B 40 60 00 80 00 00 00
+        tx 585  60 40 60 00 00 00 00 00
+        wait 1 ms
+        tx 085  00 00 00 00 00 00 00 00   # error reset
+        rx 605  40 01 10 00 00 00 00 00
+        tx 585  4F 01 10 00 00 00 00 00
+    """)
+
+
+def test_the_register_of_a_message_is_that_of_its_moment(wire):
+    wire.start()
+    wire.play("""
+        rx 305  00 00 02                  # 6320h
+        tx 085  20 63 21 00 FF 00 00 00
+        rx 205  00                        # and the bits of both
+        tx 085  10 82 31 00 FF 00 00 00
+        rx 205  00 00
+        rx 605  40 01 10 00 00 00 00 00
+        tx 585  4F 01 10 00 21 00 00 00
+        rx 000  82 05                     # reset communication forgets
+        tx 705  00
+        rx 605  40 01 10 00 00 00 00 00
+        tx 585  4F 01 10 00 00 00 00 00
+    """)
+
+
+def test_a_fault_reset_ends_conditions_of_the_bus(wire):
+    wire.enable()
+    wire.start()
+    wire.drives.machine.enable_input = False
+    wire.play("""
+        rx 305  00 00 02
+        tx 085  20 63 21 00 FF 00 00 00
+    """)
+    wire.wait(1)
+    assert "085  41 54 A1 00 FF 00 00 00" in map(str, wire.take()), "both in the register"
+    wire.drives.machine.enable_input = True
+    wire.wait(1)
+    wire.receive(0x205, "80 00")
+    wire.wait(1)
+    assert "085  00 00 00 00 00 00 00 00" in map(str, wire.take())
+
+
+def test_inhibit_time_in_tenths_of_a_millisecond(wire):
+    wire.start()
+    wire.play("""
+        rx 605  2B 15 10 00 C8 00 00 00   # 200: 20 ms
+        tx 585  60 15 10 00 00 00 00 00
+        rx 205  00
+        tx 085  10 82 11 00 FF 00 00 00   # the first at once
+        rx 205  00 00 00
+        rx 305  00
+        wait 19 ms
+        wait 1 ms
+        tx 085  20 82 11 00 FF 00 00 00
+        wait 19 ms
+        wait 1 ms
+        tx 085  10 82 11 00 FF 00 00 00
+        wait 100 ms
+        rx 405  00
+        tx 085  10 82 11 00 FF 00 00 00
+    """)
+
+
+def test_a_full_queue_loses_the_newest(wire):
+    wire.start()
+    assert wire.download(0x1015, 0, 10_000, 2) == 0  # one second
+    for k in range(2 * QUEUE):
+        wire.receive(0x205, "00" if k % 2 == 0 else "00 00 00")
+    wire.wait(10_000)
+    codes = [frame.data[:2].hex() for frame in wire.take()]
+    assert codes == ["2082", "1082"] * (QUEUE // 2), "the first went at once"
+
+
+def test_its_identifier(wire):
+    wire.start()
+    wire.play("""
+        rx 605  23 14 10 00 85 00 00 80   # off
+        tx 585  60 14 10 00 00 00 00 00
+        rx 205  00
+        rx 605  40 01 10 00 00 00 00 00
+        tx 585  4F 01 10 00 11 00 00 00   # the error is there all the same
+        rx 605  23 14 10 00 99 00 00 00   # on
+        tx 585  60 14 10 00 00 00 00 00
+        rx 305  00
+        tx 099  10 82 11 00 FF 00 00 00
+        rx 605  23 14 10 00 05 06 00 80
+        tx 585  60 14 10 00 00 00 00 00
+        rx 605  23 14 10 00 05 06 00 00   # reserved
+        tx 585  80 14 10 00 30 00 09 06
+    """)
+
+
+def test_stopped_tells_later(wire):
+    wire.enable()
+    wire.start()
+    wire.drives.machine.enable_input = False
+    wire.wait(1)
+    assert [str(f) for f in wire.take() if f.can_id == 0x085] == ["085  41 54 81 00 FF 00 00 00"]
+    wire.play("""
+        rx 000  02 05
+        wait 10 ms
+    """)
+    wire.node.overrun(wire.now)
+    wire.play("""
+        wait 10 ms
+        rx 000  80 05
+        tx 085  10 81 91 01 FF 00 00 00
+    """)
+
+
+@pytest.mark.parametrize(("buffer", "extra"), [("controller", "01"), ("transmit", "02"), ("receive", "03")])
+def test_overruns(wire, buffer, extra):
+    wire.node.overrun(wire.now, buffer)
+    assert [str(f) for f in wire.take()] == [f"085  10 81 11 {extra} FF 00 00 00"]
+    wire.node.overrun(wire.now, buffer)
+    assert len(wire.take()) == 1, "each is an event"
+    assert wire.value(0x1001) == 0, "it is over when told"
+
+
+def test_error_passive(wire):
+    wire.node.error_passive(wire.now)
+    assert [str(f) for f in wire.take()] == ["085  20 81 11 00 FF 00 00 00"]
+
+
+# --- bus-off ----------------------------------------------------------------------------------------------------------
+def test_bus_off_stops_the_drive_and_is_told_after_recovery(wire):
+    assert wire.download(0x1029, 1, 1, 1) == 0  # stay operational
+    assert wire.download(0x1017, 0, 10, 2) == 0
+    wire.enable()
+    wire.start()
+    wire.node.bus_off(wire.now)
+    wire.play("""
+        rx 605  40 41 60 00 00 00 00 00   # nothing comes, nothing goes
+        rx 000  81 05
+        wait 20 ms
+    """)
+    assert wire.node._axes[0].state == fsa.State.FAULT
+    assert wire.node.state is State.OPERATIONAL
+    wire.node.bus_on(wire.now)
+    assert str(wire.take()[0]) == "085  40 81 11 00 FF 00 00 00"
+    wire.wait(1)
+    assert {frame.can_id for frame in wire.take()} == {0x185, 0x285, 0x705}
+
+
+def test_bus_off_enters_stopped_by_default(wire):
+    wire.enable()
+    wire.start()
+    wire.node.bus_off(wire.now)
+    wire.wait(5)
+    wire.node.bus_on(wire.now)
+    wire.play("""
+        rx 605  40 41 60 00 00 00 00 00   # stopped: silent
+        rx 000  80 05
+        tx 085  40 81 11 00 FF 00 00 00
+    """)
+
+
+def test_recovery_without_bus_off_is_nothing(wire):
+    wire.node.bus_on(wire.now)
+    assert wire.take() == []
+
+
+# --- error behaviour --------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("raw", "end"), [(0, State.STOPPED), (1, State.OPERATIONAL), (2, State.STOPPED)])
+def test_an_application_error(wire, raw, end):
+    assert wire.value(0x1029, 2) == 1
+    assert wire.download(0x1029, 2, raw, 1) == 0
+    wire.enable()
+    wire.start()
+    wire.drives.machine.enable_input = False
+    wire.wait(1)
+    assert "085  41 54 81 00 FF 00 00 00" in map(str, wire.take()), "told before the state changes"
+    assert wire.node.state is end
+
+
+def test_a_warning_is_no_application_error(wire):
+    assert wire.download(0x1029, 2, 0, 1) == 0
+    wire.enable()
+    wire.start()
+    wire.drives.machine.set_temperatures(25.0, 90.0)
+    wire.wait(2)
+    assert "085  10 43 00 01 00 00 00 00" in map(str, wire.take())
+    assert wire.node.state is State.OPERATIONAL
+
+
+@pytest.mark.parametrize("raw", [0, 1])
+def test_in_pre_operational_no_error_changes_the_state(wire, raw):
+    assert wire.download(0x1029, 2, raw, 1) == 0
+    wire.enable()
+    wire.drives.machine.enable_input = False
+    wire.wait(2)
+    assert wire.node.state is State.PRE_OPERATIONAL
+
+
+# --- two nodes on one set of drives -----------------------------------------------------------------------------------
+def test_each_node_tells_of_its_own_axes():
+    with EmulatedDrives(load="inertia", num_machines=10, num_threads=1) as drives:
+        first, last = Wire(drives, node_id=1), Wire(drives, node_id=10, first_axis=9)
+        for wire in (first, last):
+            wire.enable()
+        drives.machine.enable_input = np.arange(10) != 9
+        drives.advance(0.001)
+        for wire in (first, last):
+            wire.node.after_cycle(0.001)
+        assert first.take() == []
+        assert [str(f) for f in last.take()] == ["08A  41 54 81 00 FF 00 00 00"]
+        assert first.value(0x6041) & 0x6F == 0x27
+        assert last.value(0x6041) & 0x4F == 0x08

@@ -1,0 +1,246 @@
+"""Error control, as transcripts: heartbeat producer and consumer, node and life guarding, what a loss does."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from canopen_wire import Wire
+
+from drive_env import EmulatedDrives
+from drive_env.canopen.nmt import State
+from drive_env.firmware import fsa
+
+
+@pytest.fixture(scope="module")
+def drives():
+    with EmulatedDrives(load="inertia", num_threads=1) as made:
+        yield made
+
+
+@pytest.fixture
+def wire(drives):
+    drives.machine.reset()
+    return Wire(drives)
+
+
+# --- heartbeat, sent --------------------------------------------------------------------------------------------------
+def test_heartbeat_begins_at_once_and_keeps_its_period(wire):
+    wire.play("""
+        wait 100 ms
+        rx 605  2B 17 10 00 0A 00 00 00   # 10 ms
+        tx 585  60 17 10 00 00 00 00 00
+        wait 1 ms
+        tx 705  7F
+        wait 9 ms
+        wait 1 ms
+        tx 705  7F
+        rx 000  01 05
+        wait 1 ms
+        tx 185  50 02
+        tx 285  50 02 00
+        wait 8 ms
+        wait 1 ms
+        tx 705  05
+        rx 000  02 05
+        wait 30 ms
+        tx 705  04
+        tx 705  04
+        tx 705  04
+        rx 000  80 05
+        rx 605  2B 17 10 00 00 00 00 00
+        tx 585  60 17 10 00 00 00 00 00
+        wait 100 ms
+    """)
+
+
+def test_heartbeats_are_on_time(wire):
+    assert wire.download(0x1017, 0, 7, 2) == 0
+    times = []
+    for _ in range(2000):
+        wire.wait(1)
+        if wire.take():
+            times.append(round(wire.now * 1000))
+    assert {b - a for a, b in pairwise(times)} == {7}
+
+
+def test_the_boot_up_message_is_the_first_heartbeat(wire):
+    assert wire.download(0x1017, 0, 50, 2) == 0
+    assert wire.download(0x1010, 2, 0x65766173, 4) == 0
+    wire.wait(3)
+    wire.take()
+    wire.play("""
+        rx 000  82 05
+        tx 705  00
+        wait 49 ms
+        wait 1 ms
+        tx 705  7F
+    """)
+
+
+# --- heartbeat, watched -----------------------------------------------------------------------------------------------
+WATCH_7 = "rx 605  23 16 10 01 32 00 07 00   # node 7, 50 ms\ntx 585  60 16 10 01 00 00 00 00"
+
+
+def test_a_lost_heartbeat_is_told_and_stops_the_node(wire):
+    wire.enable()
+    wire.start()
+    wire.play(f"""
+        {WATCH_7}
+        wait 200 ms                       # watching begins with the first
+        rx 707  05
+        wait 49 ms
+        rx 707  05
+        wait 50 ms
+        wait 1 ms
+        tx 085  30 81 11 00 FF 00 00 00
+        rx 605  40 41 60 00 00 00 00 00   # 1029h:01 is 0: stopped
+        wait 200 ms                       # told once
+        rx 000  80 05
+    """)
+    assert wire.value(0x6041) & 0x4F == 0x08, "operation enabled went to fault"
+    assert wire.value(0x1001) == 0x11
+    wire.play("rx 707  05")
+    assert wire.value(0x1001) == 0x11, "the axis is in fault still"
+    assert wire.download(0x6040, 0, 0x80, 2) == 0
+    assert wire.value(0x1001) == 0x00
+
+
+def test_it_is_watched_anew_after_its_next_heartbeat(wire):
+    wire.play(f"""
+        {WATCH_7}
+        rx 707  05
+        wait 51 ms
+        tx 085  30 81 11 00 FF 00 00 00
+        rx 605  40 01 10 00 00 00 00 00
+        tx 585  4F 01 10 00 11 00 00 00
+        wait 100 ms
+        rx 707  7F
+        rx 605  40 01 10 00 00 00 00 00
+        tx 585  4F 01 10 00 00 00 00 00
+        wait 51 ms
+        tx 085  30 81 11 00 FF 00 00 00
+    """)
+
+
+@pytest.mark.parametrize("entry", ["00 00 07 00", "32 00 00 00", "32 00 80 00", "32 00 FF 00"])
+def test_an_entry_that_watches_nobody(wire, entry):
+    wire.play(f"""
+        rx 605  23 16 10 01 {entry}
+        tx 585  60 16 10 01 00 00 00 00
+        rx 707  05
+        rx 700  05
+        rx 780  05
+        wait 100 ms
+    """)
+
+
+def test_the_master_s_own_number_may_be_watched_and_switched_off_again(wire):
+    wire.play("""
+        rx 605  23 16 10 01 64 00 7F 00
+        tx 585  60 16 10 01 00 00 00 00
+        rx 77F  05
+        wait 50 ms
+        rx 605  23 16 10 01 00 00 00 00
+        tx 585  60 16 10 01 00 00 00 00
+        wait 200 ms
+    """)
+
+
+@pytest.mark.parametrize(("raw", "end"), [(0, State.STOPPED), (1, State.OPERATIONAL), (2, State.STOPPED)])
+def test_error_behaviour_of_a_communication_error(wire, raw, end):
+    assert wire.download(0x1029, 1, raw, 1) == 0
+    wire.enable()
+    wire.start()
+    wire.play(f"""
+        {WATCH_7}
+        rx 707  05
+        wait 51 ms
+        tx 085  30 81 11 00 FF 00 00 00
+    """)
+    assert wire.node.state is end
+    wire.wait(5)
+    expected = fsa.State.FAULT if end is State.STOPPED else fsa.State.OPERATION_ENABLED
+    assert wire.node._axes[0].state == expected
+
+
+# --- guarding ---------------------------------------------------------------------------------------------------------
+def test_node_guarding_alternates_and_shows_the_state(wire):
+    wire.play("""
+        rx 705  RTR
+        tx 705  7F
+        rx 705  RTR
+        tx 705  FF
+        rx 000  01 05
+        rx 705  RTR
+        tx 705  05
+        rx 000  02 05
+        rx 705  RTR
+        tx 705  84
+        rx 000  80 05
+        rx 705  RTR
+        tx 705  7F
+        rx 000  82 05                     # reset communication: toggle 0 again
+        tx 705  00
+        rx 705  RTR
+        tx 705  7F
+    """)
+
+
+def test_others_are_not_answered(wire):
+    wire.play("""
+        rx 706  RTR
+        rx 700  RTR
+        rx 705  7F                        # no remote frame
+        rx 685  RTR
+    """)
+
+
+def test_heartbeat_excludes_guarding(wire):
+    wire.play("""
+        rx 605  2B 17 10 00 E8 03 00 00
+        tx 585  60 17 10 00 00 00 00 00
+        rx 705  RTR
+        wait 1 ms
+        tx 705  7F
+        rx 605  2B 17 10 00 00 00 00 00
+        tx 585  60 17 10 00 00 00 00 00
+        rx 705  RTR
+        tx 705  7F
+    """)
+
+
+def test_life_guarding(wire):
+    wire.enable()
+    wire.start()
+    wire.play("""
+        rx 605  2B 0C 10 00 0A 00 00 00   # 10 ms
+        tx 585  60 0C 10 00 00 00 00 00
+        rx 605  2F 0D 10 00 03 00 00 00   # three times
+        tx 585  60 0D 10 00 00 00 00 00
+        wait 100 ms                       # it begins with the first request
+        rx 705  RTR
+        tx 705  05
+        wait 29 ms
+        rx 705  RTR
+        tx 705  85
+        wait 30 ms
+        wait 1 ms
+        tx 085  30 81 11 00 FF 00 00 00
+        wait 100 ms
+        rx 705  RTR                       # stopped, it lives again
+        tx 705  04
+        rx 000  80 05
+    """)
+    assert wire.value(0x6041) & 0x4F == 0x08
+
+
+@pytest.mark.parametrize(("time", "factor"), [(0, 3), (10, 0)])
+def test_no_life_guarding_without_time_or_factor(wire, time, factor):
+    assert wire.download(0x100C, 0, time, 2) == 0
+    assert wire.download(0x100D, 0, factor, 1) == 0
+    wire.play("""
+        rx 705  RTR
+        tx 705  7F
+        wait 500 ms
+    """)

@@ -1,0 +1,569 @@
+"""Process data, as transcripts: defaults, transmission types, inhibit time, event timer, identifiers, wrong frames."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from canopen_wire import Wire
+
+from drive_env import EmulatedDrives
+from drive_env.canopen.frames import Frame
+
+
+@pytest.fixture(scope="module")
+def drives():
+    with EmulatedDrives(load="inertia", num_threads=1) as made:
+        yield made
+
+
+@pytest.fixture
+def wire(drives):
+    """Node 5, operational, the drive in switch on disabled."""
+    drives.machine.reset()
+    made = Wire(drives)
+    made.start()
+    return made
+
+
+def configure(wire, index, sub, raw, size):
+    assert wire.download(index, sub, raw, size) == 0
+
+
+def map_pdo(wire, index, objects, transmission_type=None, can_id=None):
+    """Follow the manual's rule: off, 0 entries, entries, count, on."""
+    cob_id = wire.value(index, 1)
+    configure(wire, index, 1, cob_id | 1 << 31, 4)
+    if transmission_type is not None:
+        configure(wire, index, 2, transmission_type, 1)
+    configure(wire, index + 0x200, 0, 0, 1)
+    for k, raw in enumerate(objects, 1):
+        configure(wire, index + 0x200, k, raw, 4)
+    configure(wire, index + 0x200, 0, len(objects), 1)
+    configure(wire, index, 1, (cob_id & ~0x7FF | can_id if can_id else cob_id) & 0x7FFF_FFFF, 4)
+
+
+# --- the manual's defaults --------------------------------------------------------------------------------------------
+def test_default_receive_pdos(wire):
+    wire.play("""
+        rx 205  06 00                 # RPDO 1: controlword
+        rx 305  07 00 03              # RPDO 2: controlword, mode
+        rx 405  0F 00 10 27 00 00     # RPDO 3: controlword, target position
+        rx 505  0F 00 F0 D8 FF FF     # RPDO 4: controlword, target velocity
+        rx 605  40 60 60 00 00 00 00 00
+        tx 585  4F 60 60 00 03 00 00 00
+        rx 605  40 7A 60 00 00 00 00 00
+        tx 585  43 7A 60 00 10 27 00 00
+        rx 605  40 FF 60 00 00 00 00 00
+        tx 585  43 FF 60 00 F0 D8 FF FF
+    """)
+    assert wire.value(0x6041) & 0x6F == 0x27
+
+
+def test_default_transmit_pdos(wire):
+    wire.play("""
+        rx 080
+        tx 385  50 02 00 00 00 00     # TPDO 3: statusword, position
+        tx 485  50 02 00 00 00 00     # TPDO 4: statusword, velocity
+        rx 605  2F 60 60 00 03 00 00 00
+        tx 585  60 60 60 00 00 00 00 00
+        wait 1 ms
+        tx 285  50 02 03              # TPDO 2: statusword, mode; TPDO 1 has not changed
+        rx 605  2B 40 60 00 06 00 00 00
+        tx 585  60 40 60 00 00 00 00 00
+        wait 1 ms
+        tx 185  31 02
+        tx 285  31 02 03
+    """)
+
+
+def test_operational_tells_event_driven_values_once(wire):
+    wire.play("""
+        wait 50 ms
+        rx 000  80 05
+        wait 5 ms
+        rx 000  01 05
+        wait 50 ms
+        tx 185  50 02
+        tx 285  50 02 00
+        rx 000  01 05                 # operational already
+        wait 50 ms
+    """)
+
+
+def test_no_remote_frames_for_pdos(wire):
+    wire.play("""
+        rx 185  RTR
+        rx 385  RTR
+        rx 205  RTR
+    """)
+
+
+# --- an RPDO takes effect as a whole ----------------------------------------------------------------------------------
+def test_a_new_set_point_finds_the_target_of_its_frame(wire):
+    for index, raw in ((0x6081, 300_000), (0x6083, 3_000_000), (0x6084, 3_000_000)):
+        configure(wire, index, 0, raw, 4)
+    wire.play("""
+        rx 305  06 00 01              # pp
+        rx 305  07 00 01              # the mode again is no write
+        rx 305  0F 00 01
+        rx 405  1F 00 20 4E 00 00     # the controlword comes first in the frame, the target takes effect first
+    """)
+    wire.wait(300)
+    assert abs(wire.value(0x6064) - 20_000) < 200  # within a degree: the factory preset is soft
+
+
+def test_a_repeated_mode_is_ignored_in_an_rpdo_and_refused_by_sdo(wire):
+    wire.play("""
+        rx 305  06 00 03
+        rx 305  06 00 03
+        rx 605  2F 60 60 00 03 00 00 00
+        tx 585  80 60 60 00 22 00 00 08
+        wait 1 ms
+        tx 185  31 02
+        tx 285  31 02 03
+    """)
+
+
+def test_data_that_cannot_be_accepted(wire):
+    before = wire.value(0x6041)
+    wire.play("""
+        rx 305  06 00 02              # no such mode: nothing of the frame takes effect
+        tx 085  20 63 21 00 FF 00 00 00
+        rx 305  06 00 0B              # the same error still: told once
+        rx 605  40 01 10 00 00 00 00 00
+        tx 585  4F 01 10 00 21 00 00 00
+    """)
+    assert wire.value(0x6041) == before
+    wire.play("""
+        rx 305  00 00 03              # a good one ends it
+        rx 605  40 01 10 00 00 00 00 00
+        tx 585  4F 01 10 00 00 00 00 00
+        rx 305  00 00 FF
+        tx 085  20 63 21 00 FF 00 00 00
+    """)
+
+
+@pytest.mark.parametrize(
+    ("frame", "code"),
+    [
+        ("205 06", "10 82"),  # too few bytes
+        ("205 ", "10 82"),
+        ("205 06 00 00", "20 82"),  # too many
+        ("205 06 00 00 00 00 00 00 00", "20 82"),
+        ("305 06 00", "10 82"),
+        ("305 06 00 03 00", "20 82"),
+        ("405 0F 00 10 27 00", "10 82"),
+        ("505 0F 00 10 27 00 00 00", "20 82"),
+    ],
+)
+def test_a_wrong_length_is_not_processed(wire, frame, code):
+    before = wire.value(0x6041), wire.value(0x6060), wire.value(0x607A), wire.value(0x60FF)
+    wire.play(f"""
+        rx {frame}
+        tx 085  {code} 11 00 FF 00 00 00
+        rx {frame}                    # told once until a good one comes
+        wait 5 ms
+    """)
+    assert (wire.value(0x6041), wire.value(0x6060), wire.value(0x607A), wire.value(0x60FF)) == before
+    wire.play(f"""
+        rx 205  00 00
+        rx 305  00 00 00
+        rx 405  00 00 00 00 00 00
+        rx 505  00 00 00 00 00 00
+        rx 605  40 01 10 00 00 00 00 00
+        tx 585  4F 01 10 00 00 00 00 00
+        rx {frame}
+        tx 085  {code} 11 00 FF 00 00 00
+    """)
+
+
+# --- transmission types -----------------------------------------------------------------------------------------------
+def test_a_synchronous_rpdo_waits_for_sync(wire):
+    configure(wire, 0x1403, 2, 0, 1)
+    wire.play("""
+        rx 505  06 00 01 00 00 00
+        rx 505  06 00 02 00 00 00     # the last one counts
+        rx 605  40 FF 60 00 00 00 00 00
+        tx 585  43 FF 60 00 00 00 00 00
+        rx 080
+        tx 385  31 02 00 00 00 00     # latched before it is sampled
+        tx 485  31 02 00 00 00 00
+        rx 605  40 FF 60 00 00 00 00 00
+        tx 585  43 FF 60 00 02 00 00 00
+        rx 605  23 FF 60 00 09 00 00 00
+        tx 585  60 FF 60 00 00 00 00 00
+        rx 080                        # latched once
+        tx 385  31 02 00 00 00 00
+        tx 485  31 02 00 00 00 00
+        rx 605  40 FF 60 00 00 00 00 00
+        tx 585  43 FF 60 00 09 00 00 00
+    """)
+
+
+def test_what_waits_for_sync_is_forgotten_when_operational_ends(wire):
+    configure(wire, 0x1403, 2, 0, 1)
+    wire.play("""
+        rx 505  06 00 01 00 00 00
+        rx 000  80 05
+        rx 080
+        rx 000  01 05
+        rx 080
+        tx 385  50 02 00 00 00 00
+        tx 485  50 02 00 00 00 00
+    """)
+
+
+def test_synchronous_data_that_cannot_be_accepted_is_told_at_sync(wire):
+    configure(wire, 0x1401, 2, 0, 1)
+    configure(wire, 0x1802, 1, 0xC000_0385, 4)
+    configure(wire, 0x1803, 1, 0xC000_0485, 4)
+    wire.play("""
+        rx 305  06 00 02
+        rx 080
+        tx 085  20 63 21 00 FF 00 00 00
+        rx 305  06 00                 # the length is told at once
+        tx 085  10 82 11 00 FF 00 00 00
+        rx 080
+    """)
+
+
+def test_type_0_is_sent_at_sync_if_a_value_has_changed(wire):
+    configure(wire, 0x1802, 2, 0, 1)
+    configure(wire, 0x1803, 1, 0xC000_0485, 4)
+    wire.play("""
+        rx 080
+        tx 385  50 02 00 00 00 00     # the first: nobody knows them
+        rx 080
+        rx 080
+        rx 205  06 00
+        rx 080
+        tx 385  31 02 00 00 00 00
+        rx 080
+    """)
+
+
+def test_type_1_is_sent_at_every_sync(wire):
+    wire.play("rx 080\ntx 385  50 02 00 00 00 00\ntx 485  50 02 00 00 00 00\n" * 5)
+
+
+@pytest.mark.parametrize("sync", ["rx 080", "rx 080  01", "rx 080  F0"])
+def test_sync_with_and_without_counter(wire, sync):
+    wire.play(f"{sync}\ntx 385  50 02 00 00 00 00\ntx 485  50 02 00 00 00 00")
+
+
+@pytest.mark.parametrize("sync", ["rx 080  RTR", "rx 080  01 02", "rx 080  00 00 00 00 00 00 00 00"])
+def test_what_is_no_sync(wire, sync):
+    wire.play(sync)
+
+
+def test_254_and_255_are_alike(wire):
+    configure(wire, 0x1800, 2, 254, 1)
+    wire.play("""
+        wait 1 ms
+        tx 185  50 02
+        rx 205  06 00
+        wait 1 ms
+        tx 185  31 02
+        tx 285  31 02 00
+        rx 080
+        tx 385  31 02 00 00 00 00
+        tx 485  31 02 00 00 00 00
+    """)
+
+
+# --- timers -----------------------------------------------------------------------------------------------------------
+def test_event_timer_in_milliseconds(wire):
+    configure(wire, 0x1800, 5, 250, 2)
+    wire.play("""
+        wait 1 ms
+        tx 185  50 02
+        wait 249 ms
+        wait 1 ms
+        tx 185  50 02
+        wait 100 ms
+        rx 205  06 00                 # an event: the timer begins anew
+        wait 1 ms
+        tx 185  31 02
+        tx 285  31 02 00
+        wait 249 ms
+        wait 1 ms
+        tx 185  31 02
+        wait 750 ms
+        tx 185  31 02
+        tx 185  31 02
+        tx 185  31 02
+        rx 605  2B 00 18 05 00 00 00 00
+        tx 585  60 00 18 05 00 00 00 00
+        wait 1 ms
+        tx 185  31 02
+        wait 600 ms
+    """)
+
+
+def test_inhibit_time_in_milliseconds(wire):
+    configure(wire, 0x1801, 1, 0xC000_0285, 4)
+    configure(wire, 0x1800, 1, 0xC000_0185, 4)
+    configure(wire, 0x1800, 3, 20, 2)
+    configure(wire, 0x1800, 1, 0x4000_0185, 4)
+    wire.play("""
+        wait 1 ms
+        tx 185  50 02
+        rx 205  06 00
+        wait 5 ms
+        rx 205  07 00
+        wait 14 ms
+        wait 1 ms
+        tx 185  33 02                 # the latest value
+        wait 100 ms
+        rx 205  06 00
+        wait 1 ms
+        tx 185  31 02                 # at once, the time is long over
+    """)
+
+
+def test_an_event_within_the_inhibit_time_is_told_although_the_value_came_back(wire):
+    configure(wire, 0x1801, 1, 0xC000_0285, 4)
+    configure(wire, 0x1800, 1, 0xC000_0185, 4)
+    configure(wire, 0x1800, 3, 20, 2)
+    configure(wire, 0x1800, 1, 0x4000_0185, 4)
+    wire.play("""
+        wait 1 ms
+        tx 185  50 02
+        rx 205  06 00
+        wait 2 ms
+        rx 205  00 00
+        wait 17 ms
+        wait 1 ms
+        tx 185  50 02
+        wait 100 ms
+    """)
+
+
+def test_the_inhibit_time_holds_back_the_event_timer_too(wire):
+    configure(wire, 0x1801, 1, 0xC000_0285, 4)
+    configure(wire, 0x1800, 1, 0xC000_0185, 4)
+    configure(wire, 0x1800, 3, 30, 2)
+    configure(wire, 0x1800, 5, 10, 2)
+    configure(wire, 0x1800, 1, 0x4000_0185, 4)
+    wire.play("""
+        wait 1 ms
+        tx 185  50 02
+        wait 29 ms
+        wait 1 ms
+        tx 185  50 02
+    """)
+
+
+# --- identifiers ------------------------------------------------------------------------------------------------------
+def test_an_identifier_changes_at_once(wire):
+    wire.play("""
+        rx 605  23 00 14 01 05 02 00 C0   # off
+        tx 585  60 00 14 01 00 00 00 00
+        rx 205  06 00                     # dead
+        rx 605  23 00 14 01 33 02 00 40   # on, with 233h
+        tx 585  60 00 14 01 00 00 00 00
+        rx 205  06 00                     # nobody's any more
+        rx 233  06 00
+        wait 1 ms
+        tx 185  31 02
+        tx 285  31 02 00
+        rx 605  23 00 18 01 85 01 00 C0
+        tx 585  60 00 18 01 00 00 00 00
+        rx 605  23 00 18 01 99 01 00 40
+        tx 585  60 00 18 01 00 00 00 00
+        wait 1 ms
+        tx 199  31 02
+        rx 605  23 05 10 00 81 00 00 00   # SYNC
+        tx 585  60 05 10 00 00 00 00 00
+        rx 080
+        rx 081
+        tx 385  31 02 00 00 00 00
+        tx 485  31 02 00 00 00 00
+    """)
+
+
+def test_bit_30_reads_1_whatever_is_written(wire):
+    wire.play("""
+        rx 605  23 00 14 01 05 02 00 00
+        tx 585  60 00 14 01 00 00 00 00
+        rx 605  40 00 14 01 00 00 00 00
+        tx 585  43 00 14 01 05 02 00 40
+        rx 605  23 00 18 01 85 01 00 80   # off
+        tx 585  60 00 18 01 00 00 00 00
+        rx 605  40 00 18 01 00 00 00 00
+        tx 585  43 00 18 01 85 01 00 C0
+    """)
+
+
+@pytest.mark.parametrize(
+    "can_id", [0x000, 0x001, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF]
+)
+@pytest.mark.parametrize("index", [0x1400, 0x1800])
+def test_restricted_identifiers_are_refused(wire, index, can_id):
+    configure(wire, index, 1, wire.value(index, 1) | 1 << 31, 4)
+    assert wire.download(index, 1, can_id | 1 << 30, 4) == 0x0609_0030
+
+
+def test_two_rpdos_on_one_identifier(wire):
+    configure(wire, 0x1403, 1, 0xC000_0505, 4)
+    configure(wire, 0x1403, 1, 0x4000_0405, 4)
+    wire.play("rx 405  06 00 07 00 00 00")
+    assert (wire.value(0x607A), wire.value(0x60FF)) == (7, 7)
+
+
+def test_a_pdo_that_is_off_is_silent(wire):
+    for index in range(0x1800, 0x1804):
+        configure(wire, index, 1, wire.value(index, 1) | 1 << 31, 4)
+    wire.play("""
+        rx 080
+        rx 205  06 00
+        wait 20 ms
+    """)
+
+
+# --- mapping ----------------------------------------------------------------------------------------------------------
+def test_a_mapping_by_the_rule(wire):
+    wire.play("""
+        rx 605  23 03 14 01 05 05 00 C0   # off
+        tx 585  60 03 14 01 00 00 00 00
+        rx 605  2F 03 16 00 00 00 00 00   # no entries
+        tx 585  60 03 16 00 00 00 00 00
+        rx 605  23 03 16 01 08 00 60 60   # mode, 8 bits
+        tx 585  60 03 16 01 00 00 00 00
+        rx 605  23 03 16 02 20 00 FF 60   # target velocity
+        tx 585  60 03 16 02 00 00 00 00
+        rx 605  23 03 16 03 10 00 71 60   # target torque
+        tx 585  60 03 16 03 00 00 00 00
+        rx 605  2F 03 16 00 03 00 00 00   # three entries
+        tx 585  60 03 16 00 00 00 00 00
+        rx 605  23 03 14 01 05 05 00 40   # on
+        tx 585  60 03 14 01 00 00 00 00
+        rx 505  09 FE FF FF FF 9C FF
+        rx 605  40 71 60 00 00 00 00 00
+        tx 585  4B 71 60 00 9C FF 00 00
+        rx 605  40 FF 60 00 00 00 00 00
+        tx 585  43 FF 60 00 FE FF FF FF
+        wait 1 ms
+        tx 285  50 02 09
+    """)
+
+
+def test_a_transmit_mapping_of_eight_bytes(wire):
+    map_pdo(wire, 0x1803, [0x6064_0020, 0x606C_0020], can_id=0x1C0)
+    wire.play("""
+        rx 080
+        tx 385  50 02 00 00 00 00
+        tx 1C0  00 00 00 00 00 00 00 00
+    """)
+
+
+def test_a_mapping_of_nothing_sends_nothing_and_takes_an_empty_frame(wire):
+    map_pdo(wire, 0x1803, [])
+    map_pdo(wire, 0x1403, [])
+    wire.play("""
+        rx 080
+        tx 385  50 02 00 00 00 00
+        rx 505
+        rx 505  00
+        tx 085  20 82 11 00 FF 00 00 00
+    """)
+
+
+UNSUPPORTED, NO_OBJECT, NOT_MAPPABLE, TOO_MUCH, TOO_HIGH = (
+    0x0601_0000,
+    0x0602_0000,
+    0x0604_0041,
+    0x0604_0042,
+    0x0609_0031,
+)
+
+
+@pytest.mark.parametrize(
+    ("index", "is_off", "count", "sub", "raw", "code"),
+    [
+        (0x1600, False, 1, 0, 0, UNSUPPORTED),  # the PDO is on
+        (0x1600, False, 1, 0, 1, UNSUPPORTED),
+        (0x1600, False, 1, 1, 0x6040_0010, UNSUPPORTED),
+        (0x1A00, False, 1, 1, 0x6041_0010, UNSUPPORTED),
+        (0x1600, True, 1, 1, 0x6040_0010, UNSUPPORTED),  # the count is not 0
+        (0x1A01, True, 2, 3, 0x6064_0020, UNSUPPORTED),
+        (0x1600, True, 0, 1, 0x9999_0010, NO_OBJECT),
+        (0x1600, True, 0, 1, 0x0005_0008, NO_OBJECT),  # no dummy mapping
+        (0x1600, True, 0, 1, 0x6040_0110, NOT_MAPPABLE),  # no such sub-index
+        (0x1600, True, 0, 1, 0x6081_0020, NOT_MAPPABLE),  # not mappable
+        (0x1600, True, 0, 1, 0x1017_0010, NOT_MAPPABLE),
+        (0x1600, True, 0, 1, 0x6041_0010, NOT_MAPPABLE),  # read-only in an RPDO
+        (0x1600, True, 0, 1, 0x6064_0020, NOT_MAPPABLE),
+        (0x1600, True, 0, 1, 0x6040_0008, NOT_MAPPABLE),  # wrong length
+        (0x1600, True, 0, 1, 0x6040_0020, NOT_MAPPABLE),
+        (0x1600, True, 0, 1, 0x6040_0000, NOT_MAPPABLE),
+        (0x1A00, True, 0, 1, 0x6041_0008, NOT_MAPPABLE),
+        (0x1A00, True, 0, 2, 0x2003_0020, NOT_MAPPABLE),
+        (0x1A00, True, 0, 0, 4, TOO_HIGH),
+        (0x1600, True, 0, 0, 255, TOO_HIGH),
+        (0x1600, True, 0, 0, 2, NO_OBJECT),  # the second entry is empty
+        (0x1600, True, 0, 4, 0x6040_0010, 0x0609_0011),
+    ],
+)
+def test_every_breach_of_the_rule_is_refused(wire, index, is_off, count, sub, raw, code):
+    if is_off:
+        configure(wire, index - 0x200, 1, wire.value(index - 0x200, 1) | 1 << 31, 4)
+    if count == 0:
+        configure(wire, index, 0, 0, 1)
+    before = [wire.value(index, k) for k in range(4)]
+    assert wire.download(index, sub, raw, 1 if sub == 0 else 4) == code
+    assert [wire.value(index, k) for k in range(4)] == before
+
+
+def test_more_than_eight_bytes_are_refused_with_the_count(wire):
+    configure(wire, 0x1803, 1, 0xC000_0485, 4)
+    configure(wire, 0x1A03, 0, 0, 1)
+    for k, raw in enumerate((0x6064_0020, 0x606C_0020, 0x6061_0008), 1):
+        configure(wire, 0x1A03, k, raw, 4)
+    assert wire.download(0x1A03, 0, 3, 1) == TOO_MUCH
+    assert wire.value(0x1A03, 0) == 0
+    configure(wire, 0x1A03, 0, 2, 1)
+
+
+def test_an_entry_may_be_emptied(wire):
+    configure(wire, 0x1803, 1, 0xC000_0485, 4)
+    configure(wire, 0x1A03, 0, 0, 1)
+    configure(wire, 0x1A03, 2, 0, 4)
+    configure(wire, 0x1A03, 0, 1, 1)
+    configure(wire, 0x1803, 1, 0x4000_0485, 4)
+    wire.play("rx 080\ntx 385  50 02 00 00 00 00\ntx 485  50 02")
+
+
+MAPPABLE_OUT = [0x6041_0010, 0x6061_0008, 0x6062_0020, 0x6063_0020, 0x6064_0020, 0x606C_0020, 0x6077_0010, 0x60FD_0020]
+MAPPABLE_IN = [
+    0x6040_0010, 0x6060_0008, 0x6071_0010, 0x607A_0020, 0x60B0_0020, 0x60B1_0020, 0x60B2_0010, 0x60FF_0020,
+    0x2703_0120, 0x2703_0220,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("raw", MAPPABLE_OUT + MAPPABLE_IN, ids=lambda raw: f"{raw:08X}")
+def test_every_mappable_object_travels(wire, raw):
+    index, sub, size = raw >> 16, raw >> 8 & 0xFF, (raw & 0xFF) // 8
+    map_pdo(wire, 0x1803, [raw])
+    frames = wire.receive(0x080)
+    data = next(frame.data for frame in frames if frame.can_id == 0x485)
+    assert len(data) == size
+    assert int.from_bytes(data, "little", signed=True) == wire.value(index, sub)
+    if raw in MAPPABLE_IN:
+        map_pdo(wire, 0x1403, [raw])
+        assert wire.receive(0x505, "03 00 00 00"[: 3 * size - 1]) == []
+        assert wire.value(index, sub) == 3
+
+
+def test_a_cycle_costs_little(wire):
+    """2 RPDO and 2 TPDO with SYNC cost tens of microseconds; the bound lets a busy machine pass."""
+    wire.enable()
+    frames = [Frame(0x405, bytes(6)), Frame(0x505, bytes(6)), Frame(0x80)]
+    start = time.perf_counter()
+    for k in range(2000):
+        for frame in frames:
+            wire.node.receive(frame, wire.now)
+        wire.node.before_cycle(wire.now + k * 0.001)
+        wire.node.after_cycle(wire.now + k * 0.001)
+    assert (time.perf_counter() - start) / 2000 < 300e-6

@@ -1,0 +1,351 @@
+"""Store and restore: signatures, groups, resets, bit rate and node ID, and a file that survives being killed."""
+
+from __future__ import annotations
+
+import json
+import random
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from canopen_wire import Wire
+
+from drive_env import EmulatedDrives
+from drive_env.canopen import store
+from drive_env.canopen.node import Node
+from drive_env.devices import find_device
+
+SAVE, LOAD = "73 61 76 65", "6C 6F 61 64"
+STORE_FILE = Path(store.__file__)
+DEVICE = find_device("tmcm1636")
+
+
+@pytest.fixture
+def drives():
+    with EmulatedDrives(load="inertia", num_threads=1) as made:
+        yield made
+
+
+@pytest.fixture
+def wire(drives):
+    return Wire(drives)
+
+
+def power_cycled(wire):
+    wire.node.power_on(wire.now)
+    assert [str(frame) for frame in wire.take()] == [f"{0x700 + wire.node.node_id:03X}  00"]
+
+
+# One object of each section: index, sub, size, a new value, the value of before.
+PARAMETERS = {
+    "communication": (0x1017, 0, 2, 1234),
+    "profile": (0x6081, 0, 4, 4711),
+    "motor 0": (0x2003, 0, 4, 815),
+    "bus": (0x2704, 0, 2, 500),
+}
+
+
+@pytest.mark.parametrize(
+    ("sub", "stored"),
+    [
+        (1, {"communication", "profile", "motor 0", "bus"}),
+        (2, {"communication", "bus"}),
+        (3, {"profile"}),
+        (4, {"motor 0"}),
+    ],
+)
+@pytest.mark.parametrize("restart", ["power cycle", "reset node"])
+def test_each_group_is_stored_alone(wire, sub, stored, restart):
+    before = {name: wire.value(index, s) for name, (index, s, _, _) in PARAMETERS.items()}
+    for index, s, size, raw in PARAMETERS.values():
+        assert wire.download(index, s, raw, size) == 0
+    wire.play(f"rx 605  23 10 10 0{sub} {SAVE}\ntx 585  60 10 10 0{sub} 00 00 00 00")
+    if restart == "power cycle":
+        power_cycled(wire)
+    else:
+        wire.play("rx 000  81 05\ntx 705  00")
+    for name, (index, s, _, raw) in PARAMETERS.items():
+        assert wire.value(index, s) == (raw if name in stored else before[name]), name
+    assert wire.value(0x1010, sub) == wire.value(0x1011, sub) == 1
+
+
+@pytest.mark.parametrize("sub", [1, 2, 3, 4])
+@pytest.mark.parametrize(
+    ("index", "signature"), [(0x10, LOAD), (0x10, "73 61 76 64"), (0x10, "65 76 61 73"), (0x11, SAVE)]
+)
+def test_a_wrong_signature_stores_nothing(wire, sub, index, signature):
+    before = wire.value(0x6081)
+    assert wire.download(0x6081, 0, 4711, 4) == 0
+    wire.play(f"rx 605  23 {index:02X} 10 0{sub} {signature}\ntx 585  80 {index:02X} 10 0{sub} 20 00 00 08")
+    power_cycled(wire)
+    assert wire.value(0x6081) == before
+
+
+@pytest.mark.parametrize("sub", [1, 2, 3, 4])
+def test_restored_values_are_the_factory_s_and_active_after_a_reset_only(wire, sub):
+    for index, s, size, raw in PARAMETERS.values():
+        assert wire.download(index, s, raw, size) == 0
+    assert wire.download(0x1010, 1, 0x65766173, 4) == 0
+    wire.play(f"rx 605  23 11 10 0{sub} {LOAD}\ntx 585  60 11 10 0{sub} 00 00 00 00")
+    for index, s, _, raw in PARAMETERS.values():
+        assert wire.value(index, s) == raw, "not yet"
+    power_cycled(wire)
+    factory = DEVICE.new_dictionary(1)
+    for name, (index, s, _, raw) in PARAMETERS.items():
+        restored = name in DEVICE.canopen.store_groups[sub]
+        assert wire.value(index, s) == (factory.find((index, s)).default if restored else raw), name
+
+
+def test_restoring_everything_takes_the_drive_to_its_factory_values(wire):
+    assert wire.value(0x2050) == 3, "the emulator comes commissioned"
+    assert wire.download(0x1011, 1, 0x64616F6C, 4) == 0
+    power_cycled(wire)
+    factory = DEVICE.new_dictionary(1)  # the factory's node ID
+    assert wire.node.node_id == 1
+    for entry in factory:
+        if entry.access == "rw":
+            assert wire.value(entry.index, entry.sub) == entry.default, entry.label
+
+
+def test_commands_and_set_points_are_no_parameters(wire):
+    wire.enable()
+    for index, raw in ((0x60FF, 1000), (0x607A, 5000)):
+        assert wire.download(index, 0, raw, 4) == 0
+    assert wire.download(0x1010, 1, 0x65766173, 4) == 0
+    power_cycled(wire)
+    assert [wire.value(index) for index in (0x6040, 0x6060, 0x60FF, 0x607A)] == [0, 0, 0, 0]
+    assert wire.value(0x6041) & 0x6F == 0x40
+
+
+def test_a_stored_mapping_comes_back_and_works(wire):
+    for index, sub, raw, size in (
+        (0x1803, 1, 0xC000_0485, 4), (0x1A03, 0, 0, 1), (0x1A03, 1, 0x6064_0020, 4), (0x1A03, 2, 0x606C_0020, 4),
+        (0x1A03, 0, 2, 1), (0x1803, 1, 0x4000_01C5, 4), (0x1010, 2, 0x65766173, 4),
+    ):  # fmt: skip
+        assert wire.download(index, sub, raw, size) == 0
+    wire.play("rx 000  82 05\ntx 705  00")
+    wire.start()
+    wire.play("rx 080\ntx 385  50 02 00 00 00 00\ntx 1C5  00 00 00 00 00 00 00 00")
+
+
+def test_reset_communication_brings_stored_communication_parameters_alone(wire):
+    assert wire.download(0x1017, 0, 1234, 2) == 0
+    assert wire.download(0x6081, 0, 4711, 4) == 0
+    assert wire.download(0x1010, 1, 0x65766173, 4) == 0
+    assert wire.download(0x1017, 0, 0, 2) == 0
+    assert wire.download(0x6081, 0, 1, 4) == 0
+    wire.play("rx 000  82 05\ntx 705  00")
+    assert wire.value(0x1017) == 1234
+    assert wire.value(0x6081) == 1
+
+
+# --- bit rate and node ID ---------------------------------------------------------------------------------------------
+def test_a_new_node_id_is_stored_by_2706h_and_active_after_a_reset_only(wire):
+    wire.play(f"""
+        rx 605  2F 05 27 00 21 00 00 00   # node 33
+        tx 585  60 05 27 00 00 00 00 00
+        rx 605  2B 04 27 00 FA 00 00 00   # 250 kbit/s
+        tx 585  60 04 27 00 00 00 00 00
+        rx 605  23 06 27 00 {SAVE}
+        tx 585  60 06 27 00 00 00 00 00
+        rx 605  40 08 27 00 00 00 00 00   # not yet
+        tx 585  4F 08 27 00 05 00 00 00
+        rx 605  40 07 27 00 00 00 00 00
+        tx 585  4B 07 27 00 E8 03 00 00
+        rx 000  82 05                     # reset communication is no reset of the module
+        tx 705  00
+        rx 000  81 05
+        tx 721  00
+        rx 605  40 08 27 00 00 00 00 00
+        rx 621  40 08 27 00 00 00 00 00
+        tx 5A1  4F 08 27 00 21 00 00 00
+        rx 621  40 07 27 00 00 00 00 00
+        tx 5A1  4B 07 27 00 FA 00 00 00
+        rx 621  40 14 10 00 00 00 00 00   # predefined identifiers follow
+        tx 5A1  43 14 10 00 A1 00 00 00
+        rx 621  40 00 14 01 00 00 00 00
+        tx 5A1  43 00 14 01 21 02 00 40
+        rx 000  01 05
+        rx 000  01 21
+        wait 1 ms
+        tx 1A1  50 02
+        tx 2A1  50 02 00
+        rx 721  RTR
+        tx 721  05
+    """)
+    assert (wire.node.node_id, wire.node.bit_rate) == (33, 250)
+
+
+def test_the_bit_rate_is_that_of_the_bus_while_none_is_stored(drives):
+    wire = Wire(drives, bit_rate=125_000)
+    wire.play("""
+        rx 605  40 04 27 00 00 00 00 00
+        tx 585  4B 04 27 00 7D 00 00 00
+        rx 605  40 07 27 00 00 00 00 00
+        tx 585  4B 07 27 00 7D 00 00 00
+    """)
+
+
+def test_a_node_with_another_bit_rate_is_off_the_bus(drives, caplog):
+    wire = Wire(drives, bit_rate=1_000_000)
+    wire.play(f"""
+        rx 605  2B 04 27 00 7D 00 00 00   # 125 kbit/s
+        tx 585  60 04 27 00 00 00 00 00
+        rx 605  23 06 27 00 {SAVE}
+        tx 585  60 06 27 00 00 00 00 00
+        rx 605  2B 17 10 00 0A 00 00 00
+        tx 585  60 17 10 00 00 00 00 00
+        rx 000  81 05
+        wait 20 ms
+        rx 605  40 07 27 00 00 00 00 00
+        rx 000  81 05
+    """)
+    assert wire.node.bit_rate == 125
+    assert "node 5 has 125 kbit/s stored and is off the bus, which has 1000 kbit/s" in caplog.text
+
+
+def test_a_bit_rate_that_the_device_does_not_have_is_told(drives):
+    with pytest.raises(ValueError, match="tmcm1636 has no bit rate of 123 bit/s; it has 20000, 50000, 100000"):
+        Node(5, drives, send=lambda frame: None, bit_rate=123)
+
+
+def test_2706h_stores_nothing_else(wire):
+    before = wire.value(0x6081)
+    assert wire.download(0x6081, 0, 4711, 4) == 0
+    assert wire.download(0x1017, 0, 99, 2) == 0
+    assert wire.download(0x2706, 0, 0x65766173, 4) == 0
+    power_cycled(wire)
+    assert (wire.value(0x6081), wire.value(0x1017)) == (before, 0)
+
+
+def test_what_is_not_stored_is_lost(wire):
+    assert wire.download(0x2705, 0, 33, 1) == 0
+    wire.play("rx 000  81 05\ntx 705  00")
+    assert (wire.value(0x2705), wire.value(0x2708)) == (5, 5)
+
+
+def test_a_stored_identifier_of_its_own_stays_while_others_follow_the_node_id(wire):
+    assert wire.download(0x1400, 1, 0xC000_0205, 4) == 0
+    assert wire.download(0x1400, 1, 0x4000_0333, 4) == 0
+    assert wire.download(0x2705, 0, 33, 1) == 0
+    assert wire.download(0x1010, 1, 0x65766173, 4) == 0
+    power_cycled(wire)
+    assert [wire.value(0x1400, 1), wire.value(0x1401, 1)] == [0x4000_0333, 0x4000_0321]
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
+def test_a_file_outlives_the_node(tmp_path, drives):
+    path = tmp_path / "node.json"
+    first = Wire(drives, store=path)
+    for index, sub, size, raw in PARAMETERS.values():
+        assert first.download(index, sub, raw, size) == 0
+    assert not path.exists(), "nothing was saved yet"
+    assert first.download(0x1010, 1, 0x65766173, 4) == 0
+    content = json.loads(path.read_text(encoding="utf-8"))
+    assert content["sections"]["profile"]["6081:0"] == 4711
+    assert content["sections"]["bus"] == {"2704:0": 500, "2705:0": 5}
+    assert [p.name for p in tmp_path.iterdir()] == ["node.json"]
+    with EmulatedDrives(load="inertia", num_threads=1) as others:
+        second = Wire(others, node_id=5, store=path)
+        for index, sub, _, raw in PARAMETERS.values():
+            assert second.value(index, sub) == raw
+        assert others.read(0x6081)[0] == 4711
+
+
+def test_a_stored_node_id_replaces_the_given_one(tmp_path, drives):
+    path = tmp_path / "node.json"
+    wire = Wire(drives, store=path)
+    assert wire.download(0x2705, 0, 33, 1) == 0
+    assert wire.download(0x2706, 0, 0x65766173, 4) == 0
+    assert Wire(drives, node_id=5, store=path).node.node_id == 33
+
+
+def test_a_file_that_cannot_be_written_is_a_hardware_error(tmp_path, drives):
+    wire = Wire(drives, store=tmp_path / "missing" / "node.json")
+    before = wire.value(0x6081)
+    assert wire.download(0x6081, 0, 4711, 4) == 0
+    for index, sub in ((0x1010, 1), (0x1010, 4), (0x2706, 0)):
+        assert wire.download(index, sub, 0x65766173, 4) == 0x0606_0000
+    assert wire.download(0x1011, 1, 0x64616F6C, 4) == 0x0606_0000
+    power_cycled(wire)
+    assert wire.value(0x6081) == before, "what was not stored is not kept"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "holds no parameters of a tmcm1636"),
+        ("{}", "holds no parameters of a tmcm1636"),
+        ("[1, 2]", "holds no parameters"),
+        ('{"format": 1, "device": "tmcm6212", "sections": {}}', "it is of format 1 and of a tmcm6212"),
+        ('{"format": 2, "device": "tmcm1636", "sections": {}}', "it is of format 2"),
+        ('{"format": 1, "device": "tmcm1636", "sections": {"profile": {"6081": 1}}}', "holds no parameters"),
+        ('{"format": 1, "device": "tmcm1636", "sections": {"profile": {"6081:0": "x"}}}', "holds no parameters"),
+        ('{"format": 1, "device": "tmcm1636", "sections": {"profile": {"9999:0": 1}}}', "9999h does not exist"),
+        ('{"format": 1, "device": "tmcm1636", "sections": {"motor 0": {"2003:0": 99999}}}', "highest is 45000"),
+    ],
+)
+def test_another_file_is_refused_and_left_alone(tmp_path, drives, content, words):
+    path = tmp_path / "node.json"
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(ValueError, match=words) as refused:
+        Node(5, drives, send=print, store=path)
+    assert str(path) in str(refused.value)
+    assert "delete it" in str(refused.value)
+    assert path.read_text(encoding="utf-8") == content
+
+
+def test_what_a_killed_save_left_behind_does_not_matter(tmp_path, drives):
+    path = tmp_path / "node.json"
+    wire = Wire(drives, store=path)
+    assert wire.download(0x6081, 0, 4711, 4) == 0
+    assert wire.download(0x1010, 1, 0x65766173, 4) == 0
+    (tmp_path / "node.json.new").write_text('{"format": 1, "dev', encoding="utf-8")
+    again = Wire(drives, store=path)
+    assert again.value(0x6081) == 4711
+    assert again.download(0x1010, 1, 0x65766173, 4) == 0
+    assert [p.name for p in tmp_path.iterdir()] == ["node.json"]
+
+
+# The child loads store.py alone: a start that takes 30 ms leaves time for 200.
+CHILD = """
+import importlib.util, os, sys
+spec = importlib.util.spec_from_file_location("store", sys.argv[1])
+store = importlib.util.module_from_spec(spec)
+sys.modules["store"] = store
+spec.loader.exec_module(store)
+from pathlib import Path
+memory = store.Store(Path(sys.argv[2]), "test")
+generation = memory.sections["a"][0x2000, 0] if memory.sections else 0
+while True:
+    generation += 1
+    values = {(0x2000 + k, 0): generation for k in range(60)}
+    memory.save({"a": values, "b": values})
+    os.write(1, b"%d\\n" % generation)
+"""
+KILLS = 200
+
+
+def test_200_kills_lose_nothing(tmp_path):
+    path = tmp_path / "memory.json"
+    dice = random.Random(1636)
+    confirmed = 0
+    begun = time.monotonic()
+    for _ in range(KILLS):
+        child = subprocess.Popen(
+            [sys.executable, "-S", "-E", "-c", CHILD, str(STORE_FILE), str(path)], stdout=subprocess.PIPE
+        )
+        first = child.stdout.readline()  # it is saving now
+        time.sleep(dice.uniform(0.0, 0.006))
+        child.kill()
+        rest, _ = child.communicate()
+        confirmed = int((first + rest).split()[-1])
+        memory = store.Store(path, "test")
+        values = {raw for section in memory.sections.values() for raw in section.values()}
+        assert {len(section) for section in memory.sections.values()} == {60}
+        assert len(values) == 1, "a mixture"
+        assert values <= {confirmed, confirmed + 1}, "the old set or the new"
+    assert confirmed > KILLS, "the children did save"
+    assert time.monotonic() - begun < 120.0

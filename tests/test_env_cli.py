@@ -1,0 +1,362 @@
+"""The command `drive-env` on emulated drives behind the virtual bus: what it prints, writes and returns."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import subprocess
+import sys
+import threading
+import uuid
+
+import can
+import pytest
+from typer.testing import CliRunner
+
+from drive_env import EmulatedDrives
+from drive_env.bus.can_port import CanPort
+from drive_env.bus.server import Server
+from drive_env.bus.world import World
+from drive_env.cli import PANELS, app
+
+DONE, REFUSED, USER_ERROR = 0, 1, 2
+
+
+@pytest.fixture(scope="module")
+def shared():
+    """A commissioned drive as node 1 and one with factory values as node 2, in real time."""
+    world = World(lockstep=False)
+    machines = [EmulatedDrives(load="inertia", motor=motor, num_threads=1) for motor in ("qbl4208", None)]
+    for node, machine in enumerate(machines, 1):
+        world.add(machine, [node])
+    channel = str(uuid.uuid4())
+    with Server(world, CanPort(can.Bus(interface="virtual", channel=channel))):
+        yield channel, machines
+    world.close()
+
+
+@pytest.fixture
+def run(shared, monkeypatch):
+    """Run the command on that bus; returns exit code and output, standard error besides."""
+    monkeypatch.setenv("DRIVE_ENV_INTERFACE", "virtual")
+    monkeypatch.setenv("DRIVE_ENV_CHANNEL", shared[0])
+
+    def call(*arguments):
+        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+        assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+        return result.exit_code, result.stdout, result.stderr
+
+    return call
+
+
+# --- scan, get, set -----------------------------------------------------------------------------------------------
+def test_scan_finds_and_names_the_nodes(run):
+    code, out, _ = run("scan", "--last", 10, "--timeout", 0.2)
+    assert code == DONE
+    assert out.splitlines()[0] == (
+        "node 1  tmcm1636  TMCM-1636  hardware 1.0  software 1.09  vendor 286h  product 664h  revision 10009h  CiA 402"
+    )
+    code, out, _ = run("scan", "--json", "--last", 10, "--timeout", 0.2)
+    assert [(row["node"], row["device"], row["vendor"]) for row in json.loads(out)] == [
+        (1, "tmcm1636", 0x286),
+        (2, "tmcm1636", 0x286),
+    ]
+
+
+def test_scan_of_an_empty_range_is_told(run):
+    code, _, error = run("scan", "--first", 50, "--last", 52, "--timeout", 0.05)
+    assert (code, "no node of 50 to 52 answered" in error) == (REFUSED, True)
+    assert run("scan", "--first", 5, "--last", 2)[0] == USER_ERROR
+
+
+@pytest.mark.parametrize("name", ["6081", "0x6081", "6081h", "6081:0", "profile velocity", "Profile Velocity"])
+def test_get_by_index_or_name(run, name):
+    code, out, _ = run("get", name)
+    assert (code, out) == (DONE, "node 1  6081h:00 Profile velocity = 2184533 pps (2000 rpm)\n")
+
+
+def test_get_raw_several_nodes_texts_and_json(run):
+    assert run("get", "--raw", "6081", "1008")[1].splitlines() == [
+        "node 1  6081h:00 Profile velocity = 2184533",
+        "node 1  1008h:00 Manufacturer device name = TMCM-1636",
+    ]
+    assert run("get", "-n", 1, "-n", 2, "2003")[1].splitlines()[1] == "node 2  2003h:00 Maximum Current = 0 mA (0 A)"
+    rows = json.loads(run("get", "607D:2", "--json")[1])
+    assert [rows[0][key] for key in ("node", "index", "sub", "raw")] == [1, "607D", 2, 2**31 - 1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (["get", "Statuswort"], USER_ERROR, "did you mean 'Statusword'"),
+        (["get", "1234"], USER_ERROR, "object 1234h does not exist"),
+        (["get", "6041", "-n", "9", "--timeout", "0.05"], REFUSED, "node 9 did not answer"),
+        (["get", "6041", "-n", "200"], USER_ERROR, "nodes are different numbers of 1 to 127"),
+        (["get", "6041", "--device", "nonsense"], USER_ERROR, "no device is named 'nonsense'"),
+        (["get", "6041", "--eds", "missing.eds"], USER_ERROR, "there is no EDS at missing.eds"),
+        (["get", "6041", "-i", "nonsense"], USER_ERROR, "cannot open interface 'nonsense'"),
+        (["set", "6041", "1"], USER_ERROR, "can only be read"),
+        (["set", "2003", "46 A"], USER_ERROR, "cannot be 46000; its highest is 45000"),
+        (["set", "605A", "3"], REFUSED, "node 1 refused the write of 3 to 605Ah:00"),
+        (["set", "6081", "1 A"], USER_ERROR, "it takes pps"),
+        (["jog", "0"], USER_ERROR, "a speed of 0 turns nothing"),
+        (["set", "6081", "1e400 rpm"], USER_ERROR, "'1e400 rpm' is beyond any number; 6081h:00 Profile velocity takes"),
+        (["set", "6081", "1e308 rev/s"], USER_ERROR, "is beyond any number"),
+        (["set", "6081", "1 rpm", "--raw"], USER_ERROR, "'1 rpm' is no integer for 6081h:00 Profile velocity"),
+        (["get", "6041", "--timeout", "nan"], USER_ERROR, "a time-out of nan s cannot be"),
+        (["get", "6041", "--timeout", "0"], USER_ERROR, "a time-out of 0 s cannot be"),
+        (["get", "6041", "-i", "slcan", "-c", "socket://127.0.0.1:1", "--bitrate", "3"], USER_ERROR, "none of slcan's"),
+        (["scan", "--timeout", "nan"], USER_ERROR, "--timeout nan s must be above 0 s"),
+        (["jog", "10 rpm", "--for", "-1"], USER_ERROR, "must be at least 0.001 s"),
+        (["jog", "1e9 rpm"], USER_ERROR, "60FFh:00 Target velocity cannot be"),
+        (["jog", "10 rpm", "--by", "1e9 rev"], USER_ERROR, "607Ah:00 Target position cannot be"),
+        (["jog", "10 rpm", "-n", "2"], USER_ERROR, "profile acceleration 6083h is 0"),
+        (["scope", "2003"], USER_ERROR, "2003h:00 Maximum Current cannot be recorded"),
+        (["scope", "--trigger", "whenever"], USER_ERROR, "is no condition"),
+        (["scope", "--period", "0.0015"], USER_ERROR, "no whole number of milliseconds"),
+        (["scope", "--duration", "0.0004"], USER_ERROR, "--duration 0.0004 s is no whole number of milliseconds"),
+        (["scope", "--out", "nowhere/file"], USER_ERROR, "there is no folder nowhere"),
+        (["diff", "missing.toml"], USER_ERROR, "there is no file missing.toml; write one with"),
+        (["commission", "nonsense"], USER_ERROR, "has no preset for motor 'nonsense'; it has class_1kw"),
+        (["log", "frames.xyz"], USER_ERROR, "'.xyz' is none of .log, .blf"),
+        (["replay", "missing.log"], USER_ERROR, "there is no file missing.log"),
+        (["log", "frames.log", "--duration", "nan"], USER_ERROR, "--duration nan s must be above 0 s"),
+        (["monitor", "--period", "0"], USER_ERROR, "must be above 0 s"),
+        (["monitor", "--duration", "nan"], USER_ERROR, "--duration nan s must be above 0 s"),
+    ],
+)
+def test_what_goes_wrong_ends_with_one_line_and_its_code(run, arguments, code, text):
+    got, _, error = run(*arguments)
+    assert got == code, error
+    assert text in error
+    assert error.startswith("drive-env: ")
+    assert error.count("\n") == 1
+
+
+def test_set_writes_with_units_and_reads_back(run, shared):
+    assert run("set", "6081", "1200 rpm") == (DONE, "node 1  6081h:00 Profile velocity = 1310720 pps (1200 rpm)\n", "")
+    assert shared[1][0].read(0x6081) == [1_310_720]
+    assert run("set", "--raw", "6081", "2184533")[1] == "node 1  6081h:00 Profile velocity = 2184533\n"
+    assert run("set", "60FF", "--", "-1000")[1].startswith("node 1  60FFh:00 Target velocity = -1000 pps")
+
+
+def test_a_service_takes_its_signature(run):
+    assert run("set", "2706", "0x65766173")[::2] == (DONE, "")
+    assert run("set", "1010:3", "0x65766173")[::2] == (DONE, "")
+    code, _, error = run("set", "1010:3", "5")
+    assert (code, "node 1 refused the write of 5 to 1010h:03" in error) == (REFUSED, True)
+
+
+def test_a_dry_run_shows_the_frames_and_changes_nothing(run, shared):
+    code, out, _ = run("set", "6081", "4660", "--dry-run")
+    assert code == DONE
+    assert "601   [8]  23 81 60 00 34 12 00 00" in out
+    assert shared[1][0].read(0x6081) == [2_184_533]
+
+
+# --- parameters ---------------------------------------------------------------------------------------------------
+def test_backup_diff_restore(run, shared, tmp_path):
+    file = tmp_path / "drive.toml"
+    code, out, _ = run("backup", file)
+    assert code == DONE
+    assert re.fullmatch(r"\d+ parameters of node 1 written to .*\n", out)
+    text = file.read_text()
+    assert '"6081:00" = 2184533  # Profile velocity [pps]' in text
+    assert '"6040:00"' not in text  # a command
+    assert run("diff", file)[0] == DONE
+    run("set", "6081", "1000")
+    run("set", "2042:1", "500")
+    code, out, _ = run("diff", file, "--json")
+    assert code == REFUSED
+    assert {row["object"]: (row["found"], row["wanted"]) for row in json.loads(out)} == {
+        "2042h:01 Velocity Mode Settings.P_Parameter": (500, 445),
+        "6081h:00 Profile velocity": (1000, 2184533),
+    }
+    code, out, _ = run("restore", file, "--yes")
+    assert code == DONE
+    assert "2 written, " in out
+    assert shared[1][0].read(0x6081) == [2_184_533]
+    assert run("diff", file)[0] == DONE
+
+
+def test_diff_of_two_files(run, tmp_path):
+    one, two = tmp_path / "one.toml", tmp_path / "two.toml"
+    one.write_text('[parameters]\n"6081:00" = 5\n"6083:00" = 7\n')
+    two.write_text('[parameters]\n"6081:00" = 6\n"6083:00" = 7\n')
+    code, out, _ = run("diff", one, two)
+    assert code == REFUSED
+    assert "6081h:00 Profile velocity" in out
+    assert "6083h" not in out
+    assert run("diff", one, one)[0] == DONE
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("nonsense", "is no TOML"),
+        ("[other]\n", "has no table [parameters]"),
+        ('[parameters]\n"velocity" = 3\n', "'velocity' is no index:sub-index"),
+        ('[parameters]\n"6041:00" = 3\n', "can only be read"),
+        ('[parameters]\n"2003:00" = 99999\n', "its highest is 45000"),
+        ('[parameters]\n"2003:00" = 1.5\n', "takes integers"),
+    ],
+)
+def test_a_file_that_is_no_parameters_is_told(run, tmp_path, text, message):
+    file = tmp_path / "wrong.toml"
+    file.write_text(text)
+    code, _, error = run("restore", file, "--yes")
+    assert (code, message in error) == (USER_ERROR, True)
+
+
+def test_restore_is_all_or_nothing(run, shared, tmp_path):
+    """605Ah knows 1, 2, 5 and 6 only: what was written before it is taken back."""
+    file = tmp_path / "bad.toml"
+    file.write_text('[parameters]\n"6081:00" = 77\n"605A:00" = 3\n"6083:00" = 99\n')
+    code, _, error = run("restore", file, "--yes")
+    assert code == REFUSED
+    assert "node 1 refused the write of 3 to 605Ah:00" in error
+    assert "everything was taken back, the drive is as it was" in error
+    assert shared[1][0].read(0x6081) == [2_184_533]
+
+
+def test_restore_remaps_pdos_in_the_order_that_a_drive_wants(run, tmp_path):
+    before, file = tmp_path / "before.toml", tmp_path / "pdos.toml"
+    run("backup", before)
+    file.write_text(
+        '[parameters]\n"1A00:00" = 2\n"1A00:01" = 0x60640020\n"1A00:02" = 0x60410010\n"1800:01" = 0x40000191\n'
+        '"1800:02" = 1\n"1A03:00" = 0\n"1803:01" = 0xC0000481\n"1600:00" = 2\n"1600:02" = 0x60FF0020\n'
+    )
+    code, _, error = run("restore", file, "--yes")
+    assert code == DONE, error
+    assert run("get", "--raw", "1400:1")[1].endswith(f"= {0x40000201}\n")  # not in the file, and on again
+    assert run("diff", file)[0] == DONE
+    code, _, error = run("restore", before, "--yes")
+    assert code == DONE, error
+    assert run("diff", before)[0] == DONE
+
+
+def test_an_enabled_axis_is_not_restored(run, shared, tmp_path):
+    file = tmp_path / "one.toml"
+    file.write_text('[parameters]\n"6081:00" = 77\n')
+    for word in (6, 7, 15):
+        run("set", "6040", word)
+    try:
+        code, _, error = run("restore", file, "--yes")
+        assert (code, "the axis is enabled" in error) == (REFUSED, True)
+    finally:
+        run("set", "6040", 0)
+
+
+def test_nobody_to_ask_changes_nothing(run, shared, tmp_path):
+    file = tmp_path / "one.toml"
+    file.write_text('[parameters]\n"6081:00" = 77\n')
+    code, _, error = run("restore", file)
+    assert (code, "say --yes" in error) == (USER_ERROR, True)
+    assert shared[1][0].read(0x6081) == [2_184_533]
+
+
+def test_commission_makes_a_bare_drive_turn(run, shared):
+    assert "qbl4208" in run("commission", "?")[1].split()
+    code, out, _ = run("commission", "qbl4208", "-n", 2, "--yes")
+    assert code == DONE
+    assert "2050h:00 Motor Type" in out
+    run("set", "2005", "3", "-n", 2)  # no limit switches
+    code, out, error = run("jog", "300 rpm", "--by", "0.5 rev", "-n", 2, "--json")
+    assert code == DONE, error
+    assert abs(json.loads(out)["moved"] - 32768) < 1000
+
+
+# --- motion and frames --------------------------------------------------------------------------------------------
+def test_jog_turns_back_and_reports(run):
+    code, out, error = run("jog", "--for", "0.2", "--", "-200 rpm")
+    assert code == DONE, error
+    turns = float(re.search(r"moved by -\d+ inc \((-\d+\.\d+) rev\)", out)[1])
+    assert -3.0 < turns < -0.4  # half a turn and the braking, or more on a busy computer
+
+
+def test_jog_above_a_current_ends_in_a_quick_stop(run, shared):
+    code, _, error = run("jog", "3000 rpm", "--for", "0.5", "--max-current", "40 mA")
+    assert (code, "the drives were quick-stopped" in error) == (REFUSED, True)
+    assert shared[1][0].read(0x6041)[0] & 0x6F != 0x27
+
+
+def test_monitor_shows_values_and_state(run):
+    code, out, _ = run("monitor", "--duration", 0.05, "--period", 0.02)
+    assert code == DONE
+    assert "switch on disabled" in out
+    lines = run("monitor", "6041", "6064", "--json", "--duration", 0.1, "--period", 0.02)[1].splitlines()
+    assert len(lines) >= 2
+    assert set(json.loads(lines[0])) == {"t", "6041:00", "6064:00", "emergencies"}
+
+
+def test_scope_writes_a_table_and_a_picture(run, tmp_path):
+    out = tmp_path / "trace"
+    code, _, error = run("scope", "6041", "6064", "--duration", 0.05, "--period", 0.002, "--out", out)
+    assert code == DONE, error
+    rows = list(csv.reader(out.with_suffix(".csv").open()))
+    assert rows[0] == ["t [s]", "6041h:00 Statusword", "6064h:00 Position actual value [inc]"]
+    assert [row[0] for row in rows[1:4]] == ["0.000", "0.002", "0.004"]
+    assert len(rows) == 1 + 25
+    assert out.with_suffix(".png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_scope_waits_for_its_trigger(run, shared, tmp_path):
+    out = tmp_path / "edge"
+    code, _, error = run("scope", "6064", "--trigger", "606C > 100 rpm", "--wait", 0.2, "--out", out)
+    assert (code, "did not fire within 0.2 s" in error) == (REFUSED, True)
+    timer = threading.Timer(0.5, lambda: shared[1][0].write("Target velocity", 77))
+    timer.start()
+    arguments = ["--trigger", "60FF == 77", "--wait", 20, "--before", 0.01, "--duration", 0.02, "--out", out]
+    code, _, error = run("scope", "60FF", *arguments)
+    timer.join()
+    assert code == DONE, error
+    rows = list(csv.reader(out.with_suffix(".csv").open()))[1:]
+    assert len(rows) == 30
+    assert [row[1] for row in rows if float(row[0]) < 0.0] == [rows[0][1]] * 10
+    assert {row[1] for row in rows if float(row[0]) >= 0.0} == {"77"}
+
+
+@pytest.mark.parametrize("ending", ["log", "blf"])
+def test_a_logged_session_replays_the_masters_frames(run, shared, tmp_path, ending):
+    file = tmp_path / f"session.{ending}"
+    timer = threading.Timer(0.3, lambda: run("set", "6081", "3333"))
+    timer.start()
+    code, out, _ = run("log", file, "--duration", 1.5)
+    timer.join()
+    assert code == DONE
+    assert re.match(r"\d+ frames written", out)
+    run("set", "6081", "2184533")
+    shown = run("replay", file, "--dry-run")[1]
+    assert "601   [8]  23 81 60 00 05 0D 00 00" in shown
+    assert "581" not in shown  # the drive's answers are its own
+    code, _, error = run("replay", file, "--speed", 10)
+    assert code == DONE, error
+    run("get", "6041")  # the drive has answered the last request
+    assert shared[1][0].read(0x6081) == [3333]
+    run("set", "6081", "2184533")
+
+
+@pytest.mark.parametrize("ending", ["log", "blf", "db"])
+def test_a_broken_log_is_told(run, tmp_path, ending):
+    path = tmp_path / f"broken.{ending}"
+    path.write_text("rubbish\n", encoding="utf-8")
+    code, _, error = run("replay", path)
+    assert code == USER_ERROR, error
+    assert f"broken.{ending} cannot be read as .{ending}: " in error
+
+
+# --- help ---------------------------------------------------------------------------------------------------------
+COMMANDS = [name for commands in PANELS.values() for name, _ in commands]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command):
+    result = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+    assert result.exit_code == DONE
+    assert "--help" in result.stdout
+
+
+def test_help_is_quick_to_import():
+    code = "import sys, drive_env.cli; sys.exit(any(name in sys.modules for name in ('numba', 'mujoco', 'can')))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,329 @@
+"""GainScheduling: gains on line, a changing payload, lanes that know nothing of each other, and the same on a bus."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from test_parity import WorldBus
+
+from drive_env import CanDrives, EmulatedDrives
+from drive_env.bus.world import World
+from drive_env.envs.gain_scheduling import ENTRIES, GAINS, GainScheduling, GainSchedulingConfig
+from drive_env.envs.lanes import OneLane
+from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
+from mechanics.loads import LOADS
+
+NOMINAL = {"parameters": {}}
+POSITION_P, VELOCITY_P = (0x2043, 1), (0x2042, 1)
+
+
+def env(lanes=1, **options):
+    return GainScheduling(lanes, num_threads=1, **options)
+
+
+def run(environment, steps, seed=0, reset_seed=3, scale=1.0):
+    rng = np.random.default_rng(seed)
+    rows = [environment.reset(seed=reset_seed)[0]]
+    rewards = []
+    for _ in range(steps):
+        action = scale * rng.uniform(-1.0, 1.0, environment.single_action_space.shape)
+        rows.append((found := environment.step(np.tile(action, (environment.num_envs, 1))))[0])
+        rewards.append(found[1])
+    return np.array(rows), np.array(rewards)
+
+
+# --- the interface ----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("load", sorted(LOADS))
+def test_the_checker_passes_on_every_load(load):
+    single = OneLane(GainScheduling(1, autoreset_mode="Disabled", load=load, duration=0.1, num_threads=1))
+    check_env(single, skip_render_check=True)
+    single.close()
+
+
+def test_it_is_registered():
+    import drive_env.envs
+
+    drive_env.envs.register()
+    single = gymnasium.make("ServoDrive/GainScheduling-v0", load="inertia", duration=0.05, num_threads=1)
+    single.reset(seed=1)
+    assert [single.step(single.action_space.sample())[3] for _ in range(5)] == [False] * 4 + [True]
+    single.close()
+    several = gymnasium.make_vec(
+        "ServoDrive/GainScheduling-v0", 3, vectorization_mode="vector_entry_point", num_threads=1
+    )
+    assert several.reset(seed=1)[0].shape == (3, len(ENTRIES) + len(GAINS))
+    several.close()
+
+
+def test_the_docstring_has_a_row_for_every_entry():
+    rows = [
+        line.split("|")[1:-1] for line in (GainScheduling.__doc__ or "").splitlines() if line.strip().startswith("| ")
+    ]
+    told = {int(row[0]): row for row in rows if row[0].strip().isdigit()}
+    for k, (name, _, low, high) in enumerate(ENTRIES):
+        assert told[k][1].strip().split(":")[0].split(",")[0] == name
+        assert (float(told[k][3]), float(told[k][4])) == (low, high)
+
+
+# --- gains ------------------------------------------------------------------------------------------------------------
+def test_an_action_is_the_logarithm_of_each_gain_over_its_base():
+    environment = env(2, distributions=NOMINAL, span=0.5, gains=("position_p", "velocity_p"))
+    environment.reset(seed=0)
+    base = {name: environment.drives.read(name) for name in (POSITION_P, VELOCITY_P, (0x2042, 2))}
+    environment.step(np.array([[1.0, 0.0], [-1.0, 0.4]], np.float32))
+    gains = {name: environment.drives.read(name) for name in base}
+    assert gains[POSITION_P].tolist() == np.rint(base[POSITION_P] * np.exp([0.5, -0.5])).tolist()
+    assert gains[VELOCITY_P].tolist() == np.rint(base[VELOCITY_P] * np.exp([0.0, 0.2])).tolist()
+    assert np.array_equal(gains[0x2042, 2], base[0x2042, 2])
+
+
+def test_present_gains_are_those_that_the_drives_hold():
+    drives = EmulatedDrives(load="inertia", num_machines=2, num_threads=1)
+    drives.write(POSITION_P, [77, 99])
+    environment = GainScheduling(2, drives=drives, load="inertia", base="present", distributions=NOMINAL)
+    environment.reset(seed=0)
+    assert drives.read(POSITION_P).tolist() == [77, 99]
+
+
+def test_a_stiffer_position_loop_lags_less_and_is_rewarded():
+    results = []
+    for action in (-1.0, 0.0):
+        environment = env(4, load="inertia", distributions=NOMINAL, gains=("position_p",), payload="none")
+        environment.reset(seed=1)
+        terms = [environment.step(np.full((4, 1), action))[4]["reward_terms"]["tracking"] for _ in range(100)]
+        results.append(np.mean(terms))
+    assert results[0] < 0.7 * results[1]
+
+
+# --- the programme and the payload ------------------------------------------------------------------------------------
+@pytest.mark.parametrize("excitation", EXCITATIONS)
+def test_a_programme_stays_within_its_reach_and_is_smooth(excitation):
+    reach = Reach(np.array([10.0, 4.0]), np.array([50.0, 50.0]), np.array([900.0, 900.0]))
+    programme = Programme(20, 3000, 0, 0.001)
+    programme.draw(excitation, reach, [np.random.default_rng(k) for k in range(20)], np.ones(20, bool))
+    position, velocity, acceleration = programme.rows(np.zeros(20, int), np.arange(3001), reach)
+    assert np.all(np.abs(position).reshape(3001, 20, 2) <= reach.distance + 1e-9)
+    assert np.abs(velocity).max() <= 50.0 + 1e-9
+    assert np.abs(acceleration).max() <= 900.0 * 1.01
+    assert np.abs(velocity).max() > 20.0
+    assert np.all(position[0] == 0.0)
+    assert np.all(velocity[0] == 0.0)
+    assert np.gradient(position, 0.001, axis=0)[1:-1] == pytest.approx(velocity[1:-1], abs=0.05)
+    steady = np.abs(np.diff(acceleration, axis=0)).max(axis=1) < 50.0  # a sine begins with its acceleration
+    rate = np.gradient(velocity, 0.001, axis=0)[1:-1]
+    assert rate[steady[1:]] == pytest.approx(acceleration[1:-1][steady[1:]], abs=30.0)
+
+
+def test_the_payload_changes_when_and_as_drawn():
+    environment = env(3, distributions=NOMINAL, payload_low=0.5, payload_high=3.0, payload_every=0.5)
+    _, info = environment.reset(seed=4)
+    masses = [info["parameters"]["load.mass"]]
+    for _ in range(200):
+        info = environment.step(np.zeros((3, 3)))[4]
+        masses.append(info["parameters"]["load.mass"])
+        assert np.array_equal(masses[-1], environment.drives.machine.parameters["load.mass"])
+    factors = np.array(masses) / masses[0]
+    assert np.all(factors[0] == 1.0)
+    assert np.all((factors[1:] >= 0.5) & (factors[1:] <= 3.0))
+    assert [np.count_nonzero(np.diff(lane)) for lane in factors.T] == [4, 4, 4]
+
+
+def test_a_payload_that_cannot_be_keeps_the_last_one():
+    environment = env(2, load="two_mass", distributions=NOMINAL, payload_low=1e-6, payload_high=1e-6)
+    _, info = environment.reset(seed=4)
+    before = info["parameters"]["load.inertia"]
+    for _ in range(200):
+        info = environment.step(np.zeros((2, 3)))[4]
+    assert np.array_equal(info["parameters"]["load.inertia"], before)
+
+
+def test_a_heavier_payload_needs_more_current():
+    currents = []
+    for factor in (0.3, 4.0):
+        environment = env(
+            1, load="inertia", mode="csv", distributions=NOMINAL, payload_low=factor, payload_high=factor,
+            payload_every=0.01, excitation="sine",
+        )  # fmt: skip
+        environment.reset(seed=2)
+        environment._change_at[:] = 0
+        reach = [np.ptp([environment.step(np.zeros((1, 3)))[0][0, 8] for _ in range(100)])]
+        currents.append(reach[0] / environment.reach.acceleration[0])
+    assert currents[1] > 3.0 * currents[0]
+
+
+# --- lanes ------------------------------------------------------------------------------------------------------------
+def test_a_lane_is_the_same_among_one_and_among_eight():
+    for lane in (0, 5):
+        alone, _ = run(env(1), 60, reset_seed=3 + lane)
+        among, _ = run(env(8), 60)
+        assert np.array_equal(alone[:, 0], among[:, lane])
+
+
+def test_threads_change_nothing():
+    assert np.array_equal(run(GainScheduling(4, num_threads=1), 30)[0], run(GainScheduling(4, num_threads=2), 30)[0])
+
+
+def test_an_episode_begins_anew_while_others_go_on():
+    """Lane 1 begins anew in the middle; what lane 0 sees does not change, and lane 1's is that of its seed."""
+    whole, _ = run(env(2), 40)
+    environment = env(2)
+    rng = np.random.default_rng(0)
+    seen = [environment.reset(seed=3)[0]]
+    for k in range(40):
+        if k == 20:
+            again, _ = environment.reset(seed=[None, 4], options={"reset_mask": np.array([False, True])})
+            assert np.array_equal(again[1], seen[0][1])
+        seen.append(environment.step(np.tile(rng.uniform(-1.0, 1.0, 3), (2, 1)))[0])
+    assert np.array_equal(np.array(seen)[:, 0], whole[:, 0])
+
+
+def test_a_tripped_drive_ends_its_lane_alone():
+    environment = env(3, load="inertia", distributions=NOMINAL, autoreset_mode="Disabled")
+    environment.reset(seed=0)
+    environment.drives.write(0x6065, 1, where=np.array([False, True, False]))  # following error window
+    found = []
+    for _ in range(60):
+        _, reward, terminated, truncated, info = environment.step(np.zeros((3, 3)))
+        found.append(terminated)
+        if terminated.any():
+            break
+    assert found[-1].tolist() == [False, True, False]
+    assert info["fault"].tolist() == ["", "following_error", ""]
+    assert reward[1] < -15.0
+    assert not truncated.any()
+
+
+def test_a_machine_that_leaves_physics_ends_its_lane_and_leaves_the_others_as_they_are():
+    whole, _ = run(env(2, distributions=NOMINAL), 10)
+    environment = env(2, distributions=NOMINAL)
+    rng = np.random.default_rng(0)
+    environment.reset(seed=3)
+    for k in range(10):
+        if k == 5:
+            environment.drives.machine.load_torque = [0.0, 1e12]
+        seen, _, terminated, _, info = environment.step(np.tile(rng.uniform(-1.0, 1.0, 3), (2, 1)))
+        if k == 5:
+            assert terminated.tolist() == [False, True]
+            assert info["fault"].tolist() == ["", "diverged"]
+            environment.drives.machine.load_torque = 0.0
+        assert np.array_equal(seen[0], whole[k + 1][0])
+        assert environment.observation_space.contains(seen)
+
+
+def test_an_episode_ends_in_time_and_the_next_begins():
+    environment = env(2, duration=0.05, autoreset_mode="SameStep")
+    first, _ = environment.reset(seed=1)
+    ends = [environment.step(np.zeros((2, 3))) for _ in range(5)]
+    assert [bool(end[3].all()) for end in ends] == [False] * 4 + [True]
+    assert not any(end[2].any() for end in ends)
+    assert ends[-1][4]["final_obs"][0].shape == first[0].shape
+    assert not np.array_equal(ends[-1][0], np.stack(list(ends[-1][4]["final_obs"])))
+
+
+def test_latency_delays_gains_and_measurements():
+    """Three cycles late: of a step of 10 ms the new gains act in the last seven."""
+    slow = {"parameters": {"bus.action_latency": {"law": "choice", "values": [3]}}}
+    environment = env(1, distributions=slow)
+    environment.reset(seed=0)
+    written = []
+    write = environment.drives.write
+    environment.drives.write = lambda name, value, where=None: (
+        written.append((environment.drives._now, name, int(value[0]))), write(name, value, where))  # fmt: skip
+    start = environment.drives._now
+    environment.step(np.full((1, 3), 0.5))
+    acts = [now - start for now, name, value in written if name == POSITION_P and value != environment.base_gains[0, 4]]
+    assert acts == [3]
+
+
+# --- on a bus ---------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("mode", ["csp", "csv"])
+def test_over_a_bus_the_same_policy_sees_the_same(mode):
+    options = {"load": "inertia", "mode": mode, "base": "present", "payload": "none", "duration": 0.2}
+    inside = env(1, distributions=NOMINAL, **options)
+    want, rewards = run(inside, 20)
+    world = World(lockstep=True)
+    served = EmulatedDrives(load="inertia", num_threads=1)
+    served._noise_seeds[:] = inside.drives._noise_seeds  # the episode's, drawn from its seed
+    served.machine.reset()
+    world.add(served, [1])
+    bus = WorldBus(world)
+    with CanDrives(bus=bus, nodes=[1], pace="lockstep", safety=False) as drives:
+        found, same = run(GainScheduling(1, drives=drives, **options), 20)
+    bus.shutdown()
+    world.close()
+    assert np.array_equal(found, want)
+    assert np.array_equal(same, rewards)
+
+
+# --- configuration ----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "pp"}, "mode is one of 'csp', 'csv', not 'pp'"),
+        ({"excitation": "step"}, "excitation is one of 'moves', 'sine', not 'step'"),
+        ({"base": "best"}, "base is one of 'rule', 'present', not 'best'"),
+        ({"gains": ("torque_p",)}, "a gain is one of 'velocity_p', 'velocity_i', 'position_p', not 'torque_p'"),
+        ({"gains": ()}, "gains must be different ones of velocity_p"),
+        ({"payload": "load.weight"}, "payload is one of 'auto', 'none', 'load.mass', .*not 'load.weight'"),
+        ({"payload_low": 3.0, "payload_high": 1.0}, "in order, not 3 and 1"),
+        ({"step": 0.003}, r"step must be 0\.005\.\.\.0\.02 s in whole milliseconds, not 0\.003 s"),
+        ({"step": 0.0105}, "whole milliseconds"),
+        ({"weights": {"effort": 1.0}}, "a weight's name is one of 'tracking', 'smoothness', 'trip', not 'effort'"),
+        ({"stage": 1.5}, r"stage of the curriculum must lie in 0\.\.\.1"),
+        ({"duration": 0.001}, "at least one step"),
+        ({"load": "conveyor"}, "no load is named 'conveyor'; there are arm, "),
+        ({"motors": "x"}, "no option 'motors'; there are load, device, motor"),
+        ({"distributions": "belts"}, "no set of distributions is named 'belts'; there are arm"),
+    ],
+)
+def test_a_wrong_value_names_the_valid_ones(options, message):
+    with pytest.raises(ValueError, match=message):
+        env(1, **options)
+
+
+def test_a_file_configures(tmp_path):
+    path = tmp_path / "scheduling.toml"
+    path.write_text('load = "arm"\nmode = "csv"\ngains = ["velocity_p"]\n[weights]\ntrip = 5\n', encoding="utf-8")
+    config = GainScheduling(1, config=path, num_threads=1).config
+    assert (config.load, config.mode, config.gains) == ("arm", "csv", ("velocity_p",))
+    assert config.weights == {"tracking": 1.0, "smoothness": 0.3, "trip": 5}
+    assert isinstance(config, GainSchedulingConfig)
+
+
+def test_drives_that_do_not_fit_are_refused():
+    drives = EmulatedDrives(load="gantry", num_machines=2, num_threads=1)
+    with pytest.raises(ValueError, match="3 lanes of load 'gantry' with 2 axes each need 6 drives, not 4"):
+        GainScheduling(3, drives=drives, load="gantry")
+
+
+def test_who_looks_changes_nothing():
+    """A picture looks at every cycle of a step; what the agent sees is the same."""
+
+    class Look:
+        looks = 0
+
+        def begin(self, lanes):
+            self.looks = 0
+
+        def look(self):
+            self.looks += 1
+
+        def close(self):
+            pass
+
+    watched = env(2)
+    watched._pictures = Look()
+    assert np.array_equal(run(watched, 20)[0], run(env(2), 20)[0])
+    assert watched._pictures.looks == 20 * 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("load", sorted(LOADS))
+def test_random_agents_on_random_machines_stay_in_their_boxes(load):
+    environment = env(64, load=load, duration=1.0)
+    rng = np.random.default_rng(0)
+    environment.reset(seed=0)
+    for _ in range(150):
+        seen, reward, *_ = environment.step(rng.uniform(-1.0, 1.0, environment.action_space.shape))
+        assert environment.observation_space.contains(seen)
+        assert np.all(np.isfinite(reward))

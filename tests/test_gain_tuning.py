@@ -1,0 +1,388 @@
+"""GainTuning: an episode of commissioning, what it observes, and what it must not depend on."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from test_parity import served
+
+from drive_env import EmulatedDrives, Limits, motion
+from drive_env.envs import gain_trial
+from drive_env.envs.gain_trial import Trials, measured_cost, softness
+from drive_env.envs.gain_tuning import GainTuning
+from drive_env.envs.lanes import OneLane
+from drive_env.gains import GAIN_OBJECTS, Gains, rule_gains, small_time_constants
+from drive_env.positioning import plan_move, power_up, reach
+from mechanics.shaft import shaft_load
+
+LOADS = ("inertia", "two_mass", "three_mass", "belt", "ball_screw", "vertical_screw", "geared_joint", "arm", "fan",
+         "winder", "cart_pendulum", "gantry")  # fmt: skip
+P = Gains._fields.index("velocity_p")
+FEW = {"trials": 3, "num_threads": 1}
+
+
+def actions(env, steps, seed=0):
+    """Return the actions of a random agent, the same for lane k of any number of lanes."""
+    shape = env.single_action_space.shape
+    lanes = [np.random.default_rng((seed, lane)).uniform(-0.7, 0.7, (steps, *shape)) for lane in range(env.num_envs)]
+    return np.stack(lanes, axis=1).astype(np.float32)
+
+
+def episode(env, seed, lanes=None):
+    """Return observations and rewards of an episode, (steps, lanes, ...)."""
+    observation, _ = env.reset(seed=seed)
+    observations, rewards = [observation], []
+    for action in actions(env, env.config.trials) if lanes is None else lanes:
+        observation, reward, *_ = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+    return np.array(observations), np.array(rewards)
+
+
+@pytest.fixture(scope="module")
+def four():
+    env = GainTuning(4, **FEW)
+    yield env
+    env.close()
+
+
+# --- an episode -------------------------------------------------------------------------------------------------------
+def test_an_episode_starts_at_the_rule_and_ends_when_its_trials_are_used_up(four):
+    observation, info = four.reset(seed=1)
+    assert observation.shape == four.observation_space.shape
+    np.testing.assert_array_equal(observation[:, 4:10], 0.0)  # last and best gains over the rule's
+    assert observation[:, -1].tolist() == [1.0] * 4
+    np.testing.assert_array_equal(info["gains"][:, 0], four._rule)
+    for left in (2, 1, 0):
+        observation, _, terminated, truncated, _ = four.step(four.action_space.sample() * 0)
+        assert observation[:, -1] == pytest.approx([left / 3] * 4)
+        assert not terminated.any()
+        assert truncated.all() == (left == 0)
+
+
+def test_rewards_add_up_to_the_decrease_of_ln_hidden_j(four):
+    _, info = four.reset(seed=2)
+    begin, total = info["hidden"], np.zeros(4)
+    for action in actions(four, 3, seed=5):
+        _, reward, _, _, info = four.step(action)
+        total += info["reward_terms"]["tuning"]
+        np.testing.assert_allclose(reward, info["reward_terms"]["tuning"] - 0.05 * info["aborted"])
+    np.testing.assert_allclose(total, np.log(begin / info["hidden"]), atol=1e-12)
+
+
+def test_the_incumbent_never_gets_worse_by_measured_terms_and_changes_only_when_better(four):
+    _, info = four.reset(seed=3)
+    for action in actions(four, 3, seed=7):
+        before, measured = info["gains"], info["measured"]
+        _, _, _, _, info = four.step(action)
+        better = info["measured"] < measured
+        assert np.all(info["measured"] <= measured)
+        changed = (info["gains"] != before).any(axis=(1, 2))
+        np.testing.assert_array_equal(changed, better)
+        np.testing.assert_array_equal(info["reward_terms"]["tuning"][~better], 0.0)
+
+
+def test_an_action_is_a_change_of_the_logarithm_of_the_chosen_gains_from_the_incumbent():
+    env = GainTuning(1, gains=("velocity_p", "torque_p"), **FEW)
+    env.reset(seed=0)
+    rule = env._rule[0].copy()
+    env.step(np.array([[0.7, -0.7]], np.float32))
+    expected = rule.copy()
+    expected[P] = round(rule[P] * np.exp(np.float32(0.7)))
+    expected[0] = round(rule[0] * np.exp(np.float32(-0.7)))
+    assert env._last[0].tolist() == expected.tolist()
+    env.close()
+
+
+def test_what_shakes_is_stopped_costs_and_leaves_the_incumbent(four):
+    _, info = four.reset(seed=4)
+    start = info["gains"]
+    aborted = np.zeros(4, bool)
+    for _ in range(3):
+        before = four._best.copy()
+        observation, reward, _, _, info = four.step(np.full((4, 3), [0.7, 0.7, 0.7], np.float32))
+        lanes = info["aborted"] & (four._best == before).all(axis=1)
+        aborted |= lanes
+        assert np.all(reward[lanes] == -0.05)
+        assert four.observation_space.contains(observation)
+    assert aborted.any()
+    assert start.shape == (4, 1, 5)
+
+
+def test_an_ended_lane_begins_anew_in_the_next_step(four):
+    four.reset(seed=5)
+    for action in actions(four, 3):
+        _, _, _, truncated, _ = four.step(action)
+    assert truncated.all()
+    observation, reward, terminated, truncated, info = four.step(actions(four, 1)[0])
+    assert not truncated.any() and not terminated.any()
+    np.testing.assert_array_equal(reward, 0.0)
+    np.testing.assert_array_equal(observation[:, -1], 1.0)
+    np.testing.assert_array_equal(info["gains"][:, 0], four._rule)
+
+
+# --- what an episode depends on ---------------------------------------------------------------------------------------
+def test_the_same_episode_alone_among_others_and_with_two_threads():
+    together = GainTuning(10, **FEW)
+    observations, rewards = episode(together, 20)
+    again, rewards_again = episode(together, 20)
+    np.testing.assert_array_equal(observations, again)
+    np.testing.assert_array_equal(rewards, rewards_again)
+    acted = actions(together, 3)
+    together.close()
+    for lane in (0, 9):
+        alone = OneLane(GainTuning(1, autoreset_mode="Disabled", **FEW))
+        observation, _ = alone.reset(seed=20 + lane)
+        for step in range(3):
+            np.testing.assert_array_equal(observation, observations[step, lane])
+            observation, reward, *_ = alone.step(acted[step, lane])
+            assert reward == rewards[step, lane]
+        alone.close()
+    threads = GainTuning(10, trials=3, num_threads=2)
+    np.testing.assert_array_equal(episode(threads, 20)[0], observations)
+    threads.close()
+
+
+def test_another_lanes_reset_changes_nothing():
+    env = GainTuning(2, autoreset_mode="Disabled", **FEW)
+    acted = actions(env, 3)
+    undisturbed, _ = episode(env, 30, acted)
+    env.reset(seed=30)
+    env.step(acted[0])
+    env.reset(seed=[77, None], options={"reset_mask": np.array([True, False])})
+    for step in (1, 2):
+        observation, *_ = env.step(acted[step])
+        np.testing.assert_array_equal(observation[1], undisturbed[step + 1, 1])
+    env.close()
+
+
+def push(drives):
+    drives.machine.load_torque = np.array([1e12, 0.0])
+
+
+@pytest.mark.parametrize("what", ["action", "machine"])
+def test_a_lane_that_is_not_a_number_leaves_the_others_as_they_are(what):
+    env = GainTuning(2, **FEW)
+    acted = actions(env, 2)
+    undisturbed, _ = episode(env, 30, acted)
+    env.reset(seed=30)
+    for step, action in enumerate(acted, 1):
+        if what == "action":
+            action[0] = np.nan
+        else:
+            env._trials._look = lambda: push(env.drives)  # a trial begins with a reset
+        observation, reward, *_ = env.step(action)
+        np.testing.assert_array_equal(observation[1], undisturbed[step, 1])
+        assert env.observation_space.contains(observation)
+        assert np.isfinite(reward).all()
+    if what == "machine":
+        assert env.drives.machine.diverged.tolist() == [True, False]
+    env.close()
+
+
+def test_every_seed_is_another_machine(four):
+    _, one = four.reset(seed=8)
+    inertia = one["parameters"]["load.inertia"].copy()
+    _, other = four.reset(seed=9)
+    np.testing.assert_array_equal(inertia[1:], other["parameters"]["load.inertia"][:-1])  # seeds follow by one
+    assert len(np.unique(inertia)) == 4
+
+
+# --- the spaces -------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("load", ["two_mass", "gantry"])
+def test_gymnasiums_checker(load):
+    env = gymnasium.make("ServoDrive/GainTuning-v0", load=load, **FEW)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", category=UserWarning)
+        warnings.filterwarnings("ignore", message=".*(normalized|symmetric).*")
+        check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("load", LOADS)
+def test_a_random_agent_stays_in_the_spaces(load):
+    env = GainTuning(8, load=load, waveform=20, trials=4)
+    env.reset(seed=0)
+    for action in actions(env, 10):
+        observation, reward, *_ = env.step(action)
+        assert env.observation_space.contains(observation)
+        assert np.isfinite(reward).all()
+    env.close()
+
+
+def test_rows_of_the_docstring_are_those_of_the_space():
+    env = GainTuning(1, load="gantry", gains=("velocity_p", "position_p"), waveform=7, **FEW)
+    assert env.single_observation_space.shape == (2 * (4 + 2 * 2 + 2 * 16 + 7) + 1,)
+    assert env.single_action_space.shape == (4,)
+    env.close()
+
+
+def test_privileged_observation_is_the_true_machine():
+    env = GainTuning(2, privileged=True, **FEW)
+    observation, info = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    names = list(info["parameters"])
+    k = names.index("load.inertia")
+    default = env._defaults["load.inertia"]
+    np.testing.assert_allclose(
+        observation["privileged"][:, k], info["parameters"]["load.inertia"] / default - 1.0, rtol=1e-5
+    )
+    env.close()
+
+
+def test_what_is_hidden_cannot_be_observed(four):
+    # Hidden J and load steps change nothing of what is observed.
+    observed, _ = episode(four, 40)
+    score = four._hidden.score
+    four._hidden.score = lambda gains: score(gains)._replace(hidden=np.full(4, 3.0))
+    again, _ = episode(four, 40)
+    four._hidden.score = score
+    np.testing.assert_array_equal(observed, again)
+
+
+# --- identification and the trial ------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("load", "low", "high"), [
+    ("inertia", 0.8, 1.15), ("two_mass", 0.75, 1.2), ("vertical_screw", 0.75, 1.2),
+])  # fmt: skip
+def test_identified_inertia_is_that_of_the_machine(load, low, high):
+    with EmulatedDrives(load=load, num_machines=16, seed=3, randomise=["load"], num_threads=1) as drives:
+        power_up(drives)
+        t_0 = 4.0 * float(small_time_constants(drives.device, 400.0))
+        every = np.ones(16, bool)
+        found, _ = Trials(drives, drives.motor, 1, t_0).identify(np.tile(reach(load), 16), every)
+        true = np.concatenate([(shaft_load(g.load).inertia + g.load.armature).reshape(-1) for g in drives._groups])
+    ratio = found.inertia / true
+    assert low < ratio.min()
+    assert ratio.max() < high
+
+
+def test_a_trial_that_shakes_is_stopped_within_50_ms_and_the_drive_goes_on_with_the_incumbent():
+    with EmulatedDrives(load="two_mass", num_machines=2, num_threads=1) as drives:
+        power_up(drives)
+        rule = rule_gains(drives.device, drives.motor, np.full(2, 3 * drives.motor.inertia))
+        move = plan_move(drives.motor, np.full(2, 3 * drives.motor.inertia), 65536, [np.inf, np.inf])
+        wild = rule.copy()
+        wild[1, P] *= 20
+        looks = []
+        trials = Trials(drives, drives.motor, 1, 0.004, lambda: looks.append(int(drives.read((0x2042, 1))[1])))
+        tried = trials.run(wild, rule, move, np.zeros(2, np.int64), np.ones(2, np.int64), np.ones(2, bool))
+        assert tried.aborted[:, 0].tolist()[:2] == [False, False]
+        assert tried.aborted[:, 1].all()
+        assert looks[:1] == [wild[1, P]]
+        assert set(looks[2:]) == {rule[1, P]}  # two looks are 50 ms
+        assert [int(drives.read(name)[1]) for name in GAIN_OBJECTS] == rule[1].tolist()
+        assert np.all(drives.read(0x6041) & 0x6F == 0x27)
+        assert abs(int(drives.read(0x6064)[1]) - move.distance[1]) < 0.05 * move.distance[1]
+
+
+def test_a_drive_that_trips_is_cleared_and_goes_on():
+    with EmulatedDrives(load="inertia", num_threads=1) as drives:
+        power_up(drives)
+        motor = drives.motor
+        rule = rule_gains(drives.device, motor, [3 * motor.inertia])
+        move = plan_move(motor, [3 * motor.inertia], 65536, [np.inf])
+        window = int(drives.read(0x6065)[0])
+        drives.write(0x6065, 200)  # the lag of the profile is more
+        calls = []
+
+        def look():
+            calls.append(int(drives.read(0x6041)[0]) & 0x4F)
+            if len(calls) == 3:
+                drives.write(0x6065, window)
+
+        one = np.ones(1, np.int64)
+        tried = Trials(drives, motor, 1, 0.004, look).run(rule, rule, move, 0 * one, one, np.ones(1, bool))
+        assert 0x08 in calls  # fault
+        assert tried.aborted.all()
+        assert calls[-1] == 0x07  # operation enabled: bits 0 to 2
+        assert next(m.name for m in drives.emergencies()) == "following_error"
+
+
+def test_softness_is_inverse_to_every_gain_of_the_cascade():
+    gains = np.array([[1, 1, 100, 200, 300], [9, 9, 200, 200, 300], [1, 1, 100, 400, 600]])
+    assert softness(gains) * 6e6 == pytest.approx([1.0, 0.5, 0.25])
+
+
+def test_measured_cost_is_half_the_mean_of_the_moves_and_half_the_worst_phase():
+    assert measured_cost(np.array([[1.0], [3.0], [30.0]])) == pytest.approx([16.0])
+
+
+# --- given drives -----------------------------------------------------------------------------------------------------
+def test_given_drives_are_taken_as_they_are_and_rewarded_by_measured_terms():
+    with EmulatedDrives(num_machines=2, num_threads=1) as drives:
+        drives.advance(0.005)
+        env = GainTuning(2, drives=drives, **FEW)
+        _, info = env.reset(seed=0)
+        assert "hidden" not in info and "parameters" not in info
+        # They were off: the first move found them enabled, and knows what they turn.
+        np.testing.assert_allclose(env._identified.inertia, 3.08 * drives.motor.inertia, rtol=0.1)
+        begin, total = info["measured"], np.zeros(2)
+        positions = []
+        for action in actions(env, 3):
+            _, _, _, _, info = env.step(action)
+            total += info["reward_terms"]["tuning"]
+            positions.append(drives.read(0x6064))
+        np.testing.assert_allclose(total, np.log(begin / info["measured"]), atol=1e-12)
+        # The rule's trial ended at the move's end; from there back, and there again: no way is gone for nothing.
+        near = np.abs(np.array(positions) / env._move.distance - [[0.0], [1.0], [0.0]])
+        assert near.max() < 0.1
+        env.close()
+        drives.advance(0.001)  # still open
+
+
+def test_given_drives_of_two_kinds_say_the_same_as_long_as_they_are_the_same():
+    observations = []
+    for _ in range(2):
+        with EmulatedDrives(num_machines=2, num_threads=1, seed=5) as drives:
+            env = GainTuning(2, drives=drives, **FEW)
+            observations.append(episode(env, 0)[0])
+    np.testing.assert_array_equal(*observations)
+
+
+# The envelope would stop the whole bus where the trial's own watch stops a lane.
+@pytest.mark.parametrize("safety", [False, Limits(oscillation=False)], ids=["no envelope", "envelope"])
+def test_over_can_in_lockstep_the_observations_are_the_same(safety):
+    inside, outside = (
+        EmulatedDrives(load="two_mass", num_machines=2, num_threads=1, seed=5),
+        served("calls", nodes=(1, 2), safety=safety, load="two_mass", num_machines=2, seed=5),
+    )
+    found = []
+    with inside as drives, outside as bus:
+        for each in (drives, bus):
+            env = GainTuning(2, drives=each, **FEW)
+            found.append(episode(env, 0))
+            env.close()
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+
+
+# --- a wrong configuration --------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("options", "says"), [
+    ({"gains": ("velocity_d",)}, "torque_p.*velocity_p.*position_p"),
+    ({"gains": ()}, "different ones of torque_p"),
+    ({"load": "three_masses"}, "two_mass"),
+    ({"motor": "qbl"}, "qbl4208"),
+    ({"trials": 0}, "1 or more"),
+    ({"stage": 2.0}, "0...1"),
+    ({"waveform": 251}, "0...250"),
+    ({"reward": 1}, "no option 'reward'.*gains"),
+    ({"travel": 0.0}, "not 0"),
+])  # fmt: skip
+def test_a_wrong_value_names_the_valid_ones(options, says):
+    with pytest.raises(ValueError, match=says):
+        GainTuning(1, **options)
+
+
+def test_given_drives_have_no_machine_to_draw():
+    with EmulatedDrives() as drives, pytest.raises(ValueError, match="leave distributions and privileged out"):
+        GainTuning(1, drives=drives, privileged=True)
+
+
+def test_the_watch_is_half_of_what_it_promises():
+    assert 2 * gain_trial.WATCH <= 50
+    assert motion.OPERATION_ENABLED == (0x6F, 0x27)

@@ -1,0 +1,229 @@
+"""Replay: an emulated machine plays the real one; what is told of the difference, and what the fit finds, is known."""
+
+import numpy as np
+import pytest
+
+from drive_env import EmulatedDrives, motion
+from drive_env.dictionary.entries import Entry
+from drive_env.envs.randomisation import Distributions
+from drive_env.replay import Log, command_of, compare, fit, read_log, replay
+from drive_env.tools.scope import _write_csv
+
+TURN = 65536  # increments
+TRUTH = {"load.inertia": 2.4e-5, "load.coulomb": 4e-3}
+DEMAND, POSITION, VELOCITY, CURRENT = (0x6062, 0), (0x6064, 0), (0x606C, 0), (0x6077, 0)
+TARGET, SPEED, TORQUE = (0x607A, 0), (0x60FF, 0), (0x6071, 0)
+
+
+def machines(count=1, seed=5, load="two_mass", **options):
+    return EmulatedDrives(load=load, num_machines=count, seed=seed, num_threads=1, **options)
+
+
+def recorded(objects, mode, play, load="two_mass", parameters=TRUTH, period=0.001):
+    """A log of the real machine, whose noise is another."""
+    real = machines(seed=77, load=load, parameters=parameters)
+    motion.enable(real, mode)
+    trace = real.record(objects, len(next(iter(play.values()))) * 0.001, play=play, period=period)
+    return Log(trace.t, {name: trace[name] for name in objects})
+
+
+def a_move(seconds=0.4):
+    t = np.arange(round(seconds * 1000)) * 1e-3
+    return np.rint(TURN * (1.0 - np.cos(2.0 * np.pi * 5.0 * t))).astype(int)
+
+
+@pytest.fixture(scope="module")
+def log():
+    return recorded([DEMAND, POSITION, VELOCITY, CURRENT], "csp", {TARGET: a_move()})
+
+
+# --- how far ----------------------------------------------------------------------------------------------------------
+def test_the_same_machine_differs_by_its_noise_alone(log):
+    report = compare(log, replay(machines(parameters=TRUTH), log))
+    assert set(report) == {POSITION, VELOCITY, CURRENT}
+    for name, limit in ((POSITION, 2e-4), (VELOCITY, 3e-3), (CURRENT, 1e-2)):
+        assert report[name].nrmse[0] < limit
+        assert report[name].shift[0] == pytest.approx(0.0, abs=3e-4)
+
+
+def test_another_machine_differs_most_in_what_moves_it(log):
+    report = compare(log, replay(machines(), log))
+    assert report[CURRENT].nrmse[0] > 0.1
+    assert report[CURRENT].nrmse[0] > 3.0 * report[POSITION].nrmse[0]
+
+
+def test_nrmse_is_the_rms_over_the_range_of_the_log():
+    t = np.arange(100) * 1e-3
+    want = Log(t, {POSITION: np.arange(100)[:, None] * 10})
+    report = compare(want, {POSITION: np.arange(100)[:, None] * 10 + 99}, 1)[POSITION]
+    assert report.nrmse[0] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("late", [-7, 0, 4])
+def test_a_response_that_is_late_is_told_by_how_much(late):
+    t = np.arange(300) * 1e-3
+    wave = [1000.0 * np.sin(40.0 * (t - shift)) for shift in (0.0, late * 1e-3)]
+    raw = [np.rint(values).astype(np.int64)[:, None] for values in wave]
+    report = compare(Log(t, {VELOCITY: raw[0]}), {VELOCITY: raw[1]})[VELOCITY]
+    assert report.shift[0] == pytest.approx(late * 1e-3, abs=1e-4)
+    assert report.shifted[0] < 1e-3
+    assert report.nrmse[0] == pytest.approx(0.0, abs=1e-9) if late == 0 else report.nrmse[0] > 0.05
+
+
+def test_every_machine_is_told_of_apart_and_of_axes_the_worst(log):
+    drives = machines(3)
+    drives.machine.set_all({name: np.array([1e-5, value, 1e-4]) for name, value in TRUTH.items() if "inertia" in name})
+    drives.machine.set("load.coulomb", TRUTH["load.coulomb"])
+    found = compare(log, replay(drives, log), 3)[CURRENT].nrmse
+    assert found.argmin() == 1
+    two = Log(np.arange(50) * 1e-3, {POSITION: np.tile(np.arange(50)[:, None], (1, 2))})
+    off = two.objects[POSITION] + np.array([0, 7])
+    assert compare(two, {POSITION: off})[POSITION].nrmse[0] == pytest.approx(7 / 49)
+
+
+@pytest.mark.parametrize(
+    ("mode", "target", "rows"),
+    [
+        ("csp", TARGET, a_move()),
+        ("csv", SPEED, np.rint(500_000 * np.sin(np.arange(400) * 0.03)).astype(int)),
+        ("cst", TORQUE, np.rint(400 * np.sin(np.arange(400) * 0.05)).astype(int)),
+    ],
+)
+def test_what_was_played_in_a_cyclic_mode_is_played_again(mode, target, rows):
+    told = recorded([target, POSITION, VELOCITY, CURRENT], mode, {target: rows})
+    assert command_of(told)[0] == target
+    report = compare(told, replay(machines(parameters=TRUTH), told))
+    # A current alone leaves what friction and noise do to the speed where it is.
+    assert report[VELOCITY].nrmse[0] < (0.05 if mode == "cst" else 0.02)
+
+
+def test_the_settings_of_the_real_drive_count(log):
+    stiff = {(0x2043, 1): 250, (0x2042, 1): 900}
+    real = machines(seed=77, parameters=TRUTH)
+    for name, value in stiff.items():
+        real.write(name, value)
+    motion.enable(real, "csp")
+    trace = real.record([TARGET, POSITION], 0.4, play={TARGET: a_move()})
+    told = Log(trace.t, {name: trace[name] for name in (TARGET, POSITION)})
+    drives = machines(parameters=TRUTH)
+    without, settled = (compare(told, replay(drives, told, s))[POSITION].nrmse[0] for s in (None, stiff))
+    assert settled < 1e-3
+    assert without > 0.02
+
+
+def test_a_log_that_begins_elsewhere_and_skips_cycles_is_played_from_there(log):
+    every = {name: values[::2] + (123_456 if name in (DEMAND, POSITION) else 0) for name, values in log.objects.items()}
+    thin = Log(log.t[::2], every)
+    found = replay(machines(parameters=TRUTH), thin)
+    assert found[POSITION][0, 0] == pytest.approx(123_456, abs=20)
+    assert compare(thin, found)[POSITION].nrmse[0] < 5e-3
+
+
+# --- the fit ----------------------------------------------------------------------------------------------------------
+def test_the_fit_finds_the_machine(log):
+    drives = machines(64)
+    before = drives.machine.parameters
+    found = fit(drives, log, "two_mass", ["load.inertia", "load.coulomb"])
+    assert found.distance[0] < 0.1 * found.nominal
+    for name, value in TRUTH.items():
+        assert found.accepted[name].min() < value < found.accepted[name].max(), name
+        assert found.accepted[name][0] == pytest.approx(value, rel=0.15)
+        assert found.narrowed[name] < 0.5
+    assert np.all(np.diff(found.distance) >= 0.0)
+    assert found.distance[-1] <= 1.2 * found.distance[0]
+    # The drives are as they were.
+    assert all(np.array_equal(values, before[name]) for name, values in drives.machine.parameters.items())
+
+
+def test_the_fitted_set_draws_machines_like_the_real_one(log, tmp_path):
+    found = fit(machines(32), log, "two_mass", list(TRUTH), rounds=5)
+    path = tmp_path / "fitted.toml"
+    path.write_text(found.to_toml(), encoding="utf-8")
+    laws = Distributions.load(path)
+    assert laws.laws == found.distributions.laws
+    assert laws.laws["motor.R_s"] == Distributions.load("two_mass").laws["motor.R_s"]
+    defaults = {name: float(values[0]) for name, values in machines().machine.parameters.items()}
+    draws = [laws.draw(np.random.default_rng(k), defaults) for k in range(50)]
+    for name in TRUTH:
+        values = [draw[name] for draw in draws]
+        assert min(values) >= found.accepted[name].min()
+        assert max(values) <= found.accepted[name].max()
+
+
+def test_a_parameter_that_the_log_does_not_show_keeps_its_law(log):
+    found = fit(machines(64), log, "two_mass", ["load.inertia", "motor.thermal_resistance"], slack=1.5)
+    assert found.narrowed["motor.thermal_resistance"] > 0.5
+    text = found.to_toml()
+    if found.narrowed["motor.thermal_resistance"] >= 0.8:
+        prior = Distributions.load("two_mass").laws["motor.thermal_resistance"]
+        assert found.distributions.laws["motor.thermal_resistance"] == prior
+        assert "motor.thermal_resistance: " in text
+        assert "says next to nothing" in text
+
+
+def test_the_same_seed_finds_the_same(log):
+    first, second = (fit(machines(16), log, "two_mass", ["load.inertia"], rounds=2, seed=3) for _ in range(2))
+    assert np.array_equal(first.distance, second.distance)
+
+
+# --- the file ---------------------------------------------------------------------------------------------------------
+def written(path, log, labels=("node 1",)):
+    known = EmulatedDrives(load="inertia", num_threads=1).device.new_dictionary()
+    entries = [known.find(name) for name in log.objects]
+    assert all(isinstance(entry, Entry) for entry in entries)
+    rows = {entry: log.objects[name] for entry, name in zip(entries, log.objects, strict=True)}
+    _write_csv(path, entries, list(labels), log.t, rows)
+
+
+def test_what_scope_writes_is_read_back(log, tmp_path):
+    written(tmp_path / "scope.csv", log)
+    again = read_log(tmp_path / "scope.csv")
+    assert again.t == pytest.approx(log.t)
+    assert set(again.objects) == set(log.objects)
+    assert all(np.array_equal(again.objects[name], values) for name, values in log.objects.items())
+
+
+def test_several_axes_are_read_back(tmp_path):
+    log = Log(np.arange(20) * 2e-3 - 0.01, {POSITION: np.arange(40).reshape(20, 2), VELOCITY: np.ones((20, 2), int)})
+    written(tmp_path / "two.csv", log, ("node 1", "node 2 axis 1"))
+    again = read_log(tmp_path / "two.csv")
+    assert (again.num_axes, again.every) == (2, 2)
+    assert np.array_equal(again.objects[POSITION], log.objects[POSITION])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "first line must begin with 't"),
+        ("time,6064h:00 P\n", "first line must begin with 't"),
+        ("t [s],position\n", r"column 'position' names no object; it must begin as '6064h:00 '"),
+        ("t [s],6064h:00 P\n" + "".join(f"{k}e-3,{k}.5\n" for k in range(12)), "needs a time and 1 whole numbers"),
+        ("t [s],6064h:00 P\n0,1\n", "at least 10 lines of 2 values"),
+        ("t [s],6064h:00 P\n" + "".join(f"{k * k}e-3,1\n" for k in range(12)), "must increase by the same"),
+        ("t [s],6064h:00 P (node 1),6064h:00 P (node 2),606Ch:00 V (node 1)\n"
+         + "".join(f"{k}e-3,1,1,1\n" for k in range(12)), "for the same axes"),
+    ],
+)  # fmt: skip
+def test_a_file_that_is_no_log_is_told_why(tmp_path, text, message):
+    path = tmp_path / "log.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        read_log(path)
+
+
+def test_logs_that_cannot_be_replayed_are_refused(log):
+    with pytest.raises(ValueError, match=r"holds no command .* record one of 6062h, 607Ah, 60FFh, 6071h"):
+        command_of(Log(log.t, {POSITION: log.objects[POSITION]}))
+    jump = np.where(np.arange(len(log.t)) < 50, 0, 5 * TURN)[:, None]
+    with pytest.raises(ValueError, match="no command that changes step by step"):
+        command_of(Log(log.t, {TARGET: jump, POSITION: log.objects[POSITION]}))
+    with pytest.raises(ValueError, match="begins in the middle of a move"):
+        command_of(Log(log.t[100:], {name: values[100:] for name, values in log.objects.items()}))
+    with pytest.raises(ValueError, match="of 1 axes, a machine of load 'gantry' has 2"):
+        replay(machines(load="gantry"), log)
+    with pytest.raises(ValueError, match=r"'load.weight' cannot be fitted; there are motor.R_s"):
+        fit(machines(16), log, "two_mass", ["load.weight"])
+    with pytest.raises(ValueError, match="at least 16 machines and one parameter, not 4 and 1"):
+        fit(machines(4), log, "two_mass", ["load.inertia"])
+    with pytest.raises(ValueError, match=r"there is no log nowhere\.csv"):
+        read_log("nowhere.csv")

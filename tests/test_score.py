@@ -1,0 +1,297 @@
+"""J and hidden J, against numbers worked out by hand, and what they must say of gains and machines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drive_env import EmulatedDrives
+from drive_env.devices import find_device
+from drive_env.gains import (
+    FITTED_RULE,
+    Gains,
+    bandwidths_from_gains,
+    gains_from_bandwidths,
+    rule_gains,
+    small_time_constants,
+)
+from drive_env.motors import MOTORS
+from drive_env.positioning import PROFILE, SETTLED, TRIAL, Move, move_terms, plan_move, reach, wrapped
+from drive_env.score import VARIANTS, HiddenScore, Terms, cost, hidden_cost
+from tuning import fit_rule
+
+DEVICE, MOTOR = find_device("tmcm1636"), MOTORS["qbl4208"]
+P = Gains._fields.index("velocity_p")
+
+
+def terms(settling=1.0, disturbance=1.0, noise=0.0, overshoot=0.0, tripped=False):
+    return Terms(*(np.array(value) for value in (settling, disturbance, noise, overshoot, tripped)))
+
+
+# --- J ----------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("given", "J"), [
+    (terms(), 1.0),
+    (terms(settling=32.0), 4.0),                    # 32^0.4
+    (terms(disturbance=32.0), 4.0),
+    (terms(noise=0.03), 2.0**0.2),
+    (terms(noise=0.03 * 31.0**0.5), 2.0),           # (1 + 31)^0.2
+    (terms(overshoot=0.02), 1.0),                   # 2 % are free
+    (terms(overshoot=0.12), 2.0),                   # 10 % more double J
+    (terms(32.0, 32.0, 0.03 * 31.0**0.5, 0.12), 30.0),  # 64, cut off: nothing is worse than a trip
+    (terms(tripped=True), 30.0),
+    (terms(settling=np.nan), 30.0),                 # it left physics
+    (terms(disturbance=np.inf), 30.0),
+])  # fmt: skip
+def test_cost(given, J):
+    assert cost(given) == pytest.approx(J)
+
+
+@pytest.mark.parametrize(("j", "hidden"), [
+    ([2.0, 1.0, 1.0, 1.0, 1.0], 2.0),    # nothing is worse than the nominal machine
+    ([2.0, 3.0, 6.0, 1.0, 1.0], 4.0),
+    ([2.0, 2.0, 2.0, 2.0, 30.0], 16.0),  # the probe trips
+])  # fmt: skip
+def test_hidden_cost_is_half_nominal_and_half_the_worst(j, hidden):
+    assert hidden_cost(np.array([j])) == pytest.approx([hidden])
+
+
+def test_variants_are_those_of_the_score():
+    rows = {variant.name: variant[1:] for variant in VARIANTS}
+    assert rows == {
+        "nominal": (1.0, 1.0, 1.0),
+        "load inertia x 1.3": (1.3, 1.0, 1.0),
+        "load inertia x 0.7": (0.7, 1.0, 1.0),
+        "stiffness x 0.8": (1.0, 0.8, 1.0),
+        "velocity P x 1.5": (1.0, 1.0, 1.5),
+    }
+
+
+# --- the terms of a move ----------------------------------------------------------------------------------------------
+MOVE = Move(np.array([10_000]), np.array([1]), np.array([1]), np.array([65536 / (2 * np.pi)]), 4096 / (2 * np.pi))
+
+
+def recorded(error_at, current=0.0):
+    """Return the position of an axis that lags its target by error_at(ms) increments, and its current."""
+    ms = np.arange(TRIAL)
+    position = (10_000 - error_at(ms)).astype(float)[:, None]
+    return position, np.broadcast_to(np.asarray(current, float), (TRIAL,))[:, None].copy()
+
+
+def of_move(position, current, sign=1, t_0=0.004):
+    found = move_terms(position, current, MOVE, t_0, 3.5, np.array([10_000 * sign]), np.array([sign]))
+    return [float(value[0]) for value in found]
+
+
+def test_an_axis_that_is_there_at_the_profiles_end_has_t_s_of_t_0_alone():
+    position, current = recorded(lambda ms: np.where(ms < PROFILE, 5000, 0))
+    assert of_move(position, current) == [1.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("error", "ms_counted"), [
+    (100, 20.0),   # 1 % of the move: each millisecond counts in full
+    (5000, 20.0),  # and so it does however far off
+    (50, 10.0),    # half the band, half the time
+])  # fmt: skip
+def test_settling_adds_the_time_out_of_the_band_after_the_profile(error, ms_counted):
+    position, current = recorded(lambda ms: np.where((ms >= PROFILE) & (ms < PROFILE + 20), error, 0))
+    settling, _, _ = of_move(position, current)
+    assert settling == pytest.approx(1.0 + ms_counted / 4.0)
+
+
+def test_the_band_is_no_finer_than_three_counts_of_the_encoder():
+    # 4096 counts: one is 16 increments, three are 48.
+    short = MOVE._replace(distance=np.array([100]))
+    position = np.where(np.arange(TRIAL) < PROFILE, 0.0, 76.0)[:, None]  # 24 short of 100: half of 48
+    settling, _, _ = move_terms(position, np.zeros((TRIAL, 1)), short, 0.09, 3.5, np.array([100]), np.array([1]))
+    assert settling[0] == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_overshoot_is_beyond_the_target_in_either_direction(sign):
+    position, current = recorded(lambda ms: np.where(ms == 70, -500, 0))
+    assert of_move(sign * position, current, sign)[2] == pytest.approx(0.05)
+
+
+def test_what_the_load_step_does_is_not_the_moves():
+    position, current = recorded(
+        lambda ms: np.where(ms >= SETTLED, -5000, 0), np.where(np.arange(TRIAL) > SETTLED, 9, 0)
+    )
+    assert of_move(position, current) == [1.0, 0.0, 0.0]
+
+
+def test_noise_is_the_rms_increment_at_rest_over_the_rated_current():
+    position, _ = recorded(lambda ms: 0 * ms)
+    current = np.where(np.arange(TRIAL) % 2, 0.35, -0.35)[:, None]  # changes by 0.7 A of 3.5 A each millisecond
+    current[: (PROFILE + SETTLED) // 2] *= 10.0  # the move itself does not count
+    assert of_move(position, current)[1] == pytest.approx(0.2)
+
+
+def test_positions_wrap_at_2_31():
+    assert wrapped(np.array([2**31 + 5 - 2**32, -(2**31) - 5 + 2**32, 7])).tolist() == [-(2**31) + 5, 2**31 - 5, 7]
+
+
+# --- the move ---------------------------------------------------------------------------------------------------------
+def test_a_move_takes_60_ms_and_0_4_of_the_rated_torque():
+    J = 3 * MOTOR.inertia
+    move = plan_move(MOTOR, [J], 65536, [np.inf])
+    a = 0.4 * MOTOR.rated_torque / J
+    assert move.acceleration[0] == pytest.approx(a * 65536 / (2 * np.pi), rel=1e-3)
+    assert 2 * np.sqrt(move.distance[0] / move.acceleration[0]) == pytest.approx(0.060, rel=1e-4)
+    assert 2 * np.sqrt(move.distance[0] / move.acceleration[0]) <= 0.060
+    assert move.velocity[0] >= np.sqrt(move.distance[0] * move.acceleration[0])
+
+
+@pytest.mark.parametrize(("inertia", "reach", "turns"), [
+    (3.0, 1.0, 0.4 / (2 * np.pi)),       # 40 % of what there is
+    (3.0, -1.0, -0.4 / (2 * np.pi)),
+    (0.1, np.inf, 0.5 * MOTOR.rated_speed * 0.03 / (2 * np.pi)),  # half the rated speed
+])  # fmt: skip
+def test_a_move_ends_before_travel_or_speed_do(inertia, reach, turns):
+    move = plan_move(MOTOR, [inertia * MOTOR.inertia], 65536, [reach])
+    assert move.distance[0] / 65536 == pytest.approx(turns, rel=1e-3)
+
+
+def test_reach_is_the_longer_way():
+    assert np.isinf(reach("two_mass")).all()
+    assert np.isfinite(reach("belt")).all()
+    assert reach("robot").shape == (6,)
+
+
+# --- the fitted rule --------------------------------------------------------------------------------------------------
+def test_small_time_constants_of_the_device():
+    # 1/(2 pi 1000 Hz) + 1.5 of 40 us + 1.4/(2 pi 400 Hz) + 200 us
+    assert small_time_constants(DEVICE, 400.0) == pytest.approx(159.2e-6 + 60e-6 + 557.0e-6 + 200e-6, rel=1e-3)
+
+
+def test_the_rule_is_its_formula_in_bandwidths():
+    rule = FITTED_RULE._replace(inertia=0.5, speed=0.2, integration=5.0, position=0.25)
+    J = np.array([3.0, 12.0]) * MOTOR.inertia
+    gains = rule_gains(DEVICE, MOTOR, J, rule)
+    for k, share in ((0, 1.0), (1, 0.5)):  # four times the inertia, half the speed
+        w_v = share * 0.2 / float(small_time_constants(DEVICE, 400.0))
+        exact = gains_from_bandwidths(
+            DEVICE, MOTOR, J[k], current_hz=1000.0, velocity_hz=w_v / 2 / np.pi, position_hz=0.25 * w_v / 2 / np.pi
+        )
+        assert np.abs(gains[k] - np.array(exact)).max() <= 1
+
+
+def test_the_rule_stays_within_the_registers():
+    gains = rule_gains(DEVICE, MOTOR, [1e-12, 1e3])
+    assert gains.min() >= 1
+    assert gains.max() <= 32767
+
+
+def test_more_inertia_makes_the_fitted_rule_slower():
+    J = np.array([2.0, 10.0]) * MOTOR.inertia
+    slow, fast = (bandwidths_from_gains(DEVICE, MOTOR, j, Gains(*map(int, row))).velocity_hz
+                  for j, row in zip(J[::-1], rule_gains(DEVICE, MOTOR, J)[::-1], strict=True))  # fmt: skip
+    assert slow < fast
+
+
+def test_a_fit_never_ends_worse_than_the_rule_in_force(monkeypatch):
+    monkeypatch.setattr(fit_rule, "SETS", 4)
+    monkeypatch.setattr(fit_rule, "LOCAL", 2)
+    bench = fit_rule.Bench("two_mass", "qbl4208", 2, 0, num_threads=1)
+    found = fit_rule.fit([bench])
+    bench.hidden.close()
+    assert len(found) == 4
+    assert FITTED_RULE in dict(found)
+    assert [one.score for one in found] == sorted(one.score for one in found)
+    for rule, _ in found:
+        for name, (low, high) in fit_rule.RANGES.items():
+            assert low <= getattr(rule, name) <= high
+
+
+# --- hidden J of machines ---------------------------------------------------------------------------------------------
+def bench(load, machines, **parameters):
+    score = HiddenScore("tmcm1636", load, "qbl4208", machines, num_threads=1)
+    with EmulatedDrives(load=load, num_machines=machines, num_threads=1, parameters=parameters) as drives:
+        axes = drives.load.num_axes
+        score.set_machines(drives.machine.parameters, drives.machine.supply.reshape(machines, axes)[:, 0])
+        score.set_moves(
+            plan_move(MOTOR, np.full(drives.num_axes, 3 * MOTOR.inertia), 65536, np.tile(reach(load), machines))
+        )
+    return score
+
+
+@pytest.fixture(scope="module")
+def two_mass():
+    score = bench("two_mass", 4)
+    yield score
+    score.close()
+
+
+RULE = rule_gains(DEVICE, MOTOR, [3 * MOTOR.inertia])
+
+
+def times(factor, machines=4):
+    gains = np.repeat(RULE, machines, axis=0)
+    gains[:, P] = np.rint(gains[:, P] * factor)
+    return gains
+
+
+def test_a_load_has_the_variants_that_it_can_have():
+    names = {}
+    for load in ("inertia", "two_mass", "ball_screw"):
+        score = HiddenScore("tmcm1636", load, "qbl4208", 1, num_threads=1)
+        names[load] = [variant.name for variant in score.variants]
+        score.close()
+    assert "stiffness x 0.8" not in names["inertia"]  # nothing is elastic
+    assert names["two_mass"] == names["ball_screw"] == [variant.name for variant in VARIANTS]
+
+
+def test_the_rules_disturbance_is_the_scale(two_mass):
+    assert two_mass.set_reference(times(1.0)).terms.disturbance[:, 0] == pytest.approx(1.0)
+
+
+def test_variants_are_parallel_machines_with_their_parameters(two_mass):
+    stiffness = two_mass._drives.machine.parameters["load.stiffness"].reshape(4, 5)
+    inertia = two_mass._drives.machine.parameters["load.inertia"].reshape(4, 5)
+    assert stiffness[0] / stiffness[0, 0] == pytest.approx([1, 1, 1, 0.8, 1])
+    assert inertia[0] / inertia[0, 0] == pytest.approx([1, 1.3, 0.7, 1, 1])
+
+
+def test_a_score_depends_on_machine_and_gains_alone(two_mass):
+    two_mass.set_reference(times(1.0))
+    first = two_mass.score(times(1.0))
+    two_mass.score(times(6.0))
+    again = two_mass.score(times(1.0))
+    for a, b in zip(first.terms, again.terms, strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(first.hidden, again.hidden)
+    assert np.ptp(first.hidden) == 0.0  # four equal machines
+
+
+def test_the_probe_is_the_machine_with_velocity_p_times_1_5(two_mass):
+    two_mass.set_reference(times(1.0))
+    probe = two_mass.score(times(1.0)).j[0, -1]
+    gains = times(1.0)
+    gains[:, P] = np.rint(gains[:, P] * 1.5)
+    assert two_mass.score(gains).j[0, 0] == pytest.approx(probe)
+
+
+def test_too_much_and_too_little_gain_are_worse(two_mass):
+    two_mass.set_reference(times(1.0))
+    slow, right, shaking = (float(two_mass.score(times(f)).hidden[0]) for f in (0.2, 1.0, 8.0))
+    assert slow > 1.3 * right
+    assert shaking > 3.0 * right
+
+
+def test_a_machine_that_cannot_be_enabled_scores_30():
+    score = bench("two_mass", 2)
+    with EmulatedDrives(num_machines=2, num_threads=1) as drives:
+        score.set_machines(drives.machine.parameters, np.array([24.0, 5.0]))  # under-voltage
+    hidden = score.score(times(1.0, 2)).hidden
+    score.close()
+    assert hidden[1] == 30.0
+    assert hidden[0] < 10.0
+
+
+def test_a_machine_is_as_good_as_its_worst_axis():
+    score = bench("gantry", 1)
+    gains = np.repeat(RULE, 2, axis=0)
+    score.set_reference(gains)
+    equal = float(score.score(gains).hidden[0])
+    gains[1, P] *= 20
+    assert float(score.score(gains).hidden[0]) > 2.0 * equal
+    score.close()

@@ -1,0 +1,448 @@
+"""ServoDrive/Tracking-v0: the agent as outer controller, in many lanes, alone, and over CAN."""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import contextmanager
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from test_parity import WorldBus
+
+from drive_env import CanDrives, EmulatedDrives
+from drive_env.bus.world import World
+from drive_env.envs import tracking_cycle as cycle
+from drive_env.envs.tracking import OBJECTS, TASKS, Tracking, TrackingConfig
+from drive_env.envs.trajectories import TRAJECTORIES, draw
+
+NAME = "ServoDrive/Tracking-v0"
+LOADS = tuple(TASKS)
+
+
+@contextmanager
+def tracking(num_envs=1, **options):
+    lanes = Tracking(num_envs, **{"num_threads": 1, **options})
+    try:
+        yield lanes
+    finally:
+        lanes.close()
+
+
+def actions(steps, lanes, axes=1, seed=3):
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, lanes, axes)).astype(np.float32)
+
+
+def run(lanes, given, seed=0):
+    """Return observations, rewards and ends of an episode and a bit more."""
+    first, _ = lanes.reset(seed=seed)
+    rows = [(first, np.zeros(lanes.num_envs), np.zeros(lanes.num_envs, bool), np.zeros(lanes.num_envs, bool))]
+    rows += [lanes.step(action)[:4] for action in given]
+    return [np.stack(column) for column in zip(*rows, strict=True)]
+
+
+# --- the interface ----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("load", LOADS)
+def test_gymnasium_finds_nothing_to_say(load):
+    env = gymnasium.make(NAME, load=load, duration=0.05, num_threads=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.parametrize("load", LOADS)
+def test_stable_baselines_finds_nothing_to_say(load):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    env = gymnasium.make(NAME, load=load, duration=0.05, num_threads=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(env.unwrapped, warn=True)
+    env.close()
+
+
+def test_make_vec_makes_lanes():
+    lanes = gymnasium.make_vec(NAME, 3, vectorization_mode="vector_entry_point", load="gantry", num_threads=1)
+    assert isinstance(lanes, Tracking) and lanes.action_space.shape == (3, 2)
+    lanes.close()
+
+
+def test_every_observation_is_in_the_docstring():
+    rows = [line for line in (Tracking.__doc__ or "").splitlines() if line.strip().startswith("| 8")]
+    bounds = [tuple(float(cell.replace("pi", str(np.pi))) for cell in row.split("|")[-3:-1]) for row in rows]
+    with tracking(load="cart_pendulum") as lanes:
+        space = lanes.single_observation_space
+        assert np.allclose(np.array(bounds), np.stack([space.low, space.high], 1))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "pp"}, r"mode is one of 'csp', 'csv', 'cst', not 'pp'"),
+        ({"action": "gain"}, r"action is one of 'direct', 'offset', not 'gain'"),
+        ({"rate": 250}, r"rate is one of 500, 1000, not 250"),
+        ({"trajectory": "circle"}, r"'hold', 'moves', 'sines', not 'circle'"),
+        ({"weights": {"speeed": 1.0}}, r"a weight's name is one of 'tracking', .*not 'speeed'"),
+        ({"delay": 0}, r"delay is 1\.\.\.10 communication cycles, not 0"),
+        ({"stage": 2.0}, r"must lie in 0\.\.\.1, not 2"),
+        ({"speed": 0.0}, "speed must be above 0 and finite, not 0"),
+        ({"loda": "gantry"}, r"there is no option 'loda'; there are load, device, motor"),
+        ({"load": "two_masses"}, "two_mass"),
+        ({"motor": "no"}, "qbl4208"),
+        ({"distributions": "no"}, "two_mass"),
+    ],
+)
+def test_a_wrong_value_names_the_valid_ones(options, message):
+    with pytest.raises(ValueError, match=message):
+        Tracking(1, **options)
+
+
+def test_a_toml_file_configures(tmp_path):
+    path = tmp_path / "tracking.toml"
+    path.write_text('load = "gantry"\nmode = "csp"\nweights = { effort = 0.5 }\n')
+    with tracking(config=path, rate=500) as lanes:
+        assert (lanes.config.load, lanes.config.mode, lanes.config.rate) == ("gantry", "csp", 500)
+        assert lanes.config.weights["effort"] == 0.5 and lanes.config.weights["tracking"] == 1.0
+
+
+# --- one lane among many ----------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("load", LOADS)
+def test_a_lane_is_the_same_alone_and_among_others(load):
+    axes = 2 if load == "gantry" else 1
+    given = actions(120, 8, axes)
+    options = {"load": load, "duration": 0.08, "distributions": load}  # autoreset is within
+    with tracking(8, **options) as lanes:
+        together = run(lanes, given)
+    for lane in (0, 5):
+        with tracking(1, **options) as alone:
+            single = run(alone, given[:, lane : lane + 1], seed=lane)
+        for many, one in zip(together, single, strict=True):
+            assert np.array_equal(many[:, lane], one[:, 0])
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_threads_change_nothing(mode):
+    given = actions(60, 130)
+    found = []
+    for threads in (1, 2):
+        with tracking(130, duration=0.04, num_threads=threads, autoreset_mode=mode) as lanes:
+            found.append(run(lanes, given))
+    for one, two in zip(*found, strict=True):
+        assert np.array_equal(one, two)
+
+
+def test_the_view_is_lane_0():
+    given = actions(50, 3)
+    with tracking(3, duration=0.05) as lanes:
+        observations, rewards, _, truncated = run(lanes, given, seed=11)
+    env = gymnasium.make(NAME, duration=0.05, num_threads=1).unwrapped
+    assert np.array_equal(env.reset(seed=11)[0], observations[0, 0])
+    for k in range(50):
+        observation, reward, _, over, _ = env.step(given[k, 0])
+        assert np.array_equal(observation, observations[k + 1, 0]) and reward == rewards[k + 1, 0]
+    assert over and truncated[50, 0]
+    env.close()
+
+
+def test_seeds_make_episodes_and_machines():
+    with tracking(2, distributions="two_mass", duration=0.01) as lanes:
+        first, told = lanes.reset(seed=0)
+        again, told_again = lanes.reset(seed=0)
+        _, told_other = lanes.reset(seed=100)
+    assert np.array_equal(first, again)
+    inertia = [info["parameters"]["load.inertia"] for info in (told, told_again, told_other)]
+    assert np.array_equal(inertia[0], inertia[1]) and not np.any(inertia[0] == inertia[2])
+
+
+# --- ends -------------------------------------------------------------------------------------------------------------
+def test_time_truncates_and_the_episodes_after_are_whole():
+    with tracking(2, duration=0.02, autoreset_mode="SameStep") as lanes:
+        *_, truncated = run(lanes, actions(60, 2))
+    assert np.flatnonzero(truncated[:, 0]).tolist() == [20, 40, 60]
+
+
+def test_a_tripped_drive_terminates_its_lane_and_names_the_fault():
+    given = actions(30, 3)
+    with tracking(3) as undisturbed:
+        expected = run(undisturbed, given)
+    with tracking(3) as lanes:
+        lanes.reset(seed=0)
+        for k in range(10):
+            lanes.step(given[k])
+        lanes.drives.machine.enable_input = np.array([True, False, True])
+        _, reward, terminated, truncated, info = lanes.step(given[10])
+        if not terminated.any():  # the sample that shows it is the next one
+            _, reward, terminated, truncated, info = lanes.step(given[11])
+        assert terminated.tolist() == [False, True, False] and not truncated.any()
+        assert info["fault"][1] == "shutdown_switch" and info["fault"][0] is None
+        assert info["reward_terms"]["trip"].tolist() == [0.0, 1.0, 0.0] and reward[1] < -5.0
+        lanes.drives.machine.enable_input = True
+        for k in range(12, 30):
+            observation, reward, *_ = lanes.step(given[k])
+            assert np.array_equal(observation[[0, 2]], expected[0][k + 1, [0, 2]])
+            assert np.array_equal(reward[[0, 2]], expected[1][k + 1, [0, 2]])
+
+
+@pytest.mark.filterwarnings("ignore:machine 1 left the range of physics:RuntimeWarning")
+def test_a_machine_that_diverges_leaves_the_others_bit_identical():
+    given = actions(40, 9)
+    with tracking(9) as undisturbed:
+        expected = run(undisturbed, given)
+    with tracking(9) as lanes:
+        lanes.reset(seed=0)
+        for k in range(40):
+            if k == 10:
+                lanes.drives.machine.load_torque = np.where(np.arange(9) == 1, np.nan_to_num(1e300), 0.0)
+            observation, reward, terminated, _, info = lanes.step(given[k])
+            if terminated[1]:
+                assert "diverged" in info["fault"][1]
+                lanes.drives.machine.load_torque = 0.0
+            others = np.arange(9) != 1
+            assert lanes.observation_space.contains(observation)
+            assert np.array_equal(observation[others], expected[0][k + 1, others])
+            assert np.array_equal(reward[others], expected[1][k + 1, others])
+            assert not terminated[others].any()
+        assert not lanes.drives.machine.diverged.any()  # it lives again
+
+
+def test_a_fallen_pole_ends_the_episode():
+    with tracking(2, load="inverted_pendulum", duration=5.0, autoreset_mode="SameStep") as lanes:
+        lanes.reset(seed=0)
+        for _ in range(3000):
+            _, _, terminated, _, info = lanes.step(np.zeros((2, 1), np.float32))
+            if terminated.any():
+                break
+        assert terminated.all() and info["final_info"]["fault"].tolist() == ["fell", "fell"]
+        angles = [row[8] for row in info["final_obs"]]
+        assert np.all(np.abs(angles) > 0.6) and np.all(np.abs(angles) < 0.7)
+
+
+# --- acting -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("rate", [500, 1000])
+@pytest.mark.parametrize("delay", [1, 2, 3, 6])
+def test_an_action_takes_effect_after_the_delay(delay, rate):
+    """The current jumps at one SYNC; the first sample that can show it is one cycle later."""
+    with tracking(delay=delay, rate=rate, trajectory="hold") as lanes:
+        plays = []
+        record = lanes.drives.record
+        lanes.drives.record = lambda names, duration, play: (
+            plays.append(play[0x6071][:, 0]) or record(names, duration, play=play)
+        )
+        lanes.reset(seed=0)
+        for k in range(12):
+            lanes.step(np.full((1, 1), 0.5 if k >= 2 else 0.0, np.float32))
+    rows = np.concatenate(plays)
+    given = 2 * lanes.config.cycles
+    assert np.flatnonzero(rows)[0] == given + delay - 1 and set(rows) == {0, 3500}
+
+
+@pytest.mark.parametrize("action", ["direct", "offset"])
+@pytest.mark.parametrize("mode", OBJECTS)
+def test_what_is_played(mode, action):
+    target, offset = OBJECTS[mode]
+    with tracking(mode=mode, action=action, trajectory="moves") as lanes:
+        plays = []
+        record = lanes.drives.record
+        lanes.drives.record = lambda names, duration, play: plays.append(play) or record(names, duration, play=play)
+        lanes.reset(seed=0)
+        for _ in range(50):
+            lanes.step(np.full((1, 1), 0.5, np.float32))
+        reference = lanes._reference[0]
+    full = {"csp": 1.25 * 2 * 65536, "csv": 1.25 * 20 * 65536, "cst": 7000}[mode]
+    if action == "direct":
+        assert set(plays[0]) == {target} and plays[20][target].tolist() == [[round(0.5 * full)]]
+        return
+    assert list(plays[0]) == [target, offset] and plays[20][offset].tolist() == [[round(0.3 * 0.5 * full)]]
+    profile = np.array([play[target][0, 0] for play in plays])
+    if mode == "cst":
+        motor = lanes.drives.motor
+        scale = 1e3 * 3 * motor.inertia / motor.torque_constant * 2 * np.pi / 65536
+        assert np.allclose(profile, np.clip(reference[2, :50] * scale, -7000, 7000), atol=0.51)
+    else:
+        assert np.allclose(profile, reference[0 if mode == "csp" else 1, :50], atol=0.51)
+
+
+@pytest.mark.parametrize(("mode", "action"), [("csp", "offset"), ("csv", "offset"), ("csv", "direct")])
+def test_a_controller_that_knows_the_reference_follows_it(mode, action):
+    with tracking(4, mode=mode, action=action, trajectory="moves", speed=5.0, amplitude=1.0) as lanes:
+        observation, _ = lanes.reset(seed=0)
+        errors = []
+        for _ in range(999):
+            wanted = observation[:, 6:7] / 1.25 + 0.3 * observation[:, 0:1]
+            observation, *_ = lanes.step(wanted if action == "direct" else np.zeros((4, 1), np.float32))
+            errors.append(np.abs(observation[:, 0]))
+        assert np.mean(errors) < (0.3 if mode == "csp" else 0.12)
+        with_nothing = []
+        lanes.reset(seed=0)
+        if action == "direct":
+            for _ in range(500):
+                with_nothing.append(np.abs(lanes.step(np.zeros((4, 1), np.float32))[0][:, 0]))
+            assert np.mean(with_nothing) > 2 * np.mean(errors)
+
+
+def test_a_state_feedback_keeps_the_pole_up():
+    """Gains chosen by hand, the cart's velocity as input: that the task can be done with what is observed."""
+    with tracking(4, load="inverted_pendulum", duration=3.0) as lanes:
+        observation, _ = lanes.reset(seed=0)
+        total = np.zeros(4)
+        for _ in range(2999):
+            position, speed = observation[:, 2] * 5.0 * 0.04, observation[:, 3] * 25.0 * 0.04  # m, m/s
+            angle, rate = observation[:, 8], observation[:, 9]
+            wanted = 1.0 * speed + 0.01 * (9.0 * position + 12.0 * speed + 90.0 * angle + 16.0 * rate)  # m/s
+            action = np.clip(wanted / (1.25 * 25.0 * 0.04), -1, 1)[:, None].astype(np.float32)
+            observation, reward, terminated, *_ = lanes.step(action)
+            total += reward
+            assert not terminated.any()
+        assert np.abs(observation[:, 8]).max() < 0.1
+
+
+def test_bus_imperfections_are_drawn_and_late():
+    laws = {
+        "parameters": {
+            "bus.action_latency": {"law": "choice", "values": [3]},
+            "bus.observation_latency": {"law": "choice", "values": [2]},
+            "bus.lost_sync": {"law": "choice", "values": [0.2]},
+        }
+    }
+    with tracking(64, distributions=laws) as lanes:
+        lanes.reset(seed=0)
+        assert set(lanes._lanes["action_latency"]) == {3} and set(lanes._lanes["observation_latency"]) == {2}
+        assert abs(np.mean(lanes._bus == cycle.LOST) - 0.2) < 0.01
+        first = None
+        for k in range(12):
+            observation, *_ = lanes.step(np.ones((64, 1), np.float32))
+            moving = np.abs(observation[:, 4]) > 0.2
+            first = k if first is None and moving.any() else first
+        assert first == 1 + 3 + 2
+
+
+# --- trajectories -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("kind", TRAJECTORIES)
+def test_trajectories_keep_to_their_limits_and_are_smooth(kind):
+    for seed in range(30):
+        position, velocity, acceleration = draw(kind, np.random.default_rng(seed), 1500, 1e-3, 2.0, 10.0)
+        assert np.abs(position).max() <= 2.0 and np.abs(velocity).max() <= 10.0 * (1 + 1e-9)
+        assert position[0] == 0.0 and abs(velocity[0]) < 0.01
+        assert np.allclose(np.gradient(position, 1e-3)[1:-1], velocity[1:-1], atol=0.2)
+        assert np.allclose(np.cumsum(acceleration)[:-2] * 1e-3, velocity[1:-1], atol=1.0)
+        assert kind == "hold" or np.ptp(position) > 0.05
+
+
+# --- on a bus ---------------------------------------------------------------------------------------------------------
+class Bare:
+    """Emulated drives that show what a bus shows."""
+
+    machine = None
+
+    def __init__(self, drives):
+        self._drives = drives
+
+    def __getattr__(self, name):
+        return getattr(self._drives, name)
+
+
+def over_can(options, given, episodes, load):
+    world = World(lockstep=True)
+    world.add(EmulatedDrives(load=load, num_threads=1), list(range(1, 1 + (2 if load == "gantry" else 1))))
+    nodes = (1, 2) if load == "gantry" else (1,)
+    bus = WorldBus(world)
+    try:
+        with CanDrives(bus=bus, nodes=nodes, pace="lockstep", safety=False) as drives:
+            return episode(drives, options, given, episodes)
+    finally:
+        bus.shutdown()
+        world.close()
+
+
+def in_process(options, given, episodes, load):
+    with EmulatedDrives(load=load, num_threads=1) as drives:
+        return episode(Bare(drives), options, given, episodes)
+
+
+def episode(drives, options, given, episodes):
+    lanes = Tracking(1, drives=drives, autoreset_mode="Disabled", **options)
+    rows = []
+    for seed in range(episodes):
+        rows.append(lanes.reset(seed=seed)[0])
+        for action in given:
+            observation, reward, terminated, *_ = lanes.step(action)
+            rows.append(observation)
+            rows.append(np.array([[reward[0], terminated[0]]]))
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("load", "mode", "action"),
+    [("two_mass", "cst", "direct"), ("two_mass", "csv", "offset"), ("two_mass", "csp", "offset"),
+     ("two_mass", "csp", "direct"), ("gantry", "csv", "direct")],
+)  # fmt: skip
+def test_over_can_in_lockstep_the_observations_are_the_same(load, mode, action):
+    options = {"load": load, "mode": mode, "action": action, "duration": 0.06, "delay": 2}
+    given = 0.5 * actions(60, 1, 2 if load == "gantry" else 1)
+    expected = in_process(options, given, 2, load)
+    found = over_can(options, given, 2, load)
+    assert len(expected) == len(found) == 2 * (1 + 2 * 60)
+    for k, (one, two) in enumerate(zip(expected, found, strict=True)):
+        assert np.array_equal(one, two), k
+    assert np.ptp([row[0, 2] for row in expected[1::2] if row.shape[1] > 2]) > 0 or mode == "csp"
+
+
+def test_on_a_bus_what_needs_a_machine_is_refused():
+    with EmulatedDrives(load="cart_pendulum", num_threads=1) as emulated:
+        drives = Bare(emulated)
+        with pytest.raises(ValueError, match="give sensor="):
+            Tracking(1, drives=drives, load="cart_pendulum")
+        with pytest.raises(ValueError, match="distributions are of emulated machines"):
+            Tracking(1, drives=drives, load="cart_pendulum", distributions="cart_pendulum", sensor=lambda: [0.0])
+        lanes = Tracking(1, drives=drives, load="cart_pendulum", sensor=lambda: [0.25], render_mode="rgb_array")
+        assert lanes.reset(seed=0)[0][0, 8] == 0.25
+        with pytest.raises(ValueError, match="pictures need emulated machines"):
+            lanes.render()
+        with pytest.raises(ValueError, match="1 axes cannot be shared by 2 lanes"):
+            Tracking(2, drives=drives)
+
+
+# --- long and with others ---------------------------------------------------------------------------------------------
+@pytest.mark.slow
+@pytest.mark.parametrize("load", LOADS)
+def test_random_agents_over_randomised_machines(load):
+    """A quarter of a million steps each: no exception, no observation outside its box."""
+    n = 256
+    laws = {"include": [load, "bus"]}
+    with tracking(n, load=load, distributions=laws, duration=0.5, num_threads=2) as lanes:
+        lanes.reset(seed=0)
+        rng = np.random.default_rng(0)
+        for k in range(1_000_000 // len(LOADS) // n + 1):
+            scale = 0.2 if k % 400 < 200 else 1.0
+            given = (scale * rng.uniform(-1, 1, lanes.action_space.shape)).astype(np.float32)
+            observation, reward, *_ = lanes.step(given)
+            assert lanes.observation_space.contains(observation)
+            assert np.all(np.isfinite(reward))
+
+
+def test_stable_baselines_trains_on_lanes_without_copies():
+    sb3 = pytest.importorskip("stable_baselines3")
+    from drive_env.envs.stable_baselines import LanesVecEnv
+
+    with pytest.raises(ValueError, match="SameStep"), tracking(2) as lanes:
+        LanesVecEnv(lanes)
+    with tracking(8, duration=0.03, autoreset_mode="SameStep") as lanes:
+        env = LanesVecEnv(lanes)
+        handed = []
+        step = lanes.step
+        lanes.step = lambda given: handed.append(step(given)) or handed[-1]
+        env.seed(3)
+        assert np.array_equal(env.reset(), Tracking(8, duration=0.03, num_threads=1).reset(seed=3)[0])
+        for _ in range(30):
+            observation, _, ended, infos = env.step(np.zeros((8, 1), np.float32))
+            assert observation is handed[-1][0]
+        assert ended.all() and infos[2]["TimeLimit.truncated"]
+        assert np.array_equal(infos[2]["terminal_observation"], handed[-1][4]["final_obs"][2])
+        sb3.PPO("MlpPolicy", env, n_steps=32, batch_size=64, n_epochs=1, device="cpu").learn(256)
+
+
+def test_a_configuration_takes_the_loads_own_task():
+    assert TrackingConfig(load="cart_pendulum").mode == "csv"
+    assert TrackingConfig(load="cart_pendulum", mode="cst").mode == "cst"
+    assert TrackingConfig(load="fan").task.joint is None
