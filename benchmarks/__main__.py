@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks import bus
+from benchmarks import bus, environments, gain_tuning
 from drive_env import EmulatedDrives, motion
 from drive_env.firmware import cycle
 from mechanics.loads import LOADS
@@ -173,7 +173,7 @@ def main() -> None:
     console = Console()
     sizes = SIZES[:-1] if options.quick else SIZES
     with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("firmware, bound, loads, bus, start-up", total=4 + len(LOADS))
+        task = progress.add_task("firmware, bound, loads, bus, environments, start-up", total=5 + len(LOADS))
         result: dict[str, Any] = {"ns per drive and tick": ticks()}
         progress.advance(task)
         result["us per axis and ms, 64 machines, 1 thread"] = bound()
@@ -184,11 +184,19 @@ def main() -> None:
             progress.advance(task)
         result["bus"] = bus.figures()
         progress.advance(task)
+        result["environments"] = environments.figures() | gain_tuning.figures()
+        progress.advance(task)
         if not options.quick:
             result["start-up"] = start_up()
         progress.advance(task)
         result["throughput"] = throughput(sizes, progress)
-    for name in ("ns per drive and tick", "us per axis and ms, 64 machines, 1 thread", "bus", "start-up"):
+    for name in (
+        "ns per drive and tick",
+        "us per axis and ms, 64 machines, 1 thread",
+        "bus",
+        "environments",
+        "start-up",
+    ):
         if name in result:
             print_table(console, name, ("what", "figure"), list(result[name].items()))
     print_table(
