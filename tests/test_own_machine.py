@@ -408,3 +408,24 @@ def test_the_example_runs():
 
 def test_the_example_s_model_says_itself_what_is_driven():
     assert find_load(EXAMPLES / "models" / "scara.xml").joints == ("shoulder", "elbow")
+
+
+# --- forces that only MuJoCo knows ------------------------------------------------------------------------------------
+def test_a_tendon_s_spring_acts_though_inertia_and_gravity_are_constant(file):
+    """The step leaves out what does not change; the spring of a tendon is no joint's, and does."""
+    path = file(
+        """<mujoco model="sprung"><option gravity="0 0 0"/>
+          <worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
+            <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></worldbody>
+          <tendon><fixed name="spring" stiffness="400" springlength="0"><joint joint="x" coef="1"/></fixed></tendon>
+        </mujoco>"""
+    )
+    load = PackedLoad(
+        find_load(Load(path, joints=("x",), start={"x": 0.05})), np.full((1, 1), J_M), np.zeros((1, 1, 4)), {}, H
+    )
+    qpos = np.zeros((2000, 1))
+    step_plant(load.plant, np.zeros((2000, 1)), H, qpos)
+    w = np.sqrt(400.0 / (1.0 + J_M))
+    # The first position counts as the middle of the first step.
+    expected = 0.05 * np.cos(w * H * np.arange(1, 2001))
+    assert np.abs(qpos[:, 0] - expected).max() < 0.05 * w * H

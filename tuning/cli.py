@@ -110,7 +110,7 @@ def _run_with_progress(sweep: Any, experiment: Any, console: Any) -> Any:
     from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     texts = {
-        "compiling": "loading the kernels (the first time: half a minute)",
+        "compiling": "loading the kernels (the first time: 40 seconds)",
         "simulating": f"simulating {experiment.size()} machines",
     }
     columns = (
