@@ -17,9 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.entries import ObjectDictionary, ObjectName
+from drive_env.firmware import cycle
+from drive_env.firmware.cycle import Call
 from drive_env.firmware.protection import CAUSES
 from drive_env.firmware.record import get_lanes, new_records, set_lanes
-from drive_env.group import Channels, Group, channels, rates_of
+from drive_env.group import Group, call_of, channels, rates_of
 from drive_env.live_dictionary import NOTHING, LiveDictionary
 from drive_env.machine import Machines
 from drive_env.misfit import warn_of_misfits
@@ -135,6 +137,10 @@ class EmulatedDrives:
         )
         self._draw(seed, numbers, randomise, ideal, parameters or {})
         self._groups = self._build_groups(physics_steps, integrator, friction)
+        self._turn = np.zeros(1, np.int64)
+        self._fleet = cycle.Fleet(np.array([group.machinery.address for group in self._groups], np.int64), self._turn)
+        nothing = np.empty((0, 0, self.num_axes))
+        self._nothing = call_of(nothing, NOTHING, nothing, NOTHING, 1)
         self._set_constants(self.motor.voltage if supply is None else supply)
         for name, values in self._parameters.items():
             everywhere = np.ones(self.num_axes, bool)
@@ -175,8 +181,7 @@ class EmulatedDrives:
     def advance(self, duration: float) -> None:
         """Let `duration` [s] pass, whole communication cycles of 1 ms."""
         cycles = self._cycles(duration)
-        nothing = np.empty((cycles, 0, self.num_axes))
-        self._run(cycles, nothing, NOTHING, np.empty((cycles, 0, self.num_axes)), NOTHING, 1)
+        self._run(cycles, self._nothing)
 
     def record(
         self,
@@ -205,13 +210,13 @@ class EmulatedDrives:
         if every < 1:
             raise ValueError(f"period must be at least {self._cycle:g} s, not {period:g} s")
         play = play or {}
-        call = (*objects, None, *play)
-        image = self._images.get(call)
+        names = (*objects, None, *play)
+        image = self._images.get(names)
         if image is not None and image.scale_changes == self._objects.scale_changes:
             values = np.empty((cycles, len(play), self.num_axes))
             if image.play(play, values):
                 samples = np.empty((-(-cycles // every), len(image.keys), self.num_axes))
-                self._run(cycles, values, image.played, samples, image.sampled, every)
+                self._run(cycles, call_of(values, image.played, samples, image.sampled, every))
                 return self._trace(image.read(samples), len(samples), every)
         known = self._objects.entries
         entries = [known.find(name) for name in objects]
@@ -221,7 +226,7 @@ class EmulatedDrives:
         values, played = self._objects.plan_play(play, cycles)
         rows = -(-cycles // every)
         samples = np.empty((rows, len(live), self.num_axes))
-        self._run(cycles, values, played, samples, sampled, every)
+        self._run(cycles, call_of(values, played, samples, sampled, every))
         result: dict[tuple[int, int], Integers] = {}
         for k, (key, binding) in enumerate(live.items()):
             result[key] = self._objects.to_od(known.find(key), binding, samples[:, k])
@@ -230,7 +235,7 @@ class EmulatedDrives:
                 result[key] = np.broadcast_to(self._objects.read(key), (rows, self.num_axes))
         prepared = self._objects.process_image(objects, list(play))
         if prepared is not None and len(self._images) < MOST_IMAGES:
-            self._images[call] = prepared
+            self._images[names] = prepared
         return self._trace(result, rows, every)
 
     def _trace(self, values: dict[tuple[int, int], Integers], rows: int, every: int) -> Trace:
@@ -431,38 +436,32 @@ class EmulatedDrives:
             )
         return cycles
 
-    def _run(self, cycles: int, play: Floats, played: Channels, samples: Floats, sampled: Channels, every: int) -> None:
-        begin, done = self._now, 0
+    def _run(self, cycles: int, call: Call) -> None:
+        begin, done, diverged = self._now, 0, False
         while done < cycles:
             while self._schedule and self._schedule[0][0] <= begin + done:
                 _, name, values, where = self._schedule.pop(0)
                 self.machine.set(name, values, where)
-            until = min([cycles, *(due - begin for due, *_ in self._schedule[:1])])
-            self._run_groups(done, until, play, played, samples, sampled, every)
+            until = min([cycles, *(due - begin for due, *_ in self._schedule[:1])]) if self._schedule else cycles
+            diverged |= self._run_groups(call, done, until, done == 0, until == cycles)
             done = until
             self._now = begin + done
-        if cycles:
+        if diverged:
             self._report_divergence()
 
-    def _run_groups(
-        self, start: int, end: int, play: Floats, played: Channels, samples: Floats, sampled: Channels, every: int
-    ) -> None:
-        if self._threads == 1 or len(self._groups) == 1:
-            for group in self._groups:
-                group.run(start, end, play, played, samples, sampled, every)
-        else:
-            if self._executor is None:
-                self._executor = ThreadPoolExecutor(self._threads, thread_name_prefix="drives")
-            jobs = [
-                self._executor.submit(group.run, start, end, play, played, samples, sampled, every)
-                for group in self._groups
-            ]
-            for job in jobs:
-                job.result()
+    def _run_groups(self, call: Call, start: int, end: int, first: bool, last: bool) -> bool:
+        self._turn[0] = 0
+        given = self._fleet.address, call.address, start, end, first, last
+        helpers = min(self._threads, len(self._groups)) - 1
+        if not helpers:
+            return bool(cycle.run(*given))
+        if self._executor is None:
+            self._executor = ThreadPoolExecutor(self._threads - 1, thread_name_prefix="drives")
+        jobs = [self._executor.submit(cycle.run, *given) for _ in range(helpers)]
+        found = bool(cycle.run(*given))
+        return sum(job.result() for job in jobs) > 0 or found
 
     def _report_divergence(self) -> None:
-        if not any(group.load.plant.diverged.any() for group in self._groups):
-            return
         diverged = self.machine.diverged
         new = np.flatnonzero(diverged & ~self._reported)
         self._reported = diverged

@@ -33,6 +33,13 @@ def channels(fields: list[tuple[str, int]], kinds: list[int] | None = None) -> C
     return Channels(np.array(found, np.int64), np.array(offsets, np.int64))
 
 
+def call_of(
+    values: NDArray[np.float64], played: Channels, samples: NDArray[np.float64], sampled: Channels, every: int
+) -> cycle.Call:
+    """Return the call that plays `values`, (cycles, objects, axes), into `samples`, (rows, objects, axes), both SI."""
+    return cycle.Call(values, played.kinds, played.offsets, samples, sampled.kinds, sampled.offsets, every)
+
+
 def rates_of(device: Device, physics_steps: int) -> cycle.Rates:
     """Return the periods for a device and a number of physics steps per window.
 
@@ -68,29 +75,17 @@ class Group:
         self.load = load
         self._records = records
         self._rates = rates
-        self._num_axes = load.copies * load.num_axes
-        self.axes = slice(machines.start * load.num_axes, machines.start * load.num_axes + self._num_axes)
+        num_axes = load.copies * load.num_axes
+        self.axes = slice(machines.start * load.num_axes, machines.start * load.num_axes + num_axes)
         memory = records.view(np.uint8).reshape(len(records), RECORD.itemsize)
-        self._reals = memory.view(np.float64)
-        self._integers = memory.view(np.int32)
         self._motion = np.zeros((7, len(records) * LANES))
-
-    def run(
-        self,
-        start: int,
-        cycles: int,
-        play: NDArray[np.float64],
-        played: Channels,
-        samples: NDArray[np.float64],
-        sampled: Channels,
-        every: int,
-    ) -> None:
-        """Run communication cycles from `start` up to `cycles`.
-
-        `play` is (cycles, objects, all axes), `samples` (rows, objects, all axes), both SI.
-        """
-        cycle.run(
-            self._records, self._reals, self._integers, self.load.plant, self._rates, self._motion,
-            self.axes.start, self._num_axes, start, cycles,
-            play, played.kinds, played.offsets, samples, sampled.kinds, sampled.offsets, every,
-        )  # fmt: skip
+        self.machinery = cycle.Machinery(
+            records=records,
+            reals=memory.view(np.float64),
+            integers=memory.view(np.int32),
+            plant=load.plant,
+            rates=rates,
+            motion=self._motion,
+            first_axis=self.axes.start,
+            num_axes=num_axes,
+        )

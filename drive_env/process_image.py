@@ -7,6 +7,7 @@ takes longer then than the drives' own millisecond.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.group import Channels
-from mechanics.compiled import cached
+from mechanics.compiled import cached, stage
+
+_SOURCES = (Path(__file__).parent,)
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -49,19 +52,19 @@ class ProcessImage:
     def __init__(
         self, played: tuple[Channels, list[Row]], sampled: tuple[Channels, list[Row]], scale_changes: int
     ) -> None:
-        self.played, self._inputs = played
+        self.played, self.inputs = played
         self.sampled, outputs = sampled
         self.scale_changes = scale_changes
         self.keys = [(row.entry.index, row.entry.sub) for row in outputs]
-        self._factors = np.array([row.factor for row in outputs], float).reshape(len(outputs), -1 if outputs else 0)
+        self.factors = np.array([row.factor for row in outputs], float).reshape(len(outputs), -1 if outputs else 0)
         limits = [(row.low, row.high) for row in outputs]
-        self._limits = np.array(limits, float).reshape(len(outputs), 2)
-        self._wraps = np.array([row.wraps for row in outputs], bool)
+        self.limits = np.array(limits, float).reshape(len(outputs), 2)
+        self.wraps = np.array([row.wraps for row in outputs], bool)
 
     def play(self, play: Mapping[ObjectName, ArrayLike], values: Floats) -> bool:
         """Fill in the SI values, shape (cycles, objects, num_axes); False for rows that the long way must refuse."""
         cycles, _, num_axes = values.shape
-        for k, (row, given) in enumerate(zip(self._inputs, play.values(), strict=True)):
+        for k, (row, given) in enumerate(zip(self.inputs, play.values(), strict=True)):
             raw = np.asarray(given)
             if raw.dtype != np.int64:
                 if raw.dtype.kind not in "iu" or raw.dtype == np.uint64:
@@ -78,34 +81,48 @@ class ProcessImage:
     def read(self, samples: Floats) -> dict[tuple[int, int], Integers]:
         """Return the integers on the wire of SI samples, shape (rows, objects, num_axes)."""
         raw = np.empty((samples.shape[1], samples.shape[0], samples.shape[2]), np.int64)
-        to_od(samples, self._factors, self._limits, self._wraps, raw)
+        to_od(samples, self.factors, self.limits, self.wraps, raw)
         return dict(zip(self.keys, raw, strict=True))
 
 
-@cached()
-def from_od(raw: Any, factor: Any, low: int, high: int, values: Any, k: int) -> Any:
-    """Set SI values of object k, as units.from_od does; return False if an integer is out of range."""
-    one_for_all = raw.shape[1] == 1
+@stage
+def from_od_rows(raw: Any, factor: Any, low: Any, high: Any, values: Any, k: Any, first: Any, end: Any) -> Any:
+    """Set SI values of object k, axes `first` up to `end`, as units.from_od does; False if an integer is out of range.
+
+    `raw` has one column for each axis, or one for all.
+    """
     for row in range(values.shape[0]):
-        for axis in range(values.shape[2]):
-            integer = raw[row, 0 if one_for_all else axis]
+        for axis in range(first, end):
+            integer = raw[row, 0 if raw.shape[1] == 1 else axis]
             if integer < low or integer > high:
                 return False
             values[row, k, axis] = integer * factor[axis]
     return True
 
 
-@cached()
-def to_od(samples: Any, factors: Any, limits: Any, wraps: Any, raw: Any) -> None:
-    """Set integers of SI samples, as units.to_od and, for counters of 32 bits that go on, units.wrap do."""
+@stage
+def to_od_rows(samples: Any, factors: Any, limits: Any, wraps: Any, raw: Any, first: Any, end: Any) -> None:
+    """Set integers of SI samples as units.to_od and, for counters of 32 bits that go on, units.wrap do."""
     half = 2.0**31
     for k in range(samples.shape[1]):
         low, high = limits[k, 0], limits[k, 1]
         for row in range(samples.shape[0]):
-            for axis in range(samples.shape[2]):
+            for axis in range(first, end):
                 value = np.rint(samples[row, k, axis] / factors[k, axis])
                 if wraps[k]:
                     value = value - 2.0 * half * np.floor((value + half) / (2.0 * half)) if np.isfinite(value) else 0.0
                 else:
                     value = low if value < low else high if value > high else value
                 raw[k, row, axis] = 0 if np.isnan(value) else np.int64(value)
+
+
+@cached(*_SOURCES)
+def from_od(raw: Any, factor: Any, low: int, high: int, values: Any, k: int) -> Any:
+    """Set SI values of object k; return False if an integer is out of range."""
+    return from_od_rows(raw, factor, low, high, values, k, 0, values.shape[2])
+
+
+@cached(*_SOURCES)
+def to_od(samples: Any, factors: Any, limits: Any, wraps: Any, raw: Any) -> None:
+    """Set integers of SI samples."""
+    to_od_rows(samples, factors, limits, wraps, raw, 0, samples.shape[2])

@@ -255,7 +255,7 @@ class PackedLoad:
         """
         self.plant.clock[:] = 0.0
         self.plant.profile_now[:] = 0.0
-        self.plant = self.plant._replace(
+        self.plant.replace(
             profile_at=np.ascontiguousarray(at, float),
             profile=np.ascontiguousarray(torque, float),
             profile_of_position=of_position,

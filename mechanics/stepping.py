@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from mechanics import native
-from mechanics.compiled import stage
+from mechanics.compiled import inlined, stage
 from mechanics.friction import bristle_torque, dry_friction, limited_torque, middle_speed
 from mechanics.looking import look
 
@@ -362,7 +362,7 @@ def report(plant, torque, moment, h, theta, omega, reaction, position):
                 theta[axis], omega[axis], reaction[axis], position[axis] = 0.0, 0.0, 0.0, 0.0
 
 
-@stage
+@inlined
 def step(plant, torque, moment, h, theta, omega, reaction, position):
     """Advance every copy by h [s].
 

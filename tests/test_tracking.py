@@ -225,13 +225,10 @@ def test_an_action_takes_effect_after_the_delay(delay, rate):
     """The current jumps at one SYNC; the first sample that can show it is one cycle later."""
     with tracking(delay=delay, rate=rate, trajectory="hold") as lanes:
         plays = []
-        record = lanes.drives.record
-        lanes.drives.record = lambda names, duration, play: (
-            plays.append(play[0x6071][:, 0]) or record(names, duration, play=play)
-        )
         lanes.reset(seed=0)
         for k in range(12):
             lanes.step(np.full((1, 1), 0.5 if k >= 2 else 0.0, np.float32))
+            plays.append(lanes._exchange.played[0, :, 0].copy())
     rows = np.concatenate(plays)
     given = 2 * lanes.config.cycles
     assert np.flatnonzero(rows)[0] == given + delay - 1 and set(rows) == {0, 3500}
@@ -243,12 +240,11 @@ def test_what_is_played(mode, action):
     target, offset = OBJECTS[mode]
     with tracking(mode=mode, action=action, trajectory="moves") as lanes:
         plays = []
-        record = lanes.drives.record
-        lanes.drives.record = lambda names, duration, play: plays.append(play) or record(names, duration, play=play)
         lanes.reset(seed=0)
         for _ in range(50):
             lanes.step(np.full((1, 1), 0.5, np.float32))
-        reference = lanes._reference[0]
+            plays.append(dict(zip(lanes._exchange.play, lanes._exchange.played.copy(), strict=True)))
+        reference = lanes._episodes.reference[0]
     full = {"csp": 1.25 * 2 * 65536, "csv": 1.25 * 20 * 65536, "cst": 7000}[mode]
     if action == "direct":
         assert set(plays[0]) == {target} and plays[20][target].tolist() == [[round(0.5 * full)]]
@@ -307,8 +303,10 @@ def test_bus_imperfections_are_drawn_and_late():
     }
     with tracking(64, distributions=laws) as lanes:
         lanes.reset(seed=0)
-        assert set(lanes._lanes["action_latency"]) == {3} and set(lanes._lanes["observation_latency"]) == {2}
-        assert abs(np.mean(lanes._bus == cycle.LOST) - 0.2) < 0.01
+        assert set(lanes._episodes.lanes["action_latency"]) == {3} and set(
+            lanes._episodes.lanes["observation_latency"]
+        ) == {2}
+        assert abs(np.mean(lanes._episodes.bus == cycle.LOST) - 0.2) < 0.01
         first = None
         for k in range(12):
             observation, *_ = lanes.step(np.ones((64, 1), np.float32))

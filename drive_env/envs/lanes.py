@@ -84,6 +84,11 @@ class Lanes(VectorEnv[Any, Any, Any]):
         """Act in every lane; return observation, reward, terminated, truncated and info of all lanes."""
         raise NotImplementedError
 
+    def _step_alone(self, action: Any) -> tuple[Observation, float, bool, bool, Info]:
+        """Act in the only lane there is, whose action this is; return what `gymnasium.Env.step` does."""
+        observation, reward, terminated, truncated, info = self._step_lanes(_batch_of_one(action))
+        return one_of(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), one_of(info)
+
     def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
         raise NotImplementedError
 
@@ -215,12 +220,11 @@ class OneLane(gymnasium.Env[Any, Any]):
         lanes = self.lanes
         if lanes._some_ended or not lanes._has_begun:
             raise gymnasium.error.ResetNeeded("the episode has ended or none has begun; call reset()")
-        observation, reward, terminated, truncated, info = lanes._step_lanes(_batch_of_one(action))
-        ended = bool(terminated[0]), bool(truncated[0])
-        if ended[0] or ended[1]:
+        stepped = lanes._step_alone(action)
+        if stepped[2] or stepped[3]:
             lanes._ended = np.ones(1, bool)
             lanes._some_ended = True
-        return one_of(observation), float(reward[0]), *ended, one_of(info)
+        return stepped
 
     def render(self) -> Any:
         """Return the picture, uint8 of shape (height, width, 3); "human" shows it and returns None."""

@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env import motion
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.configuration import configured
-from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Stepped, check_choice
+from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Observation, Stepped, check_choice
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines
 from drive_env.envs.trajectories import TRAJECTORIES, draw
+from drive_env.exchange import Hooks, exchange
 
 CYCLE = 0.001  # s, one communication cycle
 
@@ -244,33 +245,41 @@ class Tracking(Lanes):
             joint = config.task.joint
             self._sensor = lambda: drives.machine.joint_positions[:, joint]
         per_turn = drives.read(POSITION_SCALER).astype(float)
-        self._scales = np.empty((self.drives.num_axes, 4))
-        self._scales[:, 0] = config.amplitude * per_turn
-        self._scales[:, 1] = config.speed * per_turn
-        self._scales[:, 2] = drives.read(MAXIMUM_CURRENT)
-        full = {"csp": 1.25 * self._scales[:, 0], "csv": 1.25 * self._scales[:, 1], "cst": self._scales[:, 2]}
-        self._scales[:, 3] = full[str(config.mode)] * (1.0 if config.action == "direct" else config.offset)
+        scales = np.empty((self.drives.num_axes, 4))
+        scales[:, 0] = config.amplitude * per_turn
+        scales[:, 1] = config.speed * per_turn
+        scales[:, 2] = drives.read(MAXIMUM_CURRENT)
+        full = {"csp": 1.25 * scales[:, 0], "csv": 1.25 * scales[:, 1], "cst": scales[:, 2]}
+        scales[:, 3] = full[str(config.mode)] * (1.0 if config.action == "direct" else config.offset)
         self._per_turn = per_turn.reshape(n, -1)[:, 0]
         target, offset = OBJECTS[str(config.mode)]
-        self._acting = target if config.action == "direct" else offset
-        self._following = None if config.action == "direct" else target
-        self._lanes = np.zeros(n, cycle.LANE)
-        self._pending = np.zeros((drives.num_axes, cycle.DEPTH), np.int64)
-        self._history = np.zeros((cycle.DEPTH, len(SAMPLED), drives.num_axes), np.int64)
-        length = config.steps * config.cycles + cycle.PREVIEW + 1
-        self._reference = np.zeros((n, 3, length))
-        self._bus = np.zeros((n, config.steps), np.uint8)
-        self._last = np.zeros((drives.num_axes, 2))
+        play = (target,) if config.action == "direct" else (target, offset)
+        self._acts_on_position = play[-1] == 0x607A
+        self._exchange = exchange(drives, SAMPLED, play, config.cycles, CYCLE)
+        self._episodes = own = cycle.Episodes(
+            lanes=np.zeros(n, cycle.LANE),
+            action=np.zeros(drives.num_axes),
+            scales=scales,
+            origin=np.zeros(drives.num_axes),
+            pending=np.zeros((drives.num_axes, cycle.DEPTH), np.int64),
+            bus=np.zeros((n, config.steps), np.int64),
+            reference=np.zeros((n, 3, config.steps * config.cycles + cycle.PREVIEW + 1)),
+            profile_scale=self._profile_scales(),
+            last=np.zeros((drives.num_axes, 2)),
+            played=self._exchange.played,
+            sampled=self._exchange.sampled,
+            history=np.zeros((cycle.DEPTH, len(SAMPLED), drives.num_axes), np.int64),
+            angles=np.zeros(n),
+            weights=np.array([config.weights[name] for name in cycle.TERMS]),
+            observation=np.zeros((n, *(self.single_observation_space.shape or ())), np.float32),
+            reward=np.zeros(n),
+            terms=np.zeros((len(cycle.TERMS), n)),
+            ended=np.zeros((2, n), bool),
+            kind=cycle.KINDS[str(config.mode), config.action == "direct"],
+            fall=config.task.fall,
+        )
+        self._exchange.hooks = Hooks(cycle.act, cycle.observe, own)
         self._start = np.zeros(drives.num_axes, np.int64)
-        self._origin = np.zeros(drives.num_axes)
-        self._weights = np.array([config.weights[name] for name in cycle.TERMS])
-        self._angles = np.zeros(n)
-        self._kind = cycle.KINDS[str(config.mode), config.action == "direct"]
-        self._fall = config.task.fall
-        self._cycles = config.cycles
-        self._shape = (n, *(self.single_observation_space.shape or ()))
-        self._everywhere = np.ones(n, bool)
-        self._profile_scale = self._profile_scales()
         self._pictures: Pictures | None = None
 
     def _profile_scales(self) -> Floats:
@@ -296,50 +305,51 @@ class Tracking(Lanes):
             self._return_to_start(axes)
         self.drives.emergencies()
         samples = np.stack([self.drives.read(name) for name in SAMPLED])
-        self._origin[axes] = samples[1][axes]
-        self._history[:, :, axes] = samples[:, axes]
-        neutral = samples[1] if self._acting == 0x607A else np.zeros(len(axes), np.int64)
-        self._pending[axes] = neutral[axes, None]
-        self._last[axes] = 0.0
+        own = self._episodes
+        own.origin[axes] = samples[1][axes]
+        own.history[:, :, axes] = samples[:, axes]
+        neutral = samples[1] if self._acts_on_position else np.zeros(len(axes), np.int64)
+        own.pending[axes] = neutral[axes, None]
+        own.last[axes] = 0.0
         self._draw_episodes(mask)
         if self._sensor is not None:
-            self._angles = np.where(mask, np.asarray(self._sensor(), float), self._angles)
-            self._lanes["angle"][mask] = self._angles[mask]
+            own.angles[mask] = np.asarray(self._sensor(), float)[mask]
+            own.lanes["angle"][mask] = own.angles[mask]
         if self._pictures is not None:
             self._pictures.begin(mask)
-        observation = np.empty(self._shape, np.float32)
-        cycle.describe(self._lanes, self._history, self._reference, self._scales, self._origin, self._last,
-                       self._angles, observation, self.config.cycles, mask)  # fmt: skip
+        cycle.describe_lanes(own.address, mask)
+        observation = own.observation.copy()
         if self._machines is None:
             return observation, {}
         return observation, {"parameters": {name: values.copy() for name, values in self._machines.values.items()}}
 
-    def _step_lanes(self, action: Any) -> Stepped:
-        lanes = self._lanes
-        given = np.ascontiguousarray(action, np.float32).reshape(-1)
-        raw = np.empty((self._cycles, len(given)), np.int64)
-        target = np.empty_like(raw)
-        cycle.act(lanes, given, self._scales, self._origin, self._pending, self._bus, self._reference,
-                  self._profile_scale, self._last, raw, target, self._kind)  # fmt: skip
-        play = {self._acting: raw} if self._following is None else {self._following: target, self._acting: raw}
+    def _act(self, action: Any) -> bool:
+        """Let a step pass; return whether a lane tripped or fell."""
+        own = self._episodes
+        own.action[:] = np.asarray(action, float).reshape(own.action.shape)
         if self._sensor is not None:
-            self._angles = np.asarray(self._sensor(), float)
-        trace = self.drives.record(SAMPLED, self._cycles * CYCLE, play=play)
-        n = self.num_envs
-        observation = np.empty(self._shape, np.float32)
-        reward, terms = np.empty(n), np.empty((len(cycle.TERMS), n))
-        ended = np.empty((2, n), np.bool_)
-        some = cycle.observe(lanes, trace[SAMPLED[0]], trace[SAMPLED[1]], trace[SAMPLED[2]], trace[SAMPLED[3]],
-                             self._history, self._reference, self._scales, self._origin, self._last, self._angles,
-                             self._weights, self._bus, self._fall, self._everywhere, observation, reward, terms,
-                             ended)  # fmt: skip
+            own.angles[:] = self._sensor()
+        self._exchange.run()
+        if self._pictures is not None:
+            self._pictures.look()
+        return bool(own.ended[0].any())
+
+    def _step_lanes(self, action: Any) -> Stepped:
+        some, own = self._act(action), self._episodes
+        terms, ended = own.terms.copy(), own.ended.copy()
         info: Info = {"reward_terms": dict(zip(cycle.TERMS, terms, strict=True))}
         if some:
             info["fault"] = self._faults(ended[0])
             info["_fault"] = ended[0]
-        if self._pictures is not None:
-            self._pictures.look()
-        return observation, reward, ended[0], ended[1], info
+        return own.observation.copy(), own.reward.copy(), ended[0], ended[1], info
+
+    def _step_alone(self, action: Any) -> tuple[Observation, float, bool, bool, Info]:
+        some, own = self._act(action), self._episodes
+        info: Info = {"reward_terms": dict(zip(cycle.TERMS, own.terms[:, 0].tolist(), strict=True))}
+        if some:
+            info["fault"] = self._faults(own.ended[0])[0]
+        terminated, truncated = own.ended[:, 0].tolist()
+        return own.observation[0].copy(), own.reward.item(), terminated, truncated, info
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _draw_episodes(self, mask: Mask) -> None:
@@ -348,18 +358,18 @@ class Tracking(Lanes):
         bus: dict[str, Floats] = {} if self._machines is None else self._machines.values
         for lane in np.flatnonzero(mask):
             rng = self.rngs[lane]
-            length = self._reference.shape[2]
+            length = self._episodes.reference.shape[2]
             turns = draw(str(config.trajectory), rng, length, CYCLE, float(config.amplitude or 0.0),
                          float(config.speed or 0.0))  # fmt: skip
-            self._reference[lane] = turns * self._per_turn[lane]
+            self._episodes.reference[lane] = turns * self._per_turn[lane]
             jitter = int(bus["bus.jitter"][lane]) if bus else 0
             lost = float(bus["bus.lost_sync"][lane]) if bus else 0.0
             chance = rng.random((2, config.steps)) if jitter or lost else None
-            self._bus[lane] = 0
+            self._episodes.bus[lane] = 0
             if chance is not None:
-                self._bus[lane] = (chance[0] * (jitter + 1)).astype(np.uint8)
-                self._bus[lane][chance[1] < lost] = cycle.LOST
-            state = self._lanes[lane]
+                self._episodes.bus[lane] = (chance[0] * (jitter + 1)).astype(np.int64)
+                self._episodes.bus[lane][chance[1] < lost] = cycle.LOST
+            state = self._episodes.lanes[lane]
             state["step"] = 0
             state["steps"] = config.steps
             late = float(bus["bus.action_latency"][lane]) if bus else 0.0
@@ -388,11 +398,11 @@ class Tracking(Lanes):
         position = drives.read(0x6064)
         if not self._has_begun:
             self._start = position.copy()
-        away = axes & (np.abs(position - self._start) > self._scales[:, 0] * 1e-3)
+        away = axes & (np.abs(position - self._start) > self._episodes.scales[:, 0] * 1e-3)
         if away.any():
             motion.enable(drives, mode="pp", where=away)
             speed = drives.read(0x6081)
-            drives.write(0x6081, np.rint(RETURN_SPEED * self._scales[:, 1]).astype(np.int64), where=away)
+            drives.write(0x6081, np.rint(RETURN_SPEED * self._episodes.scales[:, 1]).astype(np.int64), where=away)
             try:
                 motion.move_to(drives, self._start, where=away)
             finally:
@@ -426,7 +436,7 @@ class Tracking(Lanes):
         for lane in np.flatnonzero(lanes):
             if diverged[lane]:
                 names[lane].append("diverged")
-            if self._lanes["fallen"][lane]:
+            if self._episodes.lanes["fallen"][lane]:
                 names[lane].append("fell")
             found[lane] = ", ".join(names[lane]) or "not enabled"
         return found

@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-from mechanics.compiled import cached, inlined
+import numpy as np
+from numba import from_dtype, types
+from numpy.typing import NDArray
+
+import mechanics.compiled
+from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, NumberMatrix, Vector, reader
+from mechanics.compiled import cached, inlined, stage
+
+_SOURCES = (Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
 
 # A lane's episode: step and number of steps; latencies beyond the cycle that a bus has anyway [communication cycles];
 # the pendulum's angle at the last step [rad]; whether it fell.
@@ -14,7 +24,8 @@ LANE = np.dtype([("step", "i8"), ("steps", "i8"), ("action_latency", "i8"), ("ob
 AXIS_HIGH = np.array([4.0, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0, 1.0])  # of the entries of an axis, -low as well
 LOAD_HIGH = np.array([np.pi, 50.0])
 PREVIEW = 10  # cycles
-DEPTH = 32  # cycles or steps that are remembered
+DEPTH = 32  # cycles or steps that are remembered, a power of two
+LATEST = DEPTH - 1  # step or cycle & LATEST is its place
 LONGEST_DELAY = 10  # cycles; with as much jitter it must fit into DEPTH
 LOST = 255  # the SYNC of this step is lost
 COMMISSIONED_INERTIA = 3.0  # rotor inertias: what the presets were computed for
@@ -42,49 +53,73 @@ def limited(value, high):
     return min(max(value, -high), high) if value == value else 0.0
 
 
-@cached()
-def act(lanes, action, scales, origin, pending, bus, reference, profile_scale, last, raw, target, kind):
-    """Turn actions into the rows of set-points that act in this step's cycles.
+Lanes = Annotated[NDArray[np.void], types.Array(from_dtype(LANE), 1, "C")]
 
-    Args:
-        lanes: LANE, shape (n,).
-        action: -1...1, shape (axes,).
-        scales: Amplitude [inc], speed [inc/s], current limit [mA], full scale of the action [raw], shape (axes, 4).
-        origin: Position at the episode's start [inc], shape (axes,).
-        pending: Raw values of the last steps, shape (axes, DEPTH).
-        bus: Cycles that each step's action is late besides, or LOST, shape (n, steps).
-        reference: Position [inc], velocity [inc/s], acceleration [inc/s^2], shape (n, 3, cycles).
-        profile_scale: Raw units of the target per unit of the reference, shape (axes,).
-        last: Last action and the one before, written, shape (axes, 2).
-        raw: Set-points that are the actions', written, shape (cycles, axes).
-        target: Set-points of the profile, written, shape (cycles, axes).
-        kind: A row of KINDS.
-    """
-    cycles = raw.shape[0]
-    axes = raw.shape[1] // lanes.shape[0]
-    for axis in range(raw.shape[1]):
-        lane = lanes[axis // axes]
+
+@dataclass(eq=False)
+class Episodes(Bundle):
+    """All that a step reads and writes, of n lanes with their axes; raw values are the drives' integers."""
+
+    lanes: Lanes  # (n,)
+    action: Vector  # -1...1, (axes,)
+    scales: Matrix  # amplitude [inc], speed [inc/s], current limit [mA], full scale of the action [raw], (axes, 4)
+    origin: Vector  # position at the episode's start [inc], (axes,)
+    pending: NumberMatrix  # raw values of the last steps, (axes, DEPTH)
+    bus: NumberMatrix  # cycles that each step's action is late besides, or LOST, (n, steps)
+    reference: Cube  # position [inc], velocity [inc/s], acceleration [inc/s^2], (n, 3, cycles)
+    profile_scale: Vector  # raw units of the target per unit of the reference, (axes,)
+    last: Matrix  # last action and the one before, (axes, 2)
+    played: NumberCube  # written: with an offset the profile's set-points, then the actions', (1 or 2, cycles, axes)
+    sampled: NumberCube  # statusword, position, velocity, torque, (4, cycles, axes)
+    history: NumberCube  # the same of the last cycles, cycle modulo DEPTH, (DEPTH, 4, axes)
+    angles: Vector  # the pendulums' [rad], (n,)
+    weights: Vector  # of TERMS
+    observation: Annotated[NDArray[np.float32], types.float32[:, ::1]]  # written, (n, entries)
+    reward: Vector  # written, (n,)
+    terms: Matrix  # written, (terms, n)
+    ended: Annotated[NDArray[np.bool_], types.boolean[:, ::1]]  # written: terminated and truncated, (2, n)
+    kind: int  # a row of KINDS
+    fall: float  # angle that ends an episode [rad]
+
+
+episodes_at = reader(Episodes)
+
+
+@cached(*_SOURCES, allocates=False)
+def act(address, first, count):
+    """Turn actions of some axes into the rows of set-points that act in this step's cycles."""
+    own = episodes_at(address)
+    lanes, scales, origin, pending, bus = own.lanes, own.scales, own.origin, own.pending, own.bus
+    action, last, reference, profile_scale, played = own.action, own.last, own.reference, own.profile_scale, own.played
+    kind = own.kind
+    raw = played[played.shape[0] - 1]
+    cycles, axes = raw.shape[0], raw.shape[1] // lanes.shape[0]
+    steps, length = bus.shape[1], reference.shape[2]
+    for axis in range(first, first + count):
+        k = axis // axes
+        lane = lanes[k]
         step = lane.step
-        given = limited(float(action[axis]), 1.0)
+        given = limited(action[axis], 1.0)
         value = np.rint(given * scales[axis, 3])
         if kind == DIRECT_POSITION:
             value += origin[axis]
-        late = bus[axis // axes, min(step, bus.shape[1] - 1)]
-        pending[axis, step % DEPTH] = pending[axis, (step - 1) % DEPTH] if late == LOST else np.int64(value)
+        late = bus[k, min(step, steps - 1)]
+        pending[axis, step & LATEST] = pending[axis, (step - 1) & LATEST] if late == LOST else np.int64(value)
         last[axis, 1] = last[axis, 0]
         last[axis, 0] = given
-        latency = lane.action_latency + (0 if late == LOST else np.int64(late))
+        latency = lane.action_latency + (0 if late == LOST else late)
         for c in range(cycles):
             back = 0 if latency <= c else (latency - c + cycles - 1) // cycles
-            raw[c, axis] = pending[axis, (step - min(back, DEPTH - 1)) % DEPTH]
-            now = min(step * cycles + c, reference.shape[2] - 1)
+            raw[c, axis] = pending[axis, (step - min(back, DEPTH - 1)) & LATEST]
+            now = min(step * cycles + c, length - 1)
             if kind == OFFSET_POSITION:
-                target[c, axis] = np.int64(np.rint(origin[axis] + reference[axis // axes, 0, now]))
+                played[0, c, axis] = np.int64(np.rint(origin[axis] + reference[k, 0, now]))
             elif kind == OFFSET_VELOCITY:
-                target[c, axis] = np.int64(np.rint(reference[axis // axes, 1, now]))
+                played[0, c, axis] = np.int64(np.rint(reference[k, 1, now]))
             elif kind == OFFSET_TORQUE:
-                wanted = reference[axis // axes, 2, now] * profile_scale[axis]
-                target[c, axis] = np.int64(np.rint(limited(wanted, scales[axis, 2])))
+                wanted = reference[k, 2, now] * profile_scale[axis]
+                played[0, c, axis] = np.int64(np.rint(limited(wanted, scales[axis, 2])))
+    return 0
 
 
 @inlined
@@ -94,87 +129,84 @@ def position_error(reference, position, origin):
     return error - 4294967296.0 * np.floor((error + 2147483648.0) / 4294967296.0)
 
 
-@cached()
-def describe(lanes, history, reference, scales, origin, last, angles, observation, cycles, where):
-    """Write the observations of the lanes where the mask is true, from the samples that each has by now.
-
-    `history` has the samples of the last cycles, cycle modulo DEPTH, shape (DEPTH, objects, axes); `angles` [rad] are
-    the pendulums', shape (n,); `observation`, shape (n, entries), is written. The others are those of `act`.
-    """
-    axes = history.shape[2] // lanes.shape[0]
-    for k in range(lanes.shape[0]):
-        if not where[k]:
-            continue
-        lane = lanes[k]
-        # After step s the last sample is of cycle s * cycles - 1.
-        newest = lane.step * cycles - 1
-        now = newest - lane.observation_latency
-        at = min(max(now, 0), reference.shape[2] - 1)
-        soon = min(at + PREVIEW, reference.shape[2] - 1)
-        for a in range(axes):
-            axis = k * axes + a
-            sample = history[now % DEPTH]
-            amplitude, speed = scales[axis, 0], scales[axis, 1]
-            error = position_error(reference[k, 0, at], float(sample[1, axis]), origin[axis])
-            first = 8 * a
-            observation[k, first] = limited(error / amplitude, AXIS_HIGH[0])
-            observation[k, first + 1] = limited((reference[k, 1, at] - sample[2, axis]) / speed, AXIS_HIGH[1])
-            observation[k, first + 2] = limited((reference[k, 0, at] - error) / amplitude, AXIS_HIGH[2])
-            observation[k, first + 3] = limited(sample[2, axis] / speed, AXIS_HIGH[3])
-            observation[k, first + 4] = limited(sample[3, axis] / scales[axis, 2], AXIS_HIGH[4])
-            observation[k, first + 5] = limited(reference[k, 1, at] / speed, AXIS_HIGH[5])
-            observation[k, first + 6] = limited(reference[k, 1, soon] / speed, AXIS_HIGH[6])
-            observation[k, first + 7] = last[axis, 0]
-        if observation.shape[1] > 8 * axes:
-            rate = (angles[k] - lane.angle) / (cycles * 1e-3)
-            observation[k, 8 * axes] = limited(angles[k], LOAD_HIGH[0])
-            observation[k, 8 * axes + 1] = limited(rate, LOAD_HIGH[1])
-            lane.angle = angles[k]
+@stage
+def describe(own, k):
+    """Write the observation of lane k, from the samples that it has by now."""
+    reference, history, scales, origin = own.reference, own.history, own.scales, own.origin
+    angles, observation, last = own.angles, own.observation, own.last
+    lane = own.lanes[k]
+    cycles, axes = own.played.shape[1], history.shape[2] // own.lanes.shape[0]
+    # After step s the last sample is of cycle s * cycles - 1.
+    now = lane.step * cycles - 1 - lane.observation_latency
+    at = min(max(now, 0), reference.shape[2] - 1)
+    soon = min(at + PREVIEW, reference.shape[2] - 1)
+    slot = now & LATEST
+    for a in range(axes):
+        axis = k * axes + a
+        amplitude, speed = scales[axis, 0], scales[axis, 1]
+        error = position_error(reference[k, 0, at], float(history[slot, 1, axis]), origin[axis])
+        velocity = history[slot, 2, axis]
+        row = 8 * a
+        observation[k, row] = limited(error / amplitude, AXIS_HIGH[0])
+        observation[k, row + 1] = limited((reference[k, 1, at] - velocity) / speed, AXIS_HIGH[1])
+        observation[k, row + 2] = limited((reference[k, 0, at] - error) / amplitude, AXIS_HIGH[2])
+        observation[k, row + 3] = limited(velocity / speed, AXIS_HIGH[3])
+        observation[k, row + 4] = limited(history[slot, 3, axis] / scales[axis, 2], AXIS_HIGH[4])
+        observation[k, row + 5] = limited(reference[k, 1, at] / speed, AXIS_HIGH[5])
+        observation[k, row + 6] = limited(reference[k, 1, soon] / speed, AXIS_HIGH[6])
+        observation[k, row + 7] = last[axis, 0]
+    if observation.shape[1] > 8 * axes:
+        rate = (angles[k] - lane.angle) / (cycles * 1e-3)
+        observation[k, 8 * axes] = limited(angles[k], LOAD_HIGH[0])
+        observation[k, 8 * axes + 1] = limited(rate, LOAD_HIGH[1])
+        lane.angle = angles[k]
 
 
-@cached()
-def observe(
-    lanes, status, position, velocity, torque, history, reference, scales, origin, last, angles, weights, bus, fall,
-    everywhere, observation, reward, terms, ended,
-):  # fmt: skip
-    """Take a step's samples in; write observation, reward and its terms; say whether a drive tripped.
+@cached(*_SOURCES, allocates=False)
+def describe_lanes(address, where):
+    """Write the observations of the lanes where the mask is true."""
+    own = episodes_at(address)
+    for k in range(where.shape[0]):
+        if where[k]:
+            describe(own, k)
 
-    The samples have shape (cycles, axes), `weights` are those of TERMS, `fall` is the angle that ends an episode [rad].
-    Written are `reward`, shape (n,), `terms`, shape (terms, n), and `ended`: terminated and truncated, shape (2, n).
-    The others are those of `act` and `describe`.
-    """
-    cycles = status.shape[0]
-    axes = status.shape[1] // lanes.shape[0]
-    some = False
-    for k in range(lanes.shape[0]):
+
+@cached(*_SOURCES, allocates=False)
+def observe(address, first, count):
+    """Take some axes' samples in; write observations, rewards and their terms, and which lanes have ended."""
+    own = episodes_at(address)
+    lanes, sampled, history, reference = own.lanes, own.sampled, own.history, own.reference
+    scales, origin, last, angles, weights, bus = own.scales, own.origin, own.last, own.angles, own.weights, own.bus
+    reward, terms, ended = own.reward, own.terms, own.ended
+    cycles, axes = sampled.shape[1], sampled.shape[2] // lanes.shape[0]
+    steps, length = bus.shape[1], reference.shape[2]
+    has_angle = own.observation.shape[1] > 8 * axes
+    for k in range(first // axes, (first + count) // axes):
         lane = lanes[k]
         begun = lane.step * cycles
-        lost = bus[k, min(lane.step, bus.shape[1] - 1)] == LOST
+        lost = bus[k, min(lane.step, steps - 1)] == LOST
         tripped = False
         tracking, slow, effort, smooth = 0.0, 0.0, 0.0, 0.0
-        at = min(begun + cycles - 1, reference.shape[2] - 1)
-        for a in range(axes):
-            axis = k * axes + a
+        at = min(begun + cycles - 1, length - 1)
+        for axis in range(k * axes, (k + 1) * axes):
             for c in range(cycles):
-                slot = (begun + c) % DEPTH
-                before = (begun + c - 1) % DEPTH
-                # A master that missed the SYNC still has the samples of the last one.
-                history[slot, 0, axis] = history[before, 0, axis] if lost else status[c, axis]
-                history[slot, 1, axis] = history[before, 1, axis] if lost else position[c, axis]
-                history[slot, 2, axis] = history[before, 2, axis] if lost else velocity[c, axis]
-                history[slot, 3, axis] = history[before, 3, axis] if lost else torque[c, axis]
+                slot, before = (begun + c) & LATEST, (begun + c - 1) & LATEST
+                for sample in range(4):
+                    # A master that missed the SYNC still has the samples of the last one.
+                    history[slot, sample, axis] = history[before, sample, axis] if lost else sampled[sample, c, axis]
             c = cycles - 1
-            tripped = tripped or status[c, axis] & OPERATION_ENABLED[0] != OPERATION_ENABLED[1]
-            error = position_error(reference[k, 0, at], float(position[c, axis]), origin[axis])
+            status, position, velocity = sampled[0, c, axis], sampled[1, c, axis], sampled[2, c, axis]
+            tripped |= status & OPERATION_ENABLED[0] != OPERATION_ENABLED[1]
+            error = position_error(reference[k, 0, at], float(position), origin[axis])
             tracking += tolerance(error / scales[axis, 0], TRACKING_MARGIN)
-            slow += tolerance((reference[k, 1, at] - velocity[c, axis]) / scales[axis, 1], SPEED_MARGIN)
-            effort += tolerance(torque[c, axis] / scales[axis, 2], EFFORT_MARGIN)
+            slow += tolerance((reference[k, 1, at] - velocity) / scales[axis, 1], SPEED_MARGIN)
+            effort += tolerance(sampled[3, c, axis] / scales[axis, 2], EFFORT_MARGIN)
             smooth += tolerance(last[axis, 0] - last[axis, 1], SMOOTHNESS_MARGIN)
-        fallen = abs(angles[k]) > fall
+        fallen = abs(angles[k]) > own.fall
         lane.fallen = 1 if fallen else 0
         terms[0, k] = tracking / axes
         terms[1, k] = slow / axes
-        terms[2, k] = tolerance(angles[k], LOAD_MARGIN) if observation.shape[1] > 8 * axes else 0.0
+        terms[2, k] = tolerance(angles[k], LOAD_MARGIN) if has_angle else 0.0
         terms[3, k] = effort / axes
         terms[4, k] = smooth / axes
         terms[5, k] = 1.0 if tripped or fallen else 0.0
@@ -185,6 +217,5 @@ def observe(
         lane.step += 1
         ended[0, k] = tripped or fallen
         ended[1, k] = lane.step >= lane.steps
-        some = some or tripped or fallen
-    describe(lanes, history, reference, scales, origin, last, angles, observation, cycles, everywhere)
-    return some
+        describe(own, k)
+    return 0

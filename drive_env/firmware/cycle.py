@@ -6,10 +6,12 @@ position and velocity loops, winding matrices; then the current ticks; then one 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated
 
 import numpy as np
+from numba import from_dtype, types
 from numpy.typing import NDArray
 
 import mechanics.compiled
@@ -24,10 +26,13 @@ from drive_env.firmware.power_stage import (
     power_stage,
     refresh_winding,
 )
-from drive_env.firmware.record import LANES
+from drive_env.firmware.record import LANES, RECORD
 from drive_env.firmware.sensors import measure_angle, measure_currents, measure_halls, measure_motion
 from mechanics import stepping
+from mechanics.bundle import Bundle, Cube, Matrix, Numbers, reader
+from mechanics.calls import call_hook, next_number
 from mechanics.compiled import cached, inlined, stage
+from mechanics.plant import Plant
 
 _SOURCES = (Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
 
@@ -41,7 +46,8 @@ BRAKE_OPEN, BRAKE_CLOSED, BRAKE_WITH_STAGE = 0, 1, 2
 ACTIVITY_TIME = 0.02
 
 
-class Rates(NamedTuple):
+@dataclass(eq=False)
+class Rates(Bundle):
     """Periods [s] and their ratios; data of the device and of the physics."""
 
     tick: float  # current loop
@@ -51,9 +57,61 @@ class Rates(NamedTuple):
     windows: int  # per period
     substeps: int  # physics steps per window
     # Share of each tick's torque in the mean of each physics step, shape (substeps, ticks).
-    weights: NDArray[np.float64]
+    weights: Matrix
     # The same times the time from the step's middle to the tick's [s].
-    moments: NDArray[np.float64]
+    moments: Matrix
+
+
+Records = Annotated[NDArray[np.void], types.Array(from_dtype(RECORD), 1, "C")]
+Integers = Annotated[NDArray[np.int32], types.int32[:, ::1]]
+
+
+@dataclass(eq=False)
+class Machinery(Bundle):
+    """What a run knows of a group of machines.
+
+    `reals` and `integers` are the records' memory, shape (blocks, numbers per record).
+    """
+
+    records: Records  # (blocks,)
+    reals: Matrix
+    integers: Integers
+    plant: Plant
+    rates: Rates
+    motion: Matrix  # scratch, (7, 8 blocks)
+    first_axis: int  # number of the group's first axis in a call's rows
+    num_axes: int
+
+
+@dataclass(eq=False)
+class Call(Bundle):
+    """What a run plays and samples; values are SI.
+
+    `before` and `after` are addresses of hooks or 0. They are called with `data`, a group's first axis and its number
+    of axes, in the thread that runs the group; where `before` returns 0 the group stays as it is.
+    """
+
+    values: Cube  # (cycles, objects, all axes)
+    kinds: Numbers  # REAL, INTEGER, CONTROLWORD, MODE or SET_POINT, (objects,)
+    offsets: Numbers  # index of lane 0 in `reals` or `integers`, (objects,)
+    samples: Cube  # written, (rows, objects, all axes)
+    sample_kinds: Numbers  # REAL or INTEGER
+    sample_offsets: Numbers
+    every: int = 1  # cycles per sample
+    before: int = 0
+    after: int = 0
+    data: int = 0
+
+
+@dataclass(eq=False)
+class Fleet(Bundle):
+    """All groups of a set of drives, and the number of the next one that a thread takes."""
+
+    groups: Numbers  # addresses of Machinery
+    turn: Numbers  # (1,)
+
+
+machinery_at, call_at, fleet_at = reader(Machinery), reader(Call), reader(Fleet)
 
 
 @inlined
@@ -65,7 +123,7 @@ def collect_torque(drive, s, weight, moment):
         drive.moment_window[s, lane] += moment * drive.tau_m[lane]
 
 
-@inlined
+@stage
 def tick(drive, rates, k):
     """Run one period of the current loop, tick k of its window."""
     if drive.block_uses_halls[0]:
@@ -82,7 +140,7 @@ def tick(drive, rates, k):
         collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
 
 
-@inlined
+@stage
 def start_window(drive, rates):
     """Read the encoder, close position and velocity loop, and prepare the winding for the ticks of this window."""
     if not drive.block_uses_halls[0]:
@@ -189,7 +247,7 @@ def sample_row(reals, integers, samples, kinds, offsets, row, first_axis, num_ax
                 samples[row, k, first_axis + axis] = integers[block, offsets[k] + lane]
 
 
-@stage
+@inlined
 def mechanics_window(records, plant, rates, motion):
     """Step the load through one window and bring the rotors to where it has them.
 
@@ -273,45 +331,49 @@ def halt_diverged(drive, lane):
     fsa.update_statusword(drive, lane, 0)
 
 
-@cached(*_SOURCES, allocates=False)
-def run(
-    records, reals, integers, plant, rates, motion, first_axis, num_axes, start, cycles,
-    play_values, play_kinds, play_offsets, samples, sample_kinds, sample_offsets, every,
-):  # fmt: skip
-    """Run one group of machines for whole communication cycles.
-
-    Cycle k: play row k, record row k (every `every` cycles), simulate one period.
-
-    Args:
-        records: The group's records, shape (blocks,).
-        reals: The same memory as doubles, shape (blocks, doubles per record).
-        integers: The same memory as 32-bit integers, shape (blocks, integers per record).
-        plant: The group's mechanics.
-        rates: Periods.
-        motion: Scratch, shape (7, 8 blocks).
-        first_axis: Number of the group's first axis in play and samples.
-        num_axes: Axes of the group.
-        start: Cycle to begin with.
-        cycles: Cycle to end before.
-        play_values: SI values, shape (cycles, objects, all axes).
-        play_kinds: REAL, INTEGER, CONTROLWORD, MODE or SET_POINT, shape (objects,).
-        play_offsets: Index of lane 0 in `reals` or `integers`, shape (objects,).
-        samples: SI values, written, shape (rows, objects, all axes).
-        sample_kinds: REAL or INTEGER, shape (objects,).
-        sample_offsets: Like play_offsets.
-        every: Cycles per sample.
-    """
+@inlined
+def run_group(group, call, start, cycles):
+    """Run one group; cycle k: play row k, record row k (every `every` cycles), simulate one period."""
+    records, reals, integers, plant, rates = group.records, group.reals, group.integers, group.plant, group.rates
     for cycle in range(start, cycles):
-        play_row(records, reals, integers, play_values, play_kinds, play_offsets, cycle, first_axis, num_axes)
-        if cycle % every == 0:
-            sample_row(reals, integers, samples, sample_kinds, sample_offsets, cycle // every, first_axis, num_axes)
+        play_row(
+            records, reals, integers, call.values, call.kinds, call.offsets, cycle, group.first_axis, group.num_axes
+        )
+        if cycle % call.every == 0:
+            sample_row(
+                reals, integers, call.samples, call.sample_kinds, call.sample_offsets, cycle // call.every,
+                group.first_axis, group.num_axes,
+            )  # fmt: skip
         for block in range(records.shape[0]):
             supervise(records[block], rates)
         meet(records, plant)
         for _ in range(rates.windows):
             for block in range(records.shape[0]):
                 window(records[block], rates)
-            mechanics_window(records, plant, rates, motion)
+            mechanics_window(records, plant, rates, group.motion)
+
+
+@cached(*_SOURCES, allocates=False)
+def run(fleet_address, call_address, start, cycles, first, last):
+    """Run groups for whole communication cycles from `start` up to `cycles`, taking turns with other threads.
+
+    `first` and `last` say whether the call's hooks are due. Returns whether a machine has left physics.
+    """
+    fleet, call = fleet_at(fleet_address), call_at(call_address)
+    groups, turn = fleet.groups, fleet.turn
+    some = False
+    k = next_number(turn)
+    while k < groups.shape[0]:
+        group = machinery_at(groups[k])
+        if not first or call.before == 0 or call_hook(call.before, call.data, group.first_axis, group.num_axes) != 0:
+            run_group(group, call, start, cycles)
+            if last and call.after != 0:
+                call_hook(call.after, call.data, group.first_axis, group.num_axes)
+        diverged = group.plant.diverged
+        for copy in range(diverged.shape[0]):
+            some |= diverged[copy] != 0
+        k = next_number(turn)
+    return some
 
 
 @cached(*_SOURCES, allocates=False)
