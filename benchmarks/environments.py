@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.lanes import OneLane
 from drive_env.envs.tracking import Tracking
 
@@ -82,6 +83,25 @@ def times_in_turn_once(function: Callable[[], Any], calls: int) -> float:
     return (time.perf_counter() - start) / calls
 
 
+def gain_scheduling() -> dict[str, float]:
+    """Return steps/s of 10 ms, their overhead over bare `advance`, and the time of a reset of all lanes [ms]."""
+    lanes = GainScheduling(LANES, num_threads=1)
+    lanes.reset(seed=0)
+    given = np.random.default_rng(0).uniform(-1, 1, (256, *(lanes.action_space.shape or ()))).astype(np.float32)
+    count = iter(range(10**9))
+    # 150 calls in a row, so that payloads change as often as they do.
+    functions = [lambda: lanes.step(given[next(count) % 256]), lambda: lanes.drives.advance(lanes.config.step)]
+    step, advance = times_in_turn(functions, 150)
+    (reset,) = times_in_turn([lanes.reset], 1)
+    lanes.close()
+    name = f"GainScheduling, {lanes.config.load}, {LANES} lanes"
+    return {
+        f"{name}: env-steps/s of 10 ms": LANES / step,
+        f"{name}: overhead over advance": step / advance - 1.0,
+        f"{name}: reset [ms]": reset * 1e3,
+    }
+
+
 def alone() -> dict[str, float]:
     """Return steps/s of the single environment, and of bare `advance` of its drives."""
     env = OneLane(Tracking(1, autoreset_mode="Disabled", num_threads=1, duration=1e6 / 1000))
@@ -138,6 +158,7 @@ def figures() -> dict[str, float]:
         **vectorised(LANES, (1,), 200),
         **vectorised(MANY_LANES, (1, 2), 20),
         **alone(),
+        **gain_scheduling(),
         **share_of_training(),
         **memory(),
     }

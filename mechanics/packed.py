@@ -101,6 +101,7 @@ class PackedLoad:
         if load.rolls:
             # MuJoCo takes the inertia of simple joints from a constant; a roll's grows.
             self.model.dof_simplenum[:] = 0
+        self._body_numbers: dict[str, NDArray[np.int64]] = {}
         self._joints = [
             str(self.model.joint(int(self.model.dof_jntid[d])).name).removeprefix("0/") for d in range(self.num_dofs)
         ]
@@ -146,10 +147,11 @@ class PackedLoad:
         """Return a parameter of every copy, shape (copies,)."""
         parameter = self._parameter(name)
         if parameter.field in _BODY_FIELDS:
-            bodies = [self.model.body(f"{k}/{parameter.element}") for k in range(self.copies)]
+            bodies = self._bodies(parameter.element)
             if parameter.field == "body_ipos":
-                return np.array([np.linalg.norm(body.ipos) for body in bodies])
-            return np.array([b.mass[0] if parameter.field == "body_mass" else b.inertia[0] for b in bodies])
+                return np.array([np.linalg.norm(place) for place in self.model.body_ipos[bodies]])
+            return np.array(self.model.body_mass[bodies] if parameter.field == "body_mass"
+                            else self.model.body_inertia[bodies, 0])  # fmt: skip
         if parameter.field == "gap":
             low, high = (self._column(parameter, field) for field in ("low", "high"))
             return np.asarray(high - low)
@@ -161,10 +163,10 @@ class PackedLoad:
         parameter = self._parameter(name)
         self._store(parameter, np.asarray(values, float)[where], where)
         try:
-            self._apply()
+            self._apply(where)
         except ValueError:
             self._store(parameter, before, slice(None))
-            self._apply()
+            self._apply(where)
             raise
 
     def set_motor(self, armature: Floats, friction: Floats) -> None:
@@ -202,16 +204,17 @@ class PackedLoad:
             )
         before = {name: self.get(name) for name in parameters}
         motors = self._armature.copy(), self._friction[:, : self.num_axes, :4].copy()
+        changed = where | np.any(armature != motors[0], axis=1) | np.any(friction != motors[1], axis=(1, 2))
         try:
             for name, values in parameters.items():
                 self._store(self._parameter(name), np.asarray(values, float)[where], where)
             self._armature[:], self._friction[:, : self.num_axes, :4] = armature, friction
-            self._apply()
+            self._apply(changed)
         except ValueError:
             for name, values in before.items():
                 self._store(self._parameter(name), values, slice(None))
             self._armature[:], self._friction[:, : self.num_axes, :4] = motors
-            self._apply()
+            self._apply(changed)
             raise
 
     def reset(self, where: NDArray[np.bool_]) -> None:
@@ -270,6 +273,13 @@ class PackedLoad:
     def _by_copy(self, array: Floats) -> Floats:
         return array.reshape(self.copies, self.num_dofs)
 
+    def _bodies(self, element: str) -> NDArray[np.int64]:
+        """Return the numbers of every copy's body of a name."""
+        if element not in self._body_numbers:
+            numbers = [self.model.body(f"{k}/{element}").id for k in range(self.copies)]
+            self._body_numbers[element] = np.array(numbers, np.int64)
+        return self._body_numbers[element]
+
     def _parameter(self, name: str) -> Parameter:
         for parameter in self.load.parameters:
             if parameter.name == name:
@@ -326,13 +336,16 @@ class PackedLoad:
     def _store(self, parameter: Parameter, values: Floats, where: slice | NDArray[np.bool_]) -> None:
         self.check(parameter.name, values)
         if parameter.field in _BODY_FIELDS:
-            copies = np.arange(self.copies)[where]
-            for k, value in zip(copies, np.broadcast_to(values, copies.shape), strict=True):
-                body = self.model.body(f"{k}/{parameter.element}")
-                if parameter.field == "body_ipos":
-                    body.ipos[:] *= value / np.linalg.norm(body.ipos)
-                else:
-                    (body.mass if parameter.field == "body_mass" else body.inertia)[:] = value
+            bodies = self._bodies(parameter.element)[where]
+            chosen = np.broadcast_to(values, bodies.shape)
+            if parameter.field == "body_ipos":
+                for body, value in zip(bodies, chosen, strict=True):
+                    place = self.model.body_ipos[body]
+                    self.model.body_ipos[body] = place * (value / np.linalg.norm(place))
+            elif parameter.field == "body_mass":
+                self.model.body_mass[bodies] = chosen
+            else:
+                self.model.body_inertia[bodies] = chosen[:, None]
         elif parameter.field == "gap":
             middle = 0.5 * (self._column(parameter, "low") + self._column(parameter, "high"))[where]
             self._column(parameter, "low")[where] = middle - 0.5 * values
@@ -426,38 +439,44 @@ class PackedLoad:
                 row[self._joints.index(joint)] += coefficient
         return rows
 
-    def _apply(self) -> None:
-        """Bring parameters into MuJoCo's model and the plant: stiffness corrected, damping halved, inertias derived."""
-        plant = self.plant
+    def _apply(self, changed: NDArray[np.bool_] | None = None) -> None:
+        """Bring parameters into MuJoCo's model and the plant: stiffness corrected, damping halved, inertias derived.
+
+        What is derived outside MuJoCo is so for the changed copies alone; None is all.
+        """
+        plant, copies = self.plant, np.arange(self.copies) if changed is None else np.flatnonzero(changed)
+        if not len(copies):
+            return
         self._place_rotors()
         moving = (self.data.qpos.copy(), self.data.qvel.copy())
         mujoco.mj_setConst(self.model, self.data)
         # At the reference position, so that setting one copy cannot change the rounding of another.
         self.data.qpos[:], self.data.qvel[:] = np.tile(self.start, self.copies), 0.0
-        inertia = self.mass_matrix()
-        plant.bias[:] = self._by_copy(self.data.qfrc_bias).T
+        inertia = self.mass_matrix()[copies]
+        plant.bias[:, copies] = self._by_copy(self.data.qfrc_bias)[copies].T
         self.data.qpos[:], self.data.qvel[:] = moving
         plant.damping[:] = self._damping.T
         if self.staggered:
-            found = corrections(inertia, self._stiffness, plant.axis_motion, self.h)
-            self._check_phase(found.phase, found.shapes)
-            plant.stiffness[:] = _copies_last(found.stiffness)
-            plant.held[:] = _copies_last(found.held)
-            plant.held_moment[:] = _copies_last(found.held_moment)
-            plant.axis_kick[:] = _copies_last(found.kick)
+            found = corrections(inertia, self._stiffness[copies], plant.axis_motion, self.h)
+            self._check_phase(found.phase, found.shapes, copies)
+            plant.stiffness[..., copies] = _copies_last(found.stiffness)
+            plant.held[..., copies] = _copies_last(found.held)
+            plant.held_moment[..., copies] = _copies_last(found.held_moment)
+            plant.axis_kick[..., copies] = _copies_last(found.kick)
         # The springs' force is the plant's, since the corrected one is no spring of a joint any more.
         self._by_copy(self.model.jnt_stiffness)[:] = 0.0 if self.staggered else self._stiffness
         self._by_copy(self.model.dof_damping)[:] = self._damping * (0.5 if self.staggered else 1.0)
         inverse = np.linalg.inv(inertia)
         share = np.einsum("cde,fe->fdc", inverse, plant.motion)
-        plant.mass[:] = 1.0 / np.einsum("fd,fdc->fc", plant.motion, share)
-        plant.share[:] = share * plant.mass[:, None]
-        self._apply_frictions()
-        self._apply_contacts()
+        mass = 1.0 / np.einsum("fd,fdc->fc", plant.motion, share)
+        plant.mass[:, copies] = mass
+        plant.share[..., copies] = share * mass[:, None]
+        self._apply_frictions(copies)
+        self._apply_contacts(copies)
         plant.roll[:] = self._roll
         dofs = plant.roll_dof
         wound = self._by_copy(self.model.dof_armature)[:, dofs] - plant.roll_armature
-        plant.roll_inertia[:] = inertia[:, dofs, dofs] - wound
+        plant.roll_inertia[copies] = inertia[:, dofs, dofs] - wound[copies]
 
     def _place_rotors(self) -> None:
         """Enter the rotors as armature of their joints or tendons, on the load's side of the gear."""
@@ -481,11 +500,12 @@ class PackedLoad:
         loads = range(len(self.load.frictions))
         return [*range(self.num_axes), *(self.num_axes + k for k in loads if k not in self._merged)]
 
-    def _apply_frictions(self) -> None:
+    def _apply_frictions(self, copies: NDArray[np.intp]) -> None:
         chosen, plant = self._model_of_friction, self.plant
-        column = {name: self._friction[:, :, k] for k, name in enumerate(FRICTION_COLUMNS)}
+        own = self._friction[copies]
+        column = {name: own[:, :, k] for k, name in enumerate(FRICTION_COLUMNS)}
         # The motors' bearings keep theirs: it is theirs to be without friction.
-        loads = np.arange(self._friction.shape[1]) >= self.num_axes
+        loads = np.arange(own.shape[1]) >= self.num_axes
         coulomb = np.where(loads & (not chosen.dry), 0.0, column["coulomb"])
         risen = np.where(loads & (not chosen.stribeck), column["coulomb"], column["breakaway"])
         breakaway = np.where(loads & (not chosen.dry), 0.0, np.maximum(risen, coulomb))
@@ -499,33 +519,34 @@ class PackedLoad:
             turning += row * scale**powers * np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
             turning[:, 2] = row[:, 2] / scale
         rows = rows[:, self._apart()]
-        plant.friction[:, :5] = _copies_last(rows[:, :, :5])
-        plant.friction[:, 7] = rows[:, :, 5].T
+        plant.friction[:, :5, copies] = _copies_last(rows[:, :, :5])
+        plant.friction[:, 7, copies] = rows[:, :, 5].T
         bristle = column["bristle"][:, self._apart()]
         bristled = loads[self._apart()] & chosen.bristles & (bristle > 0.0)
         stiffness = np.where(bristled, rows[:, :, 1] / np.where(bristled, bristle, 1.0), 0.0)
-        plant.friction[:, 5] = stiffness.T
-        plant.friction[:, 6] = 2.0 * BRISTLE_DAMPING * np.sqrt(stiffness.T * plant.mass[: self.num_frictions])
+        plant.friction[:, 5, copies] = stiffness.T
+        mass = plant.mass[: self.num_frictions, copies]
+        plant.friction[:, 6, copies] = 2.0 * BRISTLE_DAMPING * np.sqrt(stiffness.T * mass)
 
-    def _apply_contacts(self) -> None:
-        plant, stiffness = self.plant, self._contact[:, :, 2].T
-        plant.contact[:, :4] = _copies_last(self._contact)
-        phase = 0.5 * self.h * np.sqrt(stiffness / plant.mass[self.num_frictions :])
+    def _apply_contacts(self, copies: NDArray[np.intp]) -> None:
+        plant, stiffness = self.plant, self._contact[copies, :, 2].T
+        plant.contact[:, :4, copies] = _copies_last(self._contact[copies])
+        phase = 0.5 * self.h * np.sqrt(stiffness / plant.mass[self.num_frictions :, copies])
         if self.staggered:
             # As in modal.py, for the mode that the spring has while it is pressed.
-            plant.contact[:, 2] *= np.sinc(phase / np.pi) ** 2
-            plant.contact[:, 4] = np.sinc(2.0 * phase / np.pi) - 1.0
-            plant.contact[:, 5] = 2.0 * phase / self.h * np.sin(phase)
+            plant.contact[:, 2, copies] *= np.sinc(phase / np.pi) ** 2
+            plant.contact[:, 4, copies] = np.sinc(2.0 * phase / np.pi) - 1.0
+            plant.contact[:, 5, copies] = 2.0 * phase / self.h * np.sin(phase)
         if phase.size and 2.0 * phase.max() > MAX_PHASE_PER_STEP:
             k, worst = np.unravel_index(int(phase.argmax()), phase.shape)
-            self._refuse(f"contact {self.load.contacts[int(k)].name!r}", int(worst), float(phase.max()))
+            self._refuse(f"contact {self.load.contacts[int(k)].name!r}", int(copies[worst]), float(phase.max()))
 
-    def _check_phase(self, phase: Floats, shapes: Floats) -> None:
+    def _check_phase(self, phase: Floats, shapes: Floats, copies: NDArray[np.intp]) -> None:
         if 2.0 * phase.max() > MAX_PHASE_PER_STEP:
             worst, mode = np.unravel_index(int(phase.argmax()), phase.shape)
             # The joint whose spring takes most of that mode's energy.
-            dof = int(np.argmax(self._stiffness[worst] * shapes[worst, :, mode] ** 2))
-            self._refuse(f"joint {self._joints[dof]!r}", int(worst), float(phase.max()))
+            dof = int(np.argmax(self._stiffness[copies[worst]] * shapes[worst, :, mode] ** 2))
+            self._refuse(f"joint {self._joints[dof]!r}", int(copies[worst]), float(phase.max()))
 
     def _refuse(self, what: str, copy_: int, phase: float) -> None:
         raise ValueError(

@@ -240,7 +240,7 @@ def bus_of(lanes, action=0, observation=0, jitter=0, lost=0.0, seeds=None):
 
 
 def sent(line, lanes, cycles=40):
-    return np.array([line(np.full((lanes, 1), k))[:, 0] for k in range(cycles)])
+    return line(np.broadcast_to(np.arange(cycles)[:, None, None], (cycles, lanes, 1)))[:, :, 0]
 
 
 @pytest.mark.parametrize("latency", [0, 1, 3])
@@ -288,7 +288,7 @@ def test_a_lane_s_bus_follows_from_its_generator_alone():
 
 def test_a_bus_without_faults_hands_on_what_it_is_given():
     bus = bus_of(2)
-    message = np.ones((2, 1))
+    message = np.ones((1, 2, 1))
     assert not bus.is_there
     assert bus.act(message) is message
 

@@ -13,7 +13,6 @@ from test_parity import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World
-from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.tracking import OBJECTS, TASKS, Tracking, TrackingConfig
 from drive_env.envs.trajectories import TRAJECTORIES, draw
 
@@ -303,16 +302,19 @@ def test_bus_imperfections_are_drawn_and_late():
     }
     with tracking(64, distributions=laws) as lanes:
         lanes.reset(seed=0)
-        assert set(lanes._episodes.lanes["action_latency"]) == {3} and set(
-            lanes._episodes.lanes["observation_latency"]
-        ) == {2}
-        assert abs(np.mean(lanes._episodes.bus == cycle.LOST) - 0.2) < 0.01
+        bus = lanes._bus
+        assert set(bus.actions.latency) == {3} and set(bus.observations.latency) == {2}
         first = None
         for k in range(12):
             observation, *_ = lanes.step(np.ones((64, 1), np.float32))
             moving = np.abs(observation[:, 4]) > 0.2
             first = k if first is None and moving.any() else first
         assert first == 1 + 3 + 2
+        for _ in range(200):
+            lanes.step(np.ones((64, 1), np.float32))
+        # A lost SYNC leaves the samples of the last one standing: they are a cycle older then.
+        ages = 211 - bus.observations.held[:, -1]
+        assert set(ages) >= {2.0, 3.0} and 0.05 < np.mean(ages > 2.0) < 0.5
 
 
 # --- trajectories -----------------------------------------------------------------------------------------------------

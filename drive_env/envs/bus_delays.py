@@ -8,19 +8,26 @@ neither latch what has arrived nor sample: the last action goes on, the last mea
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
-from drive_env.envs.randomisation import shares_of_chance
+import mechanics.compiled
+from mechanics.bundle import Bundle, Cube, Matrix, NumberMatrix, Numbers, Vector, reader
+from mechanics.compiled import cached, inlined, stage
+
+_SOURCES = (Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 # Marks of the chances that a cycle has; the cycle's number is added.
-_LOST, _ACTION, _OBSERVATION = (np.uint64(k << 40) for k in (1, 2, 3))
+_LOST, _ACTION, _OBSERVATION = (k << 40 for k in (1, 2, 3))
 
 
 class BusDelays:
@@ -29,13 +36,15 @@ class BusDelays:
     Args:
         num_lanes: Lanes.
         deepest: Longest latency and jitter together that a lane can have [communication cycles].
+
+    Compiled code passes messages on by `pass_on`, with the lines' addresses.
     """
 
     def __init__(self, num_lanes: int, deepest: int = 8) -> None:
         self._keys = np.zeros(num_lanes, np.uint64)
         self._lost_sync = np.zeros(num_lanes)
-        self._actions = _Line(num_lanes, deepest, _ACTION)
-        self._observations = _Line(num_lanes, deepest, _OBSERVATION)
+        self.actions = _new_line(_ACTION, self._keys, self._lost_sync, deepest)
+        self.observations = _new_line(_OBSERVATION, self._keys, self._lost_sync, deepest)
         self.is_there = False  # whether any lane's bus does anything: without, all arrives at once
 
     def reset(
@@ -67,75 +76,128 @@ class BusDelays:
         if np.any((self._lost_sync < 0.0) | (self._lost_sync > 1.0)):
             raise ValueError(f"bus.lost_sync must lie in 0...1, not {self._lost_sync[mask].max():g}")
         jitter = values["bus.jitter"]
-        self._actions.reset(values["bus.action_latency"], jitter, np.asarray(action), mask)
-        self._observations.reset(values["bus.observation_latency"], jitter, np.asarray(observation), mask)
-        self.is_there = bool(self._lost_sync.any()) or self._actions.is_there or self._observations.is_there
+        self.actions.reset(values["bus.action_latency"], jitter, np.asarray(action), mask)
+        self.observations.reset(values["bus.observation_latency"], jitter, np.asarray(observation), mask)
+        self.is_there = bool(self._lost_sync.any()) or self.actions.is_there or self.observations.is_there
 
-    def act(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Send an action in this cycle, shape (num_lanes, ...); return the one that the drives act on in it."""
-        return self._actions.pass_on(action, self._keys, self._lost_sync) if self.is_there else action
+    def act(self, actions: NDArray[Any]) -> NDArray[Any]:
+        """Send actions in some cycles, shape (cycles, num_lanes, ...); return those that the drives act on in each."""
+        return self.actions.pass_on(actions) if self.is_there else actions
 
-    def act_unlatched(self, action: NDArray[Any]) -> NDArray[Any]:
+    def act_unlatched(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Send what needs no SYNC to act, as an SDO does not: a lost one does not hold it up."""
-        return self._actions.pass_on(action, self._keys, None) if self.is_there else action
+        return self.actions.pass_on(actions, latched=False) if self.is_there else actions
 
-    def observe(self, observation: NDArray[Any]) -> NDArray[Any]:
-        """Let the drives sample in this cycle, shape (num_lanes, ...); return what the master has by its end."""
-        return self._observations.pass_on(observation, self._keys, self._lost_sync) if self.is_there else observation
+    def observe(self, observations: NDArray[Any]) -> NDArray[Any]:
+        """Let the drives sample in some cycles, (cycles, num_lanes, ...); return what the master has by their ends."""
+        return self.observations.pass_on(observations) if self.is_there else observations
 
 
-class _Line:
-    """Messages under way of every lane, in one direction."""
+@dataclass(eq=False)
+class Line(Bundle):
+    """Messages under way of every lane, in one direction; as doubles, which hold all integers of 32 bits."""
 
-    def __init__(self, num_lanes: int, deepest: int, mark: np.uint64) -> None:
-        self._mark = mark
-        self._deepest = deepest
-        self._lanes = np.arange(num_lanes)
-        self._cycle = np.zeros(num_lanes, np.int64)
-        self._latency = np.zeros(num_lanes, np.int64)
-        self._jitter = np.zeros(num_lanes, np.int64)
-        self._arrivals = np.zeros((deepest + 1, num_lanes), np.int64)
-        self._last_arrival = np.zeros(num_lanes, np.int64)
-        self._messages: NDArray[Any] = np.zeros((deepest + 1, num_lanes))
-        self._held: NDArray[Any] = np.zeros(num_lanes)
-        self._turn = 0
+    keys: Annotated[NDArray[np.uint64], types.uint64[::1]]  # of chance, (num_lanes,)
+    mark: int  # of this direction's chances
+    lost_sync: Vector  # probability per cycle, (num_lanes,)
+    latency: Numbers  # [communication cycles]
+    jitter: Numbers
+    cycle: Numbers  # of each lane, counted since its reset
+    last_arrival: Numbers
+    arrivals: NumberMatrix  # of the last messages, (num_lanes, depth)
+    messages: Cube  # (num_lanes, depth, width)
+    held: Matrix  # what is there now, (num_lanes, width)
 
     @property
     def is_there(self) -> bool:
-        return bool(self._latency.any() or self._jitter.any())
+        """Whether this direction of any lane delays anything."""
+        return bool(self.latency.any() or self.jitter.any())
 
     def reset(self, latency: Floats, jitter: Floats, first: NDArray[Any], where: Mask) -> None:
-        if self._messages.shape[1:] != first.shape or self._messages.dtype != first.dtype:
-            self._messages = np.zeros((self._deepest + 1, *first.shape), first.dtype)
-            self._held = np.zeros_like(first)
+        """Begin anew in the lanes where the mask is true, with what is there before the first message."""
+        lanes, width, depth = len(where), first[0].size, self.arrivals.shape[1]
+        if self.held.shape[1] != width:
+            self.replace(messages=np.zeros((lanes, depth, width)), held=np.zeros((lanes, width)))
         whole = np.rint(latency).astype(np.int64), np.rint(jitter).astype(np.int64)
         longest = (whole[0] + whole[1])[where]
-        if longest.max() > self._deepest or min(whole[0][where].min(), whole[1][where].min()) < 0:
+        if longest.max() >= depth or min(whole[0][where].min(), whole[1][where].min()) < 0:
             raise ValueError(
-                f"latency and jitter of a bus together are 0...{self._deepest} communication cycles here, not "
+                f"latency and jitter of a bus together are 0...{depth - 1} communication cycles here, not "
                 f"{longest.max()}"
             )
-        self._latency[where], self._jitter[where] = whole[0][where], whole[1][where]
-        self._cycle[where] = 0
-        self._last_arrival[where] = 0
-        self._arrivals[:, where] = -1
-        self._messages[:, where] = first[where]
-        self._held[where] = first[where]
+        self.latency[where], self.jitter[where] = whole[0][where], whole[1][where]
+        self.cycle[where] = 0
+        self.last_arrival[where] = 0
+        self.arrivals[where] = -1
+        begun = np.asarray(first, float).reshape(lanes, width)
+        self.messages[where] = begun[where, None]
+        self.held[where] = begun[where]
 
-    def pass_on(self, message: NDArray[Any], keys: NDArray[np.uint64], lost_sync: Floats | None) -> NDArray[Any]:
-        cycle, depth, lanes = self._cycle, self._deepest + 1, self._lanes
-        number = cycle.astype(np.uint64)
-        delay = self._latency + (shares_of_chance(keys, self._mark + number) * (self._jitter + 1)).astype(np.int64)
-        self._last_arrival = np.maximum(self._last_arrival, cycle + delay)
-        self._turn = (self._turn + 1) % depth
-        self._messages[self._turn] = message
-        self._arrivals[self._turn] = self._last_arrival
-        newest_first = (self._turn - np.arange(depth)) % depth
-        age = (self._arrivals[newest_first] <= cycle).argmax(axis=0)
-        arrived: NDArray[Any] = self._messages[newest_first[age], lanes]
-        if lost_sync is not None and lost_sync.any():
-            lost = shares_of_chance(keys, _LOST + number) < lost_sync
-            arrived[lost] = self._held[lost]
-        self._held = arrived
-        self._cycle = cycle + 1
-        return arrived.copy()
+    def pass_on(self, messages: NDArray[Any], latched: bool = True) -> NDArray[Any]:
+        """Return what is there in each cycle, of messages of shape (cycles, num_lanes, ...) sent in them."""
+        sent = np.ascontiguousarray(messages, float).reshape(*messages.shape[:2], -1)
+        arrived = np.empty_like(sent)
+        _pass_rows_on(self.address, sent, arrived, latched)
+        return arrived.reshape(messages.shape).astype(messages.dtype)
+
+
+def _new_line(mark: int, keys: NDArray[np.uint64], lost_sync: Floats, deepest: int) -> Line:
+    lanes, depth = len(keys), deepest + 1
+    latency, jitter, cycle, last_arrival = (np.zeros(lanes, np.int64) for _ in range(4))
+    return Line(
+        keys, mark, lost_sync, latency, jitter, cycle, last_arrival, np.zeros((lanes, depth), np.int64),
+        np.zeros((lanes, depth, 1)), np.zeros((lanes, 1)),
+    )  # fmt: skip
+
+
+# --- compiled ---------------------------------------------------------------------------------------------------------
+line_at = reader(Line)
+
+
+@inlined
+def _share(key: Any, mark: Any) -> Any:
+    """Return `randomisation.shares_of_chance` of one key and one mark."""
+    z = key + np.uint64(mark) * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    return np.float64(z >> np.uint64(11)) * 2.0**-53
+
+
+@stage
+def pass_on(line: Any, lane: Any, message: Any, latched: Any) -> None:
+    """Let a cycle of a lane begin with a message, shape (width,); `line.held` of the lane is what is there then."""
+    held, latency, jitter, lost = line.held, line.latency[lane], line.jitter[lane], line.lost_sync[lane]
+    if latency == 0 and jitter == 0 and (lost == 0.0 or not latched):
+        for part in range(message.shape[0]):
+            held[lane, part] = message[part]
+        line.cycle[lane] += 1
+        return
+    arrivals, messages, last_arrival, key = line.arrivals, line.messages, line.last_arrival, line.keys[lane]
+    depth = arrivals.shape[1]
+    now = line.cycle[lane]
+    line.cycle[lane] = now + 1
+    late = latency
+    if jitter > 0:
+        late += np.int64(_share(key, line.mark + now) * (jitter + 1))
+    last_arrival[lane] = max(last_arrival[lane], now + late)
+    place = now % depth
+    arrivals[lane, place] = last_arrival[lane]
+    for part in range(message.shape[0]):
+        messages[lane, place, part] = message[part]
+    if latched and lost > 0.0 and _share(key, _LOST + now) < lost:
+        return
+    while arrivals[lane, place] > now:
+        place = place - 1 if place > 0 else depth - 1
+    for part in range(message.shape[0]):
+        held[lane, part] = messages[lane, place, part]
+
+
+@cached(*_SOURCES, allocates=False)
+def _pass_rows_on(address: Any, sent: Any, arrived: Any, latched: Any) -> None:
+    line = line_at(address)
+    for lane in range(sent.shape[1]):
+        for k in range(sent.shape[0]):
+            pass_on(line, lane, sent[k, lane], latched)
+            for part in range(sent.shape[2]):
+                arrived[k, lane, part] = line.held[lane, part]

@@ -379,22 +379,21 @@ class GainScheduling(Lanes):
     def _through_bus(self) -> Integers:
         """Return the set-points on which the drives act in each cycle of this step."""
         sent = self._set_points(np.arange(1, self._cycles + 1))
-        if not self._bus.is_there:
-            return sent
-        return np.stack([self._bus.act(row) for row in sent]).astype(np.int64)
+        return np.asarray(self._bus.act(sent), np.int64)
 
     def _run(self, targets: Integers) -> dict[tuple[int, int], Integers]:
         """Let the step pass; gains are written when they arrive, between two cycles."""
         wanted = self._gains_of(self._action)
-        arriving = [wanted] * self._cycles
+        arriving = np.broadcast_to(wanted, (self._cycles, *wanted.shape))
         if self._gain_bus.is_there:
-            flat = wanted.reshape(self.num_envs, -1)
-            arriving = [self._gain_bus.act_unlatched(flat).reshape(wanted.shape) for _ in range(self._cycles)]
+            by_lane = arriving.reshape(self._cycles, self.num_envs, -1)
+            arriving = self._gain_bus.act_unlatched(by_lane).reshape(arriving.shape)
         objects = (POSITION, VELOCITY, CURRENT, STATUSWORD)
         played = targets.reshape(self._cycles, -1)
         # A picture looks at every cycle.
         apart = self._pictures is not None
-        begins = [k for k in range(self._cycles) if k == 0 or apart or np.any(arriving[k] != arriving[k - 1])]
+        changed = np.any(arriving[1:] != arriving[:-1], axis=(1, 2))
+        begins = [k for k in range(self._cycles) if k == 0 or apart or changed[k - 1]]
         traces = []
         with warnings.catch_warnings():
             # A machine that leaves physics ends its lane; who steps it is told so by `info`.
@@ -426,8 +425,8 @@ class GainScheduling(Lanes):
             return error, velocity, current
         sampled = np.stack([error, velocity, current], 1).reshape(self._cycles, 3, self.num_envs, self._axes)
         sent = sampled.transpose(0, 2, 1, 3).reshape(self._cycles, self.num_envs, -1)
-        came = np.stack([self._bus.observe(row) for row in sent]).reshape(self._cycles, self.num_envs, 3, self._axes)
-        arrived = came.astype(float).transpose(2, 0, 1, 3).reshape(3, self._cycles, -1)
+        came = self._bus.observe(sent).reshape(self._cycles, self.num_envs, 3, self._axes)
+        arrived = came.transpose(2, 0, 1, 3).reshape(3, self._cycles, -1)
         return arrived[0], arrived[1], arrived[2]
 
     def _observe(self, error: Floats, velocity: Floats, current: Floats) -> NDArray[np.float32]:

@@ -79,10 +79,13 @@ def _moves(t: Floats, reach: Reach, rng: np.random.Generator) -> Floats:
     while now < t[-1]:
         target, pace, pause = rng.uniform(-1.0, 1.0), rng.uniform(*_PACE), rng.uniform(0.0, _LONGEST_PAUSE)
         way, duration = target - place, _quickest(abs(target - place), reach) / pace
-        s = np.clip((t - now) / duration, 0.0, 1.0)
-        found[0] += way * (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5)
-        found[1] += way / duration * 30.0 * s**2 * (1.0 - s) ** 2
-        found[2] += way / duration**2 * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
+        first, last = np.searchsorted(t, (now, now + duration))
+        last += 1
+        s = np.clip((t[first:last] - now) / duration, 0.0, 1.0)
+        found[0, first:last] += way * (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5)
+        found[1, first:last] += way / duration * 30.0 * s**2 * (1.0 - s) ** 2
+        found[2, first:last] += way / duration**2 * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
+        found[0, last:] += way
         place, now = target, now + duration + pause
     return found
 

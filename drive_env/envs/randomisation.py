@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 import tomllib
 import zlib
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from functools import cache
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -72,8 +73,8 @@ class Law(NamedTuple):
         if self.law == "choice":
             if share >= width or width <= 0.0:
                 return default
-            chances = np.cumsum(self.weights or np.ones(len(self.values)))
-            chosen = int(np.searchsorted(chances, share / width * chances[-1], side="right"))
+            chances = list(accumulate(self.weights or (1.0,) * len(self.values)))
+            chosen = bisect_right(chances, share / width * chances[-1])
             return self.values[min(chosen, len(self.values) - 1)] * scale
         if self.law == "loguniform":
             drawn = scale * self.low * (self.high / self.low) ** share
@@ -129,6 +130,7 @@ class Distributions:
         self.laws = dict(laws)
         self.curriculum = curriculum or Curriculum()
         self._marks = np.array([zlib.crc32(name.encode()) for name in self.laws], np.uint64)
+        self._widths: tuple[float, list[float]] = (math.nan, [])  # at the stage of the last draw
 
     @classmethod
     def load(cls, source: str | Path | Mapping[str, Any] | Distributions) -> Distributions:
@@ -166,10 +168,12 @@ class Distributions:
         if not 0.0 <= stage <= 1.0:
             raise ValueError(f"stage of the curriculum must lie in 0...1, not {stage:g}")
         shares = shares_of_chance(np.uint64(rng.integers(0, 2**64, dtype=np.uint64)), self._marks)
+        if stage != self._widths[0]:
+            self._widths = stage, [self.curriculum.width(name, stage) for name in self.laws]
         drawn: dict[str, float] = {}
-        for (name, law), share in zip(self.laws.items(), shares, strict=True):
+        for (name, law), share, width in zip(self.laws.items(), shares.tolist(), self._widths[1], strict=True):
             if name in defaults:
-                drawn[name] = law.value(float(share), float(defaults[name]), self.curriculum.width(name, stage))
+                drawn[name] = law.value(share, float(defaults[name]), width)
             elif name not in BESIDE:
                 raise ValueError(f"{name}: the machine has no such parameter; it has {', '.join(defaults)}")
         return drawn

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import motion
 from drive_env.envs import tracking_cycle as cycle
+from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
 from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Observation, Stepped, check_choice
 from drive_env.envs.pictures import Pictures
@@ -256,19 +257,20 @@ class Tracking(Lanes):
         play = (target,) if config.action == "direct" else (target, offset)
         self._acts_on_position = play[-1] == 0x607A
         self._exchange = exchange(drives, SAMPLED, play, config.cycles, CYCLE)
+        self._bus = BusDelays(n, 2 * cycle.LONGEST_DELAY)
         self._episodes = own = cycle.Episodes(
             lanes=np.zeros(n, cycle.LANE),
             action=np.zeros(drives.num_axes),
             scales=scales,
             origin=np.zeros(drives.num_axes),
-            pending=np.zeros((drives.num_axes, cycle.DEPTH), np.int64),
-            bus=np.zeros((n, config.steps), np.int64),
+            actions=self._bus.actions,
+            observations=self._bus.observations,
+            message=np.zeros((n, len(SAMPLED) * self._axes + 1)),
             reference=np.zeros((n, 3, config.steps * config.cycles + cycle.PREVIEW + 1)),
             profile_scale=self._profile_scales(),
             last=np.zeros((drives.num_axes, 2)),
             played=self._exchange.played,
             sampled=self._exchange.sampled,
-            history=np.zeros((cycle.DEPTH, len(SAMPLED), drives.num_axes), np.int64),
             angles=np.zeros(n),
             weights=np.array([config.weights[name] for name in cycle.TERMS]),
             observation=np.zeros((n, *(self.single_observation_space.shape or ())), np.float32),
@@ -307,11 +309,13 @@ class Tracking(Lanes):
         samples = np.stack([self.drives.read(name) for name in SAMPLED])
         own = self._episodes
         own.origin[axes] = samples[1][axes]
-        own.history[:, :, axes] = samples[:, axes]
         neutral = samples[1] if self._acts_on_position else np.zeros(len(axes), np.int64)
-        own.pending[axes] = neutral[axes, None]
         own.last[axes] = 0.0
         self._draw_episodes(mask)
+        # What is seen until the first sample comes: the drives at rest, of no cycle yet.
+        seen = np.full((self.num_envs, len(SAMPLED) * self._axes + 1), -1.0)
+        seen[:, :-1] = samples.T.reshape(self.num_envs, -1)
+        self._bus.reset(self._delays(), self.rngs, neutral.reshape(self.num_envs, -1), seen, mask)
         if self._sensor is not None:
             own.angles[mask] = np.asarray(self._sensor(), float)[mask]
             own.lanes["angle"][mask] = own.angles[mask]
@@ -326,7 +330,7 @@ class Tracking(Lanes):
     def _act(self, action: Any) -> bool:
         """Let a step pass; return whether a lane tripped or fell."""
         own = self._episodes
-        own.action[:] = np.asarray(action, float).reshape(own.action.shape)
+        own.action[:] = np.reshape(action, own.action.shape)
         if self._sensor is not None:
             own.angles[:] = self._sensor()
         self._exchange.run()
@@ -353,29 +357,23 @@ class Tracking(Lanes):
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _draw_episodes(self, mask: Mask) -> None:
-        """Draw trajectory and bus of the lanes that begin."""
-        config = self.config
-        bus: dict[str, Floats] = {} if self._machines is None else self._machines.values
+        """Draw the trajectories of the lanes that begin."""
+        config, own = self.config, self._episodes
         for lane in np.flatnonzero(mask):
-            rng = self.rngs[lane]
-            length = self._episodes.reference.shape[2]
-            turns = draw(str(config.trajectory), rng, length, CYCLE, float(config.amplitude or 0.0),
-                         float(config.speed or 0.0))  # fmt: skip
-            self._episodes.reference[lane] = turns * self._per_turn[lane]
-            jitter = int(bus["bus.jitter"][lane]) if bus else 0
-            lost = float(bus["bus.lost_sync"][lane]) if bus else 0.0
-            chance = rng.random((2, config.steps)) if jitter or lost else None
-            self._episodes.bus[lane] = 0
-            if chance is not None:
-                self._episodes.bus[lane] = (chance[0] * (jitter + 1)).astype(np.int64)
-                self._episodes.bus[lane][chance[1] < lost] = cycle.LOST
-            state = self._episodes.lanes[lane]
-            state["step"] = 0
-            state["steps"] = config.steps
-            late = float(bus["bus.action_latency"][lane]) if bus else 0.0
-            state["action_latency"] = min(config.delay - 1 + round(late), cycle.LONGEST_DELAY)
-            early = float(bus["bus.observation_latency"][lane]) if bus else 0.0
-            state["observation_latency"] = min(round(early), cycle.LONGEST_DELAY)
+            turns = draw(str(config.trajectory), self.rngs[lane], own.reference.shape[2], CYCLE,
+                         float(config.amplitude or 0.0), float(config.speed or 0.0))  # fmt: skip
+            own.reference[lane] = turns * self._per_turn[lane]
+        own.lanes["step"][mask] = 0
+        own.lanes["steps"][mask] = config.steps
+
+    def _delays(self) -> dict[str, Floats]:
+        """Return what the lanes' buses do, as BusDelays takes it: beside the cycle that an answer takes anyway."""
+        none = np.zeros(self.num_envs)
+        drawn = {} if self._machines is None else self._machines.values
+        found = {name: drawn.get(f"bus.{name}", none) for name in ("action_latency", "observation_latency", "jitter")}
+        found["action_latency"] = self.config.delay - 1 + np.rint(found["action_latency"])
+        delays = {f"bus.{name}": np.minimum(values, float(cycle.LONGEST_DELAY)) for name, values in found.items()}
+        return delays | {"bus.lost_sync": drawn.get("bus.lost_sync", none)}
 
     def _return_to_start(self, axes: Mask) -> None:
         """Begin as one does with a real drive: nothing else moves while these axes go back to where they began."""

@@ -11,23 +11,19 @@ from numba import from_dtype, types
 from numpy.typing import NDArray
 
 import mechanics.compiled
-from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, NumberMatrix, Vector, reader
+from drive_env.envs.bus_delays import Line, pass_on
+from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, Vector, reader
 from mechanics.compiled import cached, inlined, stage
 
 _SOURCES = (Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
 
-# A lane's episode: step and number of steps; latencies beyond the cycle that a bus has anyway [communication cycles];
-# the pendulum's angle at the last step [rad]; whether it fell.
-LANE = np.dtype([("step", "i8"), ("steps", "i8"), ("action_latency", "i8"), ("observation_latency", "i8"),
-                 ("angle", "f8"), ("fallen", "i8")])  # fmt: skip
+# A lane's episode: step and number of steps; the pendulum's angle at the last step [rad]; whether it fell.
+LANE = np.dtype([("step", "i8"), ("steps", "i8"), ("angle", "f8"), ("fallen", "i8")])
 
 AXIS_HIGH = np.array([4.0, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0, 1.0])  # of the entries of an axis, -low as well
 LOAD_HIGH = np.array([np.pi, 50.0])
 PREVIEW = 10  # cycles
-DEPTH = 32  # cycles or steps that are remembered, a power of two
-LATEST = DEPTH - 1  # step or cycle & LATEST is its place
-LONGEST_DELAY = 10  # cycles; with as much jitter it must fit into DEPTH
-LOST = 255  # the SYNC of this step is lost
+LONGEST_DELAY = 10  # cycles, and as many of jitter
 COMMISSIONED_INERTIA = 3.0  # rotor inertias: what the presets were computed for
 
 TERMS = ("tracking", "speed", "load", "effort", "smoothness", "trip")
@@ -64,14 +60,14 @@ class Episodes(Bundle):
     action: Vector  # -1...1, (axes,)
     scales: Matrix  # amplitude [inc], speed [inc/s], current limit [mA], full scale of the action [raw], (axes, 4)
     origin: Vector  # position at the episode's start [inc], (axes,)
-    pending: NumberMatrix  # raw values of the last steps, (axes, DEPTH)
-    bus: NumberMatrix  # cycles that each step's action is late besides, or LOST, (n, steps)
+    actions: Line  # raw values on their way to the drives, one for each of a lane's axes
+    observations: Line  # status, position, velocity, torque of each axis on their way, and their cycle's number
+    message: Matrix  # scratch, (n, as many as an observation)
     reference: Cube  # position [inc], velocity [inc/s], acceleration [inc/s^2], (n, 3, cycles)
     profile_scale: Vector  # raw units of the target per unit of the reference, (axes,)
     last: Matrix  # last action and the one before, (axes, 2)
     played: NumberCube  # written: with an offset the profile's set-points, then the actions', (1 or 2, cycles, axes)
     sampled: NumberCube  # statusword, position, velocity, torque, (4, cycles, axes)
-    history: NumberCube  # the same of the last cycles, cycle modulo DEPTH, (DEPTH, 4, axes)
     angles: Vector  # the pendulums' [rad], (n,)
     weights: Vector  # of TERMS
     observation: Annotated[NDArray[np.float32], types.float32[:, ::1]]  # written, (n, entries)
@@ -89,36 +85,36 @@ episodes_at = reader(Episodes)
 def act(address, first, count):
     """Turn actions of some axes into the rows of set-points that act in this step's cycles."""
     own = episodes_at(address)
-    lanes, scales, origin, pending, bus = own.lanes, own.scales, own.origin, own.pending, own.bus
+    lanes, scales, origin, actions, message = own.lanes, own.scales, own.origin, own.actions, own.message
     action, last, reference, profile_scale, played = own.action, own.last, own.reference, own.profile_scale, own.played
     kind = own.kind
     raw = played[played.shape[0] - 1]
     cycles, axes = raw.shape[0], raw.shape[1] // lanes.shape[0]
-    steps, length = bus.shape[1], reference.shape[2]
-    for axis in range(first, first + count):
-        k = axis // axes
-        lane = lanes[k]
-        step = lane.step
-        given = limited(action[axis], 1.0)
-        value = np.rint(given * scales[axis, 3])
-        if kind == DIRECT_POSITION:
-            value += origin[axis]
-        late = bus[k, min(step, steps - 1)]
-        pending[axis, step & LATEST] = pending[axis, (step - 1) & LATEST] if late == LOST else np.int64(value)
-        last[axis, 1] = last[axis, 0]
-        last[axis, 0] = given
-        latency = lane.action_latency + (0 if late == LOST else late)
+    held, length = actions.held, reference.shape[2]
+    for k in range(first // axes, (first + count) // axes):
+        step = lanes[k].step
+        for a in range(axes):
+            axis = k * axes + a
+            given = limited(action[axis], 1.0)
+            value = np.rint(given * scales[axis, 3])
+            if kind == DIRECT_POSITION:
+                value += origin[axis]
+            message[k, a] = value
+            last[axis, 1] = last[axis, 0]
+            last[axis, 0] = given
         for c in range(cycles):
-            back = 0 if latency <= c else (latency - c + cycles - 1) // cycles
-            raw[c, axis] = pending[axis, (step - min(back, DEPTH - 1)) & LATEST]
+            pass_on(actions, k, message[k, :axes], True)
             now = min(step * cycles + c, length - 1)
-            if kind == OFFSET_POSITION:
-                played[0, c, axis] = np.int64(np.rint(origin[axis] + reference[k, 0, now]))
-            elif kind == OFFSET_VELOCITY:
-                played[0, c, axis] = np.int64(np.rint(reference[k, 1, now]))
-            elif kind == OFFSET_TORQUE:
-                wanted = reference[k, 2, now] * profile_scale[axis]
-                played[0, c, axis] = np.int64(np.rint(limited(wanted, scales[axis, 2])))
+            for a in range(axes):
+                axis = k * axes + a
+                raw[c, axis] = np.int64(held[k, a])
+                if kind == OFFSET_POSITION:
+                    played[0, c, axis] = np.int64(np.rint(origin[axis] + reference[k, 0, now]))
+                elif kind == OFFSET_VELOCITY:
+                    played[0, c, axis] = np.int64(np.rint(reference[k, 1, now]))
+                elif kind == OFFSET_TORQUE:
+                    wanted = reference[k, 2, now] * profile_scale[axis]
+                    played[0, c, axis] = np.int64(np.rint(limited(wanted, scales[axis, 2])))
     return 0
 
 
@@ -131,27 +127,24 @@ def position_error(reference, position, origin):
 
 @stage
 def describe(own, k):
-    """Write the observation of lane k, from the samples that it has by now."""
-    reference, history, scales, origin = own.reference, own.history, own.scales, own.origin
+    """Write the observation of lane k, from the samples that have come by now."""
+    reference, held, scales, origin = own.reference, own.observations.held, own.scales, own.origin
     angles, observation, last = own.angles, own.observation, own.last
     lane = own.lanes[k]
-    cycles, axes = own.played.shape[1], history.shape[2] // own.lanes.shape[0]
-    # After step s the last sample is of cycle s * cycles - 1.
-    now = lane.step * cycles - 1 - lane.observation_latency
-    at = min(max(now, 0), reference.shape[2] - 1)
+    cycles, axes = own.played.shape[1], scales.shape[0] // own.lanes.shape[0]
+    at = min(max(np.int64(held[k, 4 * axes]), 0), reference.shape[2] - 1)
     soon = min(at + PREVIEW, reference.shape[2] - 1)
-    slot = now & LATEST
     for a in range(axes):
         axis = k * axes + a
         amplitude, speed = scales[axis, 0], scales[axis, 1]
-        error = position_error(reference[k, 0, at], float(history[slot, 1, axis]), origin[axis])
-        velocity = history[slot, 2, axis]
+        error = position_error(reference[k, 0, at], held[k, 4 * a + 1], origin[axis])
+        velocity, torque = held[k, 4 * a + 2], held[k, 4 * a + 3]
         row = 8 * a
         observation[k, row] = limited(error / amplitude, AXIS_HIGH[0])
         observation[k, row + 1] = limited((reference[k, 1, at] - velocity) / speed, AXIS_HIGH[1])
         observation[k, row + 2] = limited((reference[k, 0, at] - error) / amplitude, AXIS_HIGH[2])
         observation[k, row + 3] = limited(velocity / speed, AXIS_HIGH[3])
-        observation[k, row + 4] = limited(history[slot, 3, axis] / scales[axis, 2], AXIS_HIGH[4])
+        observation[k, row + 4] = limited(torque / scales[axis, 2], AXIS_HIGH[4])
         observation[k, row + 5] = limited(reference[k, 1, at] / speed, AXIS_HIGH[5])
         observation[k, row + 6] = limited(reference[k, 1, soon] / speed, AXIS_HIGH[6])
         observation[k, row + 7] = last[axis, 0]
@@ -175,26 +168,26 @@ def describe_lanes(address, where):
 def observe(address, first, count):
     """Take some axes' samples in; write observations, rewards and their terms, and which lanes have ended."""
     own = episodes_at(address)
-    lanes, sampled, history, reference = own.lanes, own.sampled, own.history, own.reference
-    scales, origin, last, angles, weights, bus = own.scales, own.origin, own.last, own.angles, own.weights, own.bus
-    reward, terms, ended = own.reward, own.terms, own.ended
+    lanes, sampled, reference, observations = own.lanes, own.sampled, own.reference, own.observations
+    scales, origin, last, angles, weights = own.scales, own.origin, own.last, own.angles, own.weights
+    reward, terms, ended, message = own.reward, own.terms, own.ended, own.message
     cycles, axes = sampled.shape[1], sampled.shape[2] // lanes.shape[0]
-    steps, length = bus.shape[1], reference.shape[2]
+    length, width = reference.shape[2], 4 * axes + 1
     has_angle = own.observation.shape[1] > 8 * axes
     for k in range(first // axes, (first + count) // axes):
         lane = lanes[k]
         begun = lane.step * cycles
-        lost = bus[k, min(lane.step, steps - 1)] == LOST
         tripped = False
         tracking, slow, effort, smooth = 0.0, 0.0, 0.0, 0.0
         at = min(begun + cycles - 1, length - 1)
-        for axis in range(k * axes, (k + 1) * axes):
-            for c in range(cycles):
-                slot, before = (begun + c) & LATEST, (begun + c - 1) & LATEST
+        for c in range(cycles):
+            for a in range(axes):
                 for sample in range(4):
-                    # A master that missed the SYNC still has the samples of the last one.
-                    history[slot, sample, axis] = history[before, sample, axis] if lost else sampled[sample, c, axis]
-            c = cycles - 1
+                    message[k, 4 * a + sample] = sampled[sample, c, k * axes + a]
+            message[k, 4 * axes] = begun + c
+            pass_on(observations, k, message[k, :width], True)
+        c = cycles - 1
+        for axis in range(k * axes, (k + 1) * axes):
             status, position, velocity = sampled[0, c, axis], sampled[1, c, axis], sampled[2, c, axis]
             tripped |= status & OPERATION_ENABLED[0] != OPERATION_ENABLED[1]
             error = position_error(reference[k, 0, at], float(position), origin[axis])
