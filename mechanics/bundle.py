@@ -127,7 +127,8 @@ def _slots(kind: types.Type) -> int:
     return 1 + kind.ndim if isinstance(kind, types.Array) else 1
 
 
-def _item_size(kind: types.Array) -> int:
+@cache
+def _item_size(kind: Any) -> int:
     return int(as_dtype(kind.dtype).itemsize)
 
 

@@ -82,7 +82,7 @@ def _moves(t: Floats, reach: Reach, rng: np.random.Generator) -> Floats:
         first, last = np.searchsorted(t, (now, now + duration))
         last += 1
         s = np.clip((t[first:last] - now) / duration, 0.0, 1.0)
-        found[0, first:last] += way * (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5)
+        found[0, first:last] += way * (s * s * s) * (10.0 - 15.0 * s + 6.0 * s**2)
         found[1, first:last] += way / duration * 30.0 * s**2 * (1.0 - s) ** 2
         found[2, first:last] += way / duration**2 * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
         found[0, last:] += way

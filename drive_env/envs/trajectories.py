@@ -44,7 +44,7 @@ def _moves(rng: np.random.Generator, length: int, period: float, amplitude: floa
         duration = max(PEAK_OF_MEAN * abs(way) / (speed * rng.uniform(0.3, 1.0)), SHORTEST_MOVE)
         first, last = np.searchsorted(t, (start, start + duration))
         x = (t[first:last] - start) / duration
-        found[0, first:last] = place + way * x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+        found[0, first:last] = place + way * (x * x * x) * (10.0 - 15.0 * x + 6.0 * x**2)
         found[1, first:last] = way / duration * 30.0 * x**2 * (1.0 - x) ** 2
         found[2, first:last] = way / duration**2 * 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x)
         found[0, last:] = target
