@@ -48,8 +48,8 @@ for panel, commands in PANELS.items():
 def drive_env() -> None:
     """Servo drives: real ones and emulated ones, over CAN.
 
-    Interface and channel may stand in DRIVE_ENV_INTERFACE and DRIVE_ENV_CHANNEL. Exit codes: 0 done, 1 the drive or
-    the bus said no (or differs), 2 a mistake in the command, 130 Ctrl-C.
+    Interface, channel and time-out may stand in DRIVE_ENV_INTERFACE, DRIVE_ENV_CHANNEL and DRIVE_ENV_TIMEOUT. Exit
+    codes: 0 done, 1 the drive or the bus said no (or differs), 2 a mistake in the command, 130 Ctrl-C.
     """
 
 
