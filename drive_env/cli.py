@@ -6,6 +6,7 @@ import sys
 
 import typer
 
+from drive_env.tools.compare import compare
 from drive_env.tools.get import get, set_object
 from drive_env.tools.jog import jog
 from drive_env.tools.log import log, replay
@@ -37,7 +38,7 @@ PANELS = {
     ),
     "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
     "Frames": (("log", log), ("replay", replay)),
-    "Emulated drives": (("serve", serve), ("render", render)),
+    "Emulated drives": (("serve", serve), ("render", render), ("compare", compare)),
 }
 for panel, commands in PANELS.items():
     for name, function in commands:

@@ -30,8 +30,9 @@ WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "effort": 0.05, "smoothne
 RATES = (500, 1000)
 ACTIONS = ("direct", "offset")
 RETURN_SPEED = 0.25  # of the trajectory's, back to the start on a bus
-RESTARTS = 20  # tries to reset a fault on a bus before giving up
-RESTART_PAUSE = 0.1  # s between two: a DC link that braking has filled empties slowly
+RESTARTS = 3  # tries to go back to the start on a bus: what brakes in haste may trip once more
+RESET_PAUSE, RESET_TIME = 0.1, 2.0  # s between two fault resets, and in all: a filled DC link empties slowly
+REST_SPEED, REST_TIME = 0.02, 0.5  # of the trajectory's speed: at rest; s that it may take
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class TrackingConfig:
     num_threads: As `EmulatedDrives` takes it.
     """
 
-    load: str = "two_mass"
+    load: Any = "two_mass"
     device: str = "tmcm1636"
     motor: str = "qbl4208"
     friction: str = "stribeck"
@@ -103,7 +104,7 @@ class TrackingConfig:
     num_threads: int | None = None
 
     def __post_init__(self) -> None:
-        task = TASKS.get(self.load, OTHER)
+        task = self.task
         for name in ("mode", "trajectory", "amplitude", "speed"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(task, name))
@@ -125,7 +126,7 @@ class TrackingConfig:
     @property
     def task(self) -> Task:
         """What the load's row says."""
-        return TASKS.get(self.load, OTHER)
+        return TASKS.get(self.load, OTHER) if isinstance(self.load, str) else OTHER
 
     @property
     def cycles(self) -> int:
@@ -141,10 +142,14 @@ class TrackingConfig:
 class Tracking(Lanes):
     """Lanes of `ServoDrive/Tracking-v0`: follow a trajectory, or stabilise what the load's row says.
 
-    Action, float32, one entry per axis of the machine, -1...1: share of full scale, see `TrackingConfig.action`.
+    Action, float32, one entry per axis a = 0, 1, ... of the machine:
 
-    Observation, float32, for each axis a = 0, 1, ... of the machine (8 entries each), of the drive's sample that the
-    agent has when it acts:
+    | index | name | unit | low | high |
+    | --- | --- | --- | --- | --- |
+    | a | target or offset, see `TrackingConfig.action` | full scale | -1 | 1 |
+
+    Observation, float32, for each axis a of the machine (8 entries each), of the drive's sample that the agent has
+    when it acts:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
@@ -157,7 +162,7 @@ class Tracking(Lanes):
     | 8a + 6 | reference velocity 10 ms later | speed | -2 | 2 |
     | 8a + 7 | last action | 1 | -1 | 1 |
 
-    and, with a load whose row has a sensor (cart_pendulum, inverted_pendulum), after them:
+    and, with a load whose row has a sensor (cart_pendulum, inverted_pendulum), after those of all A axes:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
@@ -271,7 +276,8 @@ class Tracking(Lanes):
         self._shape = (n, *(self.single_observation_space.shape or ()))
         self._everywhere = np.ones(n, bool)
         self._profile_scale = self._profile_scales()
-        self._pictures: Pictures | None = None
+        period = config.cycles * CYCLE
+        self._pictures = Pictures(drives, self.render_mode, period) if self.render_mode else None
 
     def _profile_scales(self) -> Floats:
         """Return raw units of the target per unit of the reference's row: increments, pps, or mA per pps^2."""
@@ -289,8 +295,9 @@ class Tracking(Lanes):
         for name in options:
             check_choice("an option of reset", name, ("reset_mask",))
         axes = np.repeat(mask, self._axes)
+        self._draw_references(mask)  # first, so that they are the same on a bus, where no machine is drawn
         if self._machines is not None:
-            self._machines.redraw(self.rngs, mask, self.config.stage)
+            self._machines.redraw(self.rngs, mask, self.stage)
             motion.enable(self.drives, mode=self.config.mode, where=axes)
         else:
             self._return_to_start(axes)
@@ -301,7 +308,7 @@ class Tracking(Lanes):
         neutral = samples[1] if self._acting == 0x607A else np.zeros(len(axes), np.int64)
         self._pending[axes] = neutral[axes, None]
         self._last[axes] = 0.0
-        self._draw_episodes(mask)
+        self._draw_buses(mask)
         if self._sensor is not None:
             self._angles = np.where(mask, np.asarray(self._sensor(), float), self._angles)
             self._lanes["angle"][mask] = self._angles[mask]
@@ -342,16 +349,21 @@ class Tracking(Lanes):
         return observation, reward, ended[0], ended[1], info
 
     # --- inside ---------------------------------------------------------------------------------------------------
-    def _draw_episodes(self, mask: Mask) -> None:
-        """Draw trajectory and bus of the lanes that begin."""
+    def _draw_references(self, mask: Mask) -> None:
+        """Draw the trajectories of the lanes that begin."""
+        config = self.config
+        for lane in np.flatnonzero(mask):
+            length = self._reference.shape[2]
+            turns = draw(str(config.trajectory), self.rngs[lane], length, CYCLE, float(config.amplitude or 0.0),
+                         float(config.speed or 0.0))  # fmt: skip
+            self._reference[lane] = turns * self._per_turn[lane]
+
+    def _draw_buses(self, mask: Mask) -> None:
+        """Draw what the buses of the lanes that begin do to messages."""
         config = self.config
         bus: dict[str, Floats] = {} if self._machines is None else self._machines.values
         for lane in np.flatnonzero(mask):
             rng = self.rngs[lane]
-            length = self._reference.shape[2]
-            turns = draw(str(config.trajectory), rng, length, CYCLE, float(config.amplitude or 0.0),
-                         float(config.speed or 0.0))  # fmt: skip
-            self._reference[lane] = turns * self._per_turn[lane]
             jitter = int(bus["bus.jitter"][lane]) if bus else 0
             lost = float(bus["bus.lost_sync"][lane]) if bus else 0.0
             chance = rng.random((2, config.steps)) if jitter or lost else None
@@ -376,11 +388,24 @@ class Tracking(Lanes):
         for attempt in range(RESTARTS):
             self._clear(axes)
             try:
+                self._come_to_rest(axes)
                 self._go_back(axes)
-            except RuntimeError:  # a drive that the episode left in haste may trip while it is caught
+            except RuntimeError:
                 if attempt == RESTARTS - 1:
                     raise
             else:
+                return
+
+    def _come_to_rest(self, axes: Mask) -> None:
+        """Hold still in csp: the slope of a last leap of the target would else be the speed that pp begins with."""
+        if self.config.mode != "csp" or not self._has_begun:
+            return
+        drives = self.drives
+        drives.write(0x607A, drives.read(0x6064), where=axes)
+        for _ in range(round(REST_TIME / CYCLE)):
+            drives.advance(CYCLE)
+            moving = np.abs(drives.read(0x606C)) > REST_SPEED * self._scales[:, 1]
+            if not np.any(axes & moving):
                 return
 
     def _go_back(self, axes: Mask) -> None:
@@ -404,15 +429,16 @@ class Tracking(Lanes):
     def _clear(self, axes: Mask) -> None:
         """Reset faults of the drives that have one, when their causes are gone."""
         drives = self.drives
-        for attempt in range(RESTARTS):
+        tries = round(RESET_TIME / RESET_PAUSE)
+        for attempt in range(tries):
             faulty = axes & (drives.read(0x6041) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1])
             if not faulty.any():
                 return
             try:
-                motion.reset_fault(drives, where=faulty, timeout=RESTART_PAUSE)
-                drives.advance(RESTART_PAUSE)
+                motion.reset_fault(drives, where=faulty, timeout=RESET_PAUSE)
+                drives.advance(RESET_PAUSE)
             except TimeoutError:
-                if attempt == RESTARTS - 1:
+                if attempt == tries - 1:
                     raise
 
     def _faults(self, lanes: Mask) -> NDArray[np.object_]:
@@ -432,9 +458,7 @@ class Tracking(Lanes):
         return found
 
     def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
-        if self._pictures is None:
-            self._pictures = Pictures(self.drives, self.num_envs, str(self.render_mode))
-        return self._pictures.draw(lane)
+        return None if self._pictures is None else self._pictures.draw(lane)
 
     def _close_lanes(self) -> None:
         if getattr(self, "_pictures", None) is not None:
