@@ -6,6 +6,7 @@ import sys
 
 import typer
 
+from drive_env.tools.compare import compare
 from drive_env.tools.get import get, set_object
 from drive_env.tools.jog import jog
 from drive_env.tools.log import log, replay
@@ -37,7 +38,7 @@ PANELS = {
     ),
     "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
     "Frames": (("log", log), ("replay", replay)),
-    "Emulated drives": (("serve", serve), ("render", render)),
+    "Emulated drives": (("serve", serve), ("render", render), ("compare", compare)),
 }
 for panel, commands in PANELS.items():
     for name, function in commands:
@@ -48,8 +49,8 @@ for panel, commands in PANELS.items():
 def drive_env() -> None:
     """Servo drives: real ones and emulated ones, over CAN.
 
-    Interface and channel may stand in DRIVE_ENV_INTERFACE and DRIVE_ENV_CHANNEL. Exit codes: 0 done, 1 the drive or
-    the bus said no (or differs), 2 a mistake in the command, 130 Ctrl-C.
+    Interface, channel and time-out may stand in DRIVE_ENV_INTERFACE, DRIVE_ENV_CHANNEL and DRIVE_ENV_TIMEOUT. Exit
+    codes: 0 done, 1 the drive or the bus said no (or differs), 2 a mistake in the command, 130 Ctrl-C.
     """
 
 

@@ -31,3 +31,15 @@ def drive_env() -> None:
     from drive_env.cli import main
 
     main()
+
+
+def drive_agent() -> None:
+    """Run `drive-agent`, if the packages that Python finds are ours."""
+    try:
+        check_own("drive_env", "mechanics", "tuning", "agents")
+    except ForeignPackageError as error:
+        print(f"drive-agent: {error}", file=sys.stderr)
+        sys.exit(USER_ERROR)
+    from agents.cli import main
+
+    main()

@@ -54,17 +54,19 @@ class Recorder:
     Args:
         drives: The drives.
         machine: Number of the machine to film.
+        period: Time between two calls of `look` [s].
 
     Raises:
         ValueError: If there is no such machine.
     """
 
-    def __init__(self, drives: EmulatedDrives, machine: int = 0) -> None:
+    def __init__(self, drives: EmulatedDrives, machine: int = 0, period: float = CYCLE) -> None:
         if not 0 <= machine < drives.num_machines:
             raise ValueError(f"there is no machine {machine}; there are 0...{drives.num_machines - 1}")
         self.drives = drives
         self.num_axes = drives.num_axes
         self._machine = machine
+        self._period = period
         count = drives.num_axes // drives.num_machines
         self._axes = slice(machine * count, (machine + 1) * count)
         self._rows: list[Floats] = []
@@ -75,7 +77,7 @@ class Recorder:
     @property
     def now(self) -> float:
         """Recorded time [s]."""
-        return len(self._rows) * CYCLE
+        return len(self._rows) * self._period
 
     def read(self, name: ObjectName) -> NDArray[np.int64]:
         """Return an object of every axis, as the drives do."""
@@ -100,7 +102,7 @@ class Recorder:
             self._rows.append(np.array([trace[name][0, self._axes] for name in _RECORDED], np.float64))
 
     def look(self) -> None:
-        """Remember how things stand now, as one communication cycle, while someone else lets time pass."""
+        """Remember how things stand now, once per period, while someone else lets time pass."""
         self._joints.append(self.drives.machine.joint_positions[self._machine])
         self._load_torque.append(float(self.drives.machine.load_torque[self._machine]))
         self._rows.append(np.array([self.drives.read(name)[self._axes] for name in _RECORDED], np.float64))
@@ -124,7 +126,7 @@ class Recorder:
         mode = k[MODE]
         # From one millisecond to the next, across the end of the counter too.
         slope = units.wrap(np.diff(k[POSITION_DEMAND], axis=0, prepend=k[POSITION_DEMAND][:1]))
-        profiled = from_raw(drives, POSITION_DEMAND, slope, self._axes) / CYCLE
+        profiled = from_raw(drives, POSITION_DEMAND, slope, self._axes) / self._period
         none = np.full_like(mode, np.nan)
         velocity_demand = np.where(mode == _CSV, si[TARGET_VELOCITY], np.where(np.isin(mode, _PROFILED_MODES), profiled,
                                                                                none))  # fmt: skip
@@ -136,7 +138,7 @@ class Recorder:
             title=title or f"{drives.load.name} · {drives.motor.name} · {drives.device.name}",
             gears=1.0 / found.position,
             linear=found.linear,
-            t=np.arange(len(raw), dtype=np.float64) * CYCLE,
+            t=np.arange(len(raw), dtype=np.float64) * self._period,
             joints=np.stack(self._joints),
             position_demand=np.where(np.isin(mode, _PROFILED_MODES[::2]), si[POSITION_DEMAND], none),
             position=si[POSITION],

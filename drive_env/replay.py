@@ -88,6 +88,10 @@ class Fit(NamedTuple):
     nominal: float
     narrowed: dict[str, float]
 
+    def is_seen(self, name: str) -> bool:
+        """Return whether the log says something about a fitted parameter."""
+        return self.narrowed[name] < UNSEEN
+
     def to_toml(self) -> str:
         """Return the fitted set as `Distributions.load` reads it, with what was found as comments."""
         lines = [
@@ -96,7 +100,7 @@ class Fit(NamedTuple):
             f"worst accepted {self.distance[-1]:.4f} of {len(self.distance)}.",
         ]
         for name, share in self.narrowed.items():
-            seen = "" if share < UNSEEN else ": the log says next to nothing about it, its law is the one given"
+            seen = "" if self.is_seen(name) else ": the log says next to nothing about it, its law is the one given"
             lines.append(f"# {name}: {100.0 * share:.0f} % of the range given{seen}")
         return "\n".join(lines) + "\n\n" + self.distributions.to_toml()
 

@@ -134,7 +134,9 @@ class Scene:
             floor="" if has_floor else _FLOOR.format(height=float(low[2]) - 0.01 * size),
         )
         scene = mujoco.MjSpec.from_string(text)
-        scene.attach(mujoco.MjSpec.from_file(str(mjcf)), prefix="machine/", frame=scene.worldbody.add_frame())
+        machine = mujoco.MjSpec.from_file(str(mjcf))
+        scene.option = machine.option  # MuJoCo warns where they differ; nothing moves here by itself
+        scene.attach(machine, prefix="machine/", frame=scene.worldbody.add_frame())
         return scene.compile()
 
     def _set_visuals(self, low: Floats, high: Floats, width: int, height: int) -> None:

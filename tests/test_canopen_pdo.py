@@ -560,10 +560,10 @@ def test_a_cycle_costs_little(wire):
     """2 RPDO and 2 TPDO with SYNC cost tens of microseconds; the bound lets a busy machine pass."""
     wire.enable()
     frames = [Frame(0x405, bytes(6)), Frame(0x505, bytes(6)), Frame(0x80)]
-    start = time.perf_counter()
+    start = time.process_time()  # a computer that does something else meanwhile does not count
     for k in range(2000):
         for frame in frames:
             wire.node.receive(frame, wire.now)
         wire.node.before_cycle(wire.now + k * 0.001)
         wire.node.after_cycle(wire.now + k * 0.001)
-    assert (time.perf_counter() - start) / 2000 < 300e-6
+    assert (time.process_time() - start) / 2000 < 300e-6

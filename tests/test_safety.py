@@ -283,9 +283,8 @@ def test_enabling_starts_heartbeats_that_the_drive_watches_and_closing_ends_both
         assert drive.get(0x1016, 1) == 127 << 16 | 60
         assert drive.get(0x1029, 1) == 0
         motion.disable(drives)
-        time.sleep(0.2)
-        beats = [data for can_id, data, _ in bus.log if can_id == HEARTBEAT]
-        assert len(beats) >= 5
+        until(lambda: len(bus.sent(HEARTBEAT)) >= 5)
+        beats = bus.sent(HEARTBEAT)
         assert set(beats) == {b"\x05"}
     assert (drive.get(0x1016, 1), drive.get(0x1029, 1)) == (0, 1)
 
@@ -298,9 +297,8 @@ def test_without_a_heartbeat_consumer_life_is_guarded(tmp_path, bus, drive):
     with CanDrives(eds=path, bus=bus, safety=Limits(silence=0.06)) as drives:
         motion.enable(drives, mode="csv")
         assert (drive.get(0x100C), drive.get(0x100D)) == (20, 3)
-        time.sleep(0.1)
         motion.disable(drives)
-        assert sum(can_id == 0x701 and remote for can_id, _, remote in bus.log) >= 3
+        until(lambda: sum(can_id == 0x701 and remote for can_id, _, remote in bus.log) >= 3)
         assert not bus.sent(HEARTBEAT)
     assert (drive.get(0x100C), drive.get(0x100D)) == (0, 0)
 
@@ -315,30 +313,37 @@ def test_a_drive_that_cannot_watch_is_told(bus, drive, caplog):
 
 
 def test_a_stalled_program_is_quick_stopped_and_told_once(bus, drive):
-    with CanDrives(bus=bus, safety=Limits(stall=0.1)) as drives:
+    with CanDrives(bus=bus, safety=Limits(stall=0.5)) as drives:
         motion.enable(drives, mode="csv")
-        time.sleep(0.3)
-        assert sent_controlwords(bus)[-1] == 2
-        with pytest.raises(SafetyError, match=r"made no call for 0\.\d+ s with an axis enabled; the limit is 0\.1 s"):
+        until(lambda: sent_controlwords(bus)[-1] == 2)
+        with pytest.raises(SafetyError, match=r"made no call for \d+\.\d+ s with an axis enabled; the limit is 0\.5 s"):
             drives.read(0x6041)
         assert drives.read(0x6041) == [0x0240]
 
 
 def test_a_program_may_take_its_time_while_no_axis_is_enabled(bus):
-    with CanDrives(bus=bus, safety=Limits(stall=0.05)) as drives:
+    with CanDrives(bus=bus, safety=Limits(stall=0.5)) as drives:
         motion.enable(drives, mode="csv")
         motion.disable(drives)
-        time.sleep(0.15)
+        time.sleep(1.0)
         drives.read(0x6041)
         assert 2 not in sent_controlwords(bus)
 
 
 def test_waiting_and_recording_is_no_stall(bus):
-    with CanDrives(bus=bus, safety=Limits(stall=0.05)) as drives:
+    with CanDrives(bus=bus, safety=Limits(stall=0.5)) as drives:
         motion.enable(drives, mode="csv")
-        drives.advance(0.2)
-        drives.record([0x6041], 0.2)
+        drives.advance(0.8)
+        drives.record([0x6041], 0.8)
         assert 2 not in sent_controlwords(bus)
+
+
+def until(condition, patience=30.0):
+    """Wait for what another thread or process does; a busy computer may take its time [s]."""
+    end = time.monotonic() + patience
+    while not condition():
+        assert time.monotonic() < end, "it never came"
+        time.sleep(0.005)
 
 
 PROGRAM = """
@@ -369,11 +374,8 @@ def test_a_program_that_ends_leaves_no_turning_axis(number):
             assert program.stdout.readline() == "running\n"
             assert abs(emulated.read(0x606C)[0]) > 800_000
             program.send_signal(number)
-            deadline = time.monotonic() + 3.0
-            while abs(emulated.read(0x606C)[0]) > 30_000 and time.monotonic() < deadline:
-                time.sleep(0.01)
-            assert abs(emulated.read(0x606C)[0]) <= 30_000
-            program.wait(5.0)
+            until(lambda: abs(emulated.read(0x606C)[0]) <= 30_000)
+            program.wait(60.0)
             state = emulated.read(0x6041)[0]
             assert state & 0x6F != 0x27
             if number == signal.SIGKILL:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import warnings
 from contextlib import contextmanager
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
+from scipy.linalg import solve_continuous_are
 from test_parity import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World
 from drive_env.envs.tracking import OBJECTS, TASKS, Tracking, TrackingConfig
 from drive_env.envs.trajectories import TRAJECTORIES, draw
+from drive_env.gains import GAIN_OBJECTS, Gains, bandwidths_from_gains
+from mechanics.loads import LOADS as ALL_LOADS
 
 NAME = "ServoDrive/Tracking-v0"
 LOADS = tuple(TASKS)
@@ -42,39 +44,6 @@ def run(lanes, given, seed=0):
 
 
 # --- the interface ----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("load", LOADS)
-def test_gymnasium_finds_nothing_to_say(load):
-    env = gymnasium.make(NAME, load=load, duration=0.05, num_threads=1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(env.unwrapped, skip_render_check=True)
-    env.close()
-
-
-@pytest.mark.parametrize("load", LOADS)
-def test_stable_baselines_finds_nothing_to_say(load):
-    checker = pytest.importorskip("stable_baselines3.common.env_checker")
-    env = gymnasium.make(NAME, load=load, duration=0.05, num_threads=1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        checker.check_env(env.unwrapped, warn=True)
-    env.close()
-
-
-def test_make_vec_makes_lanes():
-    lanes = gymnasium.make_vec(NAME, 3, vectorization_mode="vector_entry_point", load="gantry", num_threads=1)
-    assert isinstance(lanes, Tracking) and lanes.action_space.shape == (3, 2)
-    lanes.close()
-
-
-def test_every_observation_is_in_the_docstring():
-    rows = [line for line in (Tracking.__doc__ or "").splitlines() if line.strip().startswith("| 8")]
-    bounds = [tuple(float(cell.replace("pi", str(np.pi))) for cell in row.split("|")[-3:-1]) for row in rows]
-    with tracking(load="cart_pendulum") as lanes:
-        space = lanes.single_observation_space
-        assert np.allclose(np.array(bounds), np.stack([space.low, space.high], 1))
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -118,17 +87,6 @@ def test_a_lane_is_the_same_alone_and_among_others(load):
             single = run(alone, given[:, lane : lane + 1], seed=lane)
         for many, one in zip(together, single, strict=True):
             assert np.array_equal(many[:, lane], one[:, 0])
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_threads_change_nothing(mode):
-    given = actions(60, 130)
-    found = []
-    for threads in (1, 2):
-        with tracking(130, duration=0.04, num_threads=threads, autoreset_mode=mode) as lanes:
-            found.append(run(lanes, given))
-    for one, two in zip(*found, strict=True):
-        assert np.array_equal(one, two)
 
 
 def test_the_view_is_lane_0():
@@ -276,20 +234,46 @@ def test_a_controller_that_knows_the_reference_follows_it(mode, action):
             assert np.mean(with_nothing) > 2 * np.mean(errors)
 
 
-def test_a_state_feedback_keeps_the_pole_up():
-    """Gains chosen by hand, the cart's velocity as input: that the task can be done with what is observed."""
-    with tracking(4, load="inverted_pendulum", duration=3.0) as lanes:
+BELT = 0.04  # m per turn of the motor
+
+
+def pole_feedback(drives):
+    """Return gains on place [m], speed [m/s], angle [rad] and rate [rad/s] of the pole's cart, for its speed [m/s].
+
+    Those of a linear quadratic regulator. The pole from the numbers of its MJCF: l theta'' = g theta - v'; the cart as
+    the velocity loop has it, T v' = u - v, T from the gains that the drive holds. Costs by Bryson's rule: 0.1 m, 1 m/s,
+    0.05 rad, 0.5 rad/s and 0.5 m/s are equally bad.
+    """
+    model = mujoco.MjModel.from_xml_path(str(ALL_LOADS["inverted_pendulum"].mjcf))
+    cart, bob = (model.body(name).id for name in ("cart", "bob"))
+    mass, height = model.body_mass[bob], model.body_ipos[bob, 2]
+    length = (model.body_inertia[bob, 1] + mass * height**2) / (mass * height)
+    radius = BELT / (2.0 * np.pi)
+    inertia = drives.motor.inertia + (model.body_mass[cart] + mass) * radius**2
+    raw = Gains(*(int(drives.read(name)[0]) for name in GAIN_OBJECTS))
+    T = 1.0 / (2.0 * np.pi * bandwidths_from_gains(drives.device, drives.motor, inertia, raw).velocity_hz)
+    A = np.array([[0, 1, 0, 0], [0, -1 / T, 0, 0], [0, 0, 0, 1], [0, 1 / (T * length), 9.81 / length, 0]])
+    B = np.array([[0.0], [1 / T], [0.0], [-1 / (T * length)]])
+    Q, R = np.diag(np.array([0.1, 1.0, 0.05, 0.5]) ** -2.0), np.array([[0.5**-2.0]])
+    K = np.linalg.solve(R, B.T @ solve_continuous_are(A, B, Q, R))[0]
+    assert np.all(np.linalg.eigvals(A - B @ K[None]).real < -1.0)
+    return K
+
+
+@pytest.mark.parametrize("options", [{}, {"rate": 500}, {"delay": 3}, {"distributions": "inverted_pendulum"}], ids=str)
+def test_a_state_feedback_keeps_the_pole_up(options):
+    """That the task can be done with what is observed, also on machines that the feedback was not made for."""
+    with tracking(4, load="inverted_pendulum", duration=2.0, **options) as lanes:
+        K = pole_feedback(lanes.drives)
+        amplitude, speed = lanes.config.amplitude * BELT, lanes.config.speed * BELT
         observation, _ = lanes.reset(seed=0)
-        total = np.zeros(4)
-        for _ in range(2999):
-            position, speed = observation[:, 2] * 5.0 * 0.04, observation[:, 3] * 25.0 * 0.04  # m, m/s
-            angle, rate = observation[:, 8], observation[:, 9]
-            wanted = 1.0 * speed + 0.01 * (9.0 * position + 12.0 * speed + 90.0 * angle + 16.0 * rate)  # m/s
-            action = np.clip(wanted / (1.25 * 25.0 * 0.04), -1, 1)[:, None].astype(np.float32)
-            observation, reward, terminated, *_ = lanes.step(action)
-            total += reward
+        for _ in range(lanes.config.steps - 1):
+            state = observation[:, [2, 3, 8, 9]] * [amplitude, speed, 1.0, 1.0]
+            action = np.clip(-state @ K / (1.25 * speed), -1, 1)[:, None].astype(np.float32)
+            observation, _, terminated, *_ = lanes.step(action)
             assert not terminated.any()
-        assert np.abs(observation[:, 8]).max() < 0.1
+        assert np.abs(observation[:, 8]).max() < 0.05
+        assert np.abs(observation[:, 2] * amplitude).max() < 0.1
 
 
 def test_bus_imperfections_are_drawn_and_late():
@@ -388,6 +372,27 @@ def test_over_can_in_lockstep_the_observations_are_the_same(load, mode, action):
     assert np.ptp([row[0, 2] for row in expected[1::2] if row.shape[1] > 2]) > 0 or mode == "csp"
 
 
+@pytest.mark.parametrize(("load", "mode"), [("two_mass", "csp"), ("gantry", "csp"), ("two_mass", "cst")])
+def test_on_a_bus_an_axis_left_in_haste_is_taken_back_at_once(load, mode):
+    """The last leap of a target in csp is at 35 turns per ms: as the speed that pp begins with it would run away."""
+    axes = 2 if load == "gantry" else 1
+    with EmulatedDrives(load=load, num_threads=1) as drives:
+        lanes = Tracking(1, drives=Bare(drives), load=load, mode=mode, duration=0.06, autoreset_mode="Disabled")
+        went_back = []
+        go_back = lanes._go_back
+        lanes._go_back = lambda moving: went_back.append(drives.read(0x6064)) or go_back(moving)
+        for seed in range(4):
+            lanes.reset(seed=seed)
+            assert np.abs(drives.read(0x6064)).max() < 0.02 * 65536 * lanes.config.amplitude
+            drives.emergencies()
+            for action in actions(60, 1, axes, seed):
+                *_, terminated, _, _ = lanes.step(action)
+                assert not terminated.any()
+        assert drives.emergencies() == []
+        assert len(went_back) == 4  # no second try
+        lanes.close()
+
+
 def test_on_a_bus_what_needs_a_machine_is_refused():
     with EmulatedDrives(load="cart_pendulum", num_threads=1) as emulated:
         drives = Bare(emulated)
@@ -395,34 +400,16 @@ def test_on_a_bus_what_needs_a_machine_is_refused():
             Tracking(1, drives=drives, load="cart_pendulum")
         with pytest.raises(ValueError, match="distributions are of emulated machines"):
             Tracking(1, drives=drives, load="cart_pendulum", distributions="cart_pendulum", sensor=lambda: [0.0])
-        lanes = Tracking(1, drives=drives, load="cart_pendulum", sensor=lambda: [0.25], render_mode="rgb_array")
+        lanes = Tracking(1, drives=drives, load="cart_pendulum", sensor=lambda: [0.25])
         assert lanes.reset(seed=0)[0][0, 8] == 0.25
-        with pytest.raises(ValueError, match="pictures need emulated machines"):
-            lanes.render()
         with pytest.raises(ValueError, match="1 axes cannot be shared by 2 lanes"):
             Tracking(2, drives=drives)
 
 
 # --- long and with others ---------------------------------------------------------------------------------------------
-@pytest.mark.slow
-@pytest.mark.parametrize("load", LOADS)
-def test_random_agents_over_randomised_machines(load):
-    """A quarter of a million steps each: no exception, no observation outside its box."""
-    n = 256
-    laws = {"include": [load, "bus"]}
-    with tracking(n, load=load, distributions=laws, duration=0.5, num_threads=2) as lanes:
-        lanes.reset(seed=0)
-        rng = np.random.default_rng(0)
-        for k in range(1_000_000 // len(LOADS) // n + 1):
-            scale = 0.2 if k % 400 < 200 else 1.0
-            given = (scale * rng.uniform(-1, 1, lanes.action_space.shape)).astype(np.float32)
-            observation, reward, *_ = lanes.step(given)
-            assert lanes.observation_space.contains(observation)
-            assert np.all(np.isfinite(reward))
-
-
 def test_stable_baselines_trains_on_lanes_without_copies():
-    sb3 = pytest.importorskip("stable_baselines3")
+    import stable_baselines3 as sb3
+
     from drive_env.envs.stable_baselines import LanesVecEnv
 
     with pytest.raises(ValueError, match="SameStep"), tracking(2) as lanes:

@@ -3,12 +3,39 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
 
 Config = TypeVar("Config")
+
+
+def _is_number(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, Real)
+
+
+def _is_whole(value: Any) -> bool:
+    return not isinstance(value, bool) and isinstance(value, Integral)
+
+
+# Type of a field -> what it takes, in words, and whether a value is one; fields of other types check themselves.
+_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "str": ("text", lambda value: isinstance(value, str)),
+    "int": ("a whole number", _is_whole),
+    "float": ("a number", _is_number),
+    "bool": ("true or false", lambda value: isinstance(value, bool)),
+    "tuple[str, ...]": (
+        "a list of names",
+        # A lone name, too: the dataclass says which there are.
+        lambda value: isinstance(value, str | list | tuple) and all(isinstance(one, str) for one in value),
+    ),
+    "Mapping[str, float]": (
+        "a table of numbers",
+        lambda value: isinstance(value, Mapping) and all(_is_number(one) for one in value.values()),
+    ),
+}
 
 
 def configured(
@@ -39,7 +66,20 @@ def configured(
     for name in table:
         if name not in known:
             raise ValueError(f"there is no option {name!r}; there are {', '.join(known)}")
+    for field in fields(kind):  # type: ignore[arg-type]
+        if field.name in table:
+            _check_type(field.name, str(field.type), table[field.name])
     return kind(**table)
+
+
+def _check_type(name: str, kind: str, value: Any) -> None:
+    """Raise ValueError unless a value is of a field's type, as it stands in the dataclass."""
+    optional = kind.endswith(" | None")
+    if optional and value is None:
+        return
+    what, fits = _KINDS.get(kind.removesuffix(" | None"), ("", lambda value: True))
+    if not fits(value):
+        raise ValueError(f"{name} must be {what}{' or left out' if optional else ''}, not {value!r}")
 
 
 def _read(path: Path) -> dict[str, Any]:

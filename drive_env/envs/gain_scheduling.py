@@ -136,10 +136,14 @@ class GainSchedulingConfig:
 class GainScheduling(Lanes):
     """Gains that follow the machine: set every 5 to 20 ms, while a programme with changing payload runs.
 
-    An action is ln(gain / base) / span of each gain of each axis, -1 to 1, axis by axis. A gain is written by SDO
-    between two cycles, as it would be on a bus; the programme's set-points are played as PDOs.
+    Action, float32, for each axis, with G gains of the configuration; a gain is written by SDO between two cycles, as
+    it would be on a bus, and the programme's set-points are played as PDOs:
 
-    An observation has for each axis, float32, from the samples of the last step as they have come over the bus:
+    | index | name | unit | low | high |
+    | --- | --- | --- | --- | --- |
+    | 0 ... G-1 | ln(gain / base), in the configuration's order | span | -1 | 1 |
+
+    Observation, float32, for each axis, from the samples of the last step as they have come over the bus:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
@@ -154,7 +158,7 @@ class GainScheduling(Lanes):
     | 8 | current, mean over the step | of rated | -8 | 8 |
     | 9 | current_rms, over the step | of rated | 0 | 8 |
     | 10 | current_increment, RMS from sample to sample | of rated | 0 | 4 |
-    | 11... | the last action's entries for this axis | 1 | -1 | 1 |
+    | 11 ... 10+G | the last action's entries for this axis | span | -1 | 1 |
 
     The error scale is what the fitted rule's gains would leave: in csp, where this drive has no feed-forward and lags
     by v/k_v, at a fifth of the programme's top speed; in csv a/w_v at its top acceleration. What lies beyond its bounds
@@ -210,6 +214,8 @@ class GainScheduling(Lanes):
         self._owned = drives is None
         self.drives = self._new_drives() if drives is None else drives
         try:
+            if render_mode:
+                self._pictures = Pictures(self.drives, render_mode)
             self._prepare(row)
         except BaseException:
             self._close_lanes()
@@ -223,7 +229,7 @@ class GainScheduling(Lanes):
         # First, so that it is the same on a bus, where no machine is drawn.
         self._programme.draw(self.config.excitation, self.reach, self.rngs, mask)
         if self._machines is not None:
-            self._machines.redraw(self.rngs, mask, self.config.stage)
+            self._machines.redraw(self.rngs, mask, self.stage)
             self._plan_payloads(mask)
         else:
             self._bring_back(axes)
@@ -264,9 +270,7 @@ class GainScheduling(Lanes):
         return self._observe(*seen), np.asarray(reward, float), terminated, self._now >= self._steps, info
 
     def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
-        if self._pictures is None:
-            self._pictures = Pictures(self.drives, self.num_envs, self.render_mode or "rgb_array")
-        return self._pictures.draw(lane)
+        return None if self._pictures is None else self._pictures.draw(lane)
 
     def _close_lanes(self) -> None:
         if self._pictures is not None:
@@ -391,7 +395,7 @@ class GainScheduling(Lanes):
         objects = (POSITION, VELOCITY, CURRENT, STATUSWORD)
         played = targets.reshape(self._cycles, -1)
         # A picture looks at every cycle.
-        apart = self._pictures is not None
+        apart = self._pictures is not None and self._pictures.is_looking
         changed = np.any(arriving[1:] != arriving[:-1], axis=(1, 2))
         begins = [k for k in range(self._cycles) if k == 0 or apart or changed[k - 1]]
         traces = []

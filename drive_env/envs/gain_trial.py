@@ -6,7 +6,7 @@ All of it can be done and seen on a real drive: position, its demand, current an
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -113,14 +113,14 @@ class Trials:
         motor: What turns them.
         axes: Axes of a lane.
         t_0: Four times the sum of the small time constants [s].
-        look: Called each time the watch looks.
+
+    Attributes:
+        look: If not None, called after every cycle.
     """
 
-    def __init__(
-        self, drives: Drives, motor: Motor, axes: int, t_0: float, look: Callable[[], None] = lambda: None
-    ) -> None:
+    def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:
+        self.look: Callable[[], None] | None = None
         self._drives = drives
-        self._look = look
         self._motor = motor
         self._axes = axes
         self._t_0 = t_0
@@ -141,7 +141,7 @@ class Trials:
         traces = []
         for target in (origin + move.distance, origin):
             start(drives, _on_the_counter(target), where)
-            traces.append(drives.record(objects, TRIAL * CYCLE))
+            traces.append(self._record(objects, TRIAL))
         position, velocity, current = (np.concatenate([trace[name] for trace in traces]) for name in objects)
         angle = wrapped(position - origin) / move.increments
         speed = velocity / scaler * 2.0 * np.pi
@@ -215,9 +215,8 @@ class Trials:
         for _ in range(TRIAL // WATCH):
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
-                trace = drives.record(objects, WATCH * CYCLE)
+                trace = self._record(objects, WATCH)
             traces.append(trace)
-            self._look()
             mask, enabled = motion.OPERATION_ENABLED
             down = where & (trace[STATUS][-1] & mask != enabled)
             change = np.diff(trace[CURRENT], axis=0) * 1e-3
@@ -231,6 +230,17 @@ class Trials:
                 start(drives, to, down)
         position, demand, current = (np.concatenate([trace[name] for trace in traces]) for name in objects[:3])
         return position, demand, current, stopped
+
+    def _record(self, objects: list[Any], cycles: int) -> Mapping[Any, Integers]:
+        """Let cycles pass, one by one where someone looks, and return the objects, (cycles, num_axes) each."""
+        if self.look is None:
+            trace = self._drives.record(objects, cycles * CYCLE)
+            return {name: trace[name] for name in objects}
+        rows = []
+        for _ in range(cycles):
+            rows.append(self._drives.record(objects, CYCLE))
+            self.look()
+        return {name: np.concatenate([row[name] for row in rows]) for name in objects}
 
     def _whole_lanes(self, axes: Mask) -> Mask:
         return np.repeat(axes.reshape(-1, self._axes).any(axis=1), self._axes)

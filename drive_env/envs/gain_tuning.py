@@ -77,7 +77,7 @@ class GainTuningConfig:
     num_threads: As `EmulatedDrives` takes it.
     """
 
-    load: str = "two_mass"
+    load: Any = "two_mass"
     device: str = "tmcm1636"
     motor: str = "qbl4208"
     friction: str = "stribeck"
@@ -117,10 +117,17 @@ class GainTuning(Lanes):
     trips is stopped within 50 ms, the drive is cleared, and the incumbent returns. The incumbent is the trial with the
     least J by measured terms, the rule's included; it is the answer (`info["gains"]`).
 
-    Action, float32, one entry per gain of the configuration and axis of the machine, axis by axis: change of the
-    gain's natural logarithm from the incumbent, -0.7...0.7; gains are rounded and stay within 1...32767.
+    All axes of a machine move at once: what is identified is the inertia that an axis sees in that motion, coupling
+    included. The pole of the inverted pendulum falls meanwhile, and shakes its cart.
 
-    Observation, float32, for each axis of the machine, with G gains and W points of waveform:
+    Action, float32, for each axis of the machine, with G gains of the configuration; gains are rounded and stay within
+    1...32767:
+
+    | index | name | unit | low | high |
+    | --- | --- | --- | --- | --- |
+    | 0 ... G-1 | ln of the gain over the incumbent's, in the configuration's order | 1 | -0.7 | 0.7 |
+
+    Observation, float32, for each axis of the machine, with W points of waveform:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
@@ -128,20 +135,35 @@ class GainTuning(Lanes):
     | 1 | dry friction, identified | rated current | 0 | 5 |
     | 2 | viscous friction at rated speed, identified | rated current | 0 | 5 |
     | 3 | constant load, identified | rated current | -5 | 5 |
-    | 4 ... 4+G-1 | ln of the last trial's gain over the rule's | 1 | -10.4 | 10.4 |
-    | 4+G ... 4+2G-1 | ln of the incumbent's gain over the rule's | 1 | -10.4 | 10.4 |
-    | 4+2G ... +4 | of the last trial's move: ln t_s/t_0 | 1 | 0 | 5 |
-    | | ln(1 + n/3 %) | 1 | 0 | 7 |
-    | | overshoot | the move | 0 | 5 |
-    | | ln of the following error's integral over the rule's | 1 | -10 | 10 |
-    | | stopped: it oscillated or tripped | 1 | 0 | 1 |
-    | +5 ... +9, +10 ... +14 | the same of its reversal, and of its probe | | | |
-    | +15 | ln J of the last trial by measured terms, of the lane | 1 | -10 | 4 |
-    | +16 ... +31 | the 16 entries of the incumbent's trial | | | |
-    | W entries | error of the last trial's move, demand less actual | the move | -5 | 5 |
+    | 4 ... 3+G | ln of the last trial's gain over the rule's | 1 | -10.4 | 10.4 |
+    | 4+G ... 3+2G | ln of the incumbent's gain over the rule's | 1 | -10.4 | 10.4 |
+    | 4+2G | last trial's move: ln t_s/t_0 | 1 | 0 | 5 |
+    | 5+2G | last trial's move: ln(1 + n/3 %) | 1 | 0 | 7 |
+    | 6+2G | last trial's move: overshoot | the move | 0 | 5 |
+    | 7+2G | last trial's move: ln of the following error's integral over the rule's | 1 | -10 | 10 |
+    | 8+2G | last trial's move: stopped: it oscillated or tripped | 1 | 0 | 1 |
+    | 9+2G | last trial's reversal: ln t_s/t_0 | 1 | 0 | 5 |
+    | 10+2G | last trial's reversal: ln(1 + n/3 %) | 1 | 0 | 7 |
+    | 11+2G | last trial's reversal: overshoot | the move | 0 | 5 |
+    | 12+2G | last trial's reversal: ln of the following error's integral over the rule's | 1 | -10 | 10 |
+    | 13+2G | last trial's reversal: stopped: it oscillated or tripped | 1 | 0 | 1 |
+    | 14+2G | last trial's probe: ln t_s/t_0 | 1 | 0 | 5 |
+    | 15+2G | last trial's probe: ln(1 + n/3 %) | 1 | 0 | 7 |
+    | 16+2G | last trial's probe: overshoot | the move | 0 | 5 |
+    | 17+2G | last trial's probe: ln of the following error's integral over the rule's | 1 | -10 | 10 |
+    | 18+2G | last trial's probe: stopped: it oscillated or tripped | 1 | 0 | 1 |
+    | 19+2G | last trial: ln J by measured terms, of the lane | 1 | -10 | 4 |
+    | 20+2G ... 35+2G | incumbent's trial: as 4+2G ... 19+2G | | | |
+    | 36+2G ... 35+2G+W | error of the last trial's move, demand less actual | the move | -5 | 5 |
 
-    and, after the axes, one entry: the trials left, as a share of an episode's (0...1). With `privileged` it is a dict
-    of "observation" and "privileged": each true parameter's difference from its default, over the default's size.
+    and, after those of all axes:
+
+    | index | name | unit | low | high |
+    | --- | --- | --- | --- | --- |
+    | -1 | trials left | those of an episode | 0 | 1 |
+
+    With `privileged` it is a dict of "observation" and "privileged": each true parameter's difference from its default
+    over the default's size (where that is 0, the parameter itself), in the order of `info["parameters"]`, -100...100.
 
     The reward is the decrease of the incumbent's ln hidden J (drive_env/score.py), meant for a discount of 1, less
     `abort_cost` for a trial that was stopped. On given drives there is no hidden J; it is that of ln J by measured
@@ -193,6 +215,8 @@ class GainTuning(Lanes):
             elif self.config.distributions is not None or self.config.privileged:
                 raise ValueError("given drives are taken as they are: leave distributions and privileged out")
             super().__init__(num_envs, *self._spaces(), autoreset_mode=autoreset_mode, render_mode=render_mode)
+            if render_mode:
+                self._pictures = Pictures(self.drives, render_mode)
             self._prepare()
         except BaseException:
             self._close_lanes()
@@ -234,7 +258,7 @@ class GainTuning(Lanes):
     def _prepare(self) -> None:
         c, n, axes = self.config, self.num_envs, self.drives.num_axes
         t_0 = 4.0 * float(small_time_constants(self._device, self._device.stage["velocity_filter"].default))
-        self._trials = Trials(self.drives, self.motor, self._axes, t_0, self._look)
+        self._trials = Trials(self.drives, self.motor, self._axes, t_0)
         self._columns = np.array([ALL_GAINS.index(name) for name in c.gains])
         one = reach(c.load) if c.travel is None else np.full(self._axes, c.travel * 2.0 * math.pi)
         self._reach = np.tile(one, n)
@@ -259,13 +283,11 @@ class GainTuning(Lanes):
             check_choice("an option of reset", name, ("reset_mask",))
         drives, axes = self.drives, np.repeat(mask, self._axes)
         if self._machines is not None:
-            self._machines.redraw(self.rngs, mask, self.config.stage)
+            self._machines.redraw(self.rngs, mask, self.stage)
             for lane in np.flatnonzero(mask):
                 self._noise[lane] = self.rngs[lane].integers(1, 2**31)
             self._trial[mask] = 0.0
             self._parameters = drives.machine.parameters
-        if self._pictures is not None:
-            self._pictures.begin(mask)
         self._begin_trial(mask)
         self._safe = np.where(
             axes[:, None], np.stack([drives.read(name) for name in GAIN_OBJECTS], axis=-1), self._safe
@@ -334,7 +356,7 @@ class GainTuning(Lanes):
         An emulated trial begins anew so that it follows from machine, gains and the lane's noise alone, not from how
         long other lanes were being reset meanwhile.
         """
-        drives, axes = self.drives, np.repeat(mask, self._axes)
+        drives, axes, pictures = self.drives, np.repeat(mask, self._axes), self._pictures
         if self._machines is not None:
             machine, values = drives.machine, self._machines.values
             machine.seed_noise(self._noise + self._trial, mask)
@@ -346,6 +368,9 @@ class GainTuning(Lanes):
             power_up(drives, axes)
         else:
             self._trials.recover(axes)
+        if pictures is not None:
+            pictures.begin(mask)  # a trial at a time: between two the machine leaps back to zero
+            self._trials.look = pictures.look if pictures.is_looking else None
 
     def _try(self, gains: Integers, mask: Mask) -> Trial:
         axes = np.repeat(mask, self._axes)
@@ -445,14 +470,8 @@ class GainTuning(Lanes):
                 found[lane] = (*found[lane], message.name)
         return found
 
-    def _look(self) -> None:
-        if self._pictures is not None:
-            self._pictures.look()
-
     def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
-        if self._pictures is None:
-            self._pictures = Pictures(self.drives, self.num_envs, self.render_mode or "rgb_array")
-        return self._pictures.draw(lane)
+        return None if self._pictures is None else self._pictures.draw(lane)
 
     def _dead(self) -> Mask:
         return np.asarray(self._trials.down().reshape(self.num_envs, -1).any(axis=1))

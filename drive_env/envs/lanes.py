@@ -16,6 +16,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from drive_env.envs.randomisation import Curriculum
+
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Info = dict[str, Any]
@@ -26,7 +28,7 @@ RENDER_MODES = ("rgb_array", "human")
 
 
 class Lanes(VectorEnv[Any, Any, Any]):
-    """Base of the vector environments.
+    """Base of the vector environments; `config` is a subclass's configuration.
 
     A subclass gives `_reset_lanes` and `_step_lanes`; it may replace `_render_lane` and `_close_lanes`. Arrays that it
     returns are handed out as they are: it must make new ones in each step.
@@ -45,6 +47,8 @@ class Lanes(VectorEnv[Any, Any, Any]):
     Raises:
         ValueError: For a mode that is none, or less than one lane.
     """
+
+    config: Any
 
     def __init__(
         self,
@@ -70,6 +74,7 @@ class Lanes(VectorEnv[Any, Any, Any]):
         self._ended: Mask = np.zeros(num_envs, bool)
         self._some_ended = False
         self._has_begun = False
+        self._stage: float | None = None
 
     # --- what a subclass gives ------------------------------------------------------------------------------------
     def _reset_lanes(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Observation, Info]:
@@ -94,6 +99,27 @@ class Lanes(VectorEnv[Any, Any, Any]):
 
     def _close_lanes(self) -> None:
         """Give back what is held."""
+
+    # --- the curriculum -------------------------------------------------------------------------------------------
+    @property
+    def stage(self) -> float:
+        """Stage of the curriculum, 0...1, of machines that are drawn from now on; the configuration's until it is set.
+
+        Whoever trains sets it, with `curriculum.stage_at(environment steps so far)`.
+        """
+        return float(self.config.stage if self._stage is None else self._stage)
+
+    @stage.setter
+    def stage(self, stage: float) -> None:
+        if not 0.0 <= stage <= 1.0:
+            raise ValueError(f"stage of the curriculum must lie in 0...1, not {stage:g}")
+        self._stage = stage
+
+    @property
+    def curriculum(self) -> Curriculum:
+        """Schedule of the stage that the distributions have; of drives that are taken as they are, a constant."""
+        machines = getattr(self, "_machines", None)
+        return Curriculum() if machines is None else machines.distributions.curriculum
 
     # --- gymnasium.vector.VectorEnv -------------------------------------------------------------------------------
     def reset(

@@ -10,85 +10,98 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from drive_env.recording import Recorder
     from drive_env.render import Picture
+    from drive_env.window import Window
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
+HUMAN = "human"
+FRAME = 0.02  # s of emulated time between two pictures in a window: one takes a tenth of a second to draw
+
 
 class Pictures:
-    """Draws lanes of emulated drives; "human" shows them in a window.
+    """Draws lanes of emulated drives; "human" shows lane 0 in a window while time passes.
 
     Args:
         drives: The drives.
-        num_envs: Lanes.
         mode: "rgb_array" or "human".
+        period: Time between two looks [s].
 
     Raises:
         ValueError: For drives on a bus, whose machine no one sees.
+        OpenGLError: With "human", if there is no display.
     """
 
-    def __init__(self, drives: Any, num_envs: int, mode: str) -> None:
+    def __init__(self, drives: Any, mode: str, period: float = 0.001) -> None:
         if getattr(drives, "machine", None) is None:
             raise ValueError("pictures need emulated machines; leave render_mode out on a bus")
         self._drives = drives
-        self._num_envs = num_envs
-        self._human = mode == "human"
+        self._period = period
         self._recorders: dict[int, Recorder] = {}
         self._picture: Picture | None = None
-        self._window: Any = None
+        self._window: Window | None = None
+        self._looks = 0  # since the last picture in the window
+        if mode == HUMAN:
+            self._open_window()
+
+    @property
+    def is_looking(self) -> bool:
+        """Whether a lane is recorded: only then is `look` worth a call."""
+        return bool(self._recorders)
 
     def begin(self, lanes: Mask) -> None:
-        """Begin a new recording of the lanes where the mask is true."""
-        for lane in [lane for lane in self._recorders if lanes[lane]]:
+        """Begin a new recording of the lanes where the mask is true, of those that are shown."""
+        shown = {0} if self._window is not None else set(self._recorders)
+        for lane in [lane for lane in shown if lanes[lane]]:
             self._record(lane)
 
     def look(self) -> None:
         """Remember where the lanes that are shown are now."""
         for recorder in self._recorders.values():
             recorder.look()
-        if self._human:
-            self.draw(0)
+        if self._window is not None and self._recorders:
+            self._looks += 1
+            if self._looks * self._period >= FRAME - 1e-9:
+                self.draw(0)
 
     def draw(self, lane: int) -> Image | None:
         """Return the picture of a lane, uint8 of shape (height, width, 3); with "human" show it and return None."""
-        from drive_env.render import Picture
-
+        if self._window is not None and not self._window.is_open:
+            return None
         if lane not in self._recorders:
             self._record(lane)
-        if self._picture is None:
-            self._picture = Picture(self._drives.load)
-        image = self._picture.frame(self._recorders[lane].recording())
-        if not self._human:
+        image = self._drawn().frame(self._recorders[lane].recording())
+        if self._window is None:
             return image
-        self._show(image)
+        self._looks = 0
+        self._window.show(image)
         return None
 
     def close(self) -> None:
         """Close window and picture."""
         if self._window is not None:
-            import matplotlib.pyplot as plt
-
-            plt.close(self._window.figure)
-            self._window = None
+            self._window.close()
         if self._picture is not None:
             self._picture.close()
             self._picture = None
+        self._recorders.clear()
+
+    def _open_window(self) -> None:
+        from drive_env.demonstration import PictureFormat
+        from drive_env.window import Window
+
+        form = PictureFormat()
+        self._window = Window(form.width, form.height, f"drive-env: {self._drives.load.name}")
+
+    def _drawn(self) -> Picture:
+        if self._picture is None:
+            from drive_env.render import Picture
+
+            self._picture = Picture(self._drives.load)
+        return self._picture
 
     def _record(self, lane: int) -> None:
         from drive_env.recording import Recorder
 
-        self._recorders[lane] = Recorder(self._drives, lane)
+        self._recorders[lane] = Recorder(self._drives, lane, self._period)
         self._recorders[lane].look()
-
-    def _show(self, image: Image) -> None:
-        import matplotlib.pyplot as plt
-
-        if self._window is None:
-            figure, axes = plt.subplots(figsize=(image.shape[1] / 100, image.shape[0] / 100), frameon=False)
-            axes.set_axis_off()
-            axes.set_position((0.0, 0.0, 1.0, 1.0))
-            self._window = axes.imshow(image)
-            figure.show()
-        self._window.set_data(image)
-        self._window.figure.canvas.draw_idle()
-        self._window.figure.canvas.flush_events()

@@ -19,7 +19,8 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc]
     """Stable-Baselines3's view of lanes with autoreset mode "SameStep".
 
     Observations, rewards and ends are handed over as they are; infos are dicts with "terminal_observation",
-    "TimeLimit.truncated", "fault" of lanes that ended, and empty otherwise.
+    "TimeLimit.truncated", "fault" of lanes that ended, and empty otherwise. Where the distributions have a curriculum,
+    its stage follows the steps of all lanes.
 
     Raises:
         ValueError: For lanes of another autoreset mode, which SB3 does not know.
@@ -30,12 +31,15 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc]
             raise ValueError(f"Stable-Baselines3 needs autoreset_mode='SameStep', not {lanes.autoreset_mode.value!r}")
         self.lanes = lanes
         self._actions: Any = None
+        self._steps = 0
+        self._follows = len(lanes.curriculum.steps) > 1
         super().__init__(lanes.num_envs, lanes.single_observation_space, lanes.single_action_space)
 
     def reset(self) -> Any:
         """Begin an episode in every lane, with the seeds and options given before."""
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
         options = self._options[0] if self._options and self._options[0] else None
+        self._follow_curriculum()
         observation, told = self.lanes.reset(seed=seeds, options=options)
         self.reset_infos = [_of_lane(told, lane) for lane in range(self.num_envs)]
         self._reset_seeds()
@@ -48,6 +52,8 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc]
 
     def step_wait(self) -> tuple[Any, Any, Any, list[Info]]:
         """Act in every lane."""
+        self._steps += self.num_envs
+        self._follow_curriculum()
         observation, reward, terminated, truncated, info = self.lanes.step(self._actions)
         ended = terminated | truncated
         infos: list[Info] = [{} for _ in range(self.num_envs)]
@@ -59,6 +65,10 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc]
                 if fault is not None and fault[lane] is not None:
                     infos[lane]["fault"] = fault[lane]
         return observation, reward.astype(np.float32), ended, infos
+
+    def _follow_curriculum(self) -> None:
+        if self._follows:
+            self.lanes.stage = self.lanes.curriculum.stage_at(self._steps)
 
     def close(self) -> None:
         """Give drives and pictures back."""

@@ -32,8 +32,9 @@ WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "effort": 0.05, "smoothne
 RATES = (500, 1000)
 ACTIONS = ("direct", "offset")
 RETURN_SPEED = 0.25  # of the trajectory's, back to the start on a bus
-RESTARTS = 20  # tries to reset a fault on a bus before giving up
-RESTART_PAUSE = 0.1  # s between two: a DC link that braking has filled empties slowly
+RESTARTS = 3  # tries to go back to the start on a bus: what brakes in haste may trip once more
+RESET_PAUSE, RESET_TIME = 0.1, 2.0  # s between two fault resets, and in all: a filled DC link empties slowly
+REST_SPEED, REST_TIME = 0.02, 0.5  # of the trajectory's speed: at rest; s that it may take
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class TrackingConfig:
     num_threads: As `EmulatedDrives` takes it.
     """
 
-    load: str = "two_mass"
+    load: Any = "two_mass"
     device: str = "tmcm1636"
     motor: str = "qbl4208"
     friction: str = "stribeck"
@@ -105,7 +106,7 @@ class TrackingConfig:
     num_threads: int | None = None
 
     def __post_init__(self) -> None:
-        task = TASKS.get(self.load, OTHER)
+        task = self.task
         for name in ("mode", "trajectory", "amplitude", "speed"):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(task, name))
@@ -127,7 +128,7 @@ class TrackingConfig:
     @property
     def task(self) -> Task:
         """What the load's row says."""
-        return TASKS.get(self.load, OTHER)
+        return TASKS.get(self.load, OTHER) if isinstance(self.load, str) else OTHER
 
     @property
     def cycles(self) -> int:
@@ -143,10 +144,14 @@ class TrackingConfig:
 class Tracking(Lanes):
     """Lanes of `ServoDrive/Tracking-v0`: follow a trajectory, or stabilise what the load's row says.
 
-    Action, float32, one entry per axis of the machine, -1...1: share of full scale, see `TrackingConfig.action`.
+    Action, float32, one entry per axis a = 0, 1, ... of the machine:
 
-    Observation, float32, for each axis a = 0, 1, ... of the machine (8 entries each), of the drive's sample that the
-    agent has when it acts:
+    | index | name | unit | low | high |
+    | --- | --- | --- | --- | --- |
+    | a | target or offset, see `TrackingConfig.action` | full scale | -1 | 1 |
+
+    Observation, float32, for each axis a of the machine (8 entries each), of the drive's sample that the agent has
+    when it acts:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
@@ -159,7 +164,7 @@ class Tracking(Lanes):
     | 8a + 6 | reference velocity 10 ms later | speed | -2 | 2 |
     | 8a + 7 | last action | 1 | -1 | 1 |
 
-    and, with a load whose row has a sensor (cart_pendulum, inverted_pendulum), after them:
+    and, with a load whose row has a sensor (cart_pendulum, inverted_pendulum), after those of all A axes:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
@@ -282,7 +287,8 @@ class Tracking(Lanes):
         )
         self._exchange.hooks = Hooks(cycle.act, cycle.observe, own)
         self._start = np.zeros(drives.num_axes, np.int64)
-        self._pictures: Pictures | None = None
+        period = config.cycles * CYCLE
+        self._pictures = Pictures(drives, self.render_mode, period) if self.render_mode else None
 
     def _profile_scales(self) -> Floats:
         """Return raw units of the target per unit of the reference's row: increments, pps, or mA per pps^2."""
@@ -300,8 +306,9 @@ class Tracking(Lanes):
         for name in options:
             check_choice("an option of reset", name, ("reset_mask",))
         axes = np.repeat(mask, self._axes)
+        self._draw_references(mask)  # first, so that they are the same on a bus, where no machine is drawn
         if self._machines is not None:
-            self._machines.redraw(self.rngs, mask, self.config.stage)
+            self._machines.redraw(self.rngs, mask, self.stage)
             motion.enable(self.drives, mode=self.config.mode, where=axes)
         else:
             self._return_to_start(axes)
@@ -311,7 +318,6 @@ class Tracking(Lanes):
         own.origin[axes] = samples[1][axes]
         neutral = samples[1] if self._acts_on_position else np.zeros(len(axes), np.int64)
         own.last[axes] = 0.0
-        self._draw_episodes(mask)
         # What is seen until the first sample comes: the drives at rest, of no cycle yet.
         seen = np.full((self.num_envs, len(SAMPLED) * self._axes + 1), -1.0)
         seen[:, :-1] = samples.T.reshape(self.num_envs, -1)
@@ -356,7 +362,7 @@ class Tracking(Lanes):
         return own.observation[0].copy(), own.reward.item(), terminated, truncated, info
 
     # --- inside ---------------------------------------------------------------------------------------------------
-    def _draw_episodes(self, mask: Mask) -> None:
+    def _draw_references(self, mask: Mask) -> None:
         """Draw the trajectories of the lanes that begin."""
         config, own = self.config, self._episodes
         for lane in np.flatnonzero(mask):
@@ -384,11 +390,24 @@ class Tracking(Lanes):
         for attempt in range(RESTARTS):
             self._clear(axes)
             try:
+                self._come_to_rest(axes)
                 self._go_back(axes)
-            except RuntimeError:  # a drive that the episode left in haste may trip while it is caught
+            except RuntimeError:
                 if attempt == RESTARTS - 1:
                     raise
             else:
+                return
+
+    def _come_to_rest(self, axes: Mask) -> None:
+        """Hold still in csp: the slope of a last leap of the target would else be the speed that pp begins with."""
+        if self.config.mode != "csp" or not self._has_begun:
+            return
+        drives = self.drives
+        drives.write(0x607A, drives.read(0x6064), where=axes)
+        for _ in range(round(REST_TIME / CYCLE)):
+            drives.advance(CYCLE)
+            moving = np.abs(drives.read(0x606C)) > REST_SPEED * self._episodes.scales[:, 1]
+            if not np.any(axes & moving):
                 return
 
     def _go_back(self, axes: Mask) -> None:
@@ -412,15 +431,16 @@ class Tracking(Lanes):
     def _clear(self, axes: Mask) -> None:
         """Reset faults of the drives that have one, when their causes are gone."""
         drives = self.drives
-        for attempt in range(RESTARTS):
+        tries = round(RESET_TIME / RESET_PAUSE)
+        for attempt in range(tries):
             faulty = axes & (drives.read(0x6041) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1])
             if not faulty.any():
                 return
             try:
-                motion.reset_fault(drives, where=faulty, timeout=RESTART_PAUSE)
-                drives.advance(RESTART_PAUSE)
+                motion.reset_fault(drives, where=faulty, timeout=RESET_PAUSE)
+                drives.advance(RESET_PAUSE)
             except TimeoutError:
-                if attempt == RESTARTS - 1:
+                if attempt == tries - 1:
                     raise
 
     def _faults(self, lanes: Mask) -> NDArray[np.object_]:
@@ -440,9 +460,7 @@ class Tracking(Lanes):
         return found
 
     def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
-        if self._pictures is None:
-            self._pictures = Pictures(self.drives, self.num_envs, str(self.render_mode))
-        return self._pictures.draw(lane)
+        return None if self._pictures is None else self._pictures.draw(lane)
 
     def _close_lanes(self) -> None:
         if getattr(self, "_pictures", None) is not None:

@@ -41,7 +41,8 @@ Eds = Annotated[Path | None, typer.Option("--eds", help="EDS of any other CiA 40
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the frames and send none.")]
 Timeout = Annotated[
-    float | None, typer.Option(help="Longest wait for an answer [s].", show_default="the device's, 0.5")
+    float | None,
+    typer.Option(envvar="DRIVE_ENV_TIMEOUT", help="Longest wait for an answer [s].", show_default="the device's, 0.5"),
 ]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 

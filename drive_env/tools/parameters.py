@@ -84,7 +84,7 @@ def diff(
     with errors_as_exit_codes():
         if other is not None:
             dictionary = describe(device, eds).dictionary
-            wanted, found = _load(file, dictionary), _load(other, dictionary)
+            wanted, found = load_parameters(file, dictionary), load_parameters(other, dictionary)
             differences = [
                 Difference(dictionary.find(key), wanted.get(key, 0), found.get(key))
                 for key in {**wanted, **found}
@@ -94,7 +94,7 @@ def diff(
         else:
             with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
                 _check_axis(drives, axis)
-                differences = compare(drives, _load(file, drives.description.dictionary), axis)
+                differences = compare(drives, load_parameters(file, drives.description.dictionary), axis)
                 scale = increments_per_revolution(drives)[axis]
         _print(differences, "drive" if other is None else other.name, file.name, scale, json)
         if differences:
@@ -122,7 +122,7 @@ def restore(
     """
     with errors_as_exit_codes(), _connected(interface, channel, node, device, eds, bitrate, timeout, dry_run) as drives:
         _check_axis(drives, axis)
-        wanted = _load(file, drives.description.dictionary)
+        wanted = load_parameters(file, drives.description.dictionary)
         _exchange(drives, wanted, axis, file.name, store=store, yes=yes or dry_run, json=json)
 
 
@@ -221,7 +221,7 @@ def _toml(drives: Any, values: dict[tuple[int, int], int]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _load(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
+def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
     """Return the parameters of a file; ValueError for what is none."""
     from drive_env.dictionary.access import check_in_range, check_writable
 

@@ -1,0 +1,106 @@
+"""The same policy with the same seed on the emulator and through CanDrives in lockstep: the same observations."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from test_parity import WorldBus
+
+from drive_env import CanDrives, EmulatedDrives
+from drive_env.bus.world import World
+from drive_env.envs.gain_scheduling import GainScheduling
+from drive_env.envs.gain_tuning import GainTuning
+from drive_env.envs.tracking import TASKS, Tracking
+from mechanics.loads import LOADS
+
+NOMINAL = {"parameters": {}}
+EVERY_LOAD = pytest.mark.parametrize(
+    "load", [load if load in TASKS else pytest.param(load, marks=pytest.mark.slow) for load in LOADS]
+)
+
+
+@contextmanager
+def on_a_bus(emulated):
+    """Emulated drives as CanDrives, one node per axis."""
+    world = World(lockstep=True)
+    nodes = list(range(1, emulated.num_axes + 1))
+    world.add(emulated, nodes)
+    bus = WorldBus(world)
+    try:
+        with CanDrives(bus=bus, nodes=nodes, pace="lockstep", safety=False) as drives:
+            yield drives
+    finally:
+        bus.shutdown()
+        world.close()
+
+
+def twin(emulated):
+    """Return drives of one machine, at rest, with the noise that these have now."""
+    other = EmulatedDrives(load=emulated.load, num_threads=1)
+    other._noise_seeds[:] = emulated._noise_seeds
+    other.machine.reset()
+    return other
+
+
+def run(lanes, steps, seed):
+    """Return observations, rewards and ends of an episode."""
+    rng = np.random.default_rng(7)
+    rows = [lanes.reset(seed=seed)[0]]
+    results = []
+    for _ in range(steps):
+        low, high = lanes.single_action_space.low, lanes.single_action_space.high
+        action = 0.5 * rng.uniform(low, high).astype(np.float32)
+        observation, reward, terminated, truncated, _ = lanes.step(action[None])
+        rows.append(observation)
+        results.append((reward[0], terminated[0], truncated[0]))
+        if terminated[0]:
+            break
+    return np.array(rows), np.array(results)
+
+
+def assert_same(one, other):
+    for expected, found in zip(one, other, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+@EVERY_LOAD
+def test_tracking(load):
+    options = {"load": load, "duration": 0.05, "delay": 2}
+    joint = TASKS[load].joint if load in TASKS else None
+    inside = Tracking(1, num_threads=1, **options)
+    expected = run(inside, 50, seed=3)
+    served = twin(inside.drives)
+    with on_a_bus(served) as drives:
+        # The pendulum's sensor is the master's own, no drive's.
+        sensor = None if joint is None else lambda: served.machine.joint_positions[:, joint]
+        found = run(Tracking(1, drives=drives, sensor=sensor, **options), 50, seed=3)
+    assert_same(expected, found)
+    assert np.ptp(expected[0], axis=0).max() > 0.0
+    inside.close()
+
+
+@EVERY_LOAD
+def test_gain_scheduling(load):
+    options = {"load": load, "base": "present", "payload": "none", "duration": 0.1}
+    inside = GainScheduling(1, num_threads=1, distributions=NOMINAL, **options)
+    expected = run(inside, 10, seed=3)
+    with on_a_bus(twin(inside.drives)) as drives:
+        found = run(GainScheduling(1, drives=drives, **options), 10, seed=3)
+    assert_same(expected, found)
+    inside.close()
+
+
+@EVERY_LOAD
+def test_gain_tuning(load):
+    """Drives that are given are taken as they are, in process too: nothing is drawn, nothing hidden is known."""
+    with EmulatedDrives(load=load, num_threads=1) as drives:
+        env = GainTuning(1, drives=drives, load=load, trials=1)
+        expected = run(env, 1, seed=3)
+        env.close()
+    with on_a_bus(EmulatedDrives(load=load, num_threads=1)) as drives:
+        env = GainTuning(1, drives=drives, load=load, trials=1)
+        found = run(env, 1, seed=3)
+        env.close()
+    assert_same(expected, found)
