@@ -51,6 +51,30 @@ class Bandwidths(NamedTuple):
     position_hz: float
 
 
+class SiGains(NamedTuple):
+    """What raw gains are, whatever they act on.
+
+    torque_p [V/A], torque_integration [s], velocity_p [A s/rad], velocity_integration [s], position_p [1/s].
+    """
+
+    torque_p: float
+    torque_integration: float
+    velocity_p: float
+    velocity_integration: float
+    position_p: float
+
+
+def gains_in_si(device: Device, supply: float, gains: Gains) -> SiGains:
+    """Return raw gains as gains [SI] of a drive with a supply voltage [V]; an integrator that is off takes for ever."""
+    return SiGains(
+        torque_p=gains.torque_p * supply / (256.0 * device.current_full_scale),
+        torque_integration=65536.0 / device.current_rate / gains.torque_i if gains.torque_i else math.inf,
+        velocity_p=gains.velocity_p * device.current_full_scale / (256.0 * RPM * 32768.0),
+        velocity_integration=65536.0 / device.velocity_rate / gains.velocity_i if gains.velocity_i else math.inf,
+        position_p=gains.position_p / _POSITION_P_SCALE,
+    )
+
+
 def gains_from_bandwidths(
     device: Device,
     motor: Motor,

@@ -115,14 +115,16 @@ def test_without_out_results_go_to_a_folder_named_after_the_time(run):
 def test_help_is_quick_and_names_the_options(tmp_path):
     done = drive_tune("--help", cwd=tmp_path)
     assert done.returncode == 0
-    assert "sweep" in done.stdout
+    for command in ("identify", "response", "rules", "optimise", "auto", "sweep", "compare", "verify", "restore"):
+        assert f"│ {command} " in done.stdout
     options = drive_tune("sweep", "--help", cwd=tmp_path).stdout
-    for option in ("--config", "--device", "--motor", "--load", "--seed", "--out", "--show-config", "--list"):
+    for option in ("--config", "--device", "--motor", "--load", "--seed", "--out", "--show-config", "--list",
+                   "--workers", "--cluster", "--resume"):  # fmt: skip
         assert option in options
 
 
 def test_help_imports_nothing_heavy(tmp_path):
-    heavy = {"numba", "mujoco", "matplotlib", "canopen", "scipy"}
+    heavy = {"numba", "mujoco", "matplotlib", "canopen", "scipy", "optuna", "torch", "distributed"}
     code = f"import sys, tuning.cli; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -185,9 +187,9 @@ def test_a_grid_without_a_usable_pair_says_so(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_an_interrupt_ends_with_code_130_and_writes_nothing(tmp_path):
-    (tmp_path / "long.toml").write_text(
-        DEFAULT.read_text(encoding="utf-8").replace("count = 32", "count = 400"), encoding="utf-8"
-    )
+    # Minutes; and not one of its shards is done after seconds, which would be kept (test_scale.py).
+    text = DEFAULT.read_text(encoding="utf-8").replace("duration = 0.4", "duration = 40.0")
+    (tmp_path / "long.toml").write_text(text, encoding="utf-8")
     process = subprocess.Popen(
         [sys.executable, "-m", "tuning.cli", "sweep", "--config", "long.toml", "--out", "run"],
         cwd=tmp_path,
@@ -196,7 +198,10 @@ def test_an_interrupt_ends_with_code_130_and_writes_nothing(tmp_path):
         stderr=subprocess.PIPE,
         text=True,
     )
-    time.sleep(2.5)  # while it simulates, or while it compiles
+    while not (tmp_path / "run.unfinished").exists():  # the run has begun
+        assert process.poll() is None
+        time.sleep(0.01)
+    time.sleep(1.0)  # while it simulates, or while it compiles
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130

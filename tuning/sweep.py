@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +23,14 @@ from tuning import metrics, provenance
 from tuning.experiment import Experiment, Resolved, label, resolve
 from tuning.experiment import load_experiment as load_experiment
 from tuning.metrics import Recording
+from tuning.pools import Pool
+from tuning.shard_log import Arrays, ShardLog
 
 VELOCITY, CURRENT, CURRENT_LIMIT = 0x606C, 0x6077, 0x2003
 FLAGS = ("diverged", "oscillates", "fault")
 PIECE = 0.02  # s of simulation between two reports of progress
 MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
-MAX_MACHINES = 4096  # at a time
+MAX_MACHINES = 1024  # of a shard: small enough to be spread, and for little to be lost when a run is killed
 
 Progress = Callable[[str, float], None]
 
@@ -42,8 +46,8 @@ class SweepResult:
         columns: Every column of the table by name, each of shape (points,), in the order of the grid.
         order: The points from best to worst.
         response: The recording of the best point.
-        simulated: Simulated time of all machines together [s].
-        wall: Wall time of the simulation [s].
+        simulated: Simulated time of all machines together, without what was resumed [s].
+        wall: Wall time of that [s].
     """
 
     experiment: Experiment
@@ -114,54 +118,123 @@ class SweepResult:
         writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
 
 
-def run(experiment: Experiment, progress: Progress | None = None, num_threads: int | None = None) -> SweepResult:
+class Shard(NamedTuple):
+    """A part of a grid: what a sweep is split into, whatever it runs on."""
+
+    experiment: Experiment
+    first: int  # its points, of those of the grid
+    last: int  # the first that is not its own
+    num_threads: int | None
+
+
+def shards(experiment: Experiment, num_threads: int | None = None) -> list[Shard]:
+    """Return the parts of a grid; they depend on the experiment alone."""
+    samples = round(experiment.excitation.duration / experiment.excitation.sampling_period)
+    axes = find_load(experiment.load).num_axes
+    size = int(np.clip(MAX_SAMPLES // (samples * axes), 64, MAX_MACHINES))
+    points = experiment.size()
+    return [Shard(experiment, first, min(first + size, points), num_threads) for first in range(0, points, size)]
+
+
+def run(
+    experiment: Experiment,
+    progress: Progress | None = None,
+    num_threads: int | None = None,
+    *,
+    pool: Pool | None = None,
+    log: ShardLog | None = None,
+) -> SweepResult:
     """Simulate every point of an experiment and rank them.
 
     Args:
         experiment: The experiment.
         progress: Called with what is being done and its share done so far.
-        num_threads: Threads that simulate; the number of cores by default. It changes no digit.
+        num_threads: Threads that simulate, in this process; the number of cores by default. It changes no digit.
+        pool: Where shards run; in this process by default. It changes no digit either.
+        log: Shards that are done already, and where those to come are kept.
 
     Raises:
         ExperimentError: If the experiment cannot be.
+        PoolError: If shards could not be run where they were to.
     """
     report = progress or (lambda _what, _share: None)
     resolved = resolve(experiment)
+    parts = shards(experiment, num_threads if pool is None else 1)
+    found: dict[int, Arrays] = {} if log is None else dict(log.done)
+    left = [k for k in range(len(parts)) if k not in found]
     report("compiling", 0.0)
-    _compile(experiment)
-    points = experiment.points()
-    samples = round(experiment.excitation.duration / experiment.excitation.sampling_period)
+    if left:
+        # Of workers as well: they find the kernels compiled, and what there is to warn of is said once and here.
+        _compile(experiment)
+    started = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)  # a flag of the table
+        for k, arrays in _done(parts, left, pool, report):
+            found[k] = arrays
+            if log is not None:
+                log.append(k, arrays)
+    wall = time.perf_counter() - started
+    simulated = experiment.excitation.duration * sum(parts[k].last - parts[k].first for k in left)
+    columns = {name: np.concatenate([found[k][name] for k in range(len(parts))]) for name in _column_names()}
+    return _ranked(
+        experiment, resolved, columns, _best([found[k] for k in range(len(parts))], experiment), simulated, wall
+    )
+
+
+def _done(parts: list[Shard], left: list[int], pool: Pool | None, report: Progress) -> Iterator[tuple[int, Arrays]]:
+    """Give the number and the result of each shard as it is done."""
+    shares = dict.fromkeys(left, 0.0)
+    sizes = [part.last - part.first for part in parts]
+
+    def say(k: int, share: float) -> None:
+        shares[k] = share
+        report("simulating", sum(shares.get(n, 1.0) * size for n, size in enumerate(sizes)) / sum(sizes))
+
+    if pool is not None:
+        for place, arrays in pool.unordered(simulate, [parts[k] for k in left]):
+            say(left[place], 1.0)
+            yield left[place], arrays
+        return
+    # Two at a time: what builds and judges machines holds the interpreter's lock, what simulates does not.
+    with ThreadPoolExecutor(2) as executor:
+        futures = {executor.submit(simulate, parts[k], partial(say, k)): k for k in left}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def simulate(shard: Shard, report: Callable[[float], None] = lambda _share: None) -> Arrays:
+    """Return the columns of a shard, and under `best.` the recording of its best point."""
+    experiment = shard.experiment
+    points = experiment.points()[shard.first : shard.last]
     axes = find_load(experiment.load).num_axes
-    size = int(np.clip(MAX_SAMPLES // (samples * axes), 64, MAX_MACHINES))
-    batches = [points[first : first + size] for first in range(0, len(points), size)]
-    parts: list[dict[str, NDArray[Any]]] = []
-    best: tuple[float, Recording] | None = None
-    simulated = wall = 0.0
-    done = 0
-    for batch in batches:
-        with _machines(experiment, len(batch), num_threads) as drives:
+    with _machines(experiment, len(points), shard.num_threads) as drives:
+        recording, fault = _record(drives, experiment, resolve(experiment), points, report)
+        columns = _evaluate(experiment, recording) | {"fault": fault}
+        columns["diverged"] = np.asarray(columns["diverged"] | np.repeat(drives.machine.diverged, axes))
+    # All axes of a machine have the point's gains; it is as good as its worst axis.
+    worst = np.argmax(_score(columns).reshape(-1, axes), axis=1) + np.arange(len(points)) * axes
+    columns = {name: values[worst] for name, values in columns.items()}
+    best = recording.point(int(worst[np.argmin(_score(columns))]))
+    return columns | {f"best.{name}": np.asarray(getattr(best, name)) for name in _RECORDED}
 
-            def report_batch(share: float, done: int = done, size: int = len(batch)) -> None:
-                report("simulating", (done + share * size) / len(points))
 
-            started = time.perf_counter()
-            recording, fault = _record(drives, experiment, resolved, batch, report_batch)
-            wall += time.perf_counter() - started
-            columns = _evaluate(experiment, recording) | {"fault": fault}
-            columns["diverged"] = np.asarray(columns["diverged"] | np.repeat(drives.machine.diverged, axes))
-        simulated += experiment.excitation.duration * len(batch)
-        done += len(batch)
-        # All axes of a machine have the point's gains; it is as good as its worst axis.
-        worst = np.argmax(_score(columns).reshape(-1, axes), axis=1) + np.arange(len(batch)) * axes
-        columns = {name: values[worst] for name, values in columns.items()}
-        parts.append(columns)
-        ranked = _score(columns)
-        k = int(np.argmin(ranked))
-        if best is None or ranked[k] < best[0]:
-            best = (float(ranked[k]), recording.point(int(worst[k])))
-    assert best is not None, "an experiment has at least one point"
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return _ranked(experiment, resolved, points, joined, best[1], simulated, wall)
+_RECORDED = ("t", "reference_rpm", "speed_rpm", "current", "current_limit")
+
+
+def _column_names() -> list[str]:
+    return ["score", *metrics.METRICS, *FLAGS]
+
+
+def _best(found: list[Arrays], experiment: Experiment) -> Recording:
+    """Return the recording of the best point; of equals that of the first shard."""
+    shard = found[int(np.argmin([_score(arrays).min() for arrays in found]))]
+    recorded = {name: shard[f"best.{name}"] for name in _RECORDED}
+    excitation = experiment.excitation
+    return Recording(**recorded, t_step=excitation.velocity_time, t_load=excitation.load_time)
 
 
 def _compile(experiment: Experiment) -> None:
@@ -198,17 +271,15 @@ def _record(
     for column, entry in enumerate(resolved.entries):
         drives.write((entry.index, entry.sub), np.repeat(points[:, column], drives.num_axes // len(points)))
     traces: list[Trace] = []
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)  # a flag of the table
-        for start, end in _pieces(excitation.velocity_time, excitation.load_time, excitation.duration, PIECE,
-                                  excitation.sampling_period):  # fmt: skip
-            if start == excitation.velocity_time:
-                drives.write(0x60FF, resolved.velocity)
-            if start == excitation.load_time:
-                drives.machine.load_torque = excitation.load_torque
-            period = excitation.sampling_period
-            traces.append(drives.record([VELOCITY, CURRENT], round((end - start) / period) * period, period=period))
-            report(end / excitation.duration)
+    for start, end in _pieces(excitation.velocity_time, excitation.load_time, excitation.duration, PIECE,
+                              excitation.sampling_period):  # fmt: skip
+        if start == excitation.velocity_time:
+            drives.write(0x60FF, resolved.velocity)
+        if start == excitation.load_time:
+            drives.machine.load_torque = excitation.load_torque
+        period = excitation.sampling_period
+        traces.append(drives.record([VELOCITY, CURRENT], round((end - start) / period) * period, period=period))
+        report(end / excitation.duration)
     t = np.arange(sum(map(len, traces)), dtype=np.float64) * excitation.sampling_period
     rpm = 60.0 / resolved.position_scaler
     ramp = np.clip((t - excitation.velocity_time) * resolved.acceleration, 0.0, abs(resolved.velocity))
@@ -263,12 +334,12 @@ def _score(columns: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
 def _ranked(
     experiment: Experiment,
     resolved: Resolved,
-    points: NDArray[np.int64],
     found: dict[str, NDArray[Any]],
     best: Recording,
     simulated: float,
     wall: float,
 ) -> SweepResult:
+    points = experiment.points()
     score = _score(found)
     order = np.argsort(score, kind="stable")
     rank = np.empty(len(points), np.int64)

@@ -1,0 +1,116 @@
+"""What emulated drives do between two communication cycles: signals at the rate of the velocity loop.
+
+No bus carries this; a real drive of this kind shows its loops once a millisecond. The machines run exactly as they do
+otherwise, to the bit: a cycle is run as windows, and only the first of them does what the drive does once a cycle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env.dictionary.entries import ObjectName
+from drive_env.firmware import cycle
+from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.group import Channels, Group, channels
+from drive_env.live_dictionary import NOTHING
+
+if TYPE_CHECKING:
+    from drive_env.drives import EmulatedDrives
+
+Floats = NDArray[np.float64]
+
+# Signal -> unit; fields of the drive's record (firmware/record.py), as they are at a window's start.
+SIGNALS = {
+    "position_demand": "rad",
+    "theta_meas": "rad",
+    "velocity_demand": "rad/s",
+    "omega_ref": "rad/s",
+    "omega_meas": "rad/s",
+    "i_q_ref": "A",
+    "torque_meas": "A",
+    "theta_m": "rad",
+    "omega_m": "rad/s",
+}
+
+
+class LoopTrace(NamedTuple):
+    """Sample times [s], shape (n,), and each signal in SI, shape (n, num_axes)."""
+
+    t: Floats
+    signals: dict[str, Floats]
+
+
+def trace_loops(
+    drives: EmulatedDrives,
+    signals: Sequence[str],
+    duration: float,
+    play: Mapping[ObjectName, ArrayLike] | None = None,
+) -> LoopTrace:
+    """Let `duration` [s] pass while signals are sampled at the start of every window of the velocity loop.
+
+    Sample 5 k (with five windows a cycle) is what `record` has in row k: what the last cycle left behind.
+
+    Args:
+        drives: Emulated drives; on a bus no such trace exists.
+        signals: Names of `SIGNALS`.
+        duration: Whole communication cycles [s].
+        play: As `record` takes it, one row per communication cycle.
+
+    Raises:
+        ValueError: For drives on a bus, an unknown signal, or a time that is no whole number of cycles.
+        ObjectAccessError: For an object that cannot be played, or a value out of range.
+    """
+    if getattr(drives, "machine", None) is None:
+        raise ValueError("drives on a bus show their loops once per communication cycle only; use record()")
+    drives = drives.machine._drives  # whatever is wrapped around them
+    for name in signals:
+        if name not in SIGNALS:
+            raise ValueError(f"no signal is named {name!r}; there are {', '.join(SIGNALS)}")
+    cycles = drives._cycles(duration)
+    values, played = drives._objects.plan_play(play or {}, cycles)
+    sampled = channels([(name, 0) for name in signals])
+    windows = round(drives.device.velocity_rate / drives.device.profile_rate)
+    samples = np.empty((cycles, windows, len(signals), drives.num_axes))
+    live = get_lanes(drives._records, "live", drives.num_axes).astype(np.int32)
+    begin = drives._now
+    try:
+        for k in range(cycles):
+            while drives._schedule and drives._schedule[0][0] <= begin + k:
+                _, name, row, where = drives._schedule.pop(0)
+                drives.machine.set(name, row, where)
+            row_of_play = np.ascontiguousarray(values[k : k + 1])
+            for group in drives._groups:
+                samples[k, :1, :, group.axes] = _run(group, 1, row_of_play, played, sampled, supervised=True)
+            # A lane that is not alive is computed as ever, and left out of what happens once a cycle.
+            set_lanes(drives._records, "live", np.zeros(drives.num_axes, np.int32))
+            for group in drives._groups:
+                samples[k, 1:, :, group.axes] = _run(
+                    group, windows - 1, row_of_play, NOTHING, sampled, supervised=False
+                )
+            set_lanes(drives._records, "live", live)
+            drives._now = begin + k + 1
+    finally:
+        set_lanes(drives._records, "live", live)
+    if cycles:
+        drives._report_divergence()
+    rows = samples.reshape(cycles * windows, len(signals), drives.num_axes)
+    t = np.arange(len(rows)) / drives.device.velocity_rate
+    return LoopTrace(t, {name: rows[:, k].copy() for k, name in enumerate(signals)})
+
+
+def _run(group: Group, windows: int, play: Floats, played: Channels, sampled: Channels, *, supervised: bool) -> Floats:
+    """Run a group for windows, each as if it were a cycle; return what was sampled, (windows, signals, its axes)."""
+    rates = group._rates._replace(windows=1, period=group._rates.period if supervised else 0.0)
+    values = play if supervised else np.empty((windows, 0, play.shape[2]))
+    # The kernel counts axes over all groups.
+    samples = np.empty((windows, len(sampled.kinds), play.shape[2]))
+    cycle.run(  # type: ignore[no-untyped-call]
+        group._records, group._reals, group._integers, group.load.plant, rates, group._motion,
+        group.axes.start, group._num_axes, 0, windows,
+        values, played.kinds, played.offsets, samples, sampled.kinds, sampled.offsets, 1,
+    )  # fmt: skip
+    return samples[:, :, group.axes]

@@ -1,0 +1,89 @@
+"""`drive-tune rules` and `drive-tune auto` as a user types them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from drive_env.gains import RAW_MAX
+from tuning import auto as auto_module
+from tuning.certificate import is_unchanged
+from tuning.cli import app
+from tuning.snapshot import load_snapshot
+
+
+def drive_tune(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_rules_show_gains_margins_and_what_a_relay_measured():
+    done = drive_tune("rules", "simc", "margin_45", "--load", "inertia", "--relay", "--json")
+    assert done.exit_code == 0, done.output
+    (axis,) = json.loads(done.stdout)
+    assert axis["plant"]["inertia"] == pytest.approx(1.5e-5, rel=0.1)
+    assert list(axis["proposals"]) == ["simc", "margin_45", "relay, measured"]
+    for proposal in axis["proposals"].values():
+        assert all(0 < gain <= RAW_MAX for gain in proposal["gains"].values())
+        assert proposal["velocity_margins"]["phase_deg"] > 40.0
+    assert axis["proposals"]["margin_45"]["velocity_margins"]["phase_deg"] == pytest.approx(45.0, abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("rules", "ziegler"), "no rule is named 'ziegler'; there are modulus_optimum"),
+        (("rules", "--apply", "nichols"), "no rule is named 'nichols'"),
+        (("rules", "--store"), "add --apply RULE"),
+        (("rules", "--load", "brick"), "no load is named 'brick'"),
+        (("auto", "--motor", "brick"), "brick"),
+        (("auto", "--node", "1"), "add --bus"),
+        (("auto", "--bus", "--yes"), "--travel is missing"),
+    ],
+)
+def test_a_users_mistake_ends_with_one_line_and_exit_code_2(arguments, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = drive_tune(*arguments)
+    assert done.exit_code == 2
+    assert words in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_auto_does_not_write_into_a_folder_with_something_in_it(tmp_path):
+    (tmp_path / "mine").write_text("keep")
+    done = drive_tune("auto", "--load", "inertia", "--out", tmp_path)
+    assert done.exit_code == 2
+    assert "is not empty" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_auto_leaves_the_way_back_a_certificate_and_a_report(tmp_path, monkeypatch):
+    monkeypatch.setattr(auto_module, "GENERATIONS", 4)
+    out = tmp_path / "run"
+    done = drive_tune("auto", "--load", "inertia", "--out", out, "--json")
+    assert done.exit_code == 0, done.output
+    said = json.loads(done.stdout)
+    (axis,) = said["axes"]
+    assert axis["accepted"]
+    assert axis["before"] != axis["after"]
+    assert 0.0 < said["drive seconds"][0] < 10.0
+    assert sorted(path.name for path in out.iterdir()) == ["before.toml", "certificate.json", "report.html"]
+    assert is_unchanged(out / "certificate.json")
+    assert load_snapshot(out / "before.toml").axes[0][0x2042, 1] == axis["before"]["velocity_p"]
+
+
+def test_auto_ends_with_1_and_says_why_where_it_rolled_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(auto_module, "LEAST_WAY", 1e9)
+    done = drive_tune("auto", "--load", "belt", "--out", tmp_path / "run")
+    assert done.exit_code == 1
+    assert "axis 0 was rolled back: the travel is too short" in " ".join(done.stdout.split())
+
+
+def test_rules_write_one_of_them_and_leave_the_way_back(tmp_path):
+    file = tmp_path / "before.toml"
+    done = drive_tune("rules", "chain", "--load", "inertia", "--apply", "chain", "--snapshot", file, "--yes")
+    assert done.exit_code == 0, done.output
+    assert "written" in done.stdout
+    assert load_snapshot(file).axes[0][0x2042, 1] == 445

@@ -1,0 +1,319 @@
+"""Tuners compared: scored by hidden J over the rule's, counted by the meter, whoever wrote them."""
+
+from __future__ import annotations
+
+import csv
+import importlib.metadata
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from drive_env.gains import rule_gains, write_gains
+from drive_env.positioning import plan_move
+from drive_env.score import HiddenScore
+from tuning import compare as compare_module
+from tuning import tuners
+from tuning.cli import app
+from tuning.compare import compare, save
+from tuning.suite import load_suite, open_group
+from tuning.trial_bench import read_gains
+from tuning.tuners import MissingTunerError, Outcome, find_tuner, search_tuner, tuner_rows
+
+RIGID = [m for m in load_suite() if m.load == "inertia" and m.motor == "qbl4208"]
+SHORT = [m for m in load_suite() if m.load == "belt"][-1:]
+
+
+def outcome(target, gains, note=""):
+    zero = np.zeros(target.num_axes, int)
+    return Outcome(np.asarray(gains), np.zeros(target.num_axes), zero, zero, zero, (note,) * target.num_axes)
+
+
+def true_rule():
+    """Return the rule's gains for the true inertia of the rigid machines: disc and rotor, over the true K_t."""
+    with open_group(RIGID) as target:
+        true = target.drives.machine.parameters
+        inertia = (true["load.inertia"] + true["motor.inertia"]) / (true["motor.psi_m"] / target.motor.psi_m)
+        gains = [
+            rule_gains(target.device, target.motor, J, supply=volts)[0]
+            for J, volts in zip(inertia, target.supply, strict=True)
+        ]
+        return np.array(gains), inertia
+
+
+def knows_the_truth(target, rng):
+    return outcome(target, true_rule()[0])
+
+
+def moves_and_slows(target, rng):
+    """Move once, take a fifth of the gains, and say what there is."""
+    from drive_env import motion
+
+    motion.enable(target.drives, mode="pp")
+    motion.start_move(target.drives, 10_000)
+    target.drives.advance(0.3)
+    gains = np.maximum(read_gains(target) // 5, 1)
+    write_gains(target.drives, gains)
+    return outcome(target, gains, "slowed")
+
+
+def breaks(target, rng):
+    write_gains(target.drives, np.tile([4021, 1573, 700, 500, 200], (target.num_axes, 1)))
+    raise RuntimeError("out of ideas\nentirely")
+
+
+# --- the score ----------------------------------------------------------------------------------------------------
+def test_the_rule_with_the_true_inertia_is_the_yardstick():
+    found = compare(RIGID, {"truth": knows_the_truth})
+    assert [row.relative for row in found.rows] == pytest.approx([1.0] * 4, rel=1e-12)
+
+
+def test_the_score_is_hidden_j_of_the_machine():
+    found = compare(RIGID, {"factory": find_tuner("factory")})
+    gains, inertia = true_rule()
+    hidden = HiddenScore("tmcm1636", "inertia", "qbl4208", 4)
+    with open_group(RIGID) as target:
+        hidden.set_machines(target.drives.machine.parameters, target.supply)
+        hidden.set_moves(plan_move(target.motor, inertia, target.drives.read((0x2058, 0)), np.full(4, np.inf)))
+        rule = hidden.set_reference(gains).hidden
+        expected = hidden.score(read_gains(target)).hidden
+    hidden.close()
+    assert [row.hidden for row in found.rows] == pytest.approx(expected)
+    assert [row.rule for row in found.rows] == pytest.approx(rule)
+    assert [row.relative for row in found.rows] == pytest.approx(expected / rule)
+
+
+def test_a_summary_is_of_all_machines():
+    found = compare(RIGID, {"slow": moves_and_slows, "truth": knows_the_truth})
+    slow, relative = next(row for row in found.tuners if row.tuner == "slow"), [r.relative for r in found.of("slow")]
+    ordered = sorted(relative)
+    assert slow.median == pytest.approx(0.5 * (ordered[1] + ordered[2]))
+    assert slow.p95 == pytest.approx(ordered[2] + 0.85 * (ordered[3] - ordered[2]))  # 0.95 * 3 = 2.85
+    assert slow.worse == sum(value > 1.05 for value in relative) / 4 == 1.0
+    assert slow.machines == 4 and slow.failed == 0
+    assert [row.tuner for row in found.tuners] == ["truth", "slow"]  # the best first
+
+
+# --- what tuners do -----------------------------------------------------------------------------------------------
+def test_what_a_tuner_did_is_counted_by_the_meter_not_by_itself():
+    (row, *_) = compare(RIGID, {"slow": moves_and_slows}).rows
+    assert row.moves == 1 and row.note == "slowed"
+    assert 0.3 <= row.drive_seconds < 0.4
+    assert (row.velocity_p, row.position_p) == (445 // 5, 118 // 5)
+
+
+def test_a_violation_is_named():
+    def runs_off(target, rng):
+        from drive_env import motion
+
+        motion.enable(target.drives, mode="pp")
+        motion.start_move(target.drives, int(0.8 * 65536))
+        target.drives.advance(0.5)
+        return outcome(target, read_gains(target))
+
+    (row,) = compare(SHORT, {"runs off": runs_off}).rows
+    assert row.violations == 1 and row.kinds == "left its travel 1"
+
+
+def test_the_true_machine_is_hidden_from_a_tuner():
+    seen = []
+    compare(
+        RIGID, {"curious": lambda target, rng: seen.append(target.drives.machine) or outcome(target, true_rule()[0])}
+    )
+    assert seen == [None]
+
+
+def test_a_tuner_that_breaks_is_scored_by_what_it_left_and_the_others_go_on():
+    found = compare(RIGID, {"broken": breaks, "truth": knows_the_truth})
+    for row in found.of("broken"):
+        assert row.failed and row.note == "RuntimeError: out of ideas entirely"
+        assert (row.velocity_p, row.position_p) == (700, 200)
+    assert [row.relative for row in found.of("truth")] == pytest.approx([1.0] * 4)
+    assert next(row for row in found.tuners if row.tuner == "broken").failed == 4
+
+
+@pytest.mark.parametrize(
+    "gains", [np.ones((4, 4), int), np.full((4, 5), np.nan), np.full((4, 5), 10.5)], ids=["shape", "nan", "fraction"]
+)
+def test_gains_that_are_none_are_the_tuners_mistake(gains):
+    (row, *_) = compare(RIGID, {"odd": lambda target, rng: outcome(target, gains)}).rows
+    assert row.failed and "a tuner returns an Outcome with integer gains of shape (4, 5)" in row.note
+
+
+def test_a_comparison_follows_from_its_seed_and_from_nothing_else():
+    def tuner(target, rng):
+        return search_tuner(target, rng, sampler="random", trials=2)
+
+    alone, again, other = (compare(RIGID, {"search": tuner}, seed=seed).rows for seed in (0, 0, 1))
+    beside = compare(RIGID, {"factory": find_tuner("factory"), "search": tuner}).of("search")
+    assert alone == again == tuple(beside)
+    assert [row.velocity_p for row in alone] != [row.velocity_p for row in other]
+
+
+# --- the registry -------------------------------------------------------------------------------------------------
+def test_the_tuners_of_the_issue_are_there():
+    names = set(tuner_rows())
+    assert {"factory", "fitted", "auto", "random", "grid", "tpe", "cmaes", "gp"} <= names
+    from tuning.rules import RULES
+
+    assert set(RULES) <= names
+
+
+def test_the_factory_leaves_and_the_fitted_rule_computes():
+    found = compare(RIGID, {name: find_tuner(name) for name in ("factory", "fitted")})
+    assert {row.velocity_p for row in found.of("factory")} == {445}
+    assert all(0.9 < row.relative < 1.2 and row.moves == 2 for row in found.of("fitted"))
+
+
+def test_searches_are_better_than_the_rule_and_the_safe_one_is_stopped_less():
+    names = {"tpe": False, "tpe-safe": True}
+    found = compare(RIGID, {name: find_tuner(name) for name in names})
+    by_name = {row.tuner: row for row in found.tuners}
+    assert by_name["tpe"].median < 0.9 and by_name["tpe-safe"].median < 1.0
+    assert by_name["tpe-safe"].aborts < by_name["tpe"].aborts
+
+
+def test_a_rule_identifies_once_for_all_rules(monkeypatch):
+    calls = []
+    real = compare_module.identify_all
+    monkeypatch.setattr(compare_module, "identify_all", lambda target: calls.append(1) or real(target))
+    found = compare(RIGID[:1], {name: find_tuner(name) for name in ("simc", "modulus_optimum")})
+    assert calls == [1]
+    simc, modulus = found.of("simc")[0], found.of("modulus_optimum")[0]
+    assert simc.drive_seconds == modulus.drive_seconds > 1.0
+    assert simc.velocity_i != modulus.velocity_i
+    assert not simc.failed and simc.relative < 2.0
+
+
+class Entry:
+    """An entry point of a package that somebody has installed."""
+
+    def __init__(self, name, load, dist="others-agents"):
+        self.name, self.value, self._load = name, "somewhere:tune", load
+        self.dist = type("Distribution", (), {"name": dist})()
+
+    def load(self):
+        return self._load()
+
+
+def register(monkeypatch, *entries):
+    def entry_points(*, group):
+        return list(entries) if group == "drive_env.tuners" else []
+
+    monkeypatch.setattr(importlib.metadata, "entry_points", entry_points)
+
+
+def test_whatever_registers_is_compared(monkeypatch):
+    register(monkeypatch, Entry("agent", lambda: knows_the_truth))
+    assert tuner_rows()["agent"].meaning == "from others-agents"
+    found = compare(RIGID, {"agent": find_tuner("agent")})
+    assert found.tuners[0].median == pytest.approx(1.0)
+
+
+def test_a_registered_tuner_that_cannot_be_loaded_is_said(monkeypatch):
+    def missing():
+        raise ImportError("no module named onnx")
+
+    register(monkeypatch, Entry("agent", missing), Entry("number", lambda: 3))
+    with pytest.raises(MissingTunerError, match=r"'agent' of somewhere:tune cannot be loaded: no module named onnx"):
+        find_tuner("agent")
+    with pytest.raises(MissingTunerError, match=r"'number' of somewhere:tune is no function but 3"):
+        find_tuner("number")
+
+
+def test_a_registered_name_that_is_taken_is_refused(monkeypatch):
+    register(monkeypatch, Entry("tpe", lambda: knows_the_truth))
+    with pytest.raises(
+        MissingTunerError, match=r"others-agents registers a tuner 'tpe', and there is one of that name"
+    ):
+        tuner_rows()
+
+
+def test_unknown_and_incomplete_tuners_are_named_with_the_remedy(monkeypatch):
+    with pytest.raises(MissingTunerError, match=r"no tuner is named 'luck'; there are factory, fitted"):
+        find_tuner("luck")
+
+    def missing(sampler):
+        raise ValueError("the sampler 'gp' needs torch: pip install torch")
+
+    monkeypatch.setattr(tuners, "check_installed", missing)
+    with pytest.raises(MissingTunerError, match=r"pip install torch"):
+        find_tuner("gp")
+
+
+# --- files and the command ----------------------------------------------------------------------------------------
+def test_the_files_say_what_the_comparison_says(tmp_path):
+    found = compare(RIGID, {"slow": moves_and_slows, "broken": breaks})
+    save(found, tmp_path, {"suite": "public", "tuners": ["slow", "broken"], "seed": 0, "count": None})
+    machines = list(csv.DictReader((tmp_path / "machines.csv").open(encoding="utf-8")))
+    assert [row["machine"] for row in machines] == [m.name for m in RIGID] * 2
+    assert [float(row["relative"]) for row in machines] == pytest.approx([row.relative for row in found.rows], rel=1e-5)
+    summaries = list(csv.DictReader((tmp_path / "tuners.csv").open(encoding="utf-8")))
+    assert {row["tuner"] for row in summaries} == {"slow", "broken"}
+    assert (tmp_path / "comparison.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "settings.toml").read_text() == 'suite = "public"\ntuners = ["slow", "broken"]\nseed = 0\n'
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result
+
+
+def test_the_command_prints_the_table_and_writes_the_folder(tmp_path):
+    folder = tmp_path / "out"
+    result = run("compare", "-t", "factory", "-t", "fitted", "--count", 3, "--out", folder)
+    assert result.exit_code == 0
+    assert "Hidden J over the fitted rule's on 3 machines" in result.output
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"tuners.csv", "machines.csv", "comparison.png", "settings.toml"}
+    told = run("compare", "-t", "fitted", "--count", 3, "--json", "--out", tmp_path / "again")
+    first = list(csv.DictReader((folder / "tuners.csv").open(encoding="utf-8")))
+    (row,) = json.loads(told.stdout)["tuners"]
+    assert f"{row['median']:.6g}" == next(line["median"] for line in first if line["tuner"] == "fitted")
+
+
+def test_the_command_lists_tuners_and_suites():
+    output = run("compare", "--list").output
+    assert "cmaes" in output and "public" in output and "46 machines" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("compare", "-t", "luck"), "no tuner is named 'luck'"),
+        (("compare", "--suite", "secret"), "no suite is named 'secret'"),
+        (("compare", "--count", "0"), "count must be 1 or more"),
+        (("compare", "--seed", "-1"), "--seed must be 0 or more, not -1"),
+        (("optimise", "--sampler", "luck"), "no sampler is named 'luck'"),
+        (("optimise", "--sampler", "cmaes", "--objective", "speed", "--objective", "current"), "CMA-ES knows one"),
+        (("optimise", "--lanes", "0"), "--lanes must be 1 or more"),
+        (("optimise", "--load", "pendulum"), "no load is named 'pendulum'"),
+        (("optimise", "--bus"), "--travel is missing"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path):
+    result = run(*arguments, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    lines = [line for line in result.stderr.splitlines() if line.startswith("drive-tune: ")]
+    assert len(lines) == 1 and message in lines[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_optimise_prints_and_writes_what_it_found(tmp_path):
+    folder = tmp_path / "out"
+    result = run("optimise", "--load", "inertia", "--trials", 6, "--lanes", 3, "--safe", "--out", folder)
+    assert result.exit_code == 0, result.output
+    assert "6 trials" in result.output and "safe start" in result.output
+    rows = list(csv.DictReader((folder / "trials.csv").open(encoding="utf-8")))
+    assert [int(row["trial"]) for row in rows] == list(range(6))
+    assert (folder / "trials.png").read_bytes().startswith(b"\x89PNG")
+    assert "safe = true" in (folder / "settings.toml").read_text()
+    told = json.loads(
+        run(
+            "optimise", "--load", "inertia", "--trials", 6, "--lanes", 3, "--safe", "--json", "--out", tmp_path / "b"
+        ).stdout
+    )
+    best = min((row for row in rows if row["stopped"] == "False"), key=lambda row: float(row["cost"]))
+    assert told["gains"][0][2:] == [int(best[name]) for name in ("velocity_p", "velocity_i", "position_p")]

@@ -1,0 +1,319 @@
+"""Frequency responses measured on emulated axes, in process and over a bus, against the linear model of the truth."""
+
+import math
+
+import numpy as np
+import pytest
+from test_parity import served
+
+from drive_env.devices import find_device
+from drive_env.gains import FITTED_RULE, rule_gains, write_gains
+from drive_env.motors import find_motor
+from tuning.frequency_response import COHERENT, measure
+from tuning.linear_model import Plant, position_open_loop, velocity_open_loop
+from tuning.margins import margins
+from tuning.target import Target, emulated
+
+SOFT = FITTED_RULE._replace(speed=0.1)  # crossover at about 20 Hz
+FINE = {"motor.encoder_interpolation": 16.0}  # 65,536 counts per turn
+GRID = np.geomspace(5.0, 1000.0, 4000)
+
+
+def tuned(load, **options):
+    """Machines with gains that leave them margins, and what the machines truly are."""
+    target = emulated(load=load, **options)
+    plants = [Plant.from_machine(target.drives, axis) for axis in range(target.num_axes)]
+    gains = rule_gains(target.device, target.motor, np.array([plant.inertia for plant in plants]), SOFT)
+    write_gains(target.drives, gains)
+    return target, plants, gains
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """A rigid and an elastic axis, measured once with the trace: load -> target, plants, gains, response."""
+    with np.errstate(all="raise", under="ignore"):
+        found = {}
+        for load in ("inertia", "two_mass"):
+            target, plants, gains = tuned(load, num_machines=4, seed=1, randomise=["load"], parameters=FINE)
+            found[load] = target, plants, gains, measure(target, high=400.0, traced=True)
+        return found
+
+
+# --- margins ----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("load", ["inertia", "two_mass"])
+def test_measured_margins_are_those_of_the_linear_model(measured, load):
+    target, plants, gains, response = measured[load]
+    for axis, plant in enumerate(plants):
+        expected = margins(GRID, velocity_open_loop(target.device, plant, gains[axis], GRID))
+        found = response.margins(axis)
+        assert found.phase_deg == pytest.approx(expected.phase_deg, abs=3.0)
+        assert found.gain_db == pytest.approx(expected.gain_db, abs=1.0)
+        assert found.crossover_hz == pytest.approx(expected.crossover_hz, rel=0.05)
+        assert found.bandwidth_hz == pytest.approx(expected.bandwidth_hz, rel=0.08)
+        assert found.ms == pytest.approx(expected.ms, rel=0.1)
+
+
+@pytest.mark.parametrize("load", ["inertia", "two_mass"])
+def test_trusted_lines_lie_on_the_model_also_those_of_the_trace(measured, load):
+    target, plants, gains, response = measured[load]
+    for axis, plant in enumerate(plants):
+        good = response.trusted[:, axis] & (response.f < 700.0)
+        away = np.abs(response.f / plant.anti_resonance - 1.0) > 0.15
+        ratio = response.open_loop[:, axis] / velocity_open_loop(target.device, plant, gains[axis], response.f)
+        for lines in (good & away & ~response.traced, good & away & response.traced):
+            assert lines.sum() >= 5
+            assert np.median(np.abs(20.0 * np.log10(np.abs(ratio[lines])))) < 0.6
+            assert np.median(np.abs(np.degrees(np.angle(ratio[lines])))) < 4.0
+
+
+def test_images_of_held_set_points_are_taken_out(measured):
+    target, plants, gains, response = measured["inertia"]
+    # Without that, lines at 300 to 400 Hz would be off by a tenth to a quarter.
+    high = (response.f >= 300.0) & ~response.traced
+    for axis, plant in enumerate(plants):
+        ratio = response.open_loop[high, axis] / velocity_open_loop(target.device, plant, gains[axis], response.f[high])
+        assert abs(np.mean(20.0 * np.log10(np.abs(ratio)))) < 0.5
+        assert abs(np.mean(np.degrees(np.angle(ratio)))) < 3.0
+
+
+def test_what_lies_above_the_frequencies_looked_at_gives_no_gain_margin():
+    response = measure(tuned("inertia", parameters=FINE)[0], high=150.0)
+    assert math.isnan(response.margins().gain_db)
+    assert math.isfinite(response.margins().phase_deg)
+
+
+def test_the_position_loop_has_the_model_s_margin():
+    target, plants, gains = tuned("two_mass", num_machines=2, parameters=FINE)
+    response = measure(target, "position", high=30.0)
+    for axis, plant in enumerate(plants):
+        f = np.geomspace(2.0, 400.0, 2000)
+        expected = margins(f, position_open_loop(target.device, plant, gains[axis], f))
+        assert response.margins(axis).phase_deg == pytest.approx(expected.phase_deg, abs=3.0)
+        assert response.margins(axis).crossover_hz == pytest.approx(expected.crossover_hz, rel=0.05)
+    with pytest.raises(ValueError, match="position loop says nothing of the plant"):
+        response.estimates()
+
+
+def test_a_chirp_says_what_a_multisine_says():
+    target, plants, gains = tuned("inertia", parameters=FINE)
+    expected = margins(GRID, velocity_open_loop(target.device, plants[0], gains[0], GRID))
+    found = measure(target, kind="chirp").margins()
+    assert found.phase_deg == pytest.approx(expected.phase_deg, abs=4.0)
+    assert found.crossover_hz == pytest.approx(expected.crossover_hz, rel=0.06)
+
+
+# --- what the response tells of the plant -----------------------------------------------------------------------------
+def test_resonance_and_anti_resonance_come_with_intervals_that_hold_the_truth(measured):
+    _, plants, _, response = measured["two_mass"]
+    for axis, plant in enumerate(plants):
+        found = response.estimates(axis)
+        for name, near in (("resonance", 0.02), ("anti_resonance", 0.03)):
+            true = getattr(plant, name)
+            assert found[name].value == pytest.approx(true, rel=near)
+            assert found[name].low < true < found[name].high
+            assert found[name].high - found[name].low < 0.1 * true
+
+
+@pytest.mark.slow
+def test_on_forty_random_machines_a_resonance_is_right_or_refused():
+    target, plants, _ = tuned("two_mass", num_machines=40, seed=6, randomise=True)
+    response = measure(target)
+    known = inside = 0
+    for axis, plant in enumerate(plants):
+        found = response.estimates(axis)["resonance"]
+        if found.is_known:
+            known += 1
+            inside += found.low < plant.resonance < found.high
+            assert found.value == pytest.approx(plant.resonance, rel=0.02)
+        else:
+            assert found.reason
+    assert known >= 20
+    assert inside >= 0.9 * known
+
+
+@pytest.mark.parametrize("load", ["inertia", "two_mass"])
+def test_inertia_delay_and_filter_are_found(measured, load):
+    _, plants, _, response = measured[load]
+    for axis, plant in enumerate(plants):
+        found = response.estimates(axis)
+        assert found["inertia"].value == pytest.approx(plant.inertia, rel=0.06)
+        assert found["velocity_filter"].value == pytest.approx(400.0, rel=0.06)
+        assert found["loop_delay"].value == pytest.approx(plant.delay, abs=40e-6)
+
+
+def test_a_filter_that_is_another_is_told_apart():
+    target, _, _ = tuned("inertia", num_machines=2, parameters=FINE | {"stage.velocity_filter": [250.0, 600.0]})
+    response = measure(target, high=400.0)
+    for axis, corner in enumerate((250.0, 600.0)):
+        assert response.estimates(axis)["velocity_filter"].value == pytest.approx(corner, rel=0.08)
+
+
+def test_a_rigid_axis_has_no_resonance_and_says_so(measured):
+    response = measured["inertia"][3]
+    for axis in range(4):
+        for name in ("resonance", "anti_resonance"):
+            assert math.isnan(response.estimates(axis)[name].value)
+            assert "none shows between 5 and 400 Hz" in response.estimates(axis)[name].reason
+
+
+# --- over the bus -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("interpolation", "high"), [(16.0, 400.0), (1.0, 200.0)])
+def test_over_a_bus_nine_lines_in_ten_are_coherent_in_two_seconds(interpolation, high):
+    motor = find_motor("qbl4208")
+    machine = {"load": "two_mass", "parameters": {"motor.encoder_interpolation": interpolation}}
+    with served("calls", **machine) as drives:
+        free = np.array([np.inf])
+        supply = np.array([motor.voltage])
+        target = Target(
+            drives, find_device("tmcm1636"), motor, supply, -free, free, motor.rated_speed, motor.rated_current
+        )
+        response = measure(target, high=high)
+    assert response.f[0] == 5.0
+    assert response.f[-1] == high
+    assert np.mean(response.coherence[:, 0] > COHERENT) >= 0.9
+    assert response.drive_time < 2.0
+    assert response.peak_current[0] < 1.15 * motor.rated_current  # what is asked for; the sensor's noise comes on top
+    assert not response.traced.any()
+    # And it is what the emulator says without a bus, to the bit.
+    own = measure(emulated(**machine), high=high)
+    assert np.array_equal(own.open_loop, response.open_loop)
+
+
+def test_above_400_hz_there_is_only_the_trace_and_it_is_marked(measured):
+    response = measured["two_mass"][3]
+    assert response.traced.any()
+    assert np.array_equal(response.traced, response.f > 400.0)
+
+
+def test_a_bus_cannot_be_traced_nor_asked_beyond_400_hz():
+    with served("calls", load="inertia") as drives:
+        motor, free = find_motor("qbl4208"), np.array([np.inf])
+        target = Target(drives, find_device("tmcm1636"), motor, np.array([24.0]), -free, free, 300.0, 3.0)
+        with pytest.raises(ValueError, match="exists on emulated drives only; a bus shows up to 400 Hz"):
+            measure(target, traced=True)
+        with pytest.raises(ValueError, match="450 Hz must be at most 400 Hz"):
+            measure(target, high=450.0)
+
+
+# --- what is not truth ------------------------------------------------------------------------------------------------
+def test_noise_is_not_coherent():
+    noisy = {"stage.adc_noise": 3.0, "motor.cogging_torque": 0.03}
+    target, _, _ = tuned("inertia", parameters=noisy, current=0.3)
+    response = measure(target, high=200.0)
+    quiet = measure(tuned("inertia", parameters=FINE)[0], high=200.0)
+    assert response.trusted.mean() < 0.5
+    assert quiet.trusted.mean() > 0.95
+    assert np.isfinite(response.open_loop).all()
+
+
+def test_friction_on_a_short_way_is_told_and_is_not_coherent_either():
+    # 0.3 turns: the motion reverses, and what dry friction answers depends on the wave.
+    target = emulated(load="vertical_screw", travel=(-0.3 * math.pi, 0.3 * math.pi))
+    response = measure(target)
+    assert any("way is too short for a steady speed" in note for note in response.notes[0])
+    assert response.trusted.mean() < 0.8
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.3, 0.3), (0.0, 0.5), (-0.5, 0.0)])
+def test_the_travel_is_kept_and_the_axis_ends_where_it_began(low, high):
+    turn = 2.0 * math.pi
+    target = emulated(load="inertia", travel=(low * turn, high * turn), parameters=FINE)
+    seen = []
+
+    class Watched:
+        def record(self, objects, *arguments, **options):
+            trace = target.drives.record([*objects, 0x6064], *arguments, **options)
+            seen.append(trace[0x6064])
+            return trace
+
+        def __getattr__(self, name):
+            return getattr(target.drives, name)
+
+    from dataclasses import replace
+
+    measure(replace(target, drives=Watched()))
+    turns = np.concatenate(seen) / 65536.0
+    assert low - 1e-3 <= turns.min()
+    assert turns.max() <= high + 1e-3
+    assert np.ptp(turns) > 0.05
+    assert abs(turns[-1, 0]) < 0.05
+
+
+def test_an_axis_is_left_as_it_was_found():
+    target, _, _ = tuned("inertia", num_machines=3)
+    drives = target.drives
+    from drive_env import motion
+
+    motion.select_mode(drives, "pp")
+    motion.select_mode(drives, "pv", where=np.array([True, False, False]))
+    motion.enable(drives, where=np.array([True, False, False]))
+    drives.write((0x60C2, 1), 4)
+    before = [drives.read(name) for name in (0x6061, (0x60C2, 1), (0x60C2, 2))]
+    measure(target, where=np.array([True, True, False]))
+    assert [list(drives.read(name)) for name in (0x6061, (0x60C2, 1), (0x60C2, 2))] == [list(v) for v in before]
+    on = drives.read(0x6041) & 0x6F == 0x27
+    assert list(on) == [True, False, False]
+
+
+def test_an_offset_of_the_user_changes_nothing():
+    target, _, _ = tuned("inertia", num_machines=2, parameters=FINE)
+    target.drives.write(0x60B1, np.array([0, 5 * 65536]))
+    response = measure(target)
+    assert response.margins(1).phase_deg == pytest.approx(response.margins(0).phase_deg, abs=3.0)
+    # The drive adds it to what is played: not counted on, it would carry the axis nine turns away.
+    assert np.abs(target.drives.read(0x6064)).max() < 0.5 * 65536
+
+
+def test_axes_of_one_machine_are_shaken_one_after_the_other():
+    target = emulated(load="gantry")
+    response = measure(target, high=100.0)
+    assert response.drive_time > 3.0
+    assert np.isfinite(response.open_loop).all()
+    assert all(fit is not None for fit in response.fits)
+
+
+def test_only_the_chosen_axes_are_measured():
+    target, _, _ = tuned("inertia", num_machines=3)
+    response = measure(target, where=np.array([False, True, False]))
+    assert np.isnan(response.open_loop[:, [0, 2]]).all()
+    assert response.trusted[:, 1].any()
+    assert not response.trusted[:, [0, 2]].any()
+    assert target.drives.read(0x6064)[0] == 0
+
+
+# --- mistakes ---------------------------------------------------------------------------------------------------------
+def test_a_loop_without_gains_is_not_shaken():
+    with pytest.raises(ValueError, match="a P gain is 0 on every axis and the loop is open: give the drives gains"):
+        measure(emulated(load="inertia", factory_fresh=True))
+    target, _, _ = tuned("inertia", num_machines=2)
+    target.drives.write((0x2042, 1), np.array([0, 200]))
+    response = measure(target)
+    assert any("gain is 0" in note for note in response.notes[0])
+    assert not response.trusted[:, 0].any()
+    assert response.trusted[:, 1].any()
+
+
+def test_a_loop_that_oscillates_is_no_response():
+    target = emulated(load="two_mass")
+    write_gains(target.drives, np.full((1, 5), 32767))
+    response = measure(target)
+    assert not response.trusted.any()
+    assert any("oscillates" in note for note in response.notes[0])
+    assert any("excitation too weak" in note for note in response.notes[0])
+    assert math.isnan(response.margins().phase_deg)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"loop": "current"}, "no loop is named 'current'; there are velocity, position"),
+        ({"kind": "noise"}, "no excitation is named 'noise'; there are multisine, chirp"),
+        ({"resolution": 3.3}, "must divide 1000 Hz"),
+        ({"where": np.array([False])}, "no axis is chosen"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused_before_anything_moves(arguments, message):
+    target = emulated(load="inertia")
+    with pytest.raises(ValueError, match=message):
+        measure(target, **arguments)
+    assert target.drives.read(0x6041)[0] & 0x6F != 0x27

@@ -1,0 +1,334 @@
+"""Identification against machines whose truth is known: values, intervals, refusals, and how drives are left.
+
+The truth is computed here from the machines' parameters: inertia and viscous friction from the linear model's
+eigenvectors (tuning/true_plant.py), dry friction from every bearing, guide and gear.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from test_parity import served
+
+from drive_env import motion
+from drive_env.drives import EmulatedDrives
+from drive_env.gains import GAIN_OBJECTS, write_gains
+from drive_env.misfit import MisfitWarning
+from mechanics.shaft import way
+from tuning import identification, winding
+from tuning.identification import NAMES, identify
+from tuning.suite import load_suite, open_group, open_machines
+from tuning.target import Target, emulated
+from tuning.true_plant import true_plant
+from tuning.working_state import CHANGED
+
+TURN = 2.0 * math.pi
+# How far a value may be off, as a share of it.
+ALLOWED = {"resistance": 0.05, "inductance": 0.05, "inertia": 0.05, "coulomb": 0.10, "resonance": 0.02}
+
+
+def truth(drives, axis, offset):
+    """Return the true values of an axis, in data sheet units of torque."""
+    plant = true_plant(drives, axis)
+    group = next(g for g in drives._groups if g.machines.start <= axis < g.machines.stop)
+    load, copy = group.load, axis - group.machines.start
+    ratio = np.abs(load.plant.motion[: load.num_frictions] @ way(load).joints.T)[:, 0]
+    each = load.plant.friction[:, 0].T[copy] * ratio
+    dry = each.sum()
+    parameters = drives.machine.parameters
+    if "load.efficiency" in parameters:
+        # What a screw or a gear carries at constant speed: gravity, or the friction behind it.
+        carried = max(each[-1], abs(offset) * plant.torque_constant)
+        dry += (1.0 / parameters["load.efficiency"][axis] - 1.0) * carried
+    K = plant.torque_constant
+    return {
+        "resistance": parameters["motor.R_s"][axis],
+        "inductance": parameters["motor.L_q"][axis],
+        "inertia": plant.inertia * drives.motor.torque_constant / K,
+        "coulomb": dry / K,
+        "resonance": plant.resonance,
+        "anti_resonance": plant.anti_resonance,
+    }
+
+
+def compare(target, tally):
+    """Identify a target's axes and count, of each value: axes, known, near, inside the interval."""
+    for axis, found in enumerate(identify(target)):
+        true = truth(target.drives, axis, np.nan_to_num(found.value("offset")))
+        for name, allowed in ALLOWED.items():
+            estimate, value = found.estimates[name], true[name]
+            if not np.isfinite(value):
+                continue
+            row = tally.setdefault(name, np.zeros(4, int))
+            row += [1, estimate.is_known, estimate.is_known and abs(estimate.value / value - 1.0) <= allowed,
+                    estimate.is_known and estimate.low <= value <= estimate.high]  # fmt: skip
+
+
+# --- values -----------------------------------------------------------------------------------------------------------
+def test_known_machines_are_identified():
+    """Machines that are linear but for dry friction: three rigid, four with one spring, two on a belt."""
+    machines = load_suite("public")
+    chosen = [m for m in machines if m.name in (
+        "inertia-qbl4208-0", "inertia-qbl4208-1", "inertia-qbl4208-2", "two_mass-qbl4208-0", "two_mass-qbl4208-1",
+        "two_mass-qbl4208-3", "two_mass-qbl4208-4", "belt-qbl4208-0", "belt-qbl4208-1",
+    )]  # fmt: skip
+    assert len(chosen) == 9
+    tally = {}
+    for target, _ in open_machines(chosen, num_threads=1):
+        compare(target, tally)
+    for name in ("resistance", "inductance", "inertia", "coulomb"):
+        axes, known, near, _ = tally[name]
+        assert (axes, known) == (9, 9), name
+        assert near >= 8, name
+    assert tally["resonance"][0] == 6
+    assert tally["resonance"][1] >= 4
+    inside, known = sum(row[3] for row in tally.values()), sum(row[1] for row in tally.values())
+    assert inside >= 0.9 * known
+
+
+@pytest.mark.slow
+def test_the_suite_is_identified_and_the_intervals_hold():
+    """Issue 7: each value inside its interval at least 90 % of the time."""
+    tally = {}
+    for target, _ in open_machines(load_suite("public")):
+        compare(target, tally)
+    assert tally["resistance"][0] >= 40
+    # Of the values that are given; dry friction hides behind a fan's drag, an arm's weight and loose gears.
+    for name, told in (("resistance", 0.95), ("inductance", 0.95), ("inertia", 0.95), ("coulomb", 0.8)):
+        axes, known, near, inside = tally[name]
+        assert known >= told * axes, name
+        assert near >= 0.9 * known, name
+        assert inside >= 0.9 * known, name
+
+
+def test_the_ripple_that_samples_hide_is_made_up_for():
+    """Samples come at the lowest point of the current's millisecond ripple, 1.4 % below its mean here."""
+    target = emulated(load="inertia", ideal=True, num_threads=1)
+    assert identify(target)[0].value("inertia") == pytest.approx(truth(target.drives, 0, 0.0)["inertia"], rel=0.005)
+
+
+def test_gravity_and_a_vertical_axis():
+    target = emulated(load="vertical_screw", num_threads=1)
+    drives = target.drives
+    found = identify(target)[0]
+    mass = drives.machine.parameters["load.mass"][0]
+    held = mass * 9.81 * 0.005 / TURN / drives.motor.torque_constant
+    assert abs(found.value("offset")) == pytest.approx(held, rel=0.05)
+
+
+def test_one_direction_says_less_of_friction_than_of_gravity():
+    """The intervals are honest about what they are: each holds the value and has a width."""
+    found = identify(emulated(load="inertia", num_threads=1))[0]
+    for name in ("resistance", "inductance", "inertia", "coulomb", "offset"):
+        estimate = found.estimates[name]
+        assert estimate.low < estimate.value < estimate.high, name
+    assert (found.value("pole_pairs"), found.value("encoder_direction")) == (4.0, 1.0)
+    assert set(found.estimates) == set(NAMES)
+
+
+def test_sensors_that_are_wrong_altogether_are_in_the_intervals():
+    """A gain error of the current sensors shows nowhere: R, J/K_t and friction are off by it, as the intervals know."""
+    wrong = {"stage.adc_gain_error_a": 0.015, "stage.adc_gain_error_b": 0.015}
+    target = emulated(load="inertia", parameters=wrong, num_threads=1)
+    found, true = identify(target)[0], truth(target.drives, 0, 0.0)
+    for name in ("resistance", "inertia", "coulomb"):
+        estimate = found.estimates[name]
+        assert estimate.low <= true[name] <= estimate.high, name
+
+
+# --- what cannot be told ----------------------------------------------------------------------------------------------
+def test_an_inertia_above_thirty_rotors_is_refused():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MisfitWarning)
+        target = emulated(load="inertia", parameters={"load.inertia": 45 * 4.8e-6}, num_threads=1)
+        found = identify(target)[0]
+    assert not found.estimates["inertia"].is_known
+    assert "inertia ratio above 30" in found.estimates["inertia"].reason
+
+
+def test_a_travel_of_a_few_degrees_is_too_short():
+    found = identify(emulated(load="inertia", travel=(-0.01, 0.01), num_threads=1))[0]
+    for name in ("inertia", "coulomb", "pole_pairs", "resonance"):
+        assert "travel too short" in found.estimates[name].reason, name
+
+
+def test_too_little_current_is_too_weak():
+    found = identify(emulated(load="inertia", current=0.1, num_threads=1))[0]
+    assert not found.estimates["resistance"].is_known
+    assert "too weak" in found.estimates["resistance"].reason
+
+
+def test_a_rigid_axis_has_no_resonance():
+    found = identify(emulated(load="inertia", num_threads=1))[0]
+    assert not found.estimates["resonance"].is_known
+    assert "none shows" in found.estimates["resonance"].reason
+
+
+def test_a_brushed_motor_has_no_pole_pairs():
+    found = identify(emulated(load="inertia", motor="re_35", num_threads=1))[0]
+    assert "brushed" in found.estimates["pole_pairs"].reason
+    assert found.value("encoder_direction") == 1.0
+    assert found.value("resistance") == pytest.approx(0.6 * 2, rel=0.1)
+
+
+# --- wiring -----------------------------------------------------------------------------------------------------------
+def test_a_reversed_encoder_is_found_before_torque_is_commanded():
+    target = emulated(load="inertia", num_threads=1)
+    target.drives.write("ABN Encoder Settings.Encoder Direction", 1)
+    found = identify(target)[0]
+    assert found.value("encoder_direction") == -1.0
+    assert "2080h:01" in found.estimates["inertia"].reason
+    assert np.abs(target.drives.machine.rotor_speed[0]) < 1.0
+
+
+def test_wrong_pole_pairs_are_found_before_torque_is_commanded():
+    target = emulated(load="inertia", num_threads=1)
+    target.drives.write("Motor Pole Pairs", 7)
+    found = identify(target)[0]
+    assert found.value("pole_pairs") == 4.0
+    assert "4 pole pairs and 2056h says 7" in found.estimates["inertia"].reason
+
+
+def test_a_blocked_rotor_is_said():
+    target = emulated(load="inertia", num_threads=1)
+    target.drives.machine.brake = "closed"
+    found = identify(target)[0]
+    assert "did not follow" in found.estimates["pole_pairs"].reason
+    assert not found.estimates["inertia"].is_known
+
+
+# --- how drives are treated -------------------------------------------------------------------------------------------
+def test_a_factory_fresh_drive_is_identified_and_stays_factory_fresh():
+    target = emulated(load="inertia", factory_fresh=True, num_threads=1)
+    before = {key: target.drives.read(key) for key in CHANGED}
+    assert all(target.drives.read(name)[0] == 0 for name in GAIN_OBJECTS)
+    found = identify(target)[0]
+    assert found.value("resistance") == pytest.approx(0.36, rel=0.05)
+    true = truth(target.drives, 0, 0.0)
+    assert found.value("inertia") == pytest.approx(true["inertia"], rel=0.05)
+    assert {key: list(target.drives.read(key)) for key in CHANGED} == {key: list(v) for key, v in before.items()}
+
+
+WILD = np.array([[30000, 30000, 32000, 20000, 30000]])
+
+
+def test_wild_gains_never_act_and_come_back():
+    target = emulated(load="two_mass", num_threads=1)
+    write_gains(target.drives, WILD)
+    found = identify(target)[0]
+    assert found.value("inertia") == pytest.approx(truth(target.drives, 0, 0.0)["inertia"], rel=0.05)
+    assert [int(target.drives.read(name)[0]) for name in GAIN_OBJECTS] == WILD[0].tolist()
+    assert target.drives.read(0x6041)[0] & motion.OPERATION_ENABLED[0] != motion.OPERATION_ENABLED[1]
+
+
+def test_an_error_on_the_way_leaves_the_drive_as_it_was(monkeypatch):
+    target = emulated(load="two_mass", num_threads=1)
+    write_gains(target.drives, WILD)
+
+    def fails(*_):
+        raise RuntimeError("out of paper")
+
+    monkeypatch.setattr("tuning.experiments.identify_winding", fails)
+    with pytest.raises(RuntimeError, match="out of paper"):
+        identify(target)
+    assert [int(target.drives.read(name)[0]) for name in GAIN_OBJECTS] == WILD[0].tolist()
+    assert target.drives.read(0x6041)[0] & motion.OPERATION_ENABLED[0] != motion.OPERATION_ENABLED[1]
+
+
+def test_an_axis_that_is_enabled_is_left_alone():
+    target = emulated(load="inertia", num_threads=1)
+    motion.enable(target.drives, mode="pp")
+    with pytest.raises(RuntimeError, match=r"axis 0 is enabled: disable it"):
+        identify(target)
+
+
+def test_only_the_chosen_axes_move():
+    target = emulated(load="inertia", num_machines=3, num_threads=1)
+    found = identify(target, np.array([True, False, True]))
+    assert found[0].estimates["inertia"].is_known
+    assert not found[1].estimates["inertia"].is_known
+    assert found[1].drive_time == 0.0
+    assert abs(target.drives.machine.rotor_angle[1]) < 1e-9
+
+
+class Watched(EmulatedDrives):
+    """Emulated drives that remember how far, fast and hard their rotors went, cycle by cycle."""
+
+    def _run_groups(self, start, end, *others):
+        for cycle in range(start, end):
+            super()._run_groups(cycle, cycle + 1, *others)
+            angle, speed = float(self.machine.rotor_angle[0]), abs(float(self.machine.rotor_speed[0]))
+            self.low, self.high = min(getattr(self, "low", 0.0), angle), max(getattr(self, "high", 0.0), angle)
+            self.fastest = max(getattr(self, "fastest", 0.0), speed)
+            torque = abs(float(self.machine.motor_torque[0])) / self.motor.torque_constant
+            self.hardest = max(getattr(self, "hardest", 0.0), torque)
+
+
+@pytest.mark.parametrize(("load", "low", "high"), [
+    ("vertical_screw", -0.3, 0.3), ("vertical_screw", -0.15, 0.15), ("inertia", -0.15, 0.15), ("belt", 0.0, 0.3),
+])  # fmt: skip
+def test_travel_speed_and_current_are_respected(load, low, high):
+    drives = Watched(load=load, num_threads=1)
+    motor = drives.motor
+    target = Target(drives, drives.device, motor, np.array([24.0]), np.array([low * TURN]), np.array([high * TURN]),
+                    speed=300.0, current=3.0)  # fmt: skip
+    identify(target)
+    slack = 0.02  # rad: a step of the encoder, and the swing of a resting axis
+    assert low * TURN - slack <= drives.low
+    assert drives.high <= high * TURN + slack
+    assert drives.fastest <= 300.0
+    assert drives.hardest <= 1.1 * 3.0  # the loop's overshoot
+
+
+def test_axes_that_pull_at_one_thing_move_together():
+    """A gantry's two ends: each drive moves its half of the bridge."""
+    target = emulated(load="gantry", num_threads=1)
+    found = identify(target)
+    for axis in found:
+        assert axis.estimates["resistance"].is_known
+        assert axis.estimates["inertia"].is_known, axis.estimates["inertia"].reason
+    # Of the bridge as it travels, rotors included.
+    travelling = target.drives._groups[0].load.mass_matrix()[0][0, 0] * (0.04 / TURN) ** 2
+    assert sum(axis.value("inertia") for axis in found) == pytest.approx(travelling, rel=0.03)
+
+
+# --- over the bus -----------------------------------------------------------------------------------------------------
+def test_over_the_bus_the_same_comes_out():
+    machine = {"load": "two_mass", "seed": 3}
+    with served("calls", **machine) as drives:
+        own = emulated("tmcm1636", "two_mass", "qbl4208", seed=3, num_threads=1)
+        target = Target(drives, own.device, own.motor, own.supply, own.low, own.high, own.speed, own.current)
+        on_bus = identify(target)[0]
+        here = identify(own)[0]
+    for name in NAMES:
+        a, b = on_bus.estimates[name], here.estimates[name]
+        assert a.is_known == b.is_known, name
+        assert a.value == pytest.approx(b.value, rel=0.02, nan_ok=True), name
+
+
+# --- pieces -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("angle", np.linspace(0.0, TURN, 7))
+def test_dead_time_costs_four_thirds_of_a_phase_at_most_along_the_current(angle):
+    """Saturated, the lost voltage turns in steps of 60 degrees: along the current 2 / sqrt(3) to 4 / 3."""
+    lost = float(winding.dead_time(np.array([angle]), np.array([100.0]), 0.3, False)[0])
+    assert 2.0 / math.sqrt(3.0) - 1e-9 <= lost <= 4.0 / 3.0 + 1e-9
+    assert float(winding.dead_time(np.array([angle]), np.array([-100.0]), 0.3, False)[0]) == pytest.approx(-lost)
+
+
+def test_dead_time_of_a_brushed_motor_is_that_of_two_legs():
+    assert winding.dead_time(np.zeros(3), np.array([-1.0, 0.15, 1.0]), 0.3, True).tolist() == [-2.0, 1.0, 2.0]
+
+
+def test_a_refusal_has_no_value_and_a_reason():
+    none = identification.refused("ohm", "too cold")
+    assert not none.is_known
+    assert none.reason == "too cold"
+
+
+def test_open_group_is_what_a_suite_gives():
+    machines = [m for m in load_suite("public") if m.kind[1] == "belt"][:1]
+    with open_group(machines, 1) as target:
+        assert target.num_axes == 1

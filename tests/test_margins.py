@@ -1,0 +1,86 @@
+"""Margins against closed forms: an integrator with dead time has them all."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tuning.margins import margins
+
+F = np.geomspace(1.0, 1000.0, 2000)
+S = 2j * math.pi * F
+
+
+def delayed_integrator(crossover_hz, dead_time):
+    return 2.0 * math.pi * crossover_hz / S * np.exp(-S * dead_time)
+
+
+@pytest.mark.parametrize(("crossover", "dead_time"), [(20.0, 2e-3), (50.0, 1e-3), (80.0, 2.5e-3)])
+def test_an_integrator_with_dead_time(crossover, dead_time):
+    found = margins(F, delayed_integrator(crossover, dead_time))
+    assert found.crossover_hz == pytest.approx(crossover, rel=1e-4)
+    assert found.phase_deg == pytest.approx(90.0 - 360.0 * crossover * dead_time, abs=0.05)
+    # The phase is -180 degrees at 1 / (4 dead_time).
+    assert found.gain_db == pytest.approx(20.0 * math.log10(0.25 / dead_time / crossover), abs=0.02)
+
+
+def test_the_bandwidth_of_an_integrator_is_its_crossover():
+    found = margins(F, delayed_integrator(30.0, 0.0))
+    assert found.bandwidth_hz == pytest.approx(30.0, rel=1e-3)
+    assert found.ms == pytest.approx(1.0, abs=1e-3)
+    assert found.gain_db == math.inf
+
+
+def test_an_unstable_loop_has_negative_margins():
+    found = margins(F, delayed_integrator(200.0, 2.5e-3))
+    assert found.phase_deg == pytest.approx(90.0 - 180.0, abs=0.1)
+    assert found.gain_db == pytest.approx(-20.0 * math.log10(2.0), abs=0.02)
+
+
+def test_the_margin_is_the_least_of_all_crossings_and_the_crossover_the_lowest():
+    w = 2.0 * math.pi * 150.0
+    resonance = w**2 / (S**2 + 0.04 * w * S + w**2)
+    L = delayed_integrator(20.0, 0.0) * resonance
+    found = margins(F, L)
+    first = margins(F[F < 60.0], L[F < 60.0])
+    assert found.crossover_hz == first.crossover_hz
+    assert first.phase_deg == pytest.approx(90.0, abs=2.0)
+    # Above the resonance's peak, which is 20 / 150 / 0.04, the phase is near -270.
+    assert found.phase_deg < -45.0
+    assert found.gain_db < 0.0
+
+
+def test_sensitivity_is_one_over_the_distance_from_minus_one():
+    L = delayed_integrator(60.0, 1.5e-3)
+    assert margins(F, L).ms == pytest.approx((1.0 / np.abs(1.0 + L)).max())
+
+
+def test_a_crossing_that_nobody_saw_gives_no_margin():
+    L = delayed_integrator(20.0, 2e-3)
+    seen = np.abs(np.log(F / 20.0)) > 0.2
+    found = margins(F, L, seen)
+    assert math.isnan(found.phase_deg)
+    assert math.isnan(found.crossover_hz)
+    assert found.gain_db == pytest.approx(20.0 * math.log10(125.0 / 20.0), abs=0.02)
+
+
+def test_what_is_not_trusted_moves_nothing():
+    L = delayed_integrator(20.0, 2e-3)
+    seen = (F < 50.0) | (F > 60.0)
+    assert margins(F, np.where(seen, L, 100.0), seen)[:3] == pytest.approx(margins(F, L)[:3])
+
+
+def test_without_a_crossing_there_is_none():
+    found = margins(F, np.full(F.shape, 0.1 + 0.0j))
+    assert math.isnan(found.phase_deg)
+    assert math.isnan(found.crossover_hz)
+    assert found.gain_db == math.inf
+
+
+@pytest.mark.parametrize(
+    ("f", "L", "message"),
+    [([1.0, 2.0], [1.0], "rows of one length"), ([2.0, 1.0], [1.0, 1.0], "increase"), ([0.0, 1.0], [1, 1], "above 0")],
+)
+def test_rows_that_are_none_are_refused(f, L, message):
+    with pytest.raises(ValueError, match=message):
+        margins(f, L)

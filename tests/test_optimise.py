@@ -1,0 +1,349 @@
+"""Optimisation by trials: what a trial costs, that a safe search is safe, and that it works on a bus as well."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_parity import served
+
+from drive_env import motion
+from drive_env.envs.gain_trial import Trials, measured_cost, softness
+from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
+from drive_env.motors import find_motor
+from tuning.meter import KINDS, MeteredDrives
+from tuning.optimise import SAFE_STEP, Settings, objective_values, optimise, pareto
+from tuning.suite import load_suite, open_group
+from tuning.target import Target, emulated
+from tuning.trial_bench import OBJECTIVES, TrialBench, first_gains, read_gains, trial_seconds
+
+WILD = np.array([4021, 1573, 30_000, 3000, 30_000])
+FEW = Settings(sampler="tpe", trials=8)
+
+
+@pytest.fixture
+def rigid():
+    """Four rigid machines of one to eighteen rotors."""
+    with open_group([m for m in load_suite() if m.load == "inertia" and m.motor == "qbl4208"]) as target:
+        yield target
+
+
+def searched(settings, load="inertia", lanes=4, **options):
+    with emulated(load=load, num_machines=lanes) as target:
+        return optimise(target, settings, shared=True, anew=True, **options)
+
+
+# --- a trial ------------------------------------------------------------------------------------------------------
+def test_a_trial_costs_what_the_environments_trials_cost(rigid):
+    bench = TrialBench(rigid, anew=True)
+    bench.identify()
+    tried = bench.run(bench.rule)
+    # The same by hand.
+    drives = rigid.drives
+    trials = Trials(drives, rigid.motor, 1, bench._t_0)
+    drives.machine.reset()
+    everywhere = np.ones(4, bool)
+    trials.recover(everywhere)
+    by_hand = trials.run(bench.rule, bench.safe, bench.move, bench._origin, np.ones(4, int), everywhere)
+    assert not by_hand.aborted.any()
+    expected = measured_cost(by_hand.costs(softness(bench.rule) / softness(bench.rule)))
+    assert np.all(expected < 30.0)
+    np.testing.assert_allclose(np.exp(tried.cost), expected, rtol=1e-12)
+    np.testing.assert_allclose(tried.objectives[:, 0], np.log(by_hand.terms.settling[:2].max(axis=0)))
+    np.testing.assert_allclose(tried.objectives[:, 2], 100.0 * by_hand.terms.noise[:2].mean(axis=0))
+
+
+def test_a_slower_axis_costs_more_even_where_j_has_come_to_its_end(rigid):
+    bench = TrialBench(rigid, anew=True)
+    bench.identify()
+    slow, slower = bench.safe.copy(), bench.safe.copy()
+    slow[:, 2:] //= 2
+    slower[:, 2:] //= 4
+    costs = [bench.run(gains).cost for gains in (slow, slower)]
+    assert np.all(costs[0] > math.log(30.0))
+    assert np.all(costs[1] > costs[0])
+
+
+@pytest.mark.parametrize("gains", [np.zeros(5, int), WILD], ids=["factory fresh", "wild"])
+def test_whatever_gains_the_drives_had_they_are_identified_and_tried(rigid, gains):
+    write_gains(rigid.drives, np.tile(gains, (4, 1)))
+    bench = TrialBench(rigid)
+    bench.identify()
+    true = rigid.drives.machine.parameters
+    share = true["motor.psi_m"] / rigid.motor.psi_m
+    np.testing.assert_allclose(
+        bench.identified.inertia, (true["load.inertia"] + true["motor.inertia"]) / share, rtol=0.1
+    )
+    assert not bench.run(bench.safe).aborted.any()
+
+
+def test_what_oscillates_is_stopped_and_has_the_last_good_gains_again(rigid):
+    bench = TrialBench(rigid)
+    bench.identify()
+    bench.incumbent = bench.rule.copy()
+    gains = bench.rule.copy()
+    gains[1] = WILD
+    tried = bench.run(gains)
+    assert tried.aborted.tolist() == [False, True, False, False]
+    assert bench.aborts.tolist() == [0, 1, 0, 0]
+    np.testing.assert_array_equal(read_gains(rigid)[1], bench.rule[1])
+    enabled = rigid.drives.read(0x6041) & motion.OPERATION_ENABLED[0]
+    assert np.all(enabled == motion.OPERATION_ENABLED[1])
+
+
+def test_what_shakes_on_with_the_last_good_gains_is_calmed_and_said():
+    machines = [m for m in load_suite() if m.load == "inertia" and m.motor == "qbl4208"][:2]
+    with open_group(machines) as target:
+        bench = TrialBench(target)
+        bench.identify()
+        bench.incumbent[1] = WILD
+        gains = np.stack([bench.rule[0], WILD])
+        tried = bench.run(gains)
+        assert tried.fragile.tolist() == [False, True]
+        trace = target.drives.record([0x6077], 0.05)
+        change = np.diff(trace[0x6077], axis=0) * 1e-3
+        assert np.all(np.sqrt(np.mean(change**2, axis=0)) < 0.4 * target.motor.rated_current)
+
+
+def test_an_axis_that_went_astray_is_brought_back_before_the_next_trial(rigid):
+    bench = TrialBench(rigid)
+    bench.identify()
+    undisturbed = bench.run(bench.rule)
+    moves = bench.moves.copy()
+    rigid.drives.write(0x6040, 0x0F)  # bit 4 must rise
+    motion.start_move(rigid.drives, rigid.drives.read(0x6064) + 300_000, where=np.array([False, False, True, False]))
+    rigid.drives.advance(2.0)
+    tried = bench.run(bench.rule)
+    assert (bench.moves - moves).tolist() == [3, 3, 4, 3]
+    np.testing.assert_allclose(tried.cost, undisturbed.cost, atol=0.2)
+
+
+# --- a search -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("sampler", ["random", "grid", "tpe", "cmaes"])
+def test_a_search_ends_with_the_best_of_its_trials_on_the_drives(rigid, sampler):
+    found = optimise(rigid, Settings(sampler=sampler, trials=9, seed=2))
+    np.testing.assert_array_equal(read_gains(rigid), found.gains)
+    for machine in range(4):
+        rows = [row for row in found.rows if row.search == machine]
+        assert len(rows) == 9
+        np.testing.assert_array_equal(rows[0].gains[0], found.rule[machine])  # the rule is the first that is tried
+        kept = [row for row in rows if not row.aborted]
+        best = next(row for row in kept if np.array_equal(row.gains[0], found.gains[machine]))
+        assert found.cost[machine] == best.cost <= rows[0].cost
+    assert np.all(found.moves >= 2 + 3 * 9)
+    assert found.aborts.tolist() == [sum(row.aborted for row in found.rows if row.search == k) for k in range(4)]
+    assert found.drive_seconds >= trial_seconds(9)
+
+
+def test_a_search_leaves_the_drives_as_they_were_but_for_the_gains(rigid):
+    kept = (0x6081, 0x6083, 0x6084, 0x2003)
+    before = [rigid.drives.read(name) for name in kept]
+    optimise(rigid, replace(FEW, trials=3))
+    np.testing.assert_array_equal([rigid.drives.read(name) for name in kept], before)
+    assert not np.any(rigid.drives.read(0x6041) & motion.OPERATION_ENABLED[0] == motion.OPERATION_ENABLED[1])
+
+
+def test_a_generation_fills_the_lanes():
+    shares = []
+    found = searched(replace(FEW, trials=11), progress=shares.append)
+    assert [row.number for row in found.rows] == list(range(11))
+    assert shares == pytest.approx([4 / 11, 8 / 11, 1.0])
+    # Three generations of at most four side by side, not eleven one after the other.
+    assert trial_seconds(3) <= found.drive_seconds < 1.5 * trial_seconds(3)
+
+
+def test_a_search_follows_from_its_seed():
+    first, again, other = (searched(replace(FEW, seed=seed)) for seed in (1, 1, 2))
+    gains = [np.stack([row.gains for row in found.rows]) for found in (first, again, other)]
+    np.testing.assert_array_equal(gains[0], gains[1])
+    assert [row.cost for row in first.rows] == [row.cost for row in again.rows]
+    assert not np.array_equal(gains[0], gains[2])
+
+
+def test_a_machine_of_several_is_searched_as_it_is_alone():
+    machines = [m for m in load_suite() if m.load == "inertia" and m.motor == "qbl4208"][:2]
+    with open_group(machines) as both:
+        together = optimise(both, replace(FEW, trials=4))
+    with open_group(machines[:1]) as one:
+        alone = optimise(one, replace(FEW, trials=4))
+    mine = [row for row in together.rows if row.search == 0]
+    for row, own in zip(mine, alone.rows, strict=True):
+        np.testing.assert_array_equal(row.gains, own.gains)
+
+
+def test_other_gains_than_those_named_are_the_rules(rigid):
+    found = optimise(rigid, replace(FEW, gains=("torque_p",), trials=4, width=0.5))
+    tried = np.stack([row.gains[0] for row in found.rows if row.search == 0])
+    np.testing.assert_array_equal(tried[:, 1:], np.tile(found.rule[0, 1:], (4, 1)))
+    ratio = np.log(tried[:, 0] / found.rule[0, 0])
+    assert len(set(tried[:, 0].tolist())) > 1 and np.all(np.abs(ratio) < 0.5 + 1e-3)
+
+
+def test_a_journal_is_gone_on_from(tmp_path):
+    whole = searched(replace(FEW, journal=tmp_path / "whole.log"))
+    half = replace(FEW, journal=tmp_path / "half.log")
+    searched(replace(half, trials=4))
+    resumed = searched(half)
+    assert len(resumed.rows) == len(whole.rows) == 8
+    for row, expected in zip(resumed.rows, whole.rows, strict=True):
+        np.testing.assert_array_equal(row.gains, expected.gains)
+        assert row.cost == expected.cost
+    np.testing.assert_array_equal(resumed.gains, whole.gains)
+
+
+# --- several objectives -------------------------------------------------------------------------------------------
+def test_the_front_is_what_no_trial_beats_in_every_objective():
+    settings = replace(FEW, objectives=OBJECTIVES, trials=16)
+    found = searched(settings, "two_mass")
+    rows = [row for row in found.rows if not row.aborted]
+    front = {row.number for row in found.front(OBJECTIVES)}
+    for row in rows:
+        own = objective_values(row, OBJECTIVES)
+        beaten = any(
+            all(a <= b for a, b in zip(objective_values(other, OBJECTIVES), own, strict=True))
+            and objective_values(other, OBJECTIVES) != own
+            for other in rows
+        )
+        assert (row.number in front) is not beaten
+    assert 0 < len(front) < len(found.rows)
+    assert found.cost[0] in [row.cost for row in pareto(rows, OBJECTIVES)]
+
+
+def test_robustness_is_worst_of_what_was_stopped():
+    found = searched(replace(FEW, trials=16), "two_mass")
+    stopped = [row for row in found.rows if row.aborted]
+    assert stopped, "some of these gains oscillate"
+    k = OBJECTIVES.index("robustness")
+    assert {row.objectives[k] for row in stopped} == {math.log(30.0)}
+    assert all(0.0 <= row.objectives[k] < math.log(30.0) for row in found.rows if not row.aborted)
+
+
+# --- the safe search ----------------------------------------------------------------------------------------------
+def logs(row, rule):
+    return np.log(row.gains[0, 2:] / rule[2:])
+
+
+@pytest.fixture(scope="module")
+def safely():
+    """A safe search on elastic machines, which the rule itself makes oscillate, and what a meter saw of it."""
+    machines = [m for m in load_suite() if m.load == "two_mass" and m.motor == "qbl4208"]
+    with open_group(machines) as target:
+        meter = MeteredDrives(target)
+        found = optimise(replace(target, drives=meter), Settings(sampler="tpe", trials=20, safe=True, seed=3))
+    return found, meter
+
+
+def test_a_safe_search_begins_with_gains_that_are_proved(safely):
+    found, _ = safely
+    first = [row for row in found.rows if row.number == 0]
+    assert len(first) == 6 and not any(row.aborted for row in first)
+    assert all(np.all(logs(row, found.rule[row.search]) < -0.5) for row in first)
+
+
+def test_a_safe_search_goes_on_from_what_was_proved_in_small_steps(safely):
+    found, _ = safely
+    for search in range(6):
+        rows = [row for row in found.rows if row.search == search]
+        for k, row in enumerate(rows[1:], 1):
+            proved = [logs(other, found.rule[search]) for other in rows[:k] if not other.aborted]
+            way = min(np.abs(logs(row, found.rule[search]) - point).max() for point in proved)
+            assert way < SAFE_STEP + 0.02  # gains are integers
+
+
+def test_a_safe_search_keeps_off_what_oscillated(safely):
+    found, _ = safely
+    stopped = 0
+    for search in range(6):
+        rows = [row for row in found.rows if row.search == search]
+        for k, row in enumerate(rows):
+            beyond = [
+                other for other in rows[:k] if other.aborted and np.all(row.gains[0, 2:] > 1.02 * other.gains[0, 2:])
+            ]
+            assert not beyond
+            stopped += row.aborted
+    assert stopped, "a search that is never stopped shows nothing here"
+
+
+def test_a_safe_search_ends_with_gains_that_were_never_stopped_and_are_better(safely):
+    found, _ = safely
+    for search in range(6):
+        rows = [row for row in found.rows if row.search == search]
+        (kept,) = [row for row in rows if np.array_equal(row.gains[0], found.gains[search])][:1]
+        assert not kept.aborted
+        assert kept.cost < rows[0].cost
+
+
+def test_a_safe_search_shakes_the_axes_less_than_a_bold_one(safely):
+    found, meter = safely
+    machines = [m for m in load_suite() if m.load == "two_mass" and m.motor == "qbl4208"]
+    with open_group(machines) as target:
+        bold = optimise(target, Settings(sampler="tpe", trials=20, seed=3))
+    assert found.aborts.sum() < 0.7 * bold.aborts.sum()
+    assert meter.violations[KINDS.index("tripped")].sum() == 0
+
+
+def test_a_short_travel_is_kept():
+    machines = [m for m in load_suite() if m.load == "belt" and m.travel < 1.0]
+    with open_group(machines) as target:
+        meter = MeteredDrives(target)
+        optimise(replace(target, drives=meter), Settings(trials=8, safe=True))
+    assert meter.violations[KINDS.index("left its travel")].sum() == 0
+
+
+# --- on a bus -----------------------------------------------------------------------------------------------------
+def free_axis(drives):
+    """Return one axis of a bus that may turn freely, as a target."""
+    motor, free = find_motor("qbl4208"), np.array([math.inf])
+    supply = np.array([motor.voltage])
+    return Target(drives, drives.device, motor, supply, -free, free, motor.rated_speed, motor.rated_current)
+
+
+def test_a_search_runs_on_one_axis_of_a_bus_inside_the_envelope():
+    from tuning.commands.optimise import leave_oscillations_to_trials
+
+    with served("calls", load="inertia") as drives:
+        leave_oscillations_to_trials(drives)
+        target = free_axis(drives)
+        found = optimise(target, Settings(trials=5, safe=True))
+        np.testing.assert_array_equal(read_gains(target), found.gains)
+    costs = [row.cost for row in found.rows]
+    assert len(costs) == 5 and min(costs) == found.cost[0] < costs[0]
+
+
+def test_a_stop_by_the_envelope_is_an_abort():
+    with served("calls", load="inertia") as drives:  # with its own watch for oscillations
+        target = free_axis(drives)
+        bench = TrialBench(target)
+        bench.identify()
+        bench.incumbent = bench.rule.copy()
+        tried = bench.run(WILD[None])
+        assert tried.aborted.tolist() == [True] and tried.cost[0] == math.log(30.0)
+        np.testing.assert_array_equal(read_gains(target), bench.rule)
+        assert not bench.run(bench.rule).aborted.any()
+
+
+# --- mistakes -----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"sampler": "luck"}, r"no sampler is named 'luck'; there are random, grid, tpe, cmaes, gp"),
+        ({"gains": ("velocity_d",)}, r"no gain is named 'velocity_d'; there are torque_p"),
+        ({"gains": ("velocity_p", "velocity_p")}, r"give different ones of gain"),
+        ({"objectives": ("beauty",)}, r"no objective is named 'beauty'; there are cost, speed, robustness, current"),
+        ({"objectives": ()}, r"give different ones of objective: .*, not none"),
+        ({"trials": 0}, r"trials must be 1 or more, not 0"),
+        ({"width": 20.0}, r"width must lie above 0 and up to 10.4, not 20"),
+    ],
+)
+def test_mistakes_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Settings(**settings)
+
+
+def test_the_first_gains_are_those_of_the_commissioning_preset(rigid):
+    rigid = replace(rigid, supply=np.full(4, rigid.motor.voltage))
+    preset = [rigid.drives.read(name)[0] for name in GAIN_OBJECTS]
+    np.testing.assert_array_equal(first_gains(rigid), np.tile(preset, (4, 1)))
+    assert len(preset) == len(Gains._fields)

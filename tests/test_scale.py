@@ -1,0 +1,447 @@
+"""Work on processes and on a cluster, stopped and resumed: the digits of one process that was never stopped."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tuning import pools, searches, sweep
+from tuning.experiment import load_experiment
+from tuning.optimise import Settings, optimise
+from tuning.pools import PoolError, in_order, open_pool
+from tuning.shard_log import ShardLog, ShardLogError
+from tuning.target import emulated
+from tuning.unfinished import SHARDS, shard_log, unfinished_folder
+
+ROOT = Path(__file__).parent.parent
+PATIENCE = 300.0  # s, for a computer that stands still for minutes
+# 2304 points in three shards, 100 ms each.
+GRID = """
+device = "tmcm1636"
+motor = "qbl4208"
+load = "inertia"
+seed = 3
+
+[[sweep]]
+object = "2042h:01"
+low = 100
+high = 3000
+count = 48
+spacing = "log"
+
+[[sweep]]
+object = "2042h:02"
+low = 100
+high = 3000
+count = 48
+spacing = "log"
+
+[excitation]
+velocity_rpm = 1000.0
+velocity_time = 0.01
+acceleration_rpm_per_s = 100000.0
+load_torque = -0.05
+load_time = 0.06
+duration = 0.1
+sampling_period = 0.001
+
+[metric]
+name = "iae"
+"""
+FILES = ("results.csv", "settings.toml", "heatmap.png", "best_response.png")
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scale") / "grid.toml"
+    path.write_text(GRID, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def experiment(config):
+    return load_experiment(config)
+
+
+@pytest.fixture(scope="module")
+def whole(experiment):
+    """The sweep in one process, never stopped."""
+    return sweep.run(experiment)
+
+
+@pytest.fixture(scope="module")
+def saved(whole, tmp_path_factory):
+    """Its files, as bytes."""
+    return contents(whole.save(tmp_path_factory.mktemp("saved") / "run"))
+
+
+def contents(folder):
+    return {name: (folder / name).read_bytes() for name in FILES}
+
+
+def equal(one, other):
+    for name, column in one.columns.items():
+        np.testing.assert_array_equal(other.columns[name], column, err_msg=name)
+    np.testing.assert_array_equal(other.response.speed_rpm, one.response.speed_rpm)
+
+
+def square(item):
+    return item * item
+
+
+def fails(item):
+    raise ValueError(f"no {item}")
+
+
+def dies(item):
+    os._exit(9)
+
+
+# --- shards -------------------------------------------------------------------------------------------------------
+def test_shards_are_the_grid_without_gap_or_overlap_whatever_runs_them(experiment):
+    parts = sweep.shards(experiment)
+    assert len(parts) == 3
+    edges = [(part.first, part.last) for part in parts]
+    assert edges[0][0] == 0 and edges[-1][1] == experiment.size() == 2304
+    assert all(left[1] == right[0] for left, right in pairwise(edges))
+    assert edges == [(part.first, part.last) for part in sweep.shards(experiment, num_threads=7)]
+
+
+def test_only_what_is_not_done_is_simulated(experiment, whole, tmp_path, monkeypatch):
+    with ShardLog(tmp_path / "shards", "x") as log:
+        sweep.run(experiment, log=log)
+        kept = dict(log.done)
+    assert sorted(kept) == [0, 1, 2]
+    simulated = []
+    truly = sweep.simulate
+    monkeypatch.setattr(sweep, "simulate", lambda shard, *rest: simulated.append(shard.first) or truly(shard, *rest))
+    with ShardLog(tmp_path / "some", "x") as log:
+        log.append(1, kept[1])
+        result = sweep.run(experiment, log=log)
+    assert sorted(simulated) == [0, 2048]
+    equal(whole, result)
+    assert result.simulated == pytest.approx(0.1 * (1024 + 256))
+
+
+# --- the file of results ------------------------------------------------------------------------------------------
+def frames(path, count=3):
+    with ShardLog(path, "run") as log:
+        for k in range(count):
+            log.append(k, {"x": np.arange(4.0) + k, "flag": np.array([True, k == 1])})
+
+
+def test_what_was_appended_reads_back_to_the_last_bit(tmp_path):
+    values = np.array([np.nan, np.inf, -0.0, 1e-310, np.pi])
+    with ShardLog(tmp_path / "log", "run") as log:
+        log.append(5, {"x": values, "n": np.array([2**53 + 1])})
+    with ShardLog(tmp_path / "log", "run") as log:
+        assert list(log.done) == [5]
+        assert log.done[5]["x"].tobytes() == values.tobytes()
+        assert log.done[5]["n"].tolist() == [2**53 + 1]
+
+
+def test_a_file_cut_off_anywhere_holds_the_frames_before_and_goes_on(tmp_path):
+    frames(tmp_path / "whole")
+    whole = (tmp_path / "whole").read_bytes()
+    ends = []  # of the first line and of each frame
+    for k in range(4):
+        frames(tmp_path / f"first {k}", k)
+        ends.append((tmp_path / f"first {k}").stat().st_size)
+    assert ends[-1] == len(whole)
+    path = tmp_path / "cut"
+    for cut in [*range(0, len(whole), 7), *ends, *(end - 1 for end in ends)]:
+        path.write_bytes(whole[:cut])
+        with ShardLog(path, "run") as log:
+            complete = sum(end <= cut for end in ends[1:])
+            assert sorted(log.done) == list(range(complete)), cut
+            for k in range(complete, 3):
+                log.append(k, {"x": np.arange(4.0) + k, "flag": np.array([True, k == 1])})
+        assert path.read_bytes() == whole, cut
+
+
+def test_a_frame_with_a_flipped_bit_and_what_follows_it_are_done_again(tmp_path):
+    frames(tmp_path / "log")
+    data = bytearray((tmp_path / "log").read_bytes())
+    frames(tmp_path / "first", 1)
+    data[(tmp_path / "first").stat().st_size + 300] ^= 4  # in the second frame
+    (tmp_path / "log").write_bytes(data)
+    with ShardLog(tmp_path / "log", "run") as log, ShardLog(tmp_path / "first", "run") as first:
+        assert sorted(log.done) == [0]
+        for each in (log, first):
+            each.append(7, {"x": np.zeros(1)})  # shorter than what lay there
+    assert (tmp_path / "log").read_bytes() == (tmp_path / "first").read_bytes()
+
+
+def test_results_of_another_run_are_not_taken(tmp_path):
+    frames(tmp_path / "log")
+    with pytest.raises(ShardLogError, match="holds results of another experiment"):
+        ShardLog(tmp_path / "log", "another run")
+
+
+def test_an_unfinished_run_is_not_overwritten_and_one_without_results_leaves_nothing(tmp_path):
+    with shard_log(tmp_path / "run", "a = 1\n", resume=False) as log:
+        log.append(0, {"x": np.zeros(1)})
+    with pytest.raises(ShardLogError, match=r"run\.unfinished holds an unfinished run; go on with it by --resume"), \
+            shard_log(tmp_path / "run", "a = 1\n", resume=False):  # fmt: skip
+        pass
+    with shard_log(tmp_path / "run", "a = 1\n", resume=True) as log:
+        assert list(log.done) == [0]
+    with shard_log(tmp_path / "other", "a = 1\n", resume=True):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["run.unfinished"]
+
+
+# --- pools --------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("workers", [None, 2])
+def test_a_pool_gives_every_result_with_its_number(workers):
+    with open_pool(workers) as pool:
+        assert in_order(pool, square, range(20)) == [k * k for k in range(20)]
+        assert dict(pool.unordered(square, [7, 7, 8])) == {0: 49, 1: 49, 2: 64}
+        with pytest.raises(ValueError, match="no 3"):
+            in_order(pool, fails, [3])
+
+
+def test_a_worker_that_dies_is_told_with_the_remedy():
+    with open_pool(1) as pool, pytest.raises(PoolError, match=r"worker process ended on its own.*--resume"):
+        in_order(pool, dies, [1])
+
+
+@pytest.mark.parametrize(("options", "error", "message"), [
+    ({"workers": 0}, ValueError, "--workers 0 is below 1"),
+    ({"workers": 1, "cluster": "tcp://127.0.0.1:1"}, ValueError, "choose --workers or --cluster"),
+    ({"cluster": "tcp://127.0.0.1:1"}, PoolError, r"no Dask scheduler answers at tcp://127\.0\.0\.1:1"),
+    ({"cluster": "nonsense"}, PoolError, "no Dask scheduler answers at nonsense"),
+])  # fmt: skip
+def test_a_pool_that_cannot_be_says_why(options, error, message, monkeypatch):
+    monkeypatch.setattr("tuning.pools.CONNECT_TIMEOUT", 0.5)
+    with pytest.raises(error, match=message), open_pool(**options):
+        pass
+
+
+def test_worker_processes_give_the_digits_of_one_process_and_go_on_from_what_is_done(experiment, whole, tmp_path):
+    first = sweep.simulate(sweep.shards(experiment)[0])
+    with open_pool(2) as pool, ShardLog(tmp_path / "shards", "x") as log:
+        log.append(0, first)
+        equal(whole, sweep.run(experiment, pool=pool, log=log))
+        assert sorted(log.done) == [0, 1, 2]
+
+
+def test_a_cluster_that_loses_one_of_two_workers_gives_the_digits_of_one_process(experiment, whole, saved, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": "127.0.0.1:0"}
+    with distributed.LocalCluster(host="127.0.0.1", silence_logs="CRITICAL", **options) as cluster:
+        address = cluster.scheduler_address
+        with distributed.Client(address, set_as_default=False) as client:
+            workers = client.run(os.getpid)
+            assert len(workers) == 2
+            victim = next(iter(workers.values()))
+            killed = []
+
+            def kill_once(what, share):
+                if 0.0 < share < 1.0 and not killed:  # one shard is done, the others are not
+                    os.kill(victim, signal.SIGKILL)
+                    killed.append(share)
+
+            with open_pool(cluster=address) as pool, ShardLog(tmp_path / "shards", "x") as log:
+                assert pool.differences() == []
+                result = sweep.run(experiment, kill_once, pool=pool, log=log)
+            assert killed
+            with pytest.raises(ProcessLookupError):
+                os.kill(victim, 0)
+    assert sorted(log.done) == [0, 1, 2]
+    equal(whole, result)
+    assert contents(result.save(tmp_path / "run")) == saved
+
+
+def test_workers_of_another_version_are_told():
+    class Client:
+        def run(self, function):
+            here = function()
+            return {"tcp://a:1": here, "tcp://b:2": here | {"numpy": "0.9"}}
+
+    (line,) = pools._Dask(Client(), 2).differences()
+    assert line == f"worker tcp://b:2 has numpy 0.9, here it is {np.__version__}: last digits may differ"
+
+
+# --- searches -----------------------------------------------------------------------------------------------------
+MACHINE = {"load": "inertia", "num_machines": 3, "seed": 5}
+FEW = Settings(sampler="random", trials=4, seed=7)
+
+
+def found(parts, pool, path):
+    with ShardLog(path, "searches") as log:
+        return searches.run(parts, pool, log)
+
+
+def same(one, other):
+    assert one.gains.tolist() == other.gains.tolist() and one.rule.tolist() == other.rule.tolist()
+    assert one.cost.tobytes() == other.cost.tobytes()
+    assert [row.gains.tolist() for row in one.rows] == [row.gains.tolist() for row in other.rows]
+    assert [row[1:2] + row[3:] for row in one.rows] == [row[1:2] + row[3:] for row in other.rows]
+    assert (one.drive_seconds, one.notes) == (other.drive_seconds, other.notes)
+    assert one.moves.tolist() == other.moves.tolist() and one.aborts.tolist() == other.aborts.tolist()
+
+
+def test_searches_are_the_search_with_one_seed_after_the_other(tmp_path):
+    results = found(searches.searches(MACHINE, FEW, 2), None, tmp_path / "log")
+    for k, result in enumerate(results):
+        with emulated(**MACHINE) as target:
+            alone = optimise(target, replace(FEW, seed=7 + k), shared=True, anew=True)
+        assert {row.search for row in result.rows} == {k}
+        same(
+            result,
+            replace(alone, gains=alone.gains[:1], rule=alone.rule[:1], cost=alone.cost[:1], notes=alone.notes[:1]),
+        )
+    assert results[0].rows[1].gains.tolist() != results[1].rows[1].gains.tolist()
+    together = searches.joined(results)
+    assert together.gains.tolist() == [result.gains[0].tolist() for result in results]
+    assert together.drive_seconds == sum(result.drive_seconds for result in results)
+    assert len(together.rows) == 8 and together.cost.shape == (2,)
+
+
+def test_searches_on_workers_and_resumed_are_the_searches_of_one_process(tmp_path):
+    parts = searches.searches(MACHINE, FEW, 3)
+    whole = found(parts, None, tmp_path / "whole")
+    with ShardLog(tmp_path / "whole", "searches") as log, ShardLog(tmp_path / "begun", "searches") as begun:
+        begun.append(1, log.done[1])
+    with open_pool(2) as pool:
+        resumed = found(parts, pool, tmp_path / "begun")
+    for one, other in zip(whole, resumed, strict=True):
+        same(one, other)
+
+
+@pytest.mark.parametrize(("count", "settings", "message"), [
+    (0, FEW, "--searches 0 is below 1"),
+    (2, replace(FEW, journal=Path("x")), "a journal keeps one search"),
+])  # fmt: skip
+def test_searches_that_cannot_be_are_refused(count, settings, message):
+    with pytest.raises(ValueError, match=message):
+        searches.searches(MACHINE, settings, count)
+
+
+def test_another_seed_trial_or_machine_makes_another_run():
+    texts = {
+        searches.description(searches.searches(machine, settings, count))
+        for machine, settings, count in [
+            (MACHINE, FEW, 2), (MACHINE, FEW, 3), (MACHINE | {"seed": 6}, FEW, 2), (MACHINE, replace(FEW, trials=5), 2),
+            (MACHINE | {"travel": (-1.0, 1.0)}, FEW, 2), (MACHINE, replace(FEW, safe=True), 2),
+        ]
+    }  # fmt: skip
+    assert len(texts) == 6
+
+
+# --- the command --------------------------------------------------------------------------------------------------
+def arguments(config, out, *more):
+    return [sys.executable, "-m", "tuning.cli", "sweep", "--config", str(config), "--out", str(out), *map(str, more)]
+
+
+def environment():
+    return os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "100", "NO_COLOR": "1"}
+
+
+def run_command(config, out, *more):
+    return subprocess.run(
+        arguments(config, out, *more), env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
+
+
+def start_and_wait_for_a_shard(config, out, *more):
+    """Return the command, running, with at least one shard done and the rest not."""
+    log = unfinished_folder(out) / SHARDS
+    process = subprocess.Popen(
+        arguments(config, out, *more), env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + PATIENCE
+    while not (log.exists() and log.stat().st_size > 1000) and process.poll() is None:
+        assert time.monotonic() < deadline, "no shard was done"
+        time.sleep(0.002)
+    return process
+
+
+@pytest.fixture(scope="module")
+def long(config, tmp_path_factory):
+    """A grid of five shards, and the files of its uninterrupted run."""
+    folder = tmp_path_factory.mktemp("long")
+    path = folder / "long.toml"
+    path.write_text(GRID.replace("count = 48", "count = 66"), encoding="utf-8")
+    done = run_command(path, folder / "run")
+    assert done.returncode == 0, done.stderr
+    return path, contents(folder / "run")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+@pytest.mark.parametrize("more", [
+    pytest.param((), id="threads"),
+    pytest.param(("--workers", 2), id="workers", marks=pytest.mark.slow),
+])  # fmt: skip
+def test_a_run_that_is_killed_goes_on_to_the_same_bytes(long, tmp_path, more):
+    config, expected = long
+    out = tmp_path / "run"
+    process = start_and_wait_for_a_shard(config, out, *more)
+    process.kill()
+    process.communicate()
+    assert not out.exists()
+    refused = run_command(config, out)
+    assert refused.returncode == 2
+    assert "run.unfinished holds an unfinished run" in refused.stderr.replace("\n", "")
+    done = run_command(config, out, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert "note: goes on from" in done.stdout
+    assert contents(out) == expected
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_an_interrupt_says_what_is_kept_and_the_run_goes_on_from_its_own_settings(long, tmp_path):
+    config, expected = long
+    out = tmp_path / "run"
+    process = start_and_wait_for_a_shard(config, out)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert "what is done is kept; go on with --out" in errors
+    assert "Traceback" not in errors
+    done = subprocess.run(
+        [sys.executable, "-m", "tuning.cli", "sweep", "--out", str(out), "--resume"],
+        env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert contents(out) == expected
+
+
+def test_a_run_is_not_resumed_with_another_experiment(config, tmp_path):
+    with shard_log(tmp_path / "run", GRID, resume=False) as log:
+        log.append(0, {"x": np.zeros(1)})
+    done = run_command(config, tmp_path / "run", "--resume", "--seed", 9)
+    assert done.returncode == 2
+    assert "another experiment" in done.stderr
+    assert done.stderr.startswith("drive-tune: ")
+
+
+@pytest.mark.parametrize(("more", "code", "message"), [
+    (("--workers", 0), 2, "--workers 0 is below 1"),
+    (("--workers", 1, "--cluster", "tcp://x:1"), 2, "choose --workers or --cluster"),
+])  # fmt: skip
+def test_a_mistake_is_one_line(config, tmp_path, more, code, message):
+    done = run_command(config, tmp_path / "run", *more)
+    assert (done.returncode, message in done.stderr) == (code, True), done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_resume_needs_a_folder():
+    done = subprocess.run(
+        [sys.executable, "-m", "tuning.cli", "sweep", "--resume"],
+        env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.startswith("drive-tune: --resume needs --out")

@@ -1,0 +1,178 @@
+"""What is tuned: how far each rotor may turn, what the user says of it, and how a command names it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import can
+import numpy as np
+import pytest
+import typer
+
+from drive_env import EmulatedDrives, SafetyError, motion
+from drive_env.bus.can_port import CanPort
+from drive_env.bus.server import Server
+from drive_env.bus.world import World
+from mechanics.loads import LOADS
+from tuning.commands.options import errors_as_exit_codes, open_target, parse_travel
+from tuning.target import FREE, emulated, on_bus, timed
+
+TURN = 2.0 * math.pi
+
+
+def test_an_emulated_target_knows_its_machines():
+    with emulated("tmcm1636", "inertia", "ec_i_40", num_machines=2, supply=30.0, seed=4) as target:
+        assert target.num_axes == 2
+        assert target.motor.name == "ec_i_40" and target.machine == "inertia"
+        assert target.supply.tolist() == [30.0, 30.0]
+        assert target.drives.machine.supply.tolist() == [30.0, 30.0]  # what it is told is true
+        assert (target.speed, target.current) == (target.motor.rated_speed, target.motor.rated_current)
+        assert np.isinf(target.low).all() and np.isinf(target.high).all()
+        assert target.increments() == pytest.approx([65536 / TURN] * 2)
+
+
+@pytest.mark.parametrize(("load", "ends"), [
+    # The way to a limit switch, 20 mm before the end [m], over the way per turn of the rotor.
+    ("belt", (0.25 - 0.02) / 0.04),
+    ("ball_screw", (0.25 - 0.02) / 0.005),
+    ("gantry", (0.30 - 0.02) / 0.04),
+])  # fmt: skip
+def test_travel_is_the_loads_own_and_never_wider(load, ends):
+    with emulated(load=load, num_machines=2) as target:
+        axes = target.axes_per_machine
+        assert axes == LOADS[load].num_axes and target.num_axes == 2 * axes
+        np.testing.assert_allclose(target.high, ends * TURN)
+        np.testing.assert_allclose(target.low, -ends * TURN)
+    with emulated(load=load, travel=(-0.1, 1e9)) as narrow:
+        np.testing.assert_allclose(narrow.low, -0.1)
+        np.testing.assert_allclose(narrow.high, ends * TURN)
+
+
+def test_a_factory_fresh_drive_has_no_gains():
+    with emulated(factory_fresh=True) as target:
+        assert target.drives.read((0x2042, 1)) == [0]
+        assert target.motor.name == EmulatedDrives.DEFAULT_MOTOR
+    with pytest.raises(ValueError, match="factory-fresh drives turn a qbl4208, not a ec_i_40"):
+        emulated(motor="ec_i_40", factory_fresh=True)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"low": np.array([0.1])}, "axis 0: travel 0.1 to inf rad must hold 0"),
+    ({"high": np.array([-0.1])}, "axis 0: travel -inf to -0.1 rad must hold 0"),
+    ({"low": np.zeros(1), "high": np.zeros(1)}, "somewhere to go"),
+    ({"low": np.full(2, -1.0)}, r"low must have shape \(1,\), not \(2,\)"),
+    ({"supply": np.zeros(1)}, "supply 0 V must be above 0 V"),
+    ({"supply": np.array([math.nan])}, "supply nan V"),
+    ({"speed": 0.0}, "speed 0 rad/s must be above 0"),
+    ({"current": math.inf}, "current inf A must be above 0 and finite"),
+])  # fmt: skip
+def test_what_cannot_be_is_refused(change, message):
+    with emulated(load="inertia") as target, pytest.raises(ValueError, match=message):
+        replace(target, **change)
+
+
+def test_time_on_the_drives_is_counted_whoever_lets_it_pass():
+    with emulated(load="inertia") as target, timed(target) as (watched, clock):
+        assert clock.seconds == 0.0
+        motion.enable(watched.drives, mode="pv")
+        enabling = clock.seconds
+        watched.drives.advance(0.25)
+        trace = watched.drives.record([0x6064], 0.1, period=0.002)
+        assert len(trace) == 50
+        assert clock.seconds == pytest.approx(enabling + 0.35)
+        assert watched.num_axes == 1 and watched.drives.machine is target.drives.machine
+
+
+# --- on a bus -----------------------------------------------------------------------------------------------------
+@pytest.fixture
+def channel(request):
+    """The name of a virtual bus with one drive, whose time passes by SYNC."""
+    world = World(lockstep=True)
+    world.add(EmulatedDrives(load="inertia", num_threads=1), [1])
+    with Server(world, CanPort(can.Bus(interface="virtual", channel=request.node.name))):
+        yield request.node.name
+    world.close()
+
+
+def opened(channel, **options):
+    return on_bus(interface="virtual", channel=channel, pace="lockstep", timeout=20.0, supply=24.0, **options)
+
+
+def test_the_envelope_holds_an_axis_of_a_bus_to_its_travel(channel):
+    with opened(channel, travel=(-0.5 * TURN, 0.25 * TURN)) as target:
+        assert (target.low, target.high) == ([-0.5 * TURN], [0.25 * TURN])
+        assert target.machine == f"{channel}, node 1"
+        drives = target.drives
+        here = int(drives.read(0x6064)[0])
+        motion.enable(drives, mode="pp")
+        drives.write(0x6081, 100_000)
+        drives.write(0x6083, 1_000_000)
+        motion.start_move(drives, here + 16_000)
+        drives.advance(0.3)
+        with pytest.raises(SafetyError, match="beyond the limits"):
+            motion.start_move(drives, here + 16_500)  # a quarter turn is 16384
+
+
+def test_a_bus_that_says_nothing_of_its_channel_takes_it_from_the_environment(channel, monkeypatch):
+    monkeypatch.setenv("DRIVE_ENV_INTERFACE", "virtual")
+    monkeypatch.setenv("DRIVE_ENV_CHANNEL", channel)
+    with on_bus(travel=FREE, pace="lockstep", timeout=20.0) as target:
+        assert target.bus == {"interface": "virtual", "channel": channel, "nodes": [1], "pace": "lockstep"}
+        assert target.supply == [24.0]  # the motor's
+
+
+# --- options of commands ------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("text", "ends"), [
+    ("-0.15:0.15", (-0.15 * TURN, 0.15 * TURN)),
+    ("0:2", (0.0, 2 * TURN)),
+    ("free", (-math.inf, math.inf)),
+    ("-1:inf", (-TURN, math.inf)),
+])  # fmt: skip
+def test_travel_is_given_in_turns(text, ends):
+    assert parse_travel(text) == pytest.approx(ends)
+
+
+@pytest.mark.parametrize("text", ["", "0.3", "a:b", "1:2", "-2:-1", "0:0", "0.1:-0.1", "nan:1", "1:"])
+def test_a_travel_that_is_none_is_refused(text):
+    with pytest.raises(ValueError, match=f"--travel {text}"):
+        parse_travel(text)
+
+
+def test_without_bus_the_drives_are_emulated_whatever_the_environment_says(monkeypatch):
+    monkeypatch.setenv("DRIVE_ENV_CHANNEL", "can0")
+    with open_target(load="inertia", travel="-1:1", machines=2) as target:
+        assert target.drives.machine is not None
+        assert target.high.tolist() == [TURN, TURN]
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"nodes": [1]}, "--node, --bitrate and --lockstep are of drives on a bus; add --bus"),
+    ({"lockstep": True}, "add --bus"),
+    ({"bus": True}, "--travel is missing: how far may the motor turn"),
+    ({"load": "abc"}, "no load is named 'abc'"),
+    ({"motor": "abc"}, "no motor is named 'abc'"),
+])  # fmt: skip
+def test_a_mistake_in_the_options_says_what_to_do(options, message):
+    with pytest.raises(ValueError, match=message):
+        open_target(**options)
+
+
+@pytest.mark.parametrize(("error", "code"), [
+    (ValueError("x"), 2),
+    (FileNotFoundError(2, "No such file or directory", "x"), 2),
+    (SafetyError("x"), 1),
+    (TimeoutError("x"), 1),
+    (RuntimeError("x"), 1),
+    (KeyboardInterrupt(), 130),
+])  # fmt: skip
+def test_errors_end_with_a_line_and_their_code(error, code, capsys):
+    with pytest.raises(typer.Exit) as found, errors_as_exit_codes():
+        raise error
+    assert found.value.exit_code == code
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_a_mistake_of_ours_keeps_its_traceback():
+    with pytest.raises(NotImplementedError), errors_as_exit_codes():
+        raise NotImplementedError

@@ -1,0 +1,121 @@
+"""Digital twins: an emulated machine that is what was identified, and a search on it that keeps its word."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drive_env import EmulatedDrives
+from drive_env.devices import find_device
+from drive_env.gains import Gains, rule_gains
+from drive_env.motors import find_motor
+from tuning.identification import Estimate, Identification, refused
+from tuning.linear_model import Plant
+from tuning.twin import LEAST, WORLDS, Friction, Known, Spread, Twins, World, known_of, search, twin_parameters
+
+DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
+RIGID = Plant.from_data_sheet(DEVICE, MOTOR, 22.0, 2e-5, R=0.41, L=5.5e-4, velocity_filter=260.0)
+ELASTIC = replace(RIGID, anti_resonance=70.0, resonance=141.0, damping=0.03)
+KNOWN = Known(RIGID, Friction(0.1, 2e-4), math.inf)
+ONE = WORLDS[:1]
+
+
+def scaler(n=1):
+    return np.full(n, 65536.0)
+
+
+@pytest.mark.parametrize("plant", [RIGID, ELASTIC], ids=["rigid", "elastic"])
+def test_the_twin_is_the_plant_that_was_identified(plant):
+    load = "two_mass" if plant.is_elastic else "inertia"
+    values = twin_parameters(DEVICE, MOTOR, KNOWN._replace(plant=plant))
+    with EmulatedDrives(load=load, parameters=values, supply=plant.supply, num_threads=1) as drives:
+        true = Plant.from_machine(drives)
+    for name in ("R", "L", "supply", "inertia", "anti_resonance", "resonance", "damping", "velocity_filter"):
+        if name != "damping" or plant.is_elastic:
+            assert getattr(true, name) == pytest.approx(getattr(plant, name), rel=0.01), name
+    assert true.viscous == pytest.approx(2e-4 * MOTOR.torque_constant, rel=0.01)
+    dry = values["motor.coulomb"] + values["load.coulomb"]
+    assert dry == pytest.approx(0.1 * MOTOR.torque_constant)
+
+
+def test_a_resonance_too_fast_for_the_physics_is_taken_as_rigid():
+    with Twins(DEVICE, MOTOR, [KNOWN._replace(plant=replace(ELASTIC, resonance=900.0))], scaler(), 2) as twins:
+        assert [part._hidden.variants[-1].name for part in twins._parts] == ["velocity P x 1.5"]
+        assert twins._parts[0]._hidden._drives.load.name == "inertia"
+
+
+def test_a_world_is_as_far_off_as_the_interval_says_but_not_farther_than_makes_sense():
+    world = World("off", inertia=0.05, filter=-0.1)
+
+    def off(spread):
+        values = twin_parameters(DEVICE, MOTOR, KNOWN._replace(spread=spread), world)
+        inertia = values["motor.inertia"] + values["load.inertia"]
+        return inertia / RIGID.inertia, values["stage.velocity_filter"] / RIGID.velocity_filter
+
+    assert off(Spread()) == pytest.approx((1.05, 0.9))
+    assert off(Spread(inertia=0.2, filter=0.3)) == pytest.approx((1.2, 0.7))
+    assert off(Spread(inertia=9.0)) == pytest.approx((1.6, 0.9))
+
+
+def identification(**values):
+    names = {"inertia": (2e-5, 0.1), "coulomb": (0.1, 0.2), "viscous": (2e-4, 0.2)} | values
+    estimates = {n: Estimate(v, v * (1 - w), v * (1 + w), "") for n, (v, w) in names.items()}
+    blank = {
+        n: refused("", "not seen") for n in ("anti_resonance", "resonance", "velocity_filter", "coulomb", "viscous")
+    }
+    return Identification(blank | estimates, 0.0)
+
+
+def test_intervals_become_the_twins_doubt_and_what_was_refused_the_greatest():
+    found = known_of(RIGID, identification(velocity_filter=(260.0, 0.2), resonance=(141.0, 0.05)), 3.0)
+    assert found.friction == Friction(0.1, 2e-4)
+    assert found.spread == pytest.approx(Spread(inertia=0.1, anti_resonance=0.0, resonance=0.05, filter=0.2))
+    without = known_of(RIGID, identification(coulomb=(math.nan, 0.0)), 3.0)
+    assert without.friction.coulomb == 0.0
+    assert without.spread.filter == 0.5
+
+
+def test_scores_do_not_depend_on_the_lane_nor_on_the_other_axes():
+    rule = rule_gains(DEVICE, MOTOR, RIGID.inertia, supply=RIGID.supply)[0]
+    slow = np.rint(0.7 * rule).astype(int)
+    with Twins(DEVICE, MOTOR, [KNOWN], scaler(), 2, worlds=ONE) as twins:
+        alone = twins.score(np.array([[rule, slow]]))
+    with Twins(DEVICE, MOTOR, [KNOWN._replace(plant=ELASTIC), KNOWN], scaler(2), 2, worlds=ONE) as twins:
+        both = twins.score(np.array([[slow, rule], [slow, rule]]))
+    np.testing.assert_allclose(both[1], alone[0, ::-1], rtol=1e-12)
+    assert both[0, 0] != both[1, 0]
+
+
+def test_the_worlds_count_by_their_geometric_mean():
+    rule = rule_gains(DEVICE, MOTOR, RIGID.inertia, supply=RIGID.supply)
+    scores = []
+    for worlds in (WORLDS[:1], WORLDS[1:2], WORLDS[:2]):
+        with Twins(DEVICE, MOTOR, [KNOWN], scaler(), 1, worlds=worlds) as twins:
+            scores.append(float(twins.score(rule[:, None])[0, 0]))
+    assert scores[2] == pytest.approx(math.sqrt(scores[0] * scores[1]), rel=1e-9)
+    assert scores[0] != scores[1]
+
+
+def test_the_search_finds_better_gains_and_what_it_says_of_them_is_what_the_twin_says():
+    start = rule_gains(DEVICE, MOTOR, RIGID.inertia, supply=RIGID.supply)[:, None]
+    with Twins(DEVICE, MOTOR, [KNOWN], scaler(), 12, worlds=ONE) as twins:
+        found = search(twins, start, np.random.default_rng(3), generations=8, keep=12)
+        again = search(twins, start, np.random.default_rng(3), generations=8, keep=12)
+        np.testing.assert_allclose(twins.score(found.gains), found.hidden, rtol=1e-12)
+        first = twins.score(np.repeat(start, 12, axis=1))[0, 0]
+    np.testing.assert_array_equal(found.gains, again.gains)
+    assert found.start[0] == first
+    assert found.hidden[0, 0] < 0.6 * first
+    assert np.all(np.diff(found.hidden[0]) >= 0.0)
+    assert found.gains.min(axis=(0, 1)).tolist()[3] >= LEAST.velocity_i
+
+
+def test_gains_that_are_not_searched_stay_those_of_the_best_start():
+    start = np.stack([rule_gains(DEVICE, MOTOR, RIGID.inertia, supply=RIGID.supply)[0], [9, 9, 9, 30, 9]])
+    with Twins(DEVICE, MOTOR, [KNOWN], scaler(), 6, worlds=ONE) as twins:
+        found = search(twins, start[None], np.random.default_rng(0), generations=3, free=("velocity_p",), keep=3)
+    fixed = [k for k, name in enumerate(Gains._fields) if name != "velocity_p"]
+    assert np.all(found.gains[0, 0, fixed] == start[0, fixed])

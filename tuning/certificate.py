@@ -1,0 +1,346 @@
+"""The certificate of a tuning: what was found, what was changed, and the proof, with a hash that shows a change.
+
+The hash is over the content, not over the file: indented otherwise or with its keys in another order it is the same
+certificate. It tells that nothing was changed by accident or in passing; it is no signature.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from tuning.identification import Identification
+    from tuning.margins import Margins
+    from tuning.target import Target
+
+FORMAT = 1
+HASH = "sha256"
+
+Floats = NDArray[np.float64]
+
+
+class CertificateError(ValueError):
+    """A file that is no certificate: one line with its remedy."""
+
+
+@dataclass(frozen=True)
+class StepResponse:
+    """A recorded move of one axis.
+
+    Attributes:
+        name: What was done, e.g. "velocity step 500 rpm" or "reversal".
+        tuned: Whether with the new gains; else with those before.
+        unit: Unit of `reference` and `actual`.
+        t: Sample times [s], shape (n,).
+        reference, actual: Set-point and what came of it, shape (n,).
+        current: Actual current [A, peak i_q], shape (n,).
+        figures: What it says: name with unit, e.g. "settling [s]", "overshoot [%]", "disturbance dip [rpm]" -> value;
+            nan where there is none. A disturbance exists on the emulator only.
+    """
+
+    name: str
+    tuned: bool
+    unit: str
+    t: Floats
+    reference: Floats
+    actual: Floats
+    current: Floats
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FrequencyResponse:
+    """An open loop of one axis.
+
+    Attributes:
+        name: Which, e.g. "velocity loop".
+        tuned: Whether with the new gains; else with those before.
+        frequency: [Hz], shape (n,).
+        magnitude_db, phase_deg: Of the open loop as measured, shape (n,).
+        coherence: 0 to 1, shape (n,); nan where it is a model's.
+        margins: What it says: name with unit, e.g. "phase margin [deg]" -> value.
+        source: Where it is from, e.g. "multisine over the bus" or "the emulator's trace".
+    """
+
+    name: str
+    tuned: bool
+    frequency: Floats
+    magnitude_db: Floats
+    phase_deg: Floats
+    coherence: Floats
+    margins: Mapping[str, float] = field(default_factory=dict)
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """An identified value with its interval of 95 % confidence; refused: nan and the reason."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class AxisCertificate:
+    """What became of one axis.
+
+    Attributes:
+        axis: Number of the axis.
+        accepted: Whether the new gains passed the checks and are in the drive; else those before are.
+        reason: Why it stopped, in words: always said.
+        identified: Name -> parameter.
+        before, after: Raw integers in the order of `Gains`, of the drive before and now.
+        before_si, after_si: The same in SI, as `drive_env.gains.gains_in_si` has them: name with unit -> value.
+        steps: Recorded moves.
+        frequency_responses: Open loops.
+        notes: What no integer reached, limits met, what was left out.
+        hardware_seconds: Time that passed on the drive [s].
+        aborts: Trials that were stopped.
+    """
+
+    axis: int
+    accepted: bool
+    reason: str
+    identified: Mapping[str, Parameter]
+    before: tuple[int, ...]
+    after: tuple[int, ...]
+    before_si: Mapping[str, float]
+    after_si: Mapping[str, float]
+    steps: tuple[StepResponse, ...] = ()
+    frequency_responses: tuple[FrequencyResponse, ...] = ()
+    notes: tuple[str, ...] = ()
+    hardware_seconds: float = 0.0
+    aborts: int = 0
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A tuning of one or several axes.
+
+    Attributes:
+        tuner: What tuned, e.g. "auto".
+        device, motor: Names.
+        machine: What turns: an emulated load's name, or the bus and its node-IDs.
+        supply: Supply voltage as entered [V].
+        seed: Of everything random.
+        envelope: What the drive was held to: name with unit -> value, e.g. "speed [rad/s]", "travel low [rad]".
+        axes: One entry per axis.
+        versions: Of what computed it.
+        created: When [ISO 8601, UTC].
+    """
+
+    tuner: str
+    device: str
+    motor: str
+    machine: str
+    supply: float
+    seed: int
+    envelope: Mapping[str, float]
+    axes: tuple[AxisCertificate, ...]
+    versions: Mapping[str, str]
+    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
+
+    def content(self) -> dict[str, Any]:
+        """Return the certificate as JSON has it, without its hash; nan is null, infinity a text."""
+        found: dict[str, Any] = _plain(self)
+        return {"format": FORMAT} | found
+
+    def hash(self) -> str:
+        """Return the hash over the content."""
+        return content_hash(self.content())
+
+    def to_json(self) -> str:
+        """Return the file's text."""
+        return json.dumps(self.content() | {HASH: self.hash()}, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+    def save(self, folder: str | Path) -> tuple[Path, Path]:
+        """Write certificate.json and report.html into a folder, made if needed, and return their paths."""
+        from tuning.report import to_html
+
+        place = Path(folder)
+        place.mkdir(parents=True, exist_ok=True)
+        paths = place / "certificate.json", place / "report.html"
+        for path, text in zip(paths, (self.to_json(), to_html(self)), strict=True):
+            path.write_text(text, encoding="utf-8", newline="\n")
+        return paths
+
+
+# --- from what tuners have --------------------------------------------------------------------------------------------
+SI_NAMES = ("torque P [V/A]", "torque T_i [s]", "velocity P [A*s/rad]", "velocity T_i [s]", "position P [1/s]")
+MARGIN_NAMES = {
+    "phase_deg": "phase margin [deg]",
+    "gain_db": "gain margin [dB]",
+    "crossover_hz": "crossover [Hz]",
+    "bandwidth_hz": "bandwidth [Hz]",
+    "ms": "Ms",
+}
+
+
+def identified(identification: Identification) -> dict[str, Parameter]:
+    """Return what was identified as a certificate has it."""
+    return {name: Parameter(*estimate) for name, estimate in identification.estimates.items()}
+
+
+def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, float]:
+    """Return raw gains, five integers in the order of `Gains`, in SI with their units in the names."""
+    from drive_env.gains import Gains, gains_in_si
+
+    return dict(zip(SI_NAMES, gains_in_si(device, supply, Gains(*map(int, gains))), strict=True))
+
+
+def envelope(target: Target, axis: int = 0) -> dict[str, float]:
+    """Return what a target allows of one of its axes."""
+    return {
+        "travel low [rad]": float(target.low[axis]),
+        "travel high [rad]": float(target.high[axis]),
+        "speed [rad/s]": float(target.speed),
+        "current [A]": float(target.current),
+    }
+
+
+def frequency_response(
+    name: str,
+    f: ArrayLike,
+    open_loop: ArrayLike,
+    margins: Margins,
+    *,
+    tuned: bool,
+    coherence: ArrayLike | None = None,
+    source: str = "",
+) -> FrequencyResponse:
+    """Return an open loop, complex of shape (n,) at frequencies [Hz], as a certificate has it; nan was not seen."""
+    L = np.asarray(open_loop, complex)
+    seen = np.isfinite(L) & (L != 0.0)
+    magnitude, phase = np.full(L.shape, np.nan), np.full(L.shape, np.nan)
+    magnitude[seen] = 20.0 * np.log10(np.abs(L[seen]))
+    phase[seen] = np.degrees(np.unwrap(np.angle(L[seen])))
+    return FrequencyResponse(
+        name,
+        tuned,
+        np.asarray(f, float),
+        magnitude,
+        phase,
+        np.full(L.shape, np.nan) if coherence is None else np.asarray(coherence, float),
+        {MARGIN_NAMES[key]: float(value) for key, value in margins._asdict().items()},
+        source,
+    )
+
+
+# --- reading and checking ---------------------------------------------------------------------------------------------
+def content_hash(content: Mapping[str, Any]) -> str:
+    """Return the hash over a certificate's content: over its JSON with sorted keys and no white space."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
+    """Return the certificate of a JSON file, and whether it is unchanged since it was written.
+
+    Raises:
+        CertificateError: If the file is no certificate.
+    """
+    data = _read(Path(path))
+    stated = data.pop(HASH)
+    unchanged = content_hash(data) == stated
+    data.pop("format")
+    try:
+        return _built(Certificate, data), unchanged
+    except (KeyError, TypeError, ValueError) as error:
+        raise CertificateError(f"{path} is no certificate of this version: {error}") from None
+
+
+def is_unchanged(path: str | Path) -> bool:
+    """Return whether a certificate.json, or a report.html, is as it was written.
+
+    Raises:
+        CertificateError: If the file is neither.
+    """
+    where = Path(path)
+    if where.suffix == ".html":
+        from tuning.report import html_is_unchanged
+
+        return html_is_unchanged(_text(where))
+    data = _read(where)
+    return bool(content_hash({k: v for k, v in data.items() if k != HASH}) == data[HASH])
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(_text(path), parse_constant=_no_constant)
+    except ValueError as error:
+        raise CertificateError(f"{path} is no certificate: {error}; give a certificate.json of drive-tune") from None
+    if not isinstance(data, dict) or HASH not in data or data.get("format") != FORMAT:
+        raise CertificateError(f"{path} is no certificate of format {FORMAT}; give a certificate.json of drive-tune")
+    return data
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise CertificateError(f"cannot read {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise CertificateError(f"{path} is no text; give a certificate.json of drive-tune") from None
+
+
+def _no_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no JSON")
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can have it."""
+    if is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else "inf" if value > 0 else "-inf"
+    return value
+
+
+def _built(kind: type, data: Mapping[str, Any]) -> Any:
+    """Return a dataclass from what `_plain` made of it."""
+    return kind(**{f.name: _value(str(f.type), data[f.name]) for f in fields(kind)})
+
+
+def _value(kind: str, value: Any) -> Any:
+    if kind in _NESTED:
+        return tuple(_built(_NESTED[kind], item) for item in value)
+    if kind == "Floats":
+        return np.array([_number(item) for item in value], float)
+    if kind == "float":
+        return _number(value)
+    if kind == "Mapping[str, float]":
+        return {name: _number(item) for name, item in value.items()}
+    if kind == "Mapping[str, Parameter]":
+        return {name: _built(Parameter, item) for name, item in value.items()}
+    return tuple(value) if kind.startswith("tuple[") else value
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
+
+
+_NESTED: dict[str, type] = {
+    "tuple[AxisCertificate, ...]": AxisCertificate,
+    "tuple[StepResponse, ...]": StepResponse,
+    "tuple[FrequencyResponse, ...]": FrequencyResponse,
+}

@@ -1,0 +1,136 @@
+"""`drive-tune auto`: one button."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tuning.commands.options import (
+    REFUSED,
+    Bitrate,
+    Bus,
+    Channel,
+    DeviceName,
+    Interface,
+    Json,
+    LoadName,
+    Machines,
+    MotorName,
+    Nodes,
+    Randomise,
+    Seed,
+    Supply,
+    TravelRange,
+    Yes,
+    errors_as_exit_codes,
+    open_target,
+    print_json,
+    progress_bar,
+)
+
+if TYPE_CHECKING:
+    from tuning.auto import Result
+    from tuning.target import Target
+
+
+def auto(
+    bus: Bus = False,
+    device: DeviceName = "tmcm1636",
+    motor: MotorName = "qbl4208",
+    load: LoadName = "two_mass",
+    seed: Seed = 0,
+    machines: Machines = 1,
+    randomise: Randomise = False,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    bitrate: Bitrate = None,
+    supply: Supply = None,
+    travel: TravelRange = None,
+    store: Annotated[
+        bool, typer.Option("--store/--no-store", help="Have drives on a bus keep the gains over a power cycle.")
+    ] = True,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-auto")
+    ] = None,
+    yes: Yes = False,
+    json: Json = False,
+) -> None:
+    """Tune a drive: check, identify, compute, try, verify, write and keep; what fails a check is rolled back.
+
+    The motor turns, for less than 10 s in all. Writes before.toml, from which `drive-tune restore` brings back what
+    was, certificate.json and report.html. Exit code 1 if an axis was rolled back; why is said.
+    """
+    with errors_as_exit_codes():
+        from drive_env.tools.options import ask
+        from tuning import provenance
+
+        folder = provenance.run_folder("auto") if out is None else out
+        provenance.check_folder(folder)
+        if bus:
+            ask(f"The motor of node {', '.join(map(str, node or [1]))} will turn. Is its way clear?", yes)
+        with open_target(
+            bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
+            interface=interface, channel=channel, nodes=node, bitrate=bitrate, supply=supply, travel=travel,
+        ) as target:  # fmt: skip
+            result = _run(target, folder, seed, store)
+            _report(target, result, folder, seed, json)
+        if not result.accepted.all():
+            raise typer.Exit(REFUSED)
+
+
+def _run(target: Target, folder: Path, seed: int, store: bool) -> Result:
+    from tuning.auto import auto as tune
+
+    with progress_bar("tuning") as show:
+        return tune(target, folder / "before.toml", seed=seed, keep=store, progress=lambda what, share: show(share))
+
+
+def _report(target: Target, result: Result, folder: Path, seed: int, json: bool) -> None:
+    from tuning.auto_certificate import certificate
+
+    written = certificate(target, result, seed).save(folder)
+    if json:
+        rows = [
+            {
+                "axis": k,
+                "accepted": axis.accepted,
+                "reason": axis.reason,
+                "before": axis.before._asdict(),
+                "after": axis.after._asdict(),
+                "notes": axis.notes,
+            }
+            for k, axis in enumerate(result.axes)
+        ]
+        summary = {"drive seconds": result.drive_seconds.tolist(), "stored": result.kept}
+        files = {"snapshot": str(result.file), "certificate": str(written[0]), "report": str(written[1])}
+        print_json({"axes": rows} | summary | files)
+        return
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD)
+    for title in ("axis", "", "torque P, I", "velocity P, I", "position P", "phase\ndeg", "gain\ndB"):
+        table.add_column(title)
+    for k, axis in enumerate(result.axes):
+        for name, gains in (("before", axis.before), ("after", axis.after)):
+            found = axis.margins if name == "after" and axis.accepted else None
+            margins = ("", "") if found is None else (f"{found.phase_deg:.0f}", f"{found.gain_db:.0f}")
+            pairs = f"{gains.torque_p}, {gains.torque_i}", f"{gains.velocity_p}, {gains.velocity_i}"
+            table.add_row(str(k) if name == "before" else "", name, *pairs, str(gains.position_p), *margins)
+    console = Console()
+    console.print(table)
+    lines = []
+    for k, axis in enumerate(result.axes):
+        if not axis.accepted:
+            lines.append(f"axis {k} was rolled back: {axis.reason}")
+        lines += [f"axis {k}: {note}" for note in axis.notes]
+    kept = "; the drive keeps the gains" if result.kept else ""
+    lines.append(f"{result.drive_seconds.max():.1f} s of drive time, {int(result.aborts.sum())} trials stopped{kept}")
+    lines.append(f"written to {folder}: before.toml, certificate.json, report.html")
+    if target.bus:
+        lines.append(f"drive-tune restore {result.file} brings back what was")
+    console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,131 @@
+"""`drive-tune identify`: what an axis's own signals say of its motor and machine, with intervals."""
+
+from __future__ import annotations
+
+import json as json_
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tuning.commands.options import (
+    REFUSED,
+    Bitrate,
+    Bus,
+    Channel,
+    DeviceName,
+    Interface,
+    Json,
+    LoadName,
+    Lockstep,
+    Machines,
+    MotorName,
+    Nodes,
+    Randomise,
+    Seed,
+    Supply,
+    TravelRange,
+    errors_as_exit_codes,
+    open_target,
+    print_json,
+    progress_bar,
+)
+
+if TYPE_CHECKING:
+    from tuning.identification import Identification
+
+TITLES = {
+    "resistance": "winding resistance, a phase",
+    "inductance": "winding inductance, a phase",
+    "pole_pairs": "pole pairs",
+    "encoder_direction": "encoder direction",
+    "inertia": "inertia (J/K_t, times the data sheet's K_t)",
+    "coulomb": "dry friction, over K_t",
+    "viscous": "viscous friction, over K_t",
+    "offset": "gravity or constant load, over K_t",
+    "anti_resonance": "anti-resonance",
+    "resonance": "resonance",
+    "loop_delay": "delay of the velocity loop",
+    "velocity_filter": "velocity filter",
+}
+
+
+def identify(
+    bus: Bus = False,
+    device: DeviceName = "tmcm1636",
+    motor: MotorName = "qbl4208",
+    load: LoadName = "two_mass",
+    seed: Seed = 0,
+    machines: Machines = 1,
+    randomise: Randomise = False,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    bitrate: Bitrate = None,
+    lockstep: Lockstep = False,
+    supply: Supply = None,
+    travel: TravelRange = None,
+    out: Annotated[Path | None, typer.Option("--out", help="File for the results (JSON).")] = None,
+    json: Json = False,
+) -> None:
+    """Identify axes: winding, encoder, inertia, friction, gravity, resonance, delay and filter.
+
+    The motor turns: there and back within --travel, up to its rated current and 0.7 of its rated speed. Every value
+    has a 95 % interval; what cannot be told is refused with its reason. Afterwards the drive is off and has its own
+    parameters.
+    """
+    with errors_as_exit_codes():
+        if out is not None and not out.parent.is_dir():
+            raise ValueError(f"there is no folder {out.parent} for --out; make it first")
+        from tuning.identification import identify as run
+
+        with open_target(
+            bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
+            interface=interface, channel=channel, nodes=node, bitrate=bitrate, lockstep=lockstep, supply=supply,
+            travel=travel,
+        ) as target, progress_bar("identifying") as show:  # fmt: skip
+            found = run(target, progress=lambda what, share: show(share))
+        rows = [row(one) for one in found]
+        if out is not None:
+            out.write_text(json_.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        if json:
+            print_json(rows)
+        else:
+            _print(found)
+            if out is not None:
+                print(f"written to {out}")
+        if not any(estimate.is_known for one in found for estimate in one.estimates.values()):
+            raise typer.Exit(REFUSED)
+
+
+def row(found: Identification) -> dict[str, Any]:
+    """Return an identification as JSON knows it: nan, which it does not know, is null."""
+    estimates = {
+        name: {key: None if isinstance(value, float) and not math.isfinite(value) else value
+               for key, value in estimate._asdict().items()}
+        for name, estimate in found.estimates.items()
+    }  # fmt: skip
+    return {"drive_time": found.drive_time, "estimates": estimates}
+
+
+def _print(found: list[Identification]) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    for axis, one in enumerate(found):
+        title = f"axis {axis}: " if len(found) > 1 else ""
+        table = Table(box=box.SIMPLE_HEAD, title=f"{title}{one.drive_time:.1f} s of drive time", title_justify="left")
+        for column in ("", "value", "95 % interval", "unit"):
+            table.add_column(column, justify="right" if column == "value" else "left")
+        for name, estimate in one.estimates.items():
+            if estimate.is_known:
+                table.add_row(
+                    TITLES[name], f"{estimate.value:.4g}", f"{estimate.low:.4g} to {estimate.high:.4g}",
+                    "" if estimate.unit == "1" else estimate.unit,
+                )  # fmt: skip
+            else:
+                table.add_row(TITLES[name], "-", estimate.reason, "")
+        console.print(table)

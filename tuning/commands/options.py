@@ -1,0 +1,183 @@
+"""What the commands of `drive-tune` have in common: options, the target that they name, progress, and how they end."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from drive_env.tools.options import Bitrate as Bitrate
+from drive_env.tools.options import Channel as Channel
+from drive_env.tools.options import Interface as Interface
+from drive_env.tools.options import Json as Json
+from drive_env.tools.options import Nodes as Nodes
+from drive_env.tools.options import Yes as Yes
+from drive_env.tools.options import print_json as print_json
+
+if TYPE_CHECKING:
+    from tuning.target import Target
+
+# Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
+REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
+
+DeviceName = Annotated[str, typer.Option("--device", help="Drive by name.")]
+MotorName = Annotated[str, typer.Option("--motor", help="Motor by name; its data sheet values are taken.")]
+LoadName = Annotated[str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random.")]
+Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results, new or empty.")]
+Bus = Annotated[bool, typer.Option("--bus", help="Use the drives on a bus, inside the safety envelope.")]
+Lockstep = Annotated[bool, typer.Option("--lockstep", help="Let time pass by SYNC, for an emulator that is served so.")]
+Supply = Annotated[
+    float | None,
+    typer.Option("--supply", help="Supply voltage at the drive [V].", show_default="the motor's"),
+]
+TravelRange = Annotated[
+    str | None,
+    typer.Option(
+        "--travel",
+        help="How far the rotor may turn from where it stands [turns]: LOW:HIGH, e.g. -0.15:0.15, or free. "
+        "Needed on a bus; an emulated load knows its own.",
+    ),
+]
+Machines = Annotated[int, typer.Option("--machines", help="Emulated machines.")]
+Randomise = Annotated[bool, typer.Option("--randomise", help="Draw every machine's parameters.")]
+Workers = Annotated[
+    int | None,
+    typer.Option("--workers", help="Processes of this machine.", show_default="this process, with a thread per core"),
+]
+Cluster = Annotated[
+    str | None, typer.Option("--cluster", help="Dask scheduler on whose workers to run: tcp://host:port.")
+]
+Resume = Annotated[
+    bool, typer.Option("--resume", help="Go on with what a run into this --out left when it was stopped, if anything.")
+]
+
+
+def parse_travel(text: str) -> tuple[float, float]:
+    """Return how far a rotor may turn [rad] from LOW:HIGH in turns, or `free`.
+
+    Raises:
+        ValueError: For anything else.
+    """
+    if text == "free":
+        return -math.inf, math.inf
+    low, colon, high = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError(text)
+        ends = float(low) * 2.0 * math.pi, float(high) * 2.0 * math.pi
+    except ValueError:
+        raise ValueError(f"--travel {text} must be LOW:HIGH in turns, e.g. -0.15:0.15, or free") from None
+    if not ends[0] <= 0.0 <= ends[1] or not ends[0] < ends[1]:
+        raise ValueError(f"--travel {text} must hold 0, where the rotor stands; give what is free to both sides")
+    return ends
+
+
+def open_target(
+    *,
+    bus: bool = False,
+    device: str = "tmcm1636",
+    motor: str = "qbl4208",
+    load: str = "two_mass",
+    seed: int = 0,
+    machines: int = 1,
+    randomise: bool = False,
+    interface: str | None = None,
+    channel: str | None = None,
+    nodes: list[int] | None = None,
+    bitrate: int | None = None,
+    lockstep: bool = False,
+    supply: float | None = None,
+    travel: str | None = None,
+) -> Target:
+    """Return what a command's options name: drives on a bus if any of the bus's options is given, or emulated ones.
+
+    Raises:
+        ValueError: For a name that does not exist, or a bus without a travel; BusError if a node does not answer.
+    """
+    from tuning.target import emulated, on_bus
+
+    # Interface and channel may stand in the environment: alone they say nothing, and a motor must not turn by surprise.
+    if not bus:
+        if nodes or bitrate is not None or lockstep:
+            raise ValueError("--node, --bitrate and --lockstep are of drives on a bus; add --bus, or leave them out")
+        ends = None if travel is None else parse_travel(travel)
+        return emulated(
+            device, load, motor, num_machines=machines, seed=seed, randomise=randomise, supply=supply, travel=ends
+        )
+    if travel is None:
+        raise ValueError("--travel is missing: how far may the motor turn? Give LOW:HIGH in turns, or free")
+    options: dict[str, Any] = {} if bitrate is None else {"bitrate": bitrate}
+    if lockstep:
+        options["pace"] = "lockstep"
+    return on_bus(
+        device,
+        motor,
+        interface=interface,
+        channel=channel,
+        nodes=nodes or (1,),
+        supply=supply,
+        travel=parse_travel(travel),
+        **options,
+    )
+
+
+@contextmanager
+def errors_as_exit_codes() -> Iterator[None]:
+    """End with one line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
+    from drive_env.dictionary.access import ObjectAccessError
+    from drive_env.master.errors import BusError, OpenError
+    from drive_env.safety import SafetyError
+    from tuning.pools import PoolError
+
+    try:
+        yield
+    except OpenError as error:
+        fail(error)
+    except (SafetyError, BusError, PoolError, TimeoutError) as error:
+        fail(error, REFUSED)
+    except (ObjectAccessError, ValueError) as error:
+        fail(error)
+    except RuntimeError as error:  # motion: an axis is in fault
+        if type(error) is not RuntimeError:
+            raise
+        fail(error, REFUSED)
+    except OSError as error:
+        fail(f"{error.filename}: {error.strerror}" if error.filename else error)
+    except KeyboardInterrupt:
+        fail("interrupted", INTERRUPTED)
+
+
+@contextmanager
+def progress_bar(description: str) -> Iterator[Callable[[float], None]]:
+    """Show a bar on stderr while something long goes on; what is given takes the share done, 0 to 1."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(description, total=1.0)
+        yield lambda share: progress.update(task, completed=share)
+
+
+def fail(error: object, code: int = USER_ERROR) -> NoReturn:
+    """End the command with a line on stderr."""
+    print(f"drive-tune: {error}", file=sys.stderr)
+    raise typer.Exit(code)
+
+
+def interrupted() -> NoReturn:
+    """End the command as Ctrl-C does while nothing has been written yet."""
+    print("drive-tune: interrupted; nothing was written", file=sys.stderr)
+    sys.exit(INTERRUPTED)

@@ -1,0 +1,193 @@
+"""`drive-tune response`: the frequency response of an axis's velocity or position loop, with its margins."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tuning.commands.options import (
+    Bitrate,
+    Bus,
+    Channel,
+    DeviceName,
+    Interface,
+    Json,
+    LoadName,
+    Lockstep,
+    Machines,
+    MotorName,
+    Nodes,
+    Out,
+    Randomise,
+    Seed,
+    Supply,
+    TravelRange,
+    Yes,
+    errors_as_exit_codes,
+    open_target,
+    print_json,
+    progress_bar,
+)
+
+if TYPE_CHECKING:
+    from tuning.frequency_response import FrequencyResponse
+
+COLUMNS = (
+    "frequency [Hz]", "gain [dB]", "phase [deg]", "coherence", "trusted", "source",
+)  # fmt: skip
+
+
+def response(
+    loop: Annotated[str, typer.Argument(help="velocity or position.")] = "velocity",
+    bus: Bus = False,
+    device: DeviceName = "tmcm1636",
+    motor: MotorName = "qbl4208",
+    load: LoadName = "two_mass",
+    seed: Seed = 0,
+    machines: Machines = 1,
+    randomise: Randomise = False,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    bitrate: Bitrate = None,
+    lockstep: Lockstep = False,
+    supply: Supply = None,
+    travel: TravelRange = None,
+    signal: Annotated[str, typer.Option("--signal", help="What shakes the axis: multisine or chirp.")] = "multisine",
+    low: Annotated[float | None, typer.Option("--low", help="Lowest frequency [Hz].", show_default="5")] = None,
+    high: Annotated[
+        float | None,
+        typer.Option("--high", help="Highest frequency [Hz], up to 400.", show_default="400; 50 of the position loop"),
+    ] = None,
+    resolution: Annotated[float, typer.Option("--resolution", help="Distance of two frequencies [Hz].")] = 5.0,
+    trace: Annotated[
+        bool, typer.Option("--trace", help="Look above 400 Hz, through the emulator's trace; not on a bus.")
+    ] = False,
+    out: Out = None,
+    yes: Yes = False,
+    json: Json = False,
+) -> None:
+    """Shake the axes with the gains they have and show open loop, coherence and margins.
+
+    The axes run there and back at a steady speed, for about two seconds, and end where they began. With --out, a
+    picture and a CSV of each axis are written. What is not coherent is grey, and no margin is read from it.
+    """
+    with errors_as_exit_codes():
+        from drive_env.tools.options import ask
+        from tuning import provenance
+        from tuning.frequency_response import measure
+
+        if out is not None:
+            provenance.check_folder(out)
+        if bus:
+            ask(f"The motor of node {', '.join(map(str, node or [1]))} will turn. Is its way clear?", yes)
+        with open_target(
+            bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
+            interface=interface, channel=channel, nodes=node, bitrate=bitrate, lockstep=lockstep, supply=supply,
+            travel=travel,
+        ) as target, progress_bar("shaking") as show:  # fmt: skip
+            measured = measure(
+                target, loop, kind=signal, low=low, high=high, resolution=resolution, traced=trace, progress=show
+            )
+        if out is not None:
+            _write(out, measured)
+        if json:
+            print_json(_as_json(measured))
+        else:
+            _print(measured, out)
+
+
+def _axes(measured: FrequencyResponse) -> range:
+    return range(measured.open_loop.shape[1])
+
+
+def _write(folder: Path, measured: FrequencyResponse) -> None:
+    import numpy as np
+
+    from tuning.bode import write_bode
+    from tuning.provenance import new_folder
+
+    with new_folder(folder) as partial:
+        for axis in _axes(measured):
+            name = f"{measured.loop}_axis{axis}"
+            write_bode(partial / f"{name}.png", measured, axis)
+            with (partial / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+                table = csv.writer(file)
+                table.writerow(COLUMNS)
+                for k, f in enumerate(measured.f):
+                    L = measured.open_loop[k, axis]
+                    known = bool(np.isfinite(L)) and L != 0.0
+                    gain = 20.0 * math.log10(abs(L)) if known else math.nan
+                    phase = math.degrees(np.angle(L)) if known else math.nan
+                    source = "emulator's trace" if measured.traced[k] else "bus"
+                    trusted = int(measured.trusted[k, axis])
+                    row = (f"{gain:.4f}", f"{phase:.3f}", f"{measured.coherence[k, axis]:.4f}", trusted, source)
+                    table.writerow((f"{f:g}", *row))
+
+
+def _as_json(measured: FrequencyResponse) -> list[dict[str, Any]]:
+    rows = []
+    for axis in _axes(measured):
+        on_bus = ~measured.traced
+        rows.append(
+            {
+                "axis": axis,
+                "loop": measured.loop,
+                "gains": [int(gain) for gain in measured.gains[axis]],
+                "margins": {name: _or_none(value) for name, value in measured.margins(axis)._asdict().items()},
+                "coherent": float(measured.trusted[on_bus, axis].mean()),
+                "plant": _plant(measured, axis),
+                "peak_current_a": _or_none(measured.peak_current[axis]),
+                "drive_time_s": measured.drive_time,
+                "notes": list(measured.notes[axis]),
+            }
+        )
+    return rows
+
+
+def _plant(measured: FrequencyResponse, axis: int) -> dict[str, Any] | None:
+    if measured.fits[axis] is None:
+        return None
+    return {
+        name: {"value": _or_none(e.value), "low": _or_none(e.low), "high": _or_none(e.high), "unit": e.unit}
+        | ({"reason": e.reason} if e.reason else {})
+        for name, e in measured.estimates(axis).items()
+    }
+
+
+def _print(measured: FrequencyResponse, out: Path | None) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    table = Table(title=f"{measured.loop} loop", title_justify="left", box=box.SIMPLE_HEAD)
+    titles = ("axis", "phase margin\ndeg", "gain margin\ndB", "crossover\nHz", "bandwidth\nHz", "Ms", "coherent\n%")
+    for title in titles:
+        table.add_column(title, justify="right")
+    for axis in _axes(measured):
+        coherent = 100.0 * float(measured.trusted[~measured.traced, axis].mean())
+        figures = (*measured.margins(axis), coherent)
+        table.add_row(str(axis), *(_text(x, "{:.2f}" if k == 4 else "{:.1f}") for k, x in enumerate(figures)))
+    console.print(table)
+    for axis in _axes(measured):
+        if measured.fits[axis] is not None:
+            for name, e in measured.estimates(axis).items():
+                said = e.reason if e.reason else f"{e.value:.4g} {e.unit} ({e.low:.4g} ... {e.high:.4g})"
+                console.print(f"axis {axis}: {name} {said}", highlight=False, markup=False, soft_wrap=True)
+        for note in measured.notes[axis]:
+            console.print(f"axis {axis}: {note}", highlight=False, markup=False, soft_wrap=True)
+    written = "" if out is None else f"; written to {out}"
+    console.print(f"{measured.drive_time:.2f} s of drive time{written}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _text(value: float, form: str) -> str:
+    return form.format(value) if math.isfinite(value) else "infinite" if value == math.inf else "not seen"
+
+
+def _or_none(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

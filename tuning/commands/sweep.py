@@ -1,0 +1,239 @@
+"""`drive-tune sweep`: every point of a grid of gains on a machine of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import warnings
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tuning.commands.options import INTERRUPTED, Cluster, Resume, Workers, errors_as_exit_codes, fail
+
+BEST_ROWS = 10
+TABLE_FIGURES = ("settling [s]", "overshoot [%]", "dip [rpm]", "ripple [A]")
+
+
+def sweep(
+    config: Annotated[Path | None, typer.Option(help="Experiment (TOML); by default the one that ships.")] = None,
+    device: Annotated[str | None, typer.Option(help="Drive, in place of the experiment's.")] = None,
+    motor: Annotated[str | None, typer.Option(help="Motor, in place of the experiment's.")] = None,
+    load: Annotated[str | None, typer.Option(help="Load, in place of the experiment's.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed, in place of the experiment's.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-sweep")
+    ] = None,
+    show_config: Annotated[bool, typer.Option("--show-config", help="Print the experiment and stop.")] = False,
+    workers: Workers = None,
+    cluster: Cluster = None,
+    resume: Resume = False,
+    list_names: Annotated[
+        bool, typer.Option("--list", help="List devices, gains, motors, loads and metrics, and stop.")
+    ] = False,
+) -> None:
+    """Try a grid of gains, each on the same emulated machine with the same velocity and load torque step.
+
+    Prints the best and writes results.csv, heatmap.png, best_response.png and settings.toml, from which
+    `drive-tune sweep --config settings.toml` repeats the run to the last digit. Stopped at any point, it goes on with
+    --out and --resume, to the same digits.
+    """
+    overrides = {"device": device, "motor": motor, "load": load, "seed": seed}
+    with errors_as_exit_codes():
+        if list_names:
+            _list_names()
+        elif show_config:
+            _show_config(config, overrides)
+        else:
+            from tuning import provenance
+
+            if resume and out is None:
+                raise ValueError("--resume needs --out: the folder into which the run was to write")
+            folder = provenance.run_folder("sweep") if out is None else out
+            try:
+                _sweep(config, overrides, folder, workers, cluster, resume)
+            except KeyboardInterrupt:
+                fail(_interrupted(folder), INTERRUPTED)
+
+
+def _interrupted(folder: Path) -> str:
+    """Return what an interrupt leaves."""
+    from tuning import unfinished
+
+    if unfinished.unfinished_folder(folder).exists():
+        return f"interrupted; what is done is kept; go on with --out {folder} --resume"
+    return "interrupted; nothing was written"
+
+
+def _sweep(
+    config: Path | None,
+    overrides: dict[str, Any],
+    folder: Path,
+    workers: int | None,
+    cluster: str | None,
+    resume: bool,
+) -> None:
+    from rich.console import Console
+
+    from tuning import provenance, unfinished
+    from tuning.experiment import load_experiment
+    from tuning.pools import open_pool
+
+    console = Console()
+    provenance.check_folder(folder)
+    if config is None and resume and not any(value is not None for value in overrides.values()):
+        config = unfinished.settings_of(folder)
+    experiment = load_experiment(config, **overrides)
+    for line in provenance.differences(experiment.versions):
+        _note(console, line)
+    settings = provenance.HEADER + experiment.to_toml(provenance.versions())
+    with unfinished.shard_log(folder, settings, resume=resume) as log:
+        if log.done:
+            _note(console, f"goes on from {len(log.done)} shards that are done")
+        with open_pool(workers, cluster) as pool:
+            for line in pool.differences():
+                _note(console, line)
+            elsewhere = workers is not None or cluster is not None
+            result = _run_with_progress(experiment, console, pool if elsewhere else None, log, folder)
+    result.save(folder)
+    unfinished.discard(folder)
+    _print_result(console, result, folder)
+
+
+def _note(console: Any, text: str) -> None:
+    console.print(f"note: {text}", highlight=False, markup=False)
+
+
+def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folder: Path) -> Any:
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    from tuning import unfinished
+    from tuning.sweep import run
+
+    texts = {
+        "compiling": "loading the kernels (the first time: 40 seconds)",
+        "simulating": f"simulating {experiment.size()} machines",
+    }
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+    )
+
+    said: set[str] = set()
+
+    def say(message: Warning | str, *_: object, **__: object) -> None:
+        """Show a warning, of a machine that its motor cannot move, as a line and once."""
+        if str(message) not in said:
+            said.add(str(message))
+            _note(console, str(message))
+
+    def stop(*_: object) -> None:
+        # Not by an exception: raised while the compiler calls back into Python it would be printed and lost.
+        console.show_cursor(True)
+        if not log.holds_results:
+            unfinished.discard(folder)
+        print(f"\ndrive-tune: {_interrupted(folder)}", file=sys.stderr, flush=True)
+        os._exit(INTERRUPTED)
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        with Progress(*columns, console=console) as progress, warnings.catch_warnings():
+            warnings.showwarning = say
+            task = progress.add_task(texts["compiling"], total=1.0)
+            return run(
+                experiment,
+                lambda what, share: progress.update(task, description=texts[what], completed=share),
+                pool=pool,
+                log=log,
+            )
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _print_result(console: Any, result: Any, folder: Path) -> None:
+    usable = int((result.score < float("inf")).sum())
+    if usable:
+        console.print(_best_table(result, min(BEST_ROWS, usable)))
+    counts = ", ".join(
+        f"{int(result.columns[flag].sum())} {word}"
+        for flag, word in (("oscillates", "oscillate"), ("fault", "end in fault"), ("diverged", "diverge"))
+    )
+    lines = [f"{usable} of {len(result.order)} points are usable; {counts}."]
+    if not usable:
+        lines.append("No point is usable: choose other ranges; heatmap.png and results.csv show what there is.")
+    lines += [f"{name} changes nothing in this excitation." for name in result.without_effect()]
+    if result.simulated > 0.0:
+        lines.append(
+            f"simulated {result.simulated:.0f} s of drive time in {result.wall:.2f} s: "
+            f"{result.simulated / result.wall:.0f} x real time"
+        )
+    lines.append(f"written to {folder}: results.csv, heatmap.png, best_response.png, settings.toml")
+    console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+
+
+def _best_table(result: Any, count: int) -> Any:
+    from rich import box
+    from rich.table import Table
+
+    metric = result.experiment.metric.name
+    figures = [name for name in TABLE_FIGURES if not name.startswith(f"{metric} [")]
+    # Seven columns fit a terminal of 80 characters.
+    columns = [*result.objects, result.score_column, *figures[: max(0, 6 - len(result.objects))]]
+    table = Table(title=f"The best {count} of {len(result.order)} points by {metric}", box=box.SIMPLE_HEAD)
+    table.add_column("#", justify="right")
+    for name in columns:
+        # Seconds are read as milliseconds; a bracket would be taken for markup.
+        text = name.replace("score", metric).replace("[s]", "[ms]").replace(" [", "\n\\[")
+        table.add_column(text, justify="right", no_wrap=True)
+    for row in result.best(count):
+        cells = (1e3 * row[name] if name.endswith("[s]") else row[name] for name in columns)
+        table.add_row(str(row["rank"]), *(str(cell) if isinstance(cell, int) else f"{cell:.4g}" for cell in cells))
+    return table
+
+
+def _show_config(config: Path | None, overrides: dict[str, Any]) -> None:
+    from tuning.experiment import DEFAULT, load_experiment
+
+    experiment = load_experiment(config, **overrides)
+    if any(value is not None for value in overrides.values()):
+        text = experiment.to_toml(experiment.versions)
+    else:
+        text = (config or DEFAULT).read_text(encoding="utf-8")
+    sys.stdout.write(text)
+
+
+def _list_names() -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from drive_env.devices import device_names, find_device
+    from drive_env.motors import MOTORS
+    from mechanics.loads import LOADS
+    from tuning.experiment import gain_objects
+    from tuning.metrics import METRICS, TRACKING
+
+    devices = [find_device(name) for name in device_names()]
+    gains = [(device, entry) for device in devices for entry in gain_objects(device, device.new_dictionary())]
+    combined = f"{TRACKING.meaning} (weights {', '.join(TRACKING.weights)})"
+    tables = {
+        "devices": [(device.name, device.title) for device in devices],
+        "gains to sweep": [
+            (f"{e.index:04X}h:{e.sub:02X}", f"{e.name}, {e.low}...{e.high} ({d.name})") for d, e in gains
+        ],
+        "motors": [(motor.name, motor.title) for motor in MOTORS.values()],
+        "loads": [(load.name, load.meaning) for load in LOADS.values()],
+        "metrics": [(f"{TRACKING.name} [{TRACKING.unit}]", combined)]
+        + [(f"{row.name} [{row.unit}]", row.meaning) for row in METRICS.values()],
+    }
+    console = Console()
+    for title, rows in tables.items():
+        table = Table(title=title, title_justify="left", box=None, show_header=False, pad_edge=False)
+        for name, meaning in rows:
+            table.add_row(name.replace("[", "\\["), meaning)
+        console.print(table)
+        console.print()

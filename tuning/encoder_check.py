@@ -1,0 +1,188 @@
+"""Pole pairs and direction of the encoder: the field is turned in open loop, and the encoder must follow it.
+
+With commutation in open loop (2055h) the current of 2004h points along an angle that the velocity demand turns
+(2102h). The rotor follows: electrical turns of the field over turns that the encoder counts are the pole pairs, and
+the sign says whether it counts in the direction in which the field turns. Commutation by encoder needs both to be
+right before any torque is commanded: a reversed encoder makes a motor run away.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.identification import Estimate, refused
+from tuning.working_state import (
+    BY_FIELD,
+    COMMUTATION,
+    CYCLE,
+    OPEN_LOOP_CURRENT,
+    POLE_PAIRS,
+    POSITION,
+    SHAFT_DIRECTION,
+    STATUS,
+    TARGET_VELOCITY,
+    Working,
+    enable,
+    still_enabled,
+    switch_off,
+)
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FIELD_ANGLE, ENCODER_ANGLE = 0x2102, 0x2103  # 1/65536 electrical turn
+RAISE, REST, TURN = 20, 60, 240  # cycles: the current comes (gravity does not wait), the rotor rests, the field turns
+MOST_TURN, LEAST_TURN = 1.0, 0.2  # electrical turns of the field
+SHARE = 0.9  # of what current there is
+MARGIN = 0.1  # rad of room that stays free
+TOLERANCE = 0.35  # of a pole pair: from here on a ratio is no whole number
+STUCK = 0.25  # of the field's turn: a rotor that follows less does not follow
+
+
+class EncoderCheck(NamedTuple):
+    """What the check says of one axis."""
+
+    pole_pairs: Estimate
+    direction: Estimate
+
+    @property
+    def is_good(self) -> bool:
+        """Whether torque may be commanded: nothing speaks against the drive's own settings."""
+        return not self.direction.is_known or self.direction.value > 0.0
+
+
+def check_encoders(working: Working) -> list[EncoderCheck]:
+    """Turn the fields of three-phase motors and return what the encoders say, axis by axis; all axes are off then."""
+    target, drives = working.target, working.target.drives
+    count = target.num_axes
+    if target.motor.kind == "dc":
+        none = refused("1", "a brushed motor has no pole pairs")
+        later = refused("1", "a brushed motor has no field to turn; see the current pulses")
+        return [EncoderCheck(none, later)] * count
+    configured = drives.read(POLE_PAIRS).astype(float)
+    commutation = drives.read(COMMUTATION)
+    turn, where, reasons = _plan(working)
+    if not where.any():
+        return [EncoderCheck(refused("1", reason), refused("1", reason)) for reason in reasons]
+    try:
+        drives.write(COMMUTATION, BY_FIELD, where=where)
+        drives.write(OPEN_LOOP_CURRENT, 0, where=where)
+        enable(working, "csv", where)
+        away, back, field = _turn(working, where, turn, configured)
+        alive = still_enabled(working, drives.read(STATUS))
+    finally:
+        switch_off(drives, where)
+        drives.write(OPEN_LOOP_CURRENT, 0, where=where)
+        drives.write(COMMUTATION, commutation, where=where)
+    # Counting up is the field's direction unless 2057h turns the sign of positions around.
+    shaft = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
+    found = []
+    for k in range(count):
+        if not where[k]:
+            found.append(EncoderCheck(refused("1", reasons[k]), refused("1", reasons[k])))
+        elif not alive[k]:
+            reason = "the drive switched off while the field turned; see its emergencies"
+            found.append(EncoderCheck(refused("1", reason), refused("1", reason)))
+        else:
+            found.append(_judge(field[k], shaft[k] * away[k], shaft[k] * back[k], target.motor.n_p))
+    return found
+
+
+def _plan(working: Working) -> tuple[Floats, Mask, list[str]]:
+    """Return how far the fields turn [electrical rad, with the sign], which axes can, and why the others cannot."""
+    target = working.target
+    n_p = target.motor.n_p
+    down, up = working.room()
+    # Switched on, the field pulls the rotor to itself: half an electrical turn at most.
+    swing = np.pi / n_p
+    sign = np.where(up >= -down, 1.0, -1.0)
+    room = np.where(sign > 0.0, up, -down) - MARGIN
+    other = np.where(sign > 0.0, -down, up) - MARGIN
+    way = np.minimum(room - swing, MOST_TURN * 2.0 * np.pi / n_p)
+    able = (way >= LEAST_TURN * 2.0 * np.pi / n_p) & (other >= swing)
+    needed = swing + LEAST_TURN * 2.0 * np.pi / n_p + MARGIN
+    reasons = [
+        ""
+        if able[k]
+        else f"travel too short: the rotor may swing by {swing:.2g} rad to the field and has to turn with it; that "
+        f"takes {swing + MARGIN:.2g} rad to one side and {needed:.2g} to the other, and there are {-down[k]:.2g} and "
+        f"{up[k]:.2g}"
+        for k in range(target.num_axes)
+    ]
+    return sign * way * n_p, working.where & able, reasons
+
+
+def _turn(working: Working, where: Mask, turn: Floats, configured: Floats) -> tuple[Floats, Floats, Floats]:
+    """Turn the fields there and back; return how far the rotors went [rad], there and back, and the field [rad]."""
+    drives = working.target.drives
+    current = np.rint(1e3 * SHARE * working.current).astype(np.int64)
+    for k in range(1, 5):
+        drives.write(OPEN_LOOP_CURRENT, current * k // 4, where=where)
+        drives.advance(RAISE // 4 * CYCLE)
+        _stay_inside(working, where)
+    stands = [_rest(working)]
+    # Smooth, so that the rotor does not swing: a raised cosine of speed.
+    shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(TURN) + 0.5) / TURN)
+    fields = [_field(working)]
+    for sign in (1.0, -1.0):
+        speed = sign * turn / configured / (TURN * CYCLE) * shape[:, None]
+        raw = np.where(where, np.rint(speed * working.increments), 0).astype(np.int64)
+        raw[-1] = 0
+        passed = np.zeros(len(turn))
+        before = fields[-1]
+        for k in range(0, TURN, TURN // 10):
+            drives.record([POSITION], TURN // 10 * CYCLE, play={TARGET_VELOCITY: raw[k : k + TURN // 10]})
+            now = _field(working)
+            passed += (now - before + np.pi) % (2.0 * np.pi) - np.pi
+            before = now
+            _stay_inside(working, where)
+        fields.append(before)
+        stands.append(_rest(working))
+        if sign > 0.0:
+            turned = passed
+    return stands[1] - stands[0], stands[2] - stands[1], turned
+
+
+def _stay_inside(working: Working, where: Mask) -> None:
+    """Switch off an axis that left its travel: it slipped from the field, and falls."""
+    down, up = working.room()
+    out = where & ((up < 0.0) | (down > 0.0))
+    if out.any():
+        switch_off(working.target.drives, out)
+
+
+def _field(working: Working) -> Floats:
+    return np.asarray(working.target.drives.read(FIELD_ANGLE) * (2.0 * np.pi / 65536.0))
+
+
+def _rest(working: Working) -> Floats:
+    """Return where the rotors come to rest [rad]."""
+    trace = working.target.drives.record([POSITION], 2 * REST * CYCLE)
+    return np.asarray(working.angle(trace[POSITION])[REST:].mean(axis=0))
+
+
+def _judge(field: float, away: float, back: float, expected: int) -> EncoderCheck:
+    """Return what a turn of the field [electrical rad] and the rotor's ways there and back [rad] say."""
+    rotor = 0.5 * (away - back)
+    would = field / expected
+    if abs(rotor) < STUCK * abs(would) or abs(away + back) > 0.5 * abs(away - back):
+        reason = (
+            f"the rotor did not follow the field: it went {away:.2g} rad there and {back:.2g} rad back, and "
+            f"{would:.2g} rad were expected; is it blocked, a phase open, the current too weak?"
+        )
+        return EncoderCheck(refused("1", reason), refused("1", reason))
+    ratio = field / rotor
+    direction = Estimate(float(np.sign(ratio)), float(np.sign(ratio)), float(np.sign(ratio)), "1")
+    # Where the rotor rests depends on friction: by half of what it went differently there and back.
+    spread = abs(away + back) / 2.0 / abs(rotor) * abs(ratio)
+    nearest = round(abs(ratio))
+    if nearest < 1 or abs(abs(ratio) - nearest) + spread > max(TOLERANCE, 0.02 * nearest):
+        reason = (
+            f"the field's electrical turns are {abs(ratio):.2f} (give or take {spread:.2f}) of those that the encoder "
+            "counts, which is no whole number: check the encoder's steps, 2080h:02, or allow more travel and current"
+        )
+        return EncoderCheck(refused("1", reason), direction)
+    return EncoderCheck(Estimate(float(nearest), float(nearest), float(nearest), "1"), direction)

@@ -1,0 +1,207 @@
+"""The order of the experiments of an identification: each needs what the ones before it found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import gains_from_bandwidths, write_gains
+from tuning.encoder_check import EncoderCheck, check_encoders
+from tuning.frequency_response import measure
+from tuning.identification import NAMES, Estimate, Identification, Progress, refused
+from tuning.inertia import Mechanics, identify_mechanics
+from tuning.target import Target, timed
+from tuning.winding import Winding, identify_winding, pulse, to_torque_mode
+from tuning.working_state import (
+    CURRENT,
+    CYCLE,
+    GUESS,
+    STATUS,
+    Working,
+    cautious_bandwidth,
+    cautious_gains,
+    enable,
+    go_back,
+    still_enabled,
+    swinging_allowed,
+    working_state,
+)
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+HOLD, STEADY = 160, 80  # cycles at rest before anything moves, and how many of them count
+FREQUENCY_CURRENT_HZ, FREQUENCY_VELOCITY_HZ = 800.0, 25.0  # of the loops in which the response is measured
+LEAST_ROOM = 1.2  # rad
+HIGHEST = 400.0  # Hz, of the response
+WORST_MISFIT = 2.0  # of the linear model, over what noise explains
+ELECTRICAL_ANGLE, SHAFT_DIRECTION, POLE_PAIRS = 0x2103, 0x2057, 0x2056
+UNITS = {
+    "resistance": "ohm", "inductance": "H", "pole_pairs": "1", "encoder_direction": "1", "inertia": "kg*m^2",
+    "coulomb": "A", "viscous": "A*s/rad", "offset": "A", "anti_resonance": "Hz", "resonance": "Hz",
+    "loop_delay": "s", "velocity_filter": "Hz",
+}  # fmt: skip
+RESPONSE = NAMES[NAMES.index("anti_resonance") :]
+
+
+class Experiments:
+    """One identification of some axes, side by side."""
+
+    def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
+        self._target, self._where, self._progress = target, where, progress
+        self._found: list[dict[str, Estimate]] = [
+            {name: refused(UNITS[name], "not asked for") for name in NAMES} for _ in range(target.num_axes)
+        ]
+
+    def run(self) -> list[Identification]:
+        """Do them all."""
+        with timed(self._target) as (target, clock), working_state(target, self._where) as working:
+            good = self._check(working)
+            if good.any():
+                self._turn(replace(working, where=good))
+        self._progress("done", 1.0)
+        return [Identification(found, clock.seconds if chosen else 0.0)
+                for found, chosen in zip(self._found, self._where, strict=True)]  # fmt: skip
+
+    def _check(self, working: Working) -> Mask:
+        """Check the encoders and return the axes whose torque may be commanded."""
+        self._progress("pole pairs and encoder", 0.0)
+        checks: list[EncoderCheck] = check_encoders(working)
+        good = working.where.copy()
+        for k in np.flatnonzero(working.where):
+            check = checks[k]
+            self._found[k] |= {"pole_pairs": check.pole_pairs, "encoder_direction": check.direction}
+            reason = self._wrong(working, int(k), check)
+            if reason:
+                good[k] = False
+                self._refuse(int(k), NAMES, reason)
+        return good
+
+    def _wrong(self, working: Working, k: int, check: EncoderCheck) -> str:
+        """Return why no torque may be commanded, if so."""
+        if not check.is_good:
+            return (
+                "the encoder counts against the field, and torque would make the motor run away: turn 2080h:01 (or "
+                "swap two motor phases), then identify again"
+            )
+        configured = int(working.target.drives.read(POLE_PAIRS)[k])
+        if check.pole_pairs.is_known and round(check.pole_pairs.value) != configured:
+            return (
+                f"the motor has {check.pole_pairs.value:.0f} pole pairs and 2056h says {configured}: torque would turn "
+                "with the angle; write the right number, then identify again"
+            )
+        if "did not follow" in check.direction.reason or "switched off" in check.direction.reason:
+            return check.direction.reason
+        return ""
+
+    def _turn(self, working: Working) -> None:
+        """Do what needs torque."""
+        target, drives = working.target, working.target.drives
+        self._progress("winding", 0.15)
+        enable(working, "csp")
+        go_back(working, "csp")
+        holding = self._hold(working)
+        electrical = drives.read(ELECTRICAL_ANGLE) * (2.0 * np.pi / 65536.0)
+        to_torque_mode(working, holding)
+        with swinging_allowed(target.drives):
+            pulses = pulse(working, holding)
+        gains = cautious_gains(target, GUESS * target.motor.inertia)
+        write_gains(drives, gains, working.where)
+        go_back(working, "csv")
+        sign = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
+        windings = identify_winding(working, pulses, electrical, float(target.motor.n_p) * float(sign[0]))
+        self._take_windings(working, windings)
+        self._progress("inertia and friction", 0.3)
+        mechanics, inertia = identify_mechanics(working, holding)
+        self._take_mechanics(working, mechanics)
+        self._progress("resonance, delay, filter", 0.7)
+        self._respond(working, inertia)
+        on = working.where & still_enabled(working, drives.read(STATUS))
+        if on.any():
+            go_back(replace(working, where=on), "csv", to=0.0)
+
+    def _hold(self, working: Working) -> Floats:
+        """Return what holds the axes [A], at rest in csp."""
+        drives = working.target.drives
+        trace = drives.record([CURRENT], HOLD * CYCLE)
+        alive = still_enabled(working, drives.read(STATUS))
+        for k in np.flatnonzero(working.where & ~alive):
+            self._refuse(int(k), NAMES[4:], "the drive switched off while it held the axis; see its emergencies")
+        return np.asarray(trace[CURRENT][-STEADY:].mean(axis=0) * 1e-3)
+
+    def _take_windings(self, working: Working, windings: list[Winding]) -> None:
+        for k in np.flatnonzero(working.where):
+            self._found[k] |= {"resistance": windings[k].resistance, "inductance": windings[k].inductance}
+            if working.target.motor.kind == "dc" and windings[k].follows:
+                # Speed followed torque: with a reversed encoder the loops would have run away by now.
+                self._found[k]["encoder_direction"] = Estimate(1.0, 1.0, 1.0, "1")
+
+    def _take_mechanics(self, working: Working, mechanics: list[Mechanics]) -> None:
+        for k in np.flatnonzero(working.where):
+            self._found[k] |= mechanics[k]._asdict()
+
+    def _respond(self, working: Working, inertia: Floats) -> None:
+        """Measure the velocity loop's response, with loops fit for it, and take what it says."""
+        target, drives = working.target, working.target.drives
+        # Still enabled: an axis under gravity would fall between the experiments.
+        go_back(working, "csv")
+        able = working.where & still_enabled(working, drives.read(STATUS))
+        down, up = working.room()
+        for k in np.flatnonzero(working.where):
+            if not able[k]:
+                self._refuse(int(k), RESPONSE, "the drive switched off; see its emergencies")
+            elif max(up[k], -down[k]) < LEAST_ROOM:
+                able[k] = False
+                self._refuse(int(k), RESPONSE, (
+                    f"travel too short: {LEAST_ROOM:g} rad are needed to shake the axis while it moves, and there are "
+                    f"{max(up[k], -down[k]):.2g}"
+                ))  # fmt: skip
+        if not able.any():
+            return
+        write_gains(drives, self._response_gains(working, inertia), able)
+        here = replace(target, low=np.minimum(down, 0.0), high=np.maximum(up, 1e-3))
+        with swinging_allowed(drives):
+            response = measure(
+                here, "velocity", where=able, high=HIGHEST,
+                progress=lambda share: self._progress("resonance, delay, filter", 0.7 + 0.29 * share),
+            )  # fmt: skip
+        for k in np.flatnonzero(able):
+            fit = response.fits[k]
+            if fit is None:
+                self._refuse(int(k), RESPONSE, "; ".join(response.notes[k]) or "the response was not measured")
+                continue
+            self._found[k] |= {name: fit.estimates[name] for name in RESPONSE}
+            if fit.misfit > WORST_MISFIT:
+                for name in RESPONSE:
+                    self._found[k][name] = refused(UNITS[name], (
+                        f"the response is not that of one spring: the model is off by {fit.misfit:.1f} times what "
+                        "noise explains (backlash, or several resonances)"
+                    ))  # fmt: skip
+
+    def _response_gains(self, working: Working, inertia: Floats) -> NDArray[np.int64]:
+        target, motor = working.target, working.target.motor
+        rows = []
+        for k in range(target.num_axes):
+            found = self._found[k]
+            R, L = found["resistance"], found["inductance"]
+            known = motor._replace(R_s=R.value if R.is_known else motor.R_s, L_q=L.value if L.is_known else motor.L_q)
+            rows.append(
+                gains_from_bandwidths(
+                    target.device,
+                    known,
+                    float(inertia[k]),
+                    current_hz=FREQUENCY_CURRENT_HZ,
+                    velocity_hz=cautious_bandwidth(motor, float(inertia[k]), FREQUENCY_VELOCITY_HZ),
+                    position_hz=5.0,
+                    supply=float(target.supply[k]),
+                )
+            )
+        return np.array(rows, np.int64)
+
+    def _refuse(self, k: int, names: tuple[str, ...], reason: str) -> None:
+        """Refuse what has no value yet."""
+        for name in names:
+            if not self._found[k][name].is_known and self._found[k][name].reason in ("", "not asked for"):
+                self._found[k][name] = refused(UNITS[name], reason)

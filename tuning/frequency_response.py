@@ -1,0 +1,443 @@
+"""Open loops of axes that stay in closed loop: a multisine or a chirp on the set-point, and what coherence says.
+
+The set-point is the instrument: it is known exactly and independent of noise, so that the open loop is the quotient of
+two cross-spectra with it, answer over error, without the bias that noise inside the loop gives to answer over input.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from drive_env.gains import GAIN_OBJECTS
+from tuning import margins as margins_
+from tuning.excitation import CREST, Lines, dimension, peak, plan_lines
+from tuning.held_samples import split, unhold
+from tuning.lags import velocity_noise
+from tuning.linear_model import Plant, controllers, velocity_open_loop
+from tuning.plant_fit import PlantFit, fit_plant
+from tuning.shaking import CYCLE, RAMP, SETTLING, Pass, Shaker
+from tuning.target import timed
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from tuning.identification import Estimate
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+LOOPS = ("velocity", "position")
+RANGE = {"velocity": (5.0, 400.0), "position": (5.0, 50.0)}  # Hz
+RESOLUTION = 5.0  # Hz
+COHERENT = 0.95  # from which on a line is trusted
+BUS_LIMIT = 400.0  # Hz; above, a bus's samples hold more of the images than of the line
+TRACED_TOP = 495.0  # Hz, of the set-points in a traced measurement
+TRACE_LIMIT = 1000.0  # Hz
+FINE = 10  # points between two lines, where margins are looked for
+GOOD_MISFIT = 2.0  # of a fit that is good enough to read margins between lines by
+SMOOTHING = 1.5  # lines, standard deviation
+PASSES, PERIODS = 2, 3  # of a measurement; the trial before it has one of each
+
+# How an axis is loaded, over its limits.
+TRIAL_SPEED, TRIAL_CURRENT = 0.1, 0.4
+SPEED, CURRENT = 0.45, 0.9
+IN_RAMP = 0.5  # of what the shaking takes, for changing the speed
+TRAVEL = 0.85
+OVER_NOISE = 5.0  # least RMS of the shaken velocity over the encoder's noise, also where the motion then reverses
+
+
+@dataclass(frozen=True)
+class FrequencyResponse:
+    """A loop as measured; arrays are (n,) over frequencies or (n, axes).
+
+    Attributes:
+        device: What was measured.
+        loop: "velocity" or "position".
+        f: Frequencies [Hz].
+        open_loop: L; nan where nothing was measured.
+        coherence: Of set-point with answer and with error, the lower of the two, 0...1.
+        traced: Which frequencies come from an emulator's trace at the velocity loop's rate; no bus shows them.
+        gains: Raw gains in force, shape (axes, 5).
+        fits: What the linear model makes of each axis; None of the position loop.
+        peak_speed, peak_current: Of the shaking [rad/s], [A], shape (axes,).
+        drive_time: Time that passed on the drives [s].
+        notes: Of each axis, for people.
+    """
+
+    device: Device
+    loop: str
+    f: Floats
+    open_loop: Complex
+    coherence: Floats
+    traced: Mask
+    gains: Integers
+    fits: tuple[PlantFit | None, ...]
+    peak_speed: Floats
+    peak_current: Floats
+    drive_time: float
+    notes: tuple[tuple[str, ...], ...]
+
+    @property
+    def trusted(self) -> Mask:
+        """Which lines are coherent enough to be taken as truth, (n, axes)."""
+        return np.asarray((self.coherence >= COHERENT) & np.isfinite(self.open_loop))
+
+    @property
+    def closed_loop(self) -> Complex:
+        """From set-point to answer."""
+        return np.asarray(self.open_loop / (1.0 + self.open_loop))
+
+    def margins(self, axis: int = 0) -> margins_.Margins:
+        """Return the margins of an axis, by its trusted lines; what those do not show is nan."""
+        found = margins_.margins(*self.refined(axis))
+        # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
+        return found if math.isfinite(found.gain_db) else found._replace(gain_db=math.nan)
+
+    def refined(self, axis: int = 0) -> tuple[Floats, Complex, Mask]:
+        """Return frequencies, open loop, and which of them are trusted, between the lines too.
+
+        Where the linear model fits, what is measured is its quotient with the model, which changes slowly, also where
+        a resonance is narrower than the lines' distance: averaged over neighbours and interpolated, it has a fraction
+        of a line's noise. Without a fit the lines stand as they are.
+        """
+        fit, L, good = self.fits[axis], self.open_loop[:, axis], self.trusted[:, axis]
+        if fit is None or fit.reason or fit.misfit > GOOD_MISFIT or good.sum() < 2:
+            return self.f, L, good
+        lines = np.arange(len(self.f))
+        at = np.interp(np.arange(FINE * (len(self.f) - 1) + 1) / FINE, lines, self.f)
+        model = velocity_open_loop(self.device, fit.plant, self.gains[axis], self.f)
+        fine = velocity_open_loop(self.device, fit.plant, self.gains[axis], at)
+        # A line says as much as its coherence: its weight is one over its variance.
+        clear = np.clip(self.coherence[:, axis], 0.0, 1.0 - 1e-6)
+        certain = np.where(np.isfinite(L) & (clear > 0.5), clear / (1.0 - clear), 0.0)
+        near = certain * np.exp(-0.5 * ((lines - np.arange(len(at))[:, None] / FINE) / SMOOTHING) ** 2)
+        quotient = np.where(certain > 0.0, L / model, 0.0)
+        total = near.sum(axis=1)
+        # Neighbours together may be as certain as one line must be.
+        known = total >= COHERENT / (1.0 - COHERENT)
+        return at, fine * np.where(known, near @ quotient / np.maximum(total, np.finfo(float).tiny), 1.0), known
+
+    def estimates(self, axis: int = 0) -> dict[str, Estimate]:
+        """Return inertia, velocity_filter, loop_delay, anti_resonance, resonance and damping of an axis.
+
+        Each has its interval, or the reason why it is refused.
+        """
+        fit = self.fits[axis]
+        if fit is None:
+            raise ValueError(f"the {self.loop} loop says nothing of the plant; measure the velocity loop")
+        return fit.estimates
+
+
+def measure(
+    target: Target,
+    loop: str = "velocity",
+    *,
+    where: Mask | None = None,
+    kind: str = "multisine",
+    low: float | None = None,
+    high: float | None = None,
+    resolution: float = RESOLUTION,
+    traced: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> FrequencyResponse:
+    """Measure a loop's frequency response on its axes; they end where they began, as they were found.
+
+    Axes of one machine are shaken one after the other, machines side by side.
+
+    Args:
+        target: The axes.
+        loop: "velocity", in csv, or "position", in csp.
+        where: Axes that are measured; all by default. The others get nan.
+        kind: "multisine" or "chirp".
+        low: Lowest frequency [Hz].
+        high: Highest frequency [Hz], at most 400; a traced measurement always goes beyond. With 4,096 counts per turn
+            little is coherent above 200 Hz, and what excites there is missing below; what stands out there, as
+            resonances do, is still found.
+        resolution: Between two frequencies [Hz]; a period lasts its inverse.
+        traced: Look above 400 Hz too, through the emulator's trace at the velocity loop's rate.
+        progress: Called with the share done.
+
+    Raises:
+        ValueError: For a loop, a kind or frequencies that cannot be, or a trace on a bus.
+    """
+    if loop not in LOOPS:
+        raise ValueError(
+            f"no loop is named {loop!r}; there are {', '.join(LOOPS)}; the current loop is not seen on a bus"
+        )
+    if traced and target.drives.machine is None:
+        raise ValueError("a trace at the velocity loop's rate exists on emulated drives only; a bus shows up to 400 Hz")
+    bounds = RANGE[loop]
+    # A trace begins where a bus ends; a gap between the two could hide a margin.
+    top = BUS_LIMIT if traced else bounds[1] if high is None else high
+    if top > BUS_LIMIT:
+        raise ValueError(f"highest frequency {top:g} Hz must be at most {BUS_LIMIT:g} Hz, where a bus still sees it")
+    # In a trace, what is held at f is seen at 1000 Hz - f, too: lines up to nearly half of it leave no gap.
+    lines = plan_lines(bounds[0] if low is None else low, TRACED_TOP if traced else top, resolution, 1.0 / CYCLE)
+    axes = np.ones(target.num_axes, bool) if where is None else np.asarray(where, bool)
+    position = np.arange(target.num_axes) % target.axes_per_machine
+    results = []
+    for k in range(target.axes_per_machine):
+        chosen = axes & (position == k)
+        if chosen.any():
+            measurement = _Measurement(target, loop, chosen, lines, top, kind, traced)
+
+            def show(share: float, k: int = k) -> None:
+                if progress is not None:
+                    progress((k + share) / target.axes_per_machine)
+
+            results.append(measurement.run(show))
+    if not results:
+        raise ValueError("no axis is chosen")
+    return _merge(results)
+
+
+class _Measurement:
+    """One measurement of axes side by side: a trial, the run proper, and what they say."""
+
+    def __init__(
+        self, target: Target, loop: str, where: Mask, lines: Lines, top: float, kind: str, traced: bool
+    ) -> None:
+        self._top = top
+        self._target, self._loop, self._lines, self._kind, self._traced = target, loop, lines, kind, traced
+        self._device: Device = target.device
+        self._notes: list[list[str]] = [[] for _ in range(target.num_axes)]
+        self._where = where
+
+    def run(self, progress: Callable[[float], object]) -> FrequencyResponse:
+        target = self._target
+        self._gains = np.stack([target.drives.read(name) for name in GAIN_OBJECTS], axis=1)
+        where = self._with_gains()
+        with timed(target) as (counted, clock):
+            shaker = Shaker(counted, self._loop, where, self._lines, self._kind)
+            with shaker:
+                room = np.where(target.high >= -target.low, target.high, target.low) * TRAVEL
+                sign = np.sign(room)
+                limit = self._current_limit()
+                speed = self._trial_speed(np.abs(room))
+                trial = shaker.run(self._trial_amplitude(speed, limit), sign * speed, 1, 1)
+                progress(0.2)
+                rough = _transfer(trial.set_point, trial.answer, self._lines)[0]
+                room = np.abs(room) - speed * _duration(1, self._lines)
+                amplitude, speed = self._amplitude(rough, trial, room, limit)
+                seen = shaker.run(amplitude, sign * speed, PASSES, PERIODS, traced=self._traced)
+                progress(0.9)
+        self._drive_time = clock.seconds + shaker.traced_time
+        for axis in np.flatnonzero(where & ~seen.enabled):
+            self._notes[axis].append("the drive stopped while it was shaken; see its emergencies")
+        self._note_limits(seen.peak_current, where)
+        result = self._evaluate(seen, where & seen.enabled)
+        progress(1.0)
+        return result
+
+    # --- how strongly ---------------------------------------------------------------------------------------------
+    def _with_gains(self) -> Mask:
+        gains = self._gains
+        closed = (gains[:, 0] > 0) & (gains[:, 2] > 0)
+        if self._loop == "position":
+            closed &= gains[:, 4] > 0
+        for axis in np.flatnonzero(self._where & ~closed):
+            self._notes[axis].append("a gain is 0 and the loop is open: give the drive gains first")
+        if not (self._where & closed).any():
+            raise ValueError("a P gain is 0 on every axis and the loop is open: give the drives gains first")
+        return np.asarray(self._where & closed)
+
+    def _current_limit(self) -> Floats:
+        """Return what may flow [A]: the user's limit, or the drive's own."""
+        own = self._target.drives.read(self._device.master.current_limit) * 1e-3
+        return np.asarray(np.minimum(self._target.current, own))
+
+    def _trial_speed(self, room: Floats) -> Floats:
+        return np.minimum(TRIAL_SPEED * self._target.speed, 0.4 * room / _duration(1, self._lines))
+
+    def _trial_amplitude(self, speed: Floats, limit: Floats) -> Floats:
+        n = len(self._lines.f)
+        # What reverses the trial's motion does no harm to a rough first look; what cannot be seen does.
+        largest = np.maximum(0.8 * speed, OVER_NOISE * CREST * self._noise())
+        by_speed = largest / CREST / math.sqrt(n / 2.0)
+        by_current = (
+            TRIAL_CURRENT * limit / CREST / math.sqrt(n / 2.0) / np.maximum(np.abs(self._current_gain()), 1e-12)
+        )
+        return np.asarray(np.minimum(by_speed, by_current))
+
+    def _amplitude(self, rough: Complex, trial: Pass, room: Floats, limit: Floats) -> tuple[Floats, Floats]:
+        """Return amplitudes and steady speeds of the run proper by what the trial showed."""
+        lines, omega = self._lines, 2.0 * math.pi * self._lines.f[:, None]
+        gain, error = _bounded(rough, 1e-3, 10.0), _bounded(1.0 - rough, 0.02, 10.0)
+        current = _bounded(self._current_gain() * error, 1e-12, np.inf)
+        load = np.abs(trial.current.mean(axis=0))
+        available = np.maximum(CURRENT * (limit - load), 0.1 * limit)
+        # Speed per current at the lowest lines, times w: what a ramp of the steady speed takes.
+        low = slice(0, max(4, len(lines.f) // 10))
+        mobility = np.median(np.abs(gain / current * omega)[low], axis=0)
+        top = SPEED * self._target.speed
+        by_ramp = IN_RAMP * available * mobility * RAMP * CYCLE
+        by_way = room / _duration(PERIODS, lines)
+        fastest = np.minimum(np.minimum(top, by_ramp), by_way)
+        # Where the way is short, a steady speed would be too slow for the encoder: the motion reverses then.
+        largest = np.minimum(np.maximum(0.9 * fastest, OVER_NOISE * CREST * self._noise()), 0.9 * top)
+        amplitude = dimension(lines, np.abs(current), np.abs(gain), available, largest)
+        way = peak(self._kind, lines, amplitude, gain / omega)
+        flowing, shaken = (peak(self._kind, lines, amplitude, answer) for answer in (current, gain))
+        tiny = np.finfo(float).tiny
+        shares = [available / (flowing + tiny), largest / (shaken + tiny), 0.5 * np.maximum(room, 1e-9) / (way + tiny)]
+        fits = np.min(shares, axis=0)
+        amplitude, shaken = amplitude * fits, shaken * fits
+        speed = np.minimum(1.1 * shaken, fastest)
+        for axis in np.flatnonzero(self._where & (speed < 0.9 * shaken)):
+            why = "its way is too short" if by_way[axis] <= fastest[axis] else "its loop or its limits are too tight"
+            self._notes[axis].append(f"{why} for a steady speed: the motion reversed, friction is part of the response")
+        return amplitude, speed
+
+    def _current_gain(self) -> Complex:
+        """Return demanded current per velocity of the set-point, the loop being open, complex (n, axes)."""
+        f = self._lines.f
+        z = np.exp(2j * math.pi * f / self._device.velocity_rate)
+        columns = []
+        for row in self._gains:
+            regulator = controllers(self._device, row)
+            gain = regulator.velocity(z)
+            # Of a position loop, the velocity loop within answers up to 1.5 times as strongly.
+            columns.append(gain if self._loop == "velocity" else 1.5 * gain * regulator.position / (2j * math.pi * f))
+        return np.stack(columns, axis=1)
+
+    def _noise(self) -> float:
+        motor = self._target.motor
+        plant = Plant.from_data_sheet(self._device, motor, motor.voltage, motor.inertia)
+        return velocity_noise(self._device, plant)
+
+    def _note_limits(self, peak: Floats, where: Mask) -> None:
+        limit = self._target.drives.read(self._device.master.current_limit) * 1e-3
+        for axis in np.flatnonzero(where & (peak > 0.98 * limit)):
+            self._notes[axis].append(
+                f"the current reached its limit, {limit[axis]:.2f} A, beyond what was asked for: the loop oscillates, "
+                "or nearly so"
+            )
+
+    # --- what it says ---------------------------------------------------------------------------------------------
+    def _evaluate(self, seen: Pass, where: Mask) -> FrequencyResponse:
+        lines = self._lines._replace(f=self._lines.f[self._lines.f <= self._top])
+        f = lines.f
+        closed, coherence, spread = _transfer(seen.set_point, seen.answer, lines)
+        open_loop = np.full(closed.shape, np.nan, complex)
+        fits: list[PlantFit | None] = [None] * closed.shape[1]
+        for axis in map(int, np.flatnonzero(where)):
+            images = np.zeros(len(f), complex)
+            if self._loop == "velocity":
+                fit = self._fit(self._gains[axis], f, closed[:, axis], coherence[:, axis], spread[:, axis], axis)
+                fits[axis] = fit
+                images = split(self._device, f, _closed_by(self._device, fit.plant, self._gains[axis]))[1]
+            T = unhold(self._device, f, closed[:, axis], images)
+            open_loop[:, axis] = T / (1.0 - T)
+        coherence = np.where(where, coherence, 0.0)
+        traced = np.zeros(len(f), bool)
+        if self._traced:
+            fast = _fast(self._device, seen, self._lines)
+            f = np.concatenate([f, fast[0]])
+            open_loop = np.concatenate([open_loop, np.where(where, fast[1], np.nan)])
+            coherence = np.concatenate([coherence, np.where(where, fast[2], 0.0)])
+            traced = np.concatenate([traced, np.ones(len(fast[0]), bool)])
+        speed = np.abs(seen.answer).max(axis=0) if self._loop == "velocity" else np.full(len(where), np.nan)
+        return FrequencyResponse(
+            self._device, self._loop, f, open_loop, coherence, traced, self._gains, tuple(fits), speed,
+            seen.peak_current, self._drive_time, tuple(tuple(notes) for notes in self._notes),
+        )  # fmt: skip
+
+    def _fit(self, gains: Integers, f: Floats, seen: Complex, coherence: Floats, spread: Floats, axis: int) -> PlantFit:
+        target = self._target
+        start = Plant.from_data_sheet(
+            self._device, target.motor, float(target.supply[axis]), 3.0 * target.motor.inertia
+        )
+        good = coherence >= COHERENT
+        fit = fit_plant(self._device, gains, f[good], seen[good], spread[good], start)
+        if not fit.reason and fit.misfit > GOOD_MISFIT:
+            self._notes[axis].append(
+                f"the linear model is off by {fit.misfit:.1f} times the noise; margins are read from the lines alone"
+            )
+        if fit.reason:
+            self._notes[axis].append(f"excitation too weak: {fit.reason}")
+        return fit
+
+
+def _closed_by(device: Device, plant: Plant, gains: Integers) -> Callable[[Floats], Complex]:
+    def closed(at: Floats) -> Complex:
+        L = velocity_open_loop(device, plant, gains, at)
+        return np.asarray(L / (1.0 + L))
+
+    return closed
+
+
+def _bounded(value: Complex, low: float, high: float) -> Complex:
+    """Return complex numbers whose size lies within bounds; a first look is not trusted beyond them."""
+    size = np.maximum(np.abs(value), np.finfo(float).tiny)
+    return np.asarray(np.where(value == 0.0, low, value * np.clip(size, low, high) / size))
+
+
+def _duration(periods: int, lines: Lines) -> float:
+    """Return how long an axis goes one way [s], in full speeds."""
+    return (2 * RAMP + SETTLING + periods * lines.samples) * CYCLE
+
+
+def _transfer(set_point: Floats, answer: Floats, lines: Lines) -> tuple[Complex, Floats, Floats]:
+    """Return set-point to answer at the lines, its coherence, and its standard deviation over its size, (n, axes)."""
+    periods = len(set_point) // lines.samples
+
+    def cross(x: Floats, y: Floats) -> Complex:
+        # Whole periods need no window.
+        spectrum = signal.csd(x, y, lines.rate, "boxcar", lines.samples, 0, detrend="constant", axis=0)[1]
+        return np.asarray(spectrum)[lines.bins]
+
+    error = set_point - answer
+    power, answers, errors = (np.abs(cross(x, x)) for x in (set_point, answer, error))
+    to_answer, to_error = cross(set_point, answer), cross(set_point, error)
+    tiny = 1e-30  # of what was not shaken
+    with_answer = np.abs(to_answer) ** 2 / np.maximum(power * answers, tiny)
+    with_error = np.abs(to_error) ** 2 / np.maximum(power * errors, tiny)
+    freedom = max(periods - 1, 1)
+    spread = np.sqrt(np.maximum(1.0 - with_answer, 0.0) / np.maximum(with_answer, tiny) / freedom)
+    return to_answer / np.maximum(power, tiny), np.minimum(with_answer, with_error), spread
+
+
+def _fast(device: Device, seen: Pass, lines: Lines) -> tuple[Floats, Complex, Floats]:
+    """Return frequencies above the bus's, open loop and coherence there, from the trace.
+
+    What excites there are the images of the held set-points.
+    """
+    windows = len(seen.fast_answer) // len(seen.answer)
+    first = int(BUS_LIMIT / lines.rate * lines.samples) + 1
+    last = int(TRACE_LIMIT / lines.rate * lines.samples)
+    bins = np.arange(first, last + 1)
+    all_lines = Lines(bins * lines.rate / lines.samples, lines.samples * windows, lines.rate * windows)
+    closed, coherence, _ = _transfer(seen.fast_set_point, seen.fast_answer, all_lines)
+    shaken = np.abs(np.fft.rfft(seen.fast_set_point[: all_lines.samples], axis=0))[bins]
+    # A bin without a line, or one whose image the holding takes out, holds rounding alone.
+    lit = (shaken > 1e-3 * shaken.max(axis=0)).any(axis=1)
+    return all_lines.f[lit], (closed / (1.0 - closed))[lit], coherence[lit]
+
+
+def _merge(results: list[FrequencyResponse]) -> FrequencyResponse:
+    """Put measurements of different axes together; each axis was in one of them."""
+    from dataclasses import replace
+
+    whole = results[0]
+    for other in results[1:]:
+        mine = np.asarray(np.isfinite(other.open_loop).any(axis=0))
+        whole = replace(
+            whole,
+            open_loop=np.where(mine, other.open_loop, whole.open_loop),
+            coherence=np.where(mine, other.coherence, whole.coherence),
+            fits=tuple(b if m else a for a, b, m in zip(whole.fits, other.fits, mine, strict=True)),
+            peak_speed=np.where(mine, other.peak_speed, whole.peak_speed),
+            peak_current=np.where(mine, other.peak_current, whole.peak_current),
+            drive_time=whole.drive_time + other.drive_time,
+            notes=tuple(a + b for a, b in zip(whole.notes, other.notes, strict=True)),
+        )
+    return whole

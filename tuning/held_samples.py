@@ -1,0 +1,58 @@
+"""What a bus sees of a loop that runs faster: set-points held for a communication cycle, samples once in one.
+
+A set-point of the bus acts from a cycle's beginning and is held for its windows; a sample is what the last window
+before had. At f the loop therefore sees the set-point times H(f), and at f + k/T its images; sampling folds their
+answers back. Of a closed loop T(f), with m windows of h in a cycle of T = m h, the bus has
+
+    T_bus(f) = sum over k = 0 ... m-1 of T(f_k) H(f_k) exp(-j 2 pi f_k h)    f_k = f + k / T
+    H(f) = 1/m sum over n = 0 ... m-1 of exp(-j 2 pi f n h)
+
+which is exact for a linear loop. Up to a fifth of the bus's rate the images hardly count; at two fifths they are a
+quarter of it all, and only what is known of the loop above half the bus's rate can take them out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.devices import Device
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Response = Callable[[Floats], Complex]  # of frequencies above 0 and below half the velocity loop's rate [Hz], (n,)
+
+
+def seen_by_bus(device: Device, f: Floats, closed_loop: Response) -> Complex:
+    """Return T_bus at frequencies [Hz] below half the bus's rate, shape (n,)."""
+    own, images = split(device, f, closed_loop)
+    return np.asarray(own + images)
+
+
+def split(device: Device, f: Floats, closed_loop: Response) -> tuple[Complex, Complex]:
+    """Return the share of T_bus that is T at f itself, and the share of its images."""
+    at = f + device.profile_rate * np.arange(windows(device))[:, None]
+    # A sampled loop's answer repeats with its rate, and is conjugate above half of it.
+    above = at > 0.5 * device.velocity_rate
+    answer = closed_loop(np.where(above, device.velocity_rate - at, at).reshape(-1)).reshape(at.shape)
+    folded = np.where(above, answer.conj(), answer) * _hold(device, at)
+    return np.asarray(folded[0]), np.asarray(folded[1:].sum(axis=0))
+
+
+def unhold(device: Device, f: Floats, seen: Complex, images: Complex) -> Complex:
+    """Return T(f) from what the bus has, less the images."""
+    return np.asarray((seen - images) / _hold(device, f))
+
+
+def windows(device: Device) -> int:
+    """Return the windows of the velocity loop in a communication cycle."""
+    return round(device.velocity_rate / device.profile_rate)
+
+
+def _hold(device: Device, f: Floats) -> Complex:
+    """Return H(f), and the age of the sample, one window."""
+    back = np.exp(-2j * math.pi * f / device.velocity_rate)
+    return np.asarray(np.mean([back**n for n in range(windows(device))], axis=0) * back)

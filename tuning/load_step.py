@@ -1,0 +1,65 @@
+"""What a load step does to axes that stand still: on emulated machines only, for a certificate.
+
+Hardware has no load step. It comes after tuning, is no experiment, and nothing is tuned by it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import motion, response
+from drive_env.positioning import CURRENT, CYCLE, POSITION, wrapped
+from tuning.certificate import StepResponse
+
+if TYPE_CHECKING:
+    from tuning.target import Target
+
+Mask = NDArray[np.bool_]
+
+NAME = "load step of 0.3 rated torque at standstill"
+SHARE = 0.3  # of the rated torque
+REST, BEFORE, AFTER = 0.1, 0.02, 0.3  # s: until the axis stands, then recorded before the step and after it
+
+
+def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
+    """Return what a load step does to emulated axes with the gains they have; afterwards they are disabled.
+
+    Args:
+        target: Emulated machines.
+        where: Axes, shape (num_axes,); only those of machines all of whose axes are chosen take part.
+    """
+    from mechanics.shaft import one, way
+
+    drives = target.drives
+    machines = where.reshape(-1, target.axes_per_machine).all(axis=1)
+    axes = np.repeat(machines, target.axes_per_machine)
+    if not axes.any():
+        return {}
+    packed = one(drives.load)
+    # On the load, where it disturbs: the axis with the longest lever feels the share.
+    lever = float(np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max())
+    motion.enable(drives, mode="pp", where=axes)
+    drives.advance(REST)
+    try:
+        rest = drives.record([POSITION, CURRENT], BEFORE)
+        drives.machine.load_torque = np.where(machines, -SHARE * target.motor.rated_torque / lever, 0.0)
+        loaded = drives.record([POSITION, CURRENT], AFTER)
+    finally:
+        drives.machine.load_torque = 0.0
+        drives.advance(REST)
+        motion.disable(drives, where=axes)
+    raw = np.concatenate([rest[POSITION], loaded[POSITION]])
+    angle = wrapped(raw - raw[0]) / target.increments()
+    current = np.concatenate([rest[CURRENT], loaded[CURRENT]]) * 1e-3
+    t = np.arange(len(angle), dtype=np.float64) * CYCLE
+    found = response.disturbance_metrics(t, angle, np.zeros(target.num_axes), t_load=BEFORE)
+    return {
+        axis: StepResponse(
+            NAME, True, "rad", t, np.zeros(len(t)), angle[:, axis], current[:, axis],
+            {"disturbance dip [rad]": float(found.dip[axis]), "recovery [s]": float(found.recovery_time[axis])},
+        )
+        for axis in map(int, np.flatnonzero(axes))
+    }  # fmt: skip

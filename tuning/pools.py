@@ -1,0 +1,178 @@
+"""Where work runs: in this process, on processes of this machine, or on a Dask cluster.
+
+A task is a function of a module, called with one item; what it returns must depend on the item alone, so that it
+matters to no result where and in which order tasks ran.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any, Protocol, TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
+
+
+class PoolError(RuntimeError):
+    """Work could not be done where it was to run: one line with its remedy."""
+
+
+class Pool(Protocol):
+    """Somewhere for work to run."""
+
+    width: int  # tasks that run at a time, about
+
+    def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+        """Give the number of an item and its result as each is done."""
+
+    def differences(self) -> list[str]:
+        """Return a line for each way in which the workers are not like this process: last digits may then differ."""
+
+
+def in_order(pool: Pool, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """Return the results of all items in their order."""
+    found = dict(pool.unordered(function, items))
+    return [found[k] for k in range(len(items))]
+
+
+@contextmanager
+def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
+    """Give somewhere for work to run.
+
+    Args:
+        workers: Processes of this machine; None for this process itself.
+        cluster: Address of the scheduler of a running Dask cluster, tcp://host:port.
+
+    Raises:
+        ValueError: For both, or fewer than one worker.
+        PoolError: If the cluster cannot be reached, or `distributed` is not installed.
+    """
+    if workers is not None and cluster is not None:
+        raise ValueError("workers and a cluster exclude each other; choose --workers or --cluster")
+    if cluster is not None:
+        with _cluster(cluster) as pool:
+            yield pool
+    elif workers is not None:
+        if workers < 1:
+            raise ValueError(f"--workers {workers} is below 1; give the number of processes")
+        # Spawned: after threads have run compiled code, a fork may hang.
+        context = multiprocessing.get_context("spawn")
+        executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_as_worker)
+        try:
+            yield _Processes(executor, workers)
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+    else:
+        yield _Here()
+
+
+class _Here:
+    width = 1
+
+    def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+        for k, item in enumerate(items):
+            yield k, function(item)
+
+    def differences(self) -> list[str]:
+        return []
+
+
+class _Processes:
+    def __init__(self, executor: ProcessPoolExecutor, width: int) -> None:
+        self._executor = executor
+        self.width = width
+
+    def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+        futures = {self._executor.submit(function, item): k for k, item in enumerate(items)}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BrokenProcessPool:
+            raise PoolError(
+                "a worker process ended on its own, perhaps for want of memory; take fewer --workers and go on with "
+                "--resume"
+            ) from None
+
+    def differences(self) -> list[str]:
+        return []
+
+
+class _Dask:
+    def __init__(self, client: Any, width: int) -> None:
+        self._client = client
+        self.width = width
+
+    def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+        from distributed import as_completed as as_completed_there
+        from distributed.scheduler import KilledWorker
+
+        # Not pure: equal items of two runs on one cluster are computed twice rather than taken from its memory.
+        futures = {self._client.submit(function, item, pure=False): k for k, item in enumerate(items)}
+        try:
+            for future in as_completed_there(list(futures), loop=self._client.loop):
+                yield futures[future], future.result()
+                future.release()
+        except KilledWorker as error:
+            raise PoolError(f"workers of the cluster died over and over: {error}; go on with --resume") from None
+
+    def differences(self) -> list[str]:
+        here, lines = _versions(), set()
+        there: Mapping[str, dict[str, str]] = self._client.run(_versions)
+        for address, found in there.items():
+            for name, version in found.items():
+                if here.get(name) != version:
+                    lines.add(f"worker {address} has {name} {version}, here it is {here.get(name)}: last digits may "
+                              "differ")  # fmt: skip
+        return sorted(lines)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Pool]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise PoolError('--cluster needs dask.distributed; pip install "drive-env[cluster]"') from None
+    try:
+        client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise PoolError(
+            f"no Dask scheduler answers at {address}: {reason}; start one with `dask scheduler`, and workers with "
+            "`dask worker`"
+        ) from None
+    with client:
+        threads = client.nthreads()
+        if not threads:
+            raise PoolError(f"the cluster at {address} has no workers; start some with `dask worker {address}`")
+        yield _Dask(client, sum(threads.values()))
+
+
+def _versions() -> dict[str, str]:
+    from tuning.provenance import versions
+
+    return versions()
+
+
+def _as_worker() -> None:
+    """Leave Ctrl-C and warnings to the process that gives the work, and end with it, whatever ends it."""
+    warnings.simplefilter("ignore")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        # At once: whoever waits in a queue that nobody fills any more would wait for ever.
+        os._exit(1)

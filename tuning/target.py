@@ -1,0 +1,298 @@
+"""What is tuned: drives, what is known of their motors, and how far and how hard the axes may be moved.
+
+A tuner gets a target and nothing else, so that it works on emulated machines and on a bus alike.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.motors import Motor
+    from mechanics.load import Load
+
+Floats = NDArray[np.float64]
+Travel = tuple[float, float]  # how far a rotor may turn from where it stands [rad], low <= 0 <= high
+
+POSITION_SCALER = (0x2058, 0)
+FREE: Travel = (-math.inf, math.inf)
+
+
+@dataclass(frozen=True)
+class Target:
+    """Drives to tune, and what the user knows of them.
+
+    Attributes:
+        drives: `EmulatedDrives` or `CanDrives`.
+        device: What the drives are.
+        motor: Data sheet values of what turns, of every axis.
+        supply: Supply voltage as the user enters it [V], shape (num_axes,).
+        low, high: How far each rotor may turn from where it stood when the target was made [rad], shape (num_axes,),
+            low <= 0 <= high; infinite where it turns freely.
+        speed: Fastest that an excitation may turn a rotor [rad/s].
+        current: Most that an excitation may ask for [A, peak i_q].
+        axes_per_machine: Axes that one machine couples; axes are machine-major.
+        machine: What turns: an emulated load's name, or the channel.
+        bus: How the drives of a bus are opened again: what `CanDrives` takes; empty for emulated ones.
+    """
+
+    drives: Any
+    device: Device
+    motor: Motor
+    supply: Floats
+    low: Floats
+    high: Floats
+    speed: float
+    current: float
+    axes_per_machine: int = 1
+    machine: str = ""
+    bus: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("supply", "low", "high"):
+            if getattr(self, name).shape != (self.num_axes,):
+                raise ValueError(f"{name} must have shape ({self.num_axes},), not {getattr(self, name).shape}")
+        if not np.all((self.supply > 0.0) & np.isfinite(self.supply)):
+            raise ValueError(
+                f"supply {self.supply.min():g} V must be above 0 V; give the voltage at the drive's terminals"
+            )
+        wrong = np.flatnonzero(~((self.low <= 0.0) & (self.high >= 0.0) & (self.low < self.high)))
+        if wrong.size:
+            k = int(wrong[0])
+            raise ValueError(
+                f"axis {k}: travel {self.low[k]:g} to {self.high[k]:g} rad must hold 0, where the rotor stands, and "
+                "somewhere to go; give what is free to both sides"
+            )
+        for name, unit in (("speed", "rad/s"), ("current", "A")):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} {getattr(self, name):g} {unit} must be above 0 and finite")
+
+    @property
+    def num_axes(self) -> int:
+        """Number of axes."""
+        return int(self.drives.num_axes)
+
+    def increments(self) -> Floats:
+        """Return the position increments per radian of every rotor, 2058h over 2 pi, shape (num_axes,)."""
+        return np.asarray(self.drives.read(POSITION_SCALER), float) / (2.0 * math.pi)
+
+    def close(self) -> None:
+        """Close the drives."""
+        self.drives.close()
+
+    def __enter__(self) -> Target:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        # The drives' own exit, not close(): on a bus an exception stops the axes first.
+        self.drives.__exit__(*error)
+
+
+def emulated(
+    device: str = "tmcm1636",
+    load: str | Path | Load = "two_mass",
+    motor: str = "qbl4208",
+    *,
+    num_machines: int = 1,
+    seed: int = 0,
+    randomise: bool | Collection[str] = False,
+    parameters: Mapping[str, ArrayLike] | None = None,
+    supply: float | None = None,
+    travel: Travel | None = None,
+    speed: float | None = None,
+    current: float | None = None,
+    factory_fresh: bool = False,
+    **options: Any,
+) -> Target:
+    """Return emulated machines as a target.
+
+    Args:
+        device: Name of the device.
+        load: A load's name, the path of an MJCF, or a `mechanics.Load`.
+        motor: Name of the motor; the drives come up commissioned for it.
+        num_machines: Machines, each with its drives.
+        seed: Seed of everything random.
+        randomise: Parameters to draw per machine: True for all, or names or groups.
+        parameters: True machine parameters [SI] that replace defaults and draws: one value or one per machine.
+        supply: Supply voltage [V]; the motor's by default. The machines have it, and the tuner is told.
+        travel: How far each rotor may turn [rad], less than the load lets it; the load's own by default.
+        speed: Limit of what excites [rad/s]; the motor's rated speed by default.
+        current: Limit of what excites [A]; the motor's rated current by default.
+        factory_fresh: Leave the drives as they come out of the box, all gains 0; of the emulator's default motor only.
+        options: What `EmulatedDrives` takes besides.
+
+    Raises:
+        ValueError: For an unknown name, a machine that cannot be, or a travel that does not hold 0.
+    """
+    from drive_env import EmulatedDrives
+    from mechanics.shaft import one, way
+
+    if factory_fresh and motor != EmulatedDrives.DEFAULT_MOTOR:
+        raise ValueError(
+            f"factory-fresh drives turn a {EmulatedDrives.DEFAULT_MOTOR}, not a {motor}; choose one of the two"
+        )
+    drives = EmulatedDrives(
+        device,
+        load=load,
+        motor=None if factory_fresh else motor,
+        num_machines=num_machines,
+        seed=seed,
+        randomise=randomise,
+        parameters=parameters,
+        supply=supply,
+        **options,
+    )
+    own = way(one(drives.load))
+    narrow = FREE if travel is None else travel
+    low = np.tile(np.maximum(own.low, narrow[0]), num_machines)
+    high = np.tile(np.minimum(own.high, narrow[1]), num_machines)
+    volts = drives.motor.voltage if supply is None else supply
+    limits = _limits(drives.motor, drives.num_axes, volts, speed, current)
+    return Target(
+        drives,
+        drives.device,
+        drives.motor,
+        low=low,
+        high=high,
+        axes_per_machine=drives.load.num_axes,
+        machine=drives.load.name,
+        **limits,
+    )
+
+
+def on_bus(
+    device: str = "tmcm1636",
+    motor: str = "qbl4208",
+    *,
+    interface: str | None = None,
+    channel: str | None = None,
+    nodes: Iterable[int] = (1,),
+    supply: ArrayLike | None = None,
+    travel: Travel | Iterable[Travel],
+    speed: float | None = None,
+    current: float | None = None,
+    **options: Any,
+) -> Target:
+    """Return the drives of a bus as a target, inside the envelope.
+
+    The envelope holds the position to the travel of all axes together, unless `safety` says otherwise; a tuner keeps
+    each axis in its own.
+
+    Args:
+        device: Name of the device.
+        motor: Name of the motor that every node turns.
+        interface: As python-can names it; from DRIVE_ENV_INTERFACE if not given.
+        channel: The channel; from DRIVE_ENV_CHANNEL if not given.
+        nodes: Node-IDs.
+        supply: Supply voltage [V], one value or one per axis; the motor's by default.
+        travel: How far the rotors may turn from where they stand [rad]: one (low, high), or one per axis.
+        speed: Limit of what excites [rad/s]; the motor's rated speed by default.
+        current: Limit of what excites [A]; the motor's rated current by default.
+        options: What `CanDrives` takes besides.
+
+    Raises:
+        ValueError: For an unknown name or a travel that does not hold 0; BusError if a node does not answer.
+    """
+    from drive_env import CanDrives
+    from drive_env.motors import find_motor
+
+    row = find_motor(motor)
+    numbers = tuple(nodes)
+    drives = CanDrives(device, interface=interface, channel=channel, nodes=numbers, **options)
+    try:
+        ways = np.asarray(list(travel), float)
+        low, high = np.broadcast_to(ways, (drives.num_axes, 2)).T.copy()
+        assert drives.device is not None, "a device of a name is known"
+        volts = row.voltage if supply is None else supply
+        limits = _limits(row, drives.num_axes, volts, speed, current)
+        bus = _address(interface, channel, numbers, options)
+        machine = f"{bus.get('channel', 'a bus')}, node {', '.join(map(str, numbers))}"
+        target = Target(drives, drives.device, row, low=low, high=high, machine=machine, bus=bus, **limits)
+        if "safety" not in options:
+            _hold_to_travel(target)
+    except BaseException:
+        drives.close()
+        raise
+    return target
+
+
+@contextmanager
+def timed(target: Target) -> Iterator[tuple[Target, DriveTime]]:
+    """Give the target with drives whose passing time is counted, and the clock that counts it."""
+    clock = DriveTime()
+    yield replace(target, drives=_TimedDrives(target.drives, clock)), clock
+
+
+@dataclass
+class DriveTime:
+    """Time that passed on drives [s]: what a tuner costs on hardware."""
+
+    seconds: float = 0.0
+
+
+class _TimedDrives:
+    """Drives that count the time which passes on them; everything else is theirs."""
+
+    def __init__(self, drives: Any, clock: DriveTime) -> None:
+        self._drives = drives
+        self._clock = clock
+
+    def advance(self, duration: float) -> None:
+        self._clock.seconds += duration
+        self._drives.advance(duration)
+
+    def record(self, objects: Any, duration: float, *arguments: Any, **options: Any) -> Any:
+        self._clock.seconds += duration
+        return self._drives.record(objects, duration, *arguments, **options)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._drives, name)
+
+
+def _limits(
+    motor: Motor, num_axes: int, supply: ArrayLike, speed: float | None, current: float | None
+) -> dict[str, Any]:
+    return {
+        "supply": np.broadcast_to(np.asarray(supply, float), (num_axes,)).copy(),
+        "speed": motor.rated_speed if speed is None else speed,
+        "current": motor.rated_current if current is None else current,
+    }
+
+
+def _address(
+    interface: str | None, channel: str | None, nodes: tuple[int, ...], options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return what opens these drives again; what a file cannot hold, such as an open bus, is left out."""
+    from drive_env.master.port import CHANNEL_VARIABLE, INTERFACE_VARIABLE
+
+    found = {
+        "interface": interface or os.environ.get(INTERFACE_VARIABLE),
+        "channel": channel or os.environ.get(CHANNEL_VARIABLE),
+        "nodes": list(nodes),
+    } | {name: value for name, value in options.items() if isinstance(value, str | int) and name in _ADDRESS}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+_ADDRESS = ("bitrate", "pace")
+
+
+def _hold_to_travel(target: Target) -> None:
+    """Have the envelope stop an axis that leaves what all axes together may use."""
+    from drive_env.master.bounds import Limits
+    from drive_env.safety import Envelope
+
+    if not np.all(np.isfinite(target.low) & np.isfinite(target.high)):
+        return
+    here, scale = target.drives.read(0x6064), target.increments()
+    low, high = np.floor(here + target.low * scale), np.ceil(here + target.high * scale)
+    target.drives.safety = Envelope(Limits(position=(int(low.min()), int(high.max()))), target.drives)

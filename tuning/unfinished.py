@@ -1,0 +1,60 @@
+"""A run that is under way: a folder beside the one that its results will have, from which it goes on if it is killed.
+
+The folder of the results is complete or absent. Beside it, named `<folder>.unfinished`, lie the settings of the run and
+the results of the shards that are done; it vanishes with the last step of the run.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tuning.shard_log import ShardLog, ShardLogError
+
+SUFFIX, SETTINGS, SHARDS = ".unfinished", "settings.toml", "shards"
+
+
+def unfinished_folder(folder: str | Path) -> Path:
+    """Return where a run keeps what it has while its folder is absent."""
+    path = Path(folder)
+    return path.with_name(path.name + SUFFIX)
+
+
+def settings_of(folder: str | Path) -> Path | None:
+    """Return the settings of an unfinished run, None if there is none."""
+    path = unfinished_folder(folder) / SETTINGS
+    return path if path.is_file() else None
+
+
+@contextmanager
+def shard_log(folder: str | Path, settings: str, *, resume: bool) -> Iterator[ShardLog]:
+    """Give the shards of a run that are done, and keep those to come; leave nothing behind if there are none.
+
+    Args:
+        folder: Where the results will be.
+        settings: What the run repeats from: with other settings it is another run.
+        resume: Go on with an unfinished run if there is one.
+
+    Raises:
+        ShardLogError: If an unfinished run is there and is not to be resumed, or is another one.
+        OSError: If it cannot be written.
+    """
+    place = unfinished_folder(folder)
+    if place.exists() and not resume:
+        raise ShardLogError(f"{place} holds an unfinished run; go on with it by --resume, or remove it")
+    place.mkdir(parents=True, exist_ok=True)
+    with ShardLog(place / SHARDS, settings) as log:
+        if not (place / SETTINGS).exists():
+            (place / SETTINGS).write_text(settings, encoding="utf-8", newline="\n")
+        try:
+            yield log
+        finally:
+            if not log.holds_results:
+                discard(folder)
+
+
+def discard(folder: str | Path) -> None:
+    """Remove what an unfinished run has left."""
+    shutil.rmtree(unfinished_folder(folder), ignore_errors=True)

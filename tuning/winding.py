@@ -1,0 +1,374 @@
+"""Winding resistance and inductance, seen through the integrator of 2041h and the entered supply voltage.
+
+The integrator adds P I e every tick, so its change over a millisecond is the sum of the current's error over all 25
+ticks, at far better resolution than a sample of the current has. Set-point less error is the mean current, P e plus
+the integrator the mean duty; what is left is the winding's balance of flux over each millisecond,
+
+    integral of V duty = R integral of i + L (i_end - i_start) + K_e (theta_end - theta_start) + V t_dead f(i) + c
+
+whose unknowns are found by least squares over some hundred milliseconds of current pulses, forth and back, that hardly
+move the rotor. f is what dead time loses: it saturates at a current that is not known either and is averaged over.
+K_e and the dead time have priors, the data sheet's and the stage's ranges: where the rotor hardly moves they matter
+little, and elsewhere the data says better.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import motion
+from tuning.confidence import gain_error, interval, t_quantile
+from tuning.identification import Estimate, refused
+from tuning.working_state import (
+    CURRENT,
+    CYCLE,
+    POSITION,
+    STATUS,
+    TARGET_TORQUE,
+    TORQUE_I,
+    TORQUE_P,
+    TORQUE_SUM,
+    Working,
+    still_enabled,
+)
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SQRT3 = 3.0**0.5
+SHARES = (0.95, 0.7, 0.45, 0.25)  # amplitudes of the pulses, over what may be asked for
+DWELL = 3  # cycles a level lasts; a pulse is +, -, -, +, so that speed and way end at 0
+REPEATS = 8
+LOOP_GAIN, LOOP_HZ = 4.0, 600.0  # P of the loop: so many winding resistances, or this bandwidth if that is less
+INTEGRAL_SHARE = 0.1  # of the integral gain that cancels the winding's lag: an instrument, not a controller
+HOLD_HZ, HOLD_DAMPING = 7.0, 0.7  # our own slow position loop around the pulses
+# Over the data sheet's, centre and deviation: unit-to-unit spread and temperature.
+RESISTANCE_PRIOR, EMF_PRIOR = (1.1, 0.25), (0.965, 0.06)
+# Of R and L, 95 %: what the balance leaves out, as sag of the supply, lag of the encoder, what a tick hides.
+RESISTANCE_MODEL, INDUCTANCE_MODEL = 0.01, 0.02
+LEAST_NOISE = 0.005  # of the flux: a better fit than that is not taken for knowledge
+SUPPLY_IDLE = 0.1  # A, what logic draws through the supply line
+WIDEST = 0.25  # of the value: an interval that is wider says nothing
+
+
+TURN = 2  # column of the balance
+
+
+class Pulses(NamedTuple):
+    """What was recorded, one row per millisecond: n rows, or n + 1 where both ends count; (rows, num_axes)."""
+
+    demand: Floats  # A, n
+    current: Floats  # A, n + 1: the last tick's
+    angle: Floats  # rad, n + 1
+    duty_sum: Floats  # n + 1
+    block: NDArray[np.int64]  # n: which pulse
+    alive: Mask  # num_axes: enabled to the end
+
+
+class Winding(NamedTuple):
+    """What pulses say of one axis."""
+
+    resistance: Estimate
+    inductance: Estimate
+    follows: bool  # whether speed follows charge, with its sign
+
+
+def loop_gains(working: Working) -> tuple[Floats, float]:
+    """Return raw torque P of every axis, and I, of the loop that serves as an instrument."""
+    target, motor = working.target, working.target.motor
+    volts_per_ampere = min(LOOP_GAIN * motor.R_s, 2.0 * np.pi * LOOP_HZ * motor.L_q)
+    P = np.rint(256.0 * target.device.current_full_scale * volts_per_ampere / target.supply)
+    cancels = 65536.0 * motor.R_s / motor.L_q / target.device.current_rate
+    return np.clip(P, 1, 32767), float(np.clip(np.rint(INTEGRAL_SHARE * cancels), 8, 32767))
+
+
+def pulse(working: Working, holding: Floats) -> Pulses:
+    """Give current pulses in cst around the holding currents [A]; the axes are enabled in cst, at rest."""
+    target, drives = working.target, working.target.drives
+    motor, count = target.motor, target.num_axes
+    P, integral = loop_gains(working)
+    drives.write(TORQUE_P, P.astype(np.int64), where=working.where)
+    drives.write(TORQUE_I, int(integral), where=working.where)
+    J = 3.0 * motor.inertia / motor.torque_constant
+    stiffness, damping = J * (2.0 * np.pi * HOLD_HZ) ** 2, 2.0 * HOLD_DAMPING * J * 2.0 * np.pi * HOLD_HZ
+    room = np.maximum(working.current - np.abs(holding), 0.0)
+    levels, blocks = _levels()
+    rows = len(levels)
+    demand = np.zeros((rows, count))
+    current, angle, duty_sum = (np.zeros((rows + 1, count)) for _ in range(3))
+    duty_sum[0] = drives.read(TORQUE_SUM)
+    angle[0] = working.angle(drives.read(POSITION))
+    for k in range(rows):
+        speed = (angle[k] - angle[max(k - 2, 0)]) / (2 * CYCLE)
+        steer = -stiffness * (angle[k] - working.base) - damping * speed
+        asked = np.clip(holding + levels[k] * room + steer, -working.current, working.current)
+        raw = np.where(working.where, np.rint(1e3 * asked), 0).astype(np.int64)
+        demand[k] = raw * 1e-3
+        trace = drives.record([POSITION, CURRENT], CYCLE, play={TARGET_TORQUE: raw[None, :]})
+        current[k] = trace[CURRENT][0] * 1e-3
+        duty_sum[k + 1] = drives.read(TORQUE_SUM)
+        angle[k + 1] = working.angle(drives.read(POSITION))
+    current[rows] = drives.read(CURRENT) * 1e-3
+    alive = still_enabled(working, drives.read(STATUS))
+    return Pulses(demand, current, angle, duty_sum / (32768.0 * 256.0), blocks, alive)
+
+
+def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats, pole_pairs: float) -> list[Winding]:
+    """Return resistance and inductance of every axis.
+
+    Args:
+        working: The drives.
+        pulses: What `pulse` recorded.
+        electrical_angle: Where the rotors stood at the first row [rad], shape (num_axes,).
+        pole_pairs: Electrical turns per turn in the direction of counting.
+    """
+    return [
+        _winding(working, _of_axis(pulses, k), k, float(electrical_angle[k]), pole_pairs)
+        if working.where[k] and pulses.alive[k]
+        else _none("the drive switched off during the current pulses; see its emergencies")
+        for k in range(working.target.num_axes)
+    ]
+
+
+class _Window(NamedTuple):
+    """Each millisecond's part of the balance, shape (n,), and what happened within it by the model, (n, ticks)."""
+
+    flux: Floats  # V s
+    charge: Floats  # A s
+    change: Floats  # A
+    turn: Floats  # rad
+    path: Floats  # A, current at every tick, and at the end
+    angle: Floats  # rad electrical
+
+
+class _Axis(NamedTuple):
+    demand: Floats
+    current: Floats
+    angle: Floats
+    duty_sum: Floats
+    block: NDArray[np.int64]
+
+
+def _of_axis(pulses: Pulses, k: int) -> _Axis:
+    return _Axis(pulses.demand[:, k], pulses.current[:, k], pulses.angle[:, k], pulses.duty_sum[:, k], pulses.block)
+
+
+def _levels() -> tuple[Floats, NDArray[np.int64]]:
+    levels: list[float] = []
+    blocks: list[int] = []
+    for repeat in range(REPEATS):
+        for share in SHARES:
+            sign = 1.0 if repeat % 2 == 0 else -1.0
+            levels += [sign * share] * DWELL + [-sign * share] * 2 * DWELL + [sign * share] * DWELL
+            blocks += [blocks[-1] + 1 if blocks else 0] * 4 * DWELL
+    return np.array(levels), np.array(blocks)
+
+
+def _winding(working: Working, axis: _Axis, k: int, electrical: float, pole_pairs: float) -> Winding:
+    target, motor = working.target, working.target.motor
+    supply = float(target.supply[k])
+    P_raw, I_raw = loop_gains(working)
+    P, share = P_raw[k] / (256.0 * target.device.current_full_scale), I_raw / 65536.0
+    R, L, lost = motor.R_s, motor.L_q, 0.0
+    emf = motor.torque_constant / (1.0 if motor.kind == "dc" else 1.5)
+    found = None
+    for _ in range(3):  # each round models what happens within a millisecond with the values of the one before
+        window = _window(working, axis, P, share, supply, R, L, emf, lost, electrical, pole_pairs)
+        found = _fit(working, window, axis.block, supply, emf)
+        (R, L), lost = found.mean[:2], found.mean[3]
+        R, L = max(R, 0.2 * motor.R_s), max(L, 0.2 * motor.L_q)
+    assert found is not None
+    return _judge(working, axis, found, window)
+
+
+def _window(
+    working: Working, axis: _Axis, P: float, share: float, supply: float, R: float, L: float, emf: float, lost: float,
+    electrical: float, pole_pairs: float,
+) -> _Window:  # fmt: skip
+    device, motor = working.target.device, working.target.motor
+    dt, ticks = 1.0 / device.current_rate, round(CYCLE * device.current_rate)
+    turn = np.diff(axis.angle)
+    middle = electrical + pole_pairs * (0.5 * (axis.angle[1:] + axis.angle[:-1]) - axis.angle[0])
+    r, s_0 = axis.demand, axis.duty_sum[:-1]
+    errors = np.diff(axis.duty_sum) / (P * share)  # sum over the ticks
+    # What happens tick by tick, by the model: from where the last millisecond ended.
+    start = axis.current[:-1].copy()
+    # A count is a large part of a millisecond's turn: smoothed, where it is only used to model.
+    back = emf * np.convolve(np.pad(turn, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid") / CYCLE
+    for _ in range(2):
+        path = _simulate(r, s_0, start, back, P, share, supply, R, L, lost, middle, dt, ticks, motor.kind == "dc")
+        start = np.append(axis.current[0], path[:-1, ticks])
+    creep = np.append(0.0, path[:, ticks] - path[:, ticks - 1])  # between the last sample and the end
+    ends = axis.current + creep
+    modelled = r[:, None] - path[:, :ticks]
+    moment = (modelled * (ticks - np.arange(ticks))).sum(1) + 0.5 * (ticks + 1) * (errors - modelled.sum(1))
+    sums = ticks * s_0 + share * P * moment
+    last = np.append(0.0, P * (r - axis.current[1:])) + axis.duty_sum  # duty of the tick before each boundary
+    # A duty acts one tick late.
+    duty = P * errors + sums - last[1:] + last[:-1]
+    charge = dt * (ticks * r - errors + 0.5 * (ends[1:] - ends[:-1]))
+    # The encoder was read at the last window of the velocity loop: a turn is that much older than the charge. Speed
+    # follows charge, which counts do not blur; what else the rotor does is interpolated.
+    lag = 1.0 / device.velocity_rate
+    moved = charge - charge.mean()
+    gained = float(np.gradient(turn) @ moved) / float(moved @ moved) / CYCLE * charge
+    other = turn - CYCLE * (np.cumsum(gained) - 0.5 * gained)
+    turn = turn + lag * gained + lag / CYCLE * np.diff(other, append=other[-1])
+    # The supply line sags with what the stage draws; braking does not feed back.
+    factor = 1.0 if motor.kind == "dc" else 1.5
+    mean_duty, mean = duty / ticks, charge / CYCLE
+    drawn = np.maximum(factor * mean_duty * mean, 0.0) + SUPPLY_IDLE
+    link = supply - device.stage["supply_resistance"].default * drawn
+    return _Window(link * dt * duty, charge, np.diff(ends), turn, path, middle)
+
+
+def _simulate(
+    r: Floats, s_0: Floats, start: Floats, back: Floats, P: float, share: float, supply: float, R: float, L: float,
+    lost: float, angle: Floats, dt: float, ticks: int, brushed: bool,
+) -> Floats:  # fmt: skip
+    """Return the current at every tick of every millisecond and at its end, shape (n, ticks + 1)."""
+    path = np.empty((len(r), ticks + 1))
+    decay = np.exp(-R * dt / L)
+    i, s = start.copy(), s_0.copy()
+    applied = np.append(0.0, (P * (r[:-1] - start[1:]))) + s_0
+    for n in range(ticks):
+        path[:, n] = i
+        p = P * (r - i)
+        s = s + share * p
+        u = supply * applied - back - lost * dead_time(angle, i, 0.3, brushed)
+        i = decay * i + (1.0 - decay) / R * u
+        applied = p + s
+    path[:, ticks] = i
+    return path
+
+
+def dead_time(angle: Floats, i_q: Floats, saturation: float, brushed: bool) -> Floats:
+    """Return the voltage along q that dead time takes, over what one phase loses at most.
+
+    Args:
+        angle: Electrical angle [rad].
+        i_q: Current [A]; i_d is 0.
+        saturation: Current from which a phase loses all of it [A].
+        brushed: Whether the motor lies between two legs.
+    """
+    if brushed:
+        return np.asarray(2.0 * np.clip(i_q / saturation, -1.0, 1.0))
+    s, c = np.sin(angle), np.cos(angle)
+    alpha, beta = -s * i_q / saturation, c * i_q / saturation
+    a = np.clip(alpha, -1.0, 1.0)
+    b = np.clip(0.5 * (SQRT3 * beta - alpha), -1.0, 1.0)
+    third = np.clip(-0.5 * (SQRT3 * beta + alpha), -1.0, 1.0)
+    return np.asarray(c * (b - third) / SQRT3 - s * (2.0 * a - b - third) / 3.0)
+
+
+class _Fit(NamedTuple):
+    mean: Floats  # R, L, K_e, volts lost to dead time, constant
+    spread: Floats
+    freedom: int
+
+
+def _fit(working: Working, window: _Window, blocks: NDArray[np.int64], supply: float, emf: float) -> _Fit:
+    """Fit the balance for a grid of saturation currents, and average over them by their likelihood."""
+    stage, rate = working.target.device.stage, working.target.device.current_rate
+    low, high = stage["dead_time"].low, stage["dead_time"].high
+    R = working.target.motor.R_s
+    prior = np.array([RESISTANCE_PRIOR[0] * R, 0.0, EMF_PRIOR[0] * emf, 0.5 * (low + high) * rate * supply, 0.0])
+    deviation = np.array(
+        [RESISTANCE_PRIOR[1] * R, np.inf, EMF_PRIOR[1] * emf, (high - low) / 12**0.5 * rate * supply, np.inf]
+    )
+    row = stage["dead_time_current"]
+    grid = np.geomspace(row.low, row.high, 8)
+    brushed = working.target.motor.kind == "dc"
+    count = 2.0 * np.pi / working.target.motor.encoder_counts
+    results = []
+    for saturation in grid:
+        lost = dead_time(window.angle[:, None], window.path[:, :-1], saturation, brushed).mean(1) * CYCLE
+        X = np.stack([window.charge, window.change, window.turn, lost, np.full(len(lost), CYCLE)], 1)
+        # The first pulse is left out: the loop settles. A sample's noise is in change, the model's is not: instrument.
+        Z = X.copy()
+        Z[1:, 1] = window.path[1:, -1] - window.path[:-1, -1]
+        keep = blocks > 0
+        results.append(_solve(X[keep], Z[keep], window.flux[keep], blocks[keep], prior, deviation, count))
+    # Chi square over degrees of freedom that pulses, not milliseconds, have; and what the priors say.
+    rest, penalty = np.array([result[2] for result in results]), np.array([result[3] for result in results])
+    freedom = int(blocks.max()) - 4
+    misfit = freedom * rest / rest.min() + penalty
+    weight = np.exp(-0.5 * (misfit - misfit.min()))
+    weight /= weight.sum()
+    means, spreads = np.array([r[0] for r in results]), np.array([r[1] for r in results])
+    mean = weight @ means
+    spread = np.sqrt(weight @ (spreads**2 + (means - mean) ** 2))
+    return _Fit(mean, spread, freedom)
+
+
+def _solve(
+    X: Floats,
+    Z: Floats,
+    y: Floats,
+    blocks: NDArray[np.int64],
+    prior: Floats,
+    deviation: Floats,
+    count: float,
+) -> tuple[Floats, Floats, float, float]:
+    """Return coefficients, deviations for errors alike within a pulse, the rest's square, and the priors' misfit."""
+    scale = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-15)
+    A, B = X / scale, Z / scale
+    weight = np.zeros(X.shape[1])
+    b, variance, floor = np.zeros(X.shape[1]), 0.0, float(np.mean((LEAST_NOISE * y) ** 2))
+    known = np.isfinite(deviation)
+    # Turns are differences of counts, whose rounding would make K_e small: its known variance is taken out.
+    blur = np.zeros(X.shape[1])
+    blur[TURN] = min(len(y) * count**2 / 12.0 / scale[TURN] ** 2, 0.5 * float(A[:, TURN] @ A[:, TURN]))
+    for _ in range(3):
+        normal = B.T @ A + np.diag(weight - blur) + 1e-9 * len(y) * np.eye(len(scale))
+        b = np.linalg.solve(normal, B.T @ y + weight * prior * scale)
+        variance = float(np.mean((y - A @ b) ** 2)) + floor
+        weight = np.where(known, variance / (deviation * scale) ** 2, 0.0)
+    rest = y - A @ b
+    scores = np.array([B[blocks == k].T @ rest[blocks == k] for k in np.unique(blocks)])
+    inverse = np.linalg.inv(normal)
+    meat = scores.T @ scores + np.diag(weight) * variance
+    spread = np.sqrt(np.diag(inverse @ meat @ inverse.T))
+    b, spread = b / scale, spread / scale
+    penalty = float(np.sum(((b - prior)[known] / deviation[known]) ** 2))
+    return b, spread, float(rest @ rest) + len(y) * floor, penalty
+
+
+def _judge(working: Working, axis: _Axis, found: _Fit, window: _Window) -> Winding:
+    """Return the estimates with their intervals, or why there are none."""
+    target = working.target
+    t = t_quantile(found.freedom)
+    gain = gain_error(target.device, target.motor)
+    estimates = []
+    for k, (unit, model) in enumerate((("ohm", RESISTANCE_MODEL), ("H", INDUCTANCE_MODEL))):
+        value, half = float(found.mean[k]), t * float(found.spread[k])
+        if not value > 0.0 or half > WIDEST * value:
+            swing = float(np.ptp(axis.current))
+            estimates.append(refused(unit, (
+                f"excitation too weak: the pulses of {swing:.2g} A peak to peak leave an interval of "
+                f"{half:.2g} {unit} around {value:.2g} {unit}; allow a greater current"
+            )))  # fmt: skip
+        else:
+            estimates.append(interval(value, half, float(np.hypot(gain, model)), unit))
+    return Winding(estimates[0], estimates[1], _follows(window))
+
+
+def _follows(window: _Window) -> bool:
+    """Return whether the encoder counts up where the charge drives up: over the pulses, not over a count."""
+    gained = np.gradient(window.turn)
+    charge = window.charge - window.charge.mean()
+    return float(gained @ charge) > 0.3 * float(np.linalg.norm(gained) * np.linalg.norm(charge))
+
+
+def _none(reason: str) -> Winding:
+    return Winding(refused("ohm", reason), refused("H", reason), False)
+
+
+def to_torque_mode(working: Working, holding: Floats) -> None:
+    """Go from a velocity mode to cst, with the currents that hold the axes [A]."""
+    drives = working.target.drives
+    drives.write(TARGET_TORQUE, np.rint(1e3 * holding).astype(np.int64), where=working.where)
+    motion.select_mode(drives, "cst", working.where)

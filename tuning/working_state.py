@@ -1,0 +1,238 @@
+"""Drives while they are experimented on: cautious settings of our own, the old ones given back at the end.
+
+A drive may come factory-fresh, with all gains 0, or with gains that make it shake: before anything turns, it gets gains
+from the data sheet that are slow enough for any load, and the profile, limits and windows that the experiments need.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env import motion
+from drive_env.gains import GAIN_OBJECTS, gains_from_bandwidths, write_gains
+from drive_env.motors import Motor
+from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+CYCLE = 0.001  # s
+POSITION, VELOCITY, CURRENT, DEMANDED = 0x6064, 0x606C, 0x6077, 0x6062
+TARGET_TORQUE, TARGET_VELOCITY, TARGET_POSITION, STATUS = 0x6071, 0x60FF, 0x607A, 0x6041
+TORQUE_P, TORQUE_I, TORQUE_SUM = (0x2041, 1), (0x2041, 2), (0x2041, 4)
+MOTOR_TYPE, COMMUTATION, POLE_PAIRS, OPEN_LOOP_CURRENT = 0x2050, 0x2055, 0x2056, 0x2004
+MAX_CURRENT, ENCODER_DIRECTION, ENCODER_STEPS, SHAFT_DIRECTION = 0x2003, (0x2080, 1), (0x2080, 2), 0x2057
+FOLLOWING_WINDOW, LIMIT_SWITCHES, INPUTS, MOTOR_FLAGS, INIT_MODE = 0x6065, 0x2005, 0x60FD, 0x2101, (0x2080, 3)
+BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
+INITIALIZED = 1 << 15  # of 2101h: the encoder is aligned
+# What experiments change, in the order in which it is given back.
+CHANGED = (
+    MAX_CURRENT, OPEN_LOOP_CURRENT, *GAIN_OBJECTS, MOTOR_TYPE, COMMUTATION, POLE_PAIRS, ENCODER_STEPS, 0x6083, 0x6084,
+    0x6085, FOLLOWING_WINDOW, LIMIT_SWITCHES, TARGET_VELOCITY, TARGET_POSITION, TARGET_TORQUE, (0x60C2, 1), (0x60C2, 2),
+)  # fmt: skip
+BRUSHED, BRUSHLESS = 1, 3  # 2050h
+BY_FIELD, BY_ENCODER = 1, 3  # 2055h
+
+CURRENT_HZ, VELOCITY_HZ, POSITION_HZ = 300.0, 20.0, 5.0  # cautious bandwidths, of data sheet values
+INTEGRATION = 5.0  # T_i as a multiple of 1/w_v
+# Above its resonance an elastic load leaves the rotor alone, whose crossover then is what P makes of its inertia.
+ROTOR_HZ = 100.0
+BASE_MARGIN, BASE_SHARE = 0.5, 0.4  # rad from the ends of the travel, or of the travel if that is less
+RETURN_SPEED, REST = 0.1, 60  # of the speed limit, on the way back; cycles at rest there
+GUESS = 3.0  # total inertia over the rotor's, until it is known
+ENABLE_TIME, ALIGNMENT_TIME = 1.0, 8.0  # s, longest waits: for the states, and for an encoder that is aligned first
+
+
+@dataclass
+class Working:
+    """Drives in their working state.
+
+    Attributes:
+        target: What is identified.
+        where: Axes that are experimented on.
+        origin: Position of every axis when the target was made known [inc].
+        increments: Position increments per radian.
+        current: Most that may be asked for [A], of every axis: the target's limit, or the drive's own if that is lower.
+    """
+
+    target: Target
+    where: Mask
+    origin: Integers
+    increments: Floats
+    current: Floats
+
+    @property
+    def base(self) -> Floats:
+        """Return where experiments begin and end [rad from the origin]: there, or a little inside of a near limit."""
+        low, high = self.target.low, self.target.high
+        margin = np.minimum(BASE_MARGIN, BASE_SHARE * (high - low))
+        return np.clip(np.zeros(len(low)), low + margin, high - margin)
+
+    def angle(self, position: ArrayLike) -> Floats:
+        """Return positions [inc] as angles from the origin [rad]; the counter wraps at 2^31."""
+        away = np.asarray(position, float) - self.origin
+        return np.asarray(((away + 2.0**31) % 2.0**32 - 2.0**31) / self.increments)
+
+    def room(self) -> tuple[Floats, Floats]:
+        """Return how far the rotors may turn from where they are now [rad], down and up."""
+        here = self.angle(self.target.drives.read(POSITION))
+        return self.target.low - here, self.target.high - here
+
+
+def cautious_gains(target: Target, inertia: ArrayLike, motor: Motor | None = None) -> Integers:
+    """Return raw gains, shape (num_axes, 5), for total inertias [kg*m^2], slow enough for rigid and elastic loads."""
+    J = np.broadcast_to(np.asarray(inertia, float), (target.num_axes,))
+    return np.array([
+        gains_from_bandwidths(
+            target.device, motor or target.motor, float(J[k]), current_hz=CURRENT_HZ,
+            velocity_hz=cautious_bandwidth(target.motor, float(J[k])), position_hz=POSITION_HZ,
+            supply=float(target.supply[k]), integration=INTEGRATION,
+        )
+        for k in range(target.num_axes)
+    ], np.int64)  # fmt: skip
+
+
+def cautious_bandwidth(motor: Motor, inertia: float, wanted: float = VELOCITY_HZ) -> float:
+    """Return the bandwidth of a velocity loop [Hz] that is stable on the whole inertia and on the rotor alone."""
+    return min(wanted, ROTOR_HZ * motor.inertia / inertia)
+
+
+@contextmanager
+def working_state(target: Target, where: Mask | None = None) -> Iterator[Working]:
+    """Give drives that are commissioned, cautious and off; afterwards they are off and have back what they had.
+
+    Raises:
+        RuntimeError: If a drive is enabled, moves, or does not take what it must.
+    """
+    drives = target.drives
+    axes = np.ones(target.num_axes, bool) if where is None else where
+    status = drives.read(STATUS)
+    enabled = axes & (status & motion.OPERATION_ENABLED[0] == motion.OPERATION_ENABLED[1])
+    if enabled.any():
+        raise RuntimeError(
+            f"axis {int(np.flatnonzero(enabled)[0])} is enabled: disable it, identification begins with a drive at rest"
+        )
+    before = {key: drives.read(key) for key in CHANGED}
+    mode = drives.read(0x6060)
+    try:
+        yield _prepare(target, axes, before)
+    finally:
+        _give_back(target, axes, before, mode)
+
+
+def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Working:
+    drives, motor = target.drives, target.motor
+    increments = target.increments()
+    write_gains(drives, cautious_gains(target, GUESS * motor.inertia), axes)
+    # A drive fresh from the factory knows no motor; one that is commissioned is taken at its word and checked.
+    fresh = axes & (before[MOTOR_TYPE] == 0)
+    if fresh.any():
+        drives.write(MOTOR_TYPE, BRUSHED if motor.kind == "dc" else BRUSHLESS, where=fresh)
+        drives.write(POLE_PAIRS, motor.n_p, where=fresh)
+        drives.write(ENCODER_STEPS, motor.encoder_counts, where=fresh)
+        drives.write(COMMUTATION, BY_ENCODER, where=fresh)
+        # No axis is at both ends: switches that say so are not there.
+        unwired = fresh & (drives.read(INPUTS) & BOTH_ENDS == BOTH_ENDS)
+        drives.write(LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
+    own = before[MAX_CURRENT] * 1e-3
+    current = np.where(own > 0.0, np.minimum(own, target.current), target.current)
+    drives.write(MAX_CURRENT, np.rint(current * 1e3).astype(np.int64), where=axes)
+    scale = increments
+    for ramp in (0x6083, 0x6084, 0x6085):
+        drives.write(ramp, _raw(10.0 * target.speed * scale), where=axes)
+    # Slow loops lag by turns: what the experiments allow is watched by them, not by this window.
+    drives.write(FOLLOWING_WINDOW, _raw(200.0 * math.pi * scale), where=axes)
+    drives.write((0x60C2, 1), 1, where=axes)
+    drives.write((0x60C2, 2), -3, where=axes)
+    return Working(target, axes, drives.read(POSITION), increments, current)
+
+
+def _give_back(target: Target, axes: Mask, before: Mapping[Any, Integers], mode: Integers) -> None:
+    drives = target.drives
+    switch_off(drives, axes)
+    for key in CHANGED:
+        changed = axes & (drives.read(key) != before[key])
+        if changed.any():
+            drives.write(key, before[key], where=changed)
+    other = axes & (drives.read(0x6060) != mode)
+    if other.any():
+        drives.write(0x6060, mode, where=other)
+
+
+def enable(working: Working, mode: str, where: Mask | None = None) -> None:
+    """Enable axes in a cyclic mode, at rest until told otherwise.
+
+    Raises:
+        RuntimeError: If an axis does not come up.
+    """
+    drives = working.target.drives
+    axes = working.where if where is None else where
+    drives.write(TARGET_VELOCITY, 0, where=axes)
+    drives.write(TARGET_TORQUE, 0, where=axes)
+    try:
+        motion.enable(drives, mode=mode, where=axes, timeout=ENABLE_TIME)
+        waited = 0.0
+        aligns = axes & (drives.read(COMMUTATION) == BY_ENCODER) & (drives.read(MOTOR_TYPE) == BRUSHLESS)
+        while np.any(aligns & (drives.read(MOTOR_FLAGS) & INITIALIZED == 0)) and waited < ALIGNMENT_TIME:
+            drives.advance(50 * CYCLE)
+            waited += 50 * CYCLE
+    except (TimeoutError, RuntimeError) as error:
+        causes = ", ".join(sorted({message.name for message in drives.emergencies()}))
+        raise RuntimeError(f"{error}{f' ({causes})' if causes else ''}") from error
+
+
+def go_back(working: Working, mode: str, to: ArrayLike | None = None) -> None:
+    """Bring axes that are enabled back to their base, or to an angle [rad], in csp, and go on in a mode, at rest."""
+    target, drives = working.target, working.target.drives
+    motion.select_mode(drives, "csp", working.where)
+    goal = working.base if to is None else np.asarray(to, float)
+    here = working.angle(drives.read(POSITION)) - goal
+    # As slow as the axis farthest away needs it: the path's peak is twice its mean.
+    cycles = int(
+        np.clip(np.ceil(2.0 * np.abs(here[working.where]).max() / (RETURN_SPEED * target.speed) / CYCLE), 60, 2000)
+    )
+    left = 0.5 + 0.5 * np.cos(np.pi * (np.arange(cycles) + 1.0) / cycles)
+    path = working.origin + (goal + here * np.concatenate([left, np.zeros(REST)])[:, None]) * working.increments
+    raw = ((np.rint(path) + 2.0**31) % 2.0**32 - 2.0**31).astype(np.int64)
+    drives.record([POSITION], len(raw) * CYCLE, play={TARGET_POSITION: raw})
+    drives.write(TARGET_VELOCITY, 0, where=working.where)
+    motion.select_mode(drives, mode, working.where)
+
+
+def switch_off(drives: motion.Drives, where: Mask) -> None:
+    """Switch axes off; one in fault is off already, and its fault stays, to be read and reset by who wants."""
+    fault = drives.read(STATUS) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1]
+    motion.disable(drives, where & ~fault)
+
+
+@contextmanager
+def swinging_allowed(drives: Any) -> Iterator[None]:
+    """Have a bus's envelope take current that swings for intended meanwhile; all its other limits stay."""
+    envelope = getattr(drives, "safety", None)
+    if envelope is None:
+        yield
+        return
+    limits = envelope.limits
+    envelope.limits = replace(limits, oscillation=False)
+    try:
+        yield
+    finally:
+        envelope.limits = limits
+
+
+def still_enabled(working: Working, status: Integers) -> Mask:
+    """Return which axes are in operation enabled by their statuswords."""
+    mask, value = motion.OPERATION_ENABLED
+    return np.asarray((status & mask) == value)
+
+
+def _raw(values: Floats) -> Integers:
+    return np.clip(np.rint(values), 1, 2**31 - 1).astype(np.int64)
