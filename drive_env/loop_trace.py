@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.dictionary.entries import ObjectName
-from drive_env.firmware import cycle
 from drive_env.firmware.record import get_lanes, set_lanes
-from drive_env.group import Channels, Group, channels
+from drive_env.group import call_of, channels
 from drive_env.live_dictionary import NOTHING
 
 if TYPE_CHECKING:
@@ -76,41 +75,36 @@ def trace_loops(
     windows = round(drives.device.velocity_rate / drives.device.profile_rate)
     samples = np.empty((cycles, windows, len(signals), drives.num_axes))
     live = get_lanes(drives._records, "live", drives.num_axes).astype(np.int32)
-    begin = drives._now
+    rates = {id(group.machinery.rates): group.machinery.rates for group in drives._groups}.values()
+    period = 1.0 / drives.device.profile_rate
+    begin, diverged = drives._now, False
     try:
+        # Each window as if it were a cycle.
+        for one in rates:
+            one.replace(windows=1)
         for k in range(cycles):
             while drives._schedule and drives._schedule[0][0] <= begin + k:
                 _, name, row, where = drives._schedule.pop(0)
                 drives.machine.set(name, row, where)
-            row_of_play = np.ascontiguousarray(values[k : k + 1])
-            for group in drives._groups:
-                samples[k, :1, :, group.axes] = _run(group, 1, row_of_play, played, sampled, supervised=True)
+            first = call_of(np.ascontiguousarray(values[k : k + 1]), played, samples[k, :1], sampled, 1)
+            diverged |= drives._run_groups(first, 0, 1, True, True)
             # A lane that is not alive is computed as ever, and left out of what happens once a cycle.
             set_lanes(drives._records, "live", np.zeros(drives.num_axes, np.int32))
-            for group in drives._groups:
-                samples[k, 1:, :, group.axes] = _run(
-                    group, windows - 1, row_of_play, NOTHING, sampled, supervised=False
-                )
+            for one in rates:
+                one.replace(period=0.0)
+            nothing = np.empty((windows - 1, 0, drives.num_axes))
+            others = call_of(nothing, NOTHING, samples[k, 1:], sampled, 1)
+            diverged |= drives._run_groups(others, 0, windows - 1, True, True)
             set_lanes(drives._records, "live", live)
+            for one in rates:
+                one.replace(period=period)
             drives._now = begin + k + 1
     finally:
         set_lanes(drives._records, "live", live)
-    if cycles:
+        for one in rates:
+            one.replace(windows=windows, period=period)
+    if diverged:
         drives._report_divergence()
     rows = samples.reshape(cycles * windows, len(signals), drives.num_axes)
     t = np.arange(len(rows)) / drives.device.velocity_rate
     return LoopTrace(t, {name: rows[:, k].copy() for k, name in enumerate(signals)})
-
-
-def _run(group: Group, windows: int, play: Floats, played: Channels, sampled: Channels, *, supervised: bool) -> Floats:
-    """Run a group for windows, each as if it were a cycle; return what was sampled, (windows, signals, its axes)."""
-    rates = group._rates._replace(windows=1, period=group._rates.period if supervised else 0.0)
-    values = play if supervised else np.empty((windows, 0, play.shape[2]))
-    # The kernel counts axes over all groups.
-    samples = np.empty((windows, len(sampled.kinds), play.shape[2]))
-    cycle.run(  # type: ignore[no-untyped-call]
-        group._records, group._reals, group._integers, group.load.plant, rates, group._motion,
-        group.axes.start, group._num_axes, 0, windows,
-        values, played.kinds, played.offsets, samples, sampled.kinds, sampled.offsets, 1,
-    )  # fmt: skip
-    return samples[:, :, group.axes]
