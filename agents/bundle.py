@@ -1,0 +1,166 @@
+"""The file of a trained agent: one small .npz with everything in it that acting needs, and where it comes from.
+
+It holds arrays without pickles and, as `about`, JSON: kind, settings, environment with its configuration, card,
+versions and a hash of all that. The observation's normaliser is among the arrays, never in a second file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT, FORMAT_VERSION = "drive-agent", 1
+MAX_BYTES = 1_000_000  # of a file: what ships in the package and is read by a small computer
+ABOUT = "about"  # the array with the JSON, as bytes
+
+
+class BundleError(ValueError):
+    """A file is no bundle, is damaged, or would not be one; the message says which and what to do."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A trained agent as data.
+
+    Attributes:
+        kind: How arrays and settings become something that acts: a row of `policy.KINDS`.
+        arrays: Numbers by name, e.g. weights and normaliser.
+        settings: What the kind needs besides, as JSON has it.
+        environment: Name of the environment that it was trained in, e.g. "ServoDrive/Tracking-v0".
+        configuration: The environment's options that observations and actions depend on, as JSON has them.
+        card: How it was trained, on what distribution, with which seeds, what it reaches, and its limits.
+        versions: Package -> version, of those that made it.
+    """
+
+    kind: str
+    arrays: Mapping[str, NDArray[Any]]
+    settings: Mapping[str, Any]
+    environment: str
+    configuration: Mapping[str, Any] = field(default_factory=dict)
+    card: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, array in self.arrays.items():
+            if name == ABOUT:
+                raise BundleError(f"no array can be named {ABOUT!r}: that is the file's own; choose another name")
+            if array.dtype.kind not in "fiub":
+                raise BundleError(f"array {name!r} holds {array.dtype}; a bundle holds numbers")
+            if array.dtype.kind == "f" and not np.all(np.isfinite(array)):
+                raise BundleError(f"array {name!r} holds NaN or infinity: the training diverged; use a checkpoint")
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of everything in it, hexadecimal."""
+        digest = hashlib.sha256(_canonical(self._about()).encode())
+        for name in sorted(self.arrays):
+            array = np.ascontiguousarray(self.arrays[name])
+            digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+            digest.update(array.tobytes())
+        return digest.hexdigest()
+
+    def save(self, path: str | Path) -> Path:
+        """Write the bundle; equal bundles make equal files.
+
+        Raises:
+            BundleError: If it would be larger than MAX_BYTES, or its tables hold what JSON cannot.
+        """
+        path = Path(path)
+        about = _canonical({**self._about(), "hash": self.hash}).encode()
+        arrays = {name: np.ascontiguousarray(self.arrays[name]) for name in sorted(self.arrays)}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        beside = path.with_name(path.name + ".part")  # a run that dies leaves the old file whole
+        with beside.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **{ABOUT: np.frombuffer(about, np.uint8), **arrays})
+        size = beside.stat().st_size
+        if size > MAX_BYTES:
+            beside.unlink()
+            raise BundleError(f"{path} would have {size} bytes and {MAX_BYTES} are allowed; use a smaller network")
+        beside.replace(path)
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path) -> Bundle:
+        """Read a bundle.
+
+        Raises:
+            BundleError: If there is none, it is of another format, or it was changed after it was written.
+        """
+        path = Path(path)
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            about = json.loads(bytes(arrays.pop(ABOUT)).decode())
+        except FileNotFoundError:
+            raise BundleError(f"there is no file {path}") from None
+        except (OSError, EOFError, KeyError, ValueError, AttributeError, zipfile.BadZipFile) as error:
+            raise BundleError(f"{path} is no agent of drive-agent: {error}") from None
+        if not isinstance(about, dict) or about.get("format") != FORMAT:
+            raise BundleError(f"{path} is no agent of drive-agent")
+        if about["format_version"] != FORMAT_VERSION:
+            raise BundleError(
+                f"{path} has format {about['format_version']} and this drive-env reads {FORMAT_VERSION}; "
+                "use the drive-env that wrote it, or train again"
+            )
+        names = ("kind", "settings", "environment", "configuration", "card", "versions")
+        bundle = cls(arrays=arrays, **{name: about[name] for name in names})
+        if bundle.hash != about.get("hash"):
+            raise BundleError(f"{path} was changed after it was written: its hash is {bundle.hash[:12]}…; get it anew")
+        return bundle
+
+    def _about(self) -> dict[str, Any]:
+        return {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "kind": self.kind,
+            "settings": dict(self.settings),
+            "environment": self.environment,
+            "configuration": dict(self.configuration),
+            "card": dict(self.card),
+            "versions": dict(self.versions),
+        }
+
+
+def installed(*packages: str) -> dict[str, str]:
+    """Return the versions of packages; those that are not installed are left out."""
+    found = {}
+    for name in packages:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it: arrays as lists, tuples as lists, infinities as text, mappings as tables."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(one) for one in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def _canonical(table: Mapping[str, Any]) -> str:
+    try:
+        return json.dumps(table, sort_keys=True, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    except (TypeError, ValueError) as error:
+        raise BundleError(f"card, settings and configuration hold what JSON holds: {error}; use bundle.plain") from None

@@ -1,0 +1,1 @@
+"""The commands of `drive-agent`: one file each, with the function that the command line registers."""

@@ -1,0 +1,84 @@
+"""What the commands of `drive-agent` have in common: options, result folders, and how they end."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from drive_env.tools.options import Bitrate as Bitrate
+from drive_env.tools.options import Channel as Channel
+from drive_env.tools.options import Interface as Interface
+from drive_env.tools.options import Json as Json
+from drive_env.tools.options import Nodes as Nodes
+from drive_env.tools.options import print_json as print_json
+
+# Whatever takes long to import (torch, the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
+REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
+
+Environment = Annotated[str, typer.Argument(help="gain_tuning, gain_scheduling or tracking.")]
+Algorithm = Annotated[str, typer.Option("--algorithm", "-a", help="ppo, sac or recurrent_ppo.")]
+Preset = Annotated[str, typer.Option("--preset", help="quick (minutes) or full (half an hour).")]
+Load = Annotated[str | None, typer.Option("--load", help="Load, in place of the configuration's.")]
+Config = Annotated[Path | None, typer.Option("--config", help="Hyper-parameters (YAML), in place of the shipped ones.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random.")]
+Steps = Annotated[int | None, typer.Option("--steps", help="Steps of all lanes together, in place of the preset's.")]
+Out = Annotated[
+    Path | None, typer.Option("--out", help="Folder for the results, new or empty.", show_default="runs/<timestamp>-…")
+]
+
+
+def new_folder(path: Path | None, name: str) -> Path:
+    """Return a folder for results that holds nothing yet; by default one named after time and command.
+
+    Raises:
+        ValueError: If it holds something.
+    """
+    if path is None:
+        path = Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{name}"
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise ValueError(f"--out {path} holds something already; choose a new folder")
+    return path
+
+
+@contextmanager
+def errors_as_exit_codes() -> Iterator[None]:
+    """End with one line: 1 for what drive, bus or the watch say, 2 for the user's mistake, 130 for Ctrl-C."""
+    from agents.policy import PolicyError
+    from drive_env.dictionary.access import ObjectAccessError
+    from drive_env.master.errors import BusError, OpenError
+    from drive_env.safety import SafetyError
+
+    try:
+        yield
+    except OpenError as error:
+        fail(error)
+    except (PolicyError, SafetyError, BusError, TimeoutError) as error:
+        fail(error, REFUSED)
+    except (ObjectAccessError, ValueError, ImportError) as error:
+        fail(error)
+    except RuntimeError as error:  # motion: an axis is in fault
+        if type(error) is not RuntimeError:
+            raise
+        fail(error, REFUSED)
+    except OSError as error:
+        fail(f"{error.filename}: {error.strerror}" if error.filename else error)
+    except KeyboardInterrupt:
+        fail("interrupted", INTERRUPTED)
+
+
+def fail(error: object, code: int = USER_ERROR) -> NoReturn:
+    """End the command with a red line on stderr."""
+    typer.secho(f"drive-agent: {error}", fg=typer.colors.RED, err=True)
+    raise typer.Exit(code)
+
+
+def interrupted() -> NoReturn:
+    """End the command as Ctrl-C does before it has begun."""
+    print("drive-agent: interrupted", file=sys.stderr)
+    sys.exit(INTERRUPTED)

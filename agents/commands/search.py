@@ -1,0 +1,52 @@
+"""`drive-agent search`: hyper-parameters by Optuna."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from agents.commands.options import Algorithm, Config, Environment, Load, Preset, Seed, Steps, errors_as_exit_codes
+
+
+def search(
+    environment: Environment = "gain_tuning",
+    algorithm: Algorithm = "ppo",
+    preset: Preset = "quick",
+    load: Load = None,
+    config: Config = None,
+    seed: Seed = 0,
+    steps: Steps = None,
+    trials: Annotated[int, typer.Option("--trials", help="Trainings.")] = 20,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", help="Folder of the study; one that is there is gone on with.", show_default="runs/search-…"
+        ),
+    ] = None,
+) -> None:
+    """Search hyper-parameters: each trial trains an agent and scores it on machines that it has not seen.
+
+    The study is a journal that several processes may share. Writes best.yaml, which `drive-agent train --config` takes.
+    """
+    with errors_as_exit_codes():
+        from agents.commands.train import with_load
+        from agents.search import BEST, Trial
+        from agents.search import search as run_search
+        from agents.tasks import ENVIRONMENTS, environment_name
+
+        for name, value in (("--trials", trials), ("--steps", steps)):
+            if value is not None and value < 1:
+                raise ValueError(f"{name} {value} must be 1 or more")
+        given = with_load(environment, algorithm, preset, load, config)
+        if steps is not None:
+            given["n_timesteps"] = steps
+        short = ENVIRONMENTS[environment_name(environment)].short
+        folder = Path("runs") / f"search-{short}-{algorithm}" if out is None else out
+
+        def tell(trial: Trial, best: Trial) -> None:
+            print(f"trial {trial.number}: {trial.score:.4g}; best {best.score:.4g} of trial {best.number}", flush=True)
+
+        run_search(environment, algorithm, given, folder, trials=trials, seed=seed, told=tell)
+        print(f"written to {folder / BEST}")

@@ -1,0 +1,155 @@
+"""`drive-agent train`: an agent from an environment and hyper-parameters."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from agents.commands.options import (
+    INTERRUPTED,
+    Algorithm,
+    Config,
+    Environment,
+    Load,
+    Out,
+    Preset,
+    Seed,
+    Steps,
+    errors_as_exit_codes,
+    fail,
+    new_folder,
+)
+
+if TYPE_CHECKING:
+    from agents.training import Progress, Report
+
+EPISODES = 64  # for the card
+LINES = 10  # of progress where nobody watches a terminal
+
+
+def train(
+    environment: Environment = "gain_tuning",
+    algorithm: Algorithm = "ppo",
+    preset: Preset = "quick",
+    load: Load = None,
+    config: Config = None,
+    seed: Seed = 0,
+    steps: Steps = None,
+    out: Out = None,
+    resume: Annotated[Path | None, typer.Option("--resume", help="Go on with the run in this folder.")] = None,
+) -> None:
+    """Train an agent with Stable-Baselines3 (pip install 'drive-env[agents]').
+
+    Writes agent.npz (the agent, its normaliser and its card), checkpoint.zip, training.csv and TensorBoard's files. The
+    same seed gives the same agent on the same machine, also when the run was interrupted and resumed.
+    """
+    with errors_as_exit_codes():
+        from agents.tasks import ENVIRONMENTS
+        from agents.training import AGENT, CHECKPOINT, Run, with_figures
+        from agents.training import train as run_training
+
+        if resume is None:
+            given = with_load(environment, algorithm, preset, load, config)
+            if steps is not None:
+                if steps < 1:
+                    raise ValueError(f"--steps {steps} must be 1 or more")
+                given["n_timesteps"] = steps
+            run = Run(environment, algorithm, given, seed=seed, preset=preset)
+            folder = new_folder(out, f"{ENVIRONMENTS[run.environment].short}-{algorithm}")
+        else:
+            from agents import checkpoint
+
+            if out is not None or load is not None or config is not None or steps is not None:
+                raise ValueError("--resume goes on as the run began; leave --out, --load, --config and --steps out")
+            folder = resume
+            run = Run(**checkpoint.read_run(folder / CHECKPOINT)["run"])
+        try:
+            with progress(f"{run.environment} {run.algorithm}") as report:
+                bundle = run_training(run, folder, report=report, resume=resume is not None)
+        except KeyboardInterrupt:
+            if not (folder / CHECKPOINT).is_file():
+                raise
+            fail(f"interrupted; go on with: drive-agent train --resume {folder}", INTERRUPTED)
+        print(f"judging it in {EPISODES} episodes with seeds that it has not seen", file=sys.stderr)
+        evaluation = judge(bundle)
+        figures = {name: evaluation.interval(name)._asdict() for name in evaluation.values}
+        seeds = {"evaluation": f"{evaluation.seeds[0]}...{evaluation.seeds[-1]}"}
+        with_figures(bundle, {**figures, "violations": evaluation.violations}, seeds).save(folder / AGENT)
+        for name in evaluation.values:
+            found = evaluation.interval(name)
+            print(f"{name}: {found.mean:.4g} (95 % of {found.low:.4g} to {found.high:.4g}), median {found.median:.4g}")
+        print(f"written to {folder / AGENT}")
+
+
+def judge(bundle: Any) -> Any:
+    """Return the evaluation of a bundle on emulated machines."""
+    from agents.evaluation import evaluate
+    from agents.policy import policy_of
+
+    return evaluate(policy_of(bundle), bundle.environment, bundle.configuration, episodes=EPISODES)
+
+
+def with_load(
+    environment: str, algorithm: str, preset: str, load: str | None, config: Path | None = None
+) -> dict[str, Any]:
+    """Return hyper-parameters for a load: with the section that is named after it, where there is one."""
+    from agents import hyperparameters
+
+    section = load if load in hyperparameters.sections(environment, algorithm, config) else None
+    given = hyperparameters.load(environment, algorithm, preset, path=config, section=section)
+    if load is not None:
+        hyperparameters.merge(given, {"env_kwargs": {"load": load}})
+    return given
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Report]:
+    """Show how far a training is, with speed and reward terms: a line that changes, or some lines in a file."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        shown = -1
+
+        def print_line(state: Any) -> None:
+            nonlocal shown
+            part = LINES * state.timesteps // max(state.total, 1)
+            if part > shown:
+                shown = part
+                print(f"{title}: {state.timesteps} of {state.total} steps, {text(state)}", file=sys.stderr, flush=True)
+
+        yield print_line
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=20),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[text]}"),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(title, total=1.0, text="")
+        yield lambda state: bar.update(task, completed=state.timesteps / max(state.total, 1), text=text(state))
+
+
+def text(state: Progress) -> str:
+    """Return speed, share of the environment, mean return and reward terms in words."""
+    terms = ", ".join(f"{name} {value:.3g}" for name, value in state.terms.items())
+    return (
+        f"{state.speed:,.0f} steps/s ({state.environment_share:.0%} environment), "
+        f"return {state.means['return']:.4g}, {terms}"
+    )

@@ -1,0 +1,293 @@
+"""Episodes of a policy, on emulated machines or on a bus, and what they say: score, interval, violations.
+
+On emulated machines many lanes run side by side, each with a machine of its own. On a bus (or `as_on_a_bus`, which
+hides the machine so that the environment acts as it would there) the lanes are those of the drives.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.bundle import plain
+from agents.guard import GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
+from agents.scores import Episode, Interval, figures, interval
+from agents.tasks import ENVIRONMENTS, configuration_of, environment_name, make_lanes
+
+LANES = 64
+FIRST_SEED = 1_000_000  # far from those of a training
+STEP_SECONDS: dict[str, Callable[[Any], float]] = {"ServoDrive/Tracking-v0": lambda config: 1.0 / config.rate,
+                "ServoDrive/GainScheduling-v0": lambda config: config.step,
+                "ServoDrive/GainTuning-v0": lambda config: 0.75}  # fmt: skip
+
+
+@dataclass
+class Evaluation:
+    """What episodes said.
+
+    Attributes:
+        policy: Its name.
+        environment: Name of the environment.
+        configuration: Its options.
+        side: "emulator", "emulator as on a bus", or the bus.
+        seeds: Of the episodes.
+        values: Figure -> value of each episode.
+        lower_is_better: Figure -> direction.
+        violations: What ended episodes early -> how often.
+        pace: Time that steps took over the time that they should; 1 where time waits.
+        episodes: What was recorded; not saved with the report.
+    """
+
+    policy: str
+    environment: str
+    configuration: dict[str, Any]
+    side: str
+    seeds: list[int]
+    values: dict[str, list[float]]
+    lower_is_better: dict[str, bool]
+    violations: dict[str, int]
+    pace: float = 1.0
+    episodes: list[Episode] = field(default_factory=list, repr=False)
+
+    @property
+    def score(self) -> str:
+        """Name of the figure that is the score."""
+        return next(iter(self.values))
+
+    def interval(self, name: str) -> Interval:
+        """Return mean, 95 % interval and median of a figure."""
+        return interval(self.values[name])
+
+    def save(self, path: str | Path) -> Path:
+        """Write the report as JSON."""
+        path = Path(path)
+        table = {key: value for key, value in vars(self).items() if key != "episodes"}
+        table["intervals"] = {name: self.interval(name)._asdict() for name in self.values}
+        path.write_text(json.dumps(plain(table), indent=1), encoding="utf-8")
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path) -> Evaluation:
+        """Read a report.
+
+        Raises:
+            ValueError: If the file is none.
+        """
+        try:
+            table = json.loads(Path(path).read_text(encoding="utf-8"))
+            table.pop("intervals")
+            table["values"] = {name: [float(one) for one in values] for name, values in table["values"].items()}
+            return cls(**table)
+        except OSError as error:
+            raise ValueError(f"{path} cannot be read: {error.strerror}") from None
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise ValueError(f"{path} is no report of `drive-agent evaluate`; give its report.json") from None
+
+
+class AsOnABus:
+    """Emulated drives without their machine: whatever acts on them does as it would on a bus."""
+
+    machine = None
+
+    def __init__(self, drives: Any) -> None:
+        self._drives = drives
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._drives, name)
+
+
+def evaluate(
+    policy: Any,
+    environment: str,
+    configuration: Mapping[str, Any] | None = None,
+    *,
+    name: str = "policy",
+    episodes: int = 64,
+    seed: int = FIRST_SEED,
+    drives: Any = None,
+    sensor: Any = None,
+    guard: GuardLimits | None = None,
+    side: str | None = None,
+    told: Callable[[int, int], None] | None = None,
+) -> Evaluation:
+    """Run episodes and return what they say.
+
+    Args:
+        policy: What acts: `act(observations)`, shape (lanes, entries), and `reset(mask)`.
+        environment: Name of the environment.
+        configuration: Its options.
+        name: Of the policy, for the report.
+        episodes: How many; each has a seed of its own, `seed`, `seed` + 1, ...
+        seed: Of the first one.
+        drives: Drives to act on, whose gains, offsets and mode are as before afterwards; emulated machines of the
+            environment's own by default.
+        sensor: As `Tracking` takes it.
+        guard: Limits of the policy; by default those of GuardLimits on given drives, and none on emulated machines.
+        side: What the report calls the drives.
+        told: Is told how many episodes are over, of how many.
+
+    Raises:
+        PolicyStoppedError: If the policy did what it must not; given drives are at rest and disabled then.
+        ValueError: For a configuration that is none.
+    """
+    environment = environment_name(environment)
+    given = drives is not None
+    options = dict(configuration or {})
+    if given:  # machines are drawn on emulators alone
+        options = {key: value for key, value in options.items() if key not in ("distributions", "privileged", "stage")}
+    lanes: Any
+    count = min(episodes, LANES) if not given else _lanes_of(environment, drives, options)
+    more = {"drives": drives, "autoreset_mode": "Disabled"} if given else {"autoreset_mode": "NextStep"}
+    if sensor is not None:
+        more["sensor"] = sensor
+    recorded: list[Episode] = []
+    spent, due = 0.0, 0.0
+    with ExitStack() as care:
+        if given:
+            care.enter_context(unchanged(drives))
+            care.enter_context(stopping(drives))
+        lanes = make_lanes(environment, count, options, **more)
+        try:
+            space: Any = lanes.single_action_space
+            limits = guard or (GuardLimits() if given else GuardLimits(saturation=None, stall=None))
+            if environment == "ServoDrive/GainTuning-v0":  # a trial's gains may well be at the end of their range
+                limits = GuardLimits(saturation=None, stall=limits.stall)
+            step = STEP_SECONDS[environment](lanes.config)
+            watched = GuardedPolicy(policy, space.low, space.high, step, limits)
+            for first in range(0, episodes, count):
+                seeds = [seed + first + lane for lane in range(count)]
+                wanted = min(count, episodes - first)
+                found_now, seconds = _episodes(watched, lanes, seeds, all_end=given)
+                recorded += found_now[:wanted]
+                spent += seconds
+                due += step * max(len(episode.rewards) for episode in found_now)
+                if told is not None:
+                    told(len(recorded), episodes)
+            if given:
+                come_to_rest(drives)
+            config = lanes.config
+            found = configuration_of(lanes)
+        finally:
+            lanes.close()
+    evaluation = summary(recorded, config, found, environment, name, side or ("bus" if given else "emulator"))
+    if not getattr(drives, "time_waits", True):
+        evaluation.pace = spent / due
+    return evaluation
+
+
+def summary(
+    episodes: Sequence[Episode], config: Any, configuration: dict[str, Any], environment: str, policy: str, side: str
+) -> Evaluation:
+    """Return what recorded episodes say."""
+    rows = figures(environment, config)
+    values = {row.name: [row.compute(episode, config) for episode in episodes] for row in rows}
+    values = {name: found for name, found in values.items() if np.isfinite(found).any()}
+    violations: dict[str, int] = {}
+    for episode in episodes:
+        if episode.terminated:
+            what = episode.fault or "ended early"
+            violations[what] = violations.get(what, 0) + 1
+    better = {row.name: row.lower_is_better for row in rows if row.name in values}
+    seeds = [episode.seed for episode in episodes]
+    return Evaluation(
+        policy, environment, configuration, side, seeds, values, better, violations, episodes=list(episodes)
+    )
+
+
+def _episodes(policy: Any, lanes: Any, seeds: Sequence[int], all_end: bool) -> tuple[list[Episode], float]:
+    """Return an episode of every lane, and the time that its steps took [s].
+
+    Args:
+        policy: What acts.
+        lanes: The lanes.
+        seeds: One for each lane.
+        all_end: Whether every lane's episode ends with the first that does: beginning anew would move the others.
+    """
+    count = lanes.num_envs
+    observation, told = lanes.reset(seed=list(seeds))
+    policy.reset(None)
+    first = [_of_lane(told, lane) for lane in range(count)]
+    rows: list[Any] = [_seen(observation)]
+    actions: list[Any] = []
+    rewards: list[Any] = []
+    terms: dict[str, list[Any]] = {}
+    lengths = np.zeros(count, np.int64)
+    fell = np.zeros(count, bool)
+    faults: list[str] = [""] * count
+    last: list[dict[str, Any]] = [{} for _ in range(count)]
+    open_ = np.ones(count, bool)
+    start = time.perf_counter()
+    while open_.any():
+        action = policy.act(rows[-1])
+        observation, reward, terminated, truncated, info = lanes.step(action)
+        rows.append(_seen(observation))
+        actions.append(np.array(action, np.float32).reshape(count, -1))
+        rewards.append(reward)
+        for name, value in info.get("reward_terms", {}).items():
+            terms.setdefault(name, []).append(np.array(value, float))
+        lengths += open_
+        ended = open_ & (terminated | truncated)
+        for lane in map(int, np.flatnonzero(ended)):
+            fell[lane] = terminated[lane]
+            last[lane] = _of_lane(info, lane)
+            faults[lane] = str(last[lane].get("fault", "") or "")
+        open_ &= ~ended
+        if all_end and ended.any():
+            for lane in map(int, np.flatnonzero(open_)):
+                last[lane] = _of_lane(info, lane)
+            break
+    seconds = time.perf_counter() - start
+    episodes = [
+        Episode(
+            seeds[lane],
+            np.stack([row[lane] for row in rows[: lengths[lane] + 1]]),
+            np.stack([row[lane] for row in actions[: lengths[lane]]]),
+            np.array([row[lane] for row in rewards[: lengths[lane]]], float),
+            {name: np.array([row[lane] for row in values[: lengths[lane]]]) for name, values in terms.items()},
+            bool(fell[lane]),
+            faults[lane],
+            first[lane],
+            last[lane],
+        )
+        for lane in range(count)
+    ]
+    return episodes, seconds
+
+
+def _seen(observation: Any) -> Any:
+    """Return what a policy sees: of a dict its `observation`; a copy, since it is kept."""
+    return np.array(observation["observation"] if isinstance(observation, dict) else observation)
+
+
+def _of_lane(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
+    """Return the numbers and texts that an info tells of a lane."""
+    found = {}
+    for key, value in info.items():
+        if key.startswith("_") or isinstance(value, Mapping) or np.ndim(value) < 1:
+            continue
+        found[key] = value[lane]
+    return found
+
+
+def _lanes_of(environment: str, drives: Any, options: Mapping[str, Any]) -> int:
+    """Return how many lanes given drives are: a lane has the axes of the load."""
+    from mechanics.loads import find_load
+
+    load = options.get("load")
+    if load is None:
+        import importlib
+
+        task = ENVIRONMENTS[environment]
+        module = importlib.import_module(f"drive_env.envs.{task.short}")
+        load = getattr(module, f"{task.kind}Config")().load
+    axes = find_load(load).num_axes
+    if drives.num_axes % axes:
+        raise ValueError(f"the load {load!r} has {axes} axes and {drives.num_axes} drives were given; name all --node")
+    return int(drives.num_axes // axes)

@@ -1,0 +1,158 @@
+"""Any policy as something that acts: our bundle, a checkpoint of Stable-Baselines3, ONNX, or a Python callable.
+
+How it is written says what it is: agent.npz, checkpoint.zip, agent.onnx, or module:function.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.policy import load_policy
+
+ACTOR = "observation"  # the entry of a dict observation that the actor sees
+
+
+class PolicyNotFoundError(ValueError):
+    """There is no such policy, or it cannot be used; the message says what can."""
+
+
+@dataclass
+class LoadedPolicy:
+    """A policy and what is known of it.
+
+    Attributes:
+        name: As the user wrote it.
+        policy: What acts: `act(observation)`, `reset(mask)`.
+        environment: Name of the environment that it was trained in; None if unknown.
+        configuration: The environment's options then.
+        card: What is known of it.
+    """
+
+    name: str
+    policy: Any
+    environment: str | None = None
+    configuration: Mapping[str, Any] = field(default_factory=dict)
+    card: Mapping[str, Any] = field(default_factory=dict)
+
+
+def open_policy(text: str) -> LoadedPolicy:
+    """Return the policy that a text names.
+
+    Raises:
+        PolicyNotFoundError: If it is none; BundleError or CheckpointError if its file is not what it seems.
+    """
+    for ending, opened in OPENERS.items():
+        if text.lower().endswith(ending):
+            return opened(text)
+    if ":" in text:
+        return _callable(text)
+    raise PolicyNotFoundError(
+        f"{text!r} is no policy; give an agent ({', '.join(OPENERS)}) or a Python function (module:function)"
+    )
+
+
+class CallablePolicy:
+    """A Python function of an observation; it gets all lanes' at once, shape (lanes, entries).
+
+    A class, or an object with `act`, is taken as it is.
+    """
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self._function = function
+
+    def act(self, observation: Any) -> Any:
+        """Return what the function returns."""
+        return np.asarray(self._function(observation), np.float32)
+
+    def reset(self, mask: Any = None) -> None:
+        """Do nothing."""
+
+
+class ModelPolicy:
+    """A model of Stable-Baselines3 with its normaliser, acting without noise."""
+
+    def __init__(self, model: Any, normaliser: Any) -> None:
+        self.model, self._normaliser = model, normaliser
+        self._state: Any = None
+        self._begins: Any = None
+
+    def act(self, observation: Any) -> Any:
+        """Return the model's action."""
+        rows: Any = np.atleast_2d(observation)
+        lanes = len(rows)
+        if hasattr(self.model.observation_space, "spaces"):  # what only the critic saw does not matter to the actor
+            spaces = self.model.observation_space.spaces
+            rows = {key: rows if key == ACTOR else np.zeros((lanes, *spaces[key].shape)) for key in spaces}
+        if self._normaliser is not None:
+            rows = self._normaliser.normalize_obs(rows)
+        if self._begins is None or len(self._begins) != lanes:
+            self._begins = np.ones(lanes, bool)
+        action, self._state = self.model.predict(rows, self._state, self._begins, deterministic=True)
+        self._begins = np.zeros(lanes, bool)
+        return action[0] if np.ndim(observation) == 1 else action
+
+    def reset(self, mask: Any = None) -> None:
+        """Forget what was."""
+        if mask is None or self._begins is None:
+            self._state = self._begins = None
+        else:
+            self._begins = self._begins | mask
+
+
+def _bundle(text: str) -> LoadedPolicy:
+    policy = load_policy(text)
+    bundle = policy.bundle
+    return LoadedPolicy(text, policy, bundle.environment, bundle.configuration, bundle.card)
+
+
+def _onnx(text: str) -> LoadedPolicy:
+    from agents.onnx_policy import OnnxPolicy
+
+    policy = OnnxPolicy(text)
+    return LoadedPolicy(text, policy, policy.environment, policy.configuration, policy.card)
+
+
+def _checkpoint(text: str) -> LoadedPolicy:
+    from agents import checkpoint
+
+    path = Path(text)
+    run = checkpoint.read_run(path)
+    model, normaliser = checkpoint.load(path)
+    card = {"trained": f"{run['algorithm']}, {run['timesteps']} steps", "seeds": {"training": run["run"]["seed"]}}
+    return LoadedPolicy(text, ModelPolicy(model, normaliser), run["environment"], run["configuration"], card)
+
+
+def _callable(text: str) -> LoadedPolicy:
+    module, _, name = text.partition(":")
+    folder = str(Path.cwd())
+    if folder not in sys.path:  # a console script's path lacks it, and the user's function is there
+        sys.path.insert(0, folder)
+    try:
+        found = importlib.import_module(module)
+    except ImportError as error:
+        raise PolicyNotFoundError(f"{text}: module {module!r} cannot be imported: {error}") from None
+    if not hasattr(found, name):
+        functions = [key for key, value in vars(found).items() if callable(value) and not key.startswith("_")]
+        raise PolicyNotFoundError(f"{text}: {module} has no {name!r}; it has {', '.join(functions) or 'nothing'}")
+    policy = getattr(found, name)
+    if inspect.isclass(policy):
+        policy = policy()
+    if not hasattr(policy, "act"):
+        if not callable(policy):
+            raise PolicyNotFoundError(f"{text} is a {type(policy).__name__}; a policy is a function of an observation")
+        policy = CallablePolicy(policy)
+    elif not hasattr(policy, "reset"):
+        policy = CallablePolicy(policy.act)
+    return LoadedPolicy(text, policy)
+
+
+# Ending of a file -> what opens it.
+OPENERS: dict[str, Callable[[str], LoadedPolicy]] = {".npz": _bundle, ".zip": _checkpoint, ".onnx": _onnx}

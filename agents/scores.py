@@ -1,0 +1,168 @@
+"""What an episode is judged by: figures of each environment, from what a policy sees and is told, on a bus too.
+
+Nothing here is known on an emulator alone but what says so, so that the figures of both sides can be compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Episode(NamedTuple):
+    """An episode of one lane, as recorded.
+
+    seed: Of the episode.
+    observations: Shape (steps + 1, entries); the last one is the final one.
+    actions: Shape (steps, actions).
+    rewards: Shape (steps,).
+    terms: Reward term -> values, shape (steps,).
+    terminated: Whether it ended early, which is a violation.
+    fault: What ended it; "" if nothing did.
+    first, last: What the environment told at its begin and in its last step, of this lane.
+    """
+
+    seed: int
+    observations: Floats
+    actions: Floats
+    rewards: Floats
+    terms: Mapping[str, Floats]
+    terminated: bool
+    fault: str
+    first: Mapping[str, Any]
+    last: Mapping[str, Any]
+
+
+class Figure(NamedTuple):
+    """A figure of an episode.
+
+    name: With its unit.
+    compute: From the episode and the environment's configuration (as the environment has it).
+    lower_is_better: Direction.
+    """
+
+    name: str
+    compute: Callable[[Episode, Any], float]
+    lower_is_better: bool = True
+
+
+AXIS_ENTRIES = 8  # of an axis in Tracking's observation
+
+
+def _tracking_axes(episode: Episode) -> Floats:
+    """Return the entries of the axes, shape (steps, axes, entries), without the first observation."""
+    rows = episode.observations[1:]
+    axes = rows.shape[1] // AXIS_ENTRIES
+    return rows[:, : axes * AXIS_ENTRIES].reshape(len(rows), axes, AXIS_ENTRIES)
+
+
+def following_error(episode: Episode, config: Any) -> float:
+    """Return the RMS following error of the worst axis [revolutions]."""
+    rms = np.sqrt(np.mean(np.square(_tracking_axes(episode)[:, :, 0]), axis=0))
+    return float(config.amplitude * rms.max())
+
+
+def current(episode: Episode, config: Any) -> float:
+    """Return the RMS current of the worst axis, share of the current limit."""
+    return float(np.sqrt(np.mean(np.square(_tracking_axes(episode)[:, :, 4]), axis=0)).max())
+
+
+def upright(episode: Episode, config: Any) -> float:
+    """Return the share of the episode's time that it lasted."""
+    return float(len(episode.rewards) / config.steps)
+
+
+def pole(episode: Episode, config: Any) -> float:
+    """Return the RMS angle of the pendulum [rad]; NaN without one."""
+    if config.task.joint is None:
+        return float("nan")
+    return float(np.sqrt(np.mean(np.square(episode.observations[1:, -2]))))
+
+
+def _told(name: str, ratio: bool) -> Callable[[Episode, Any], float]:
+    """Return a figure of what GainTuning tells: at the end, or over that of the rule, with which it begins."""
+
+    def compute(episode: Episode, config: Any) -> float:
+        if name not in episode.last:
+            return float("nan")
+        end = float(np.asarray(episode.last[name]))
+        return end / float(np.asarray(episode.first[name])) if ratio else end
+
+    return compute
+
+
+def _mean_term(name: str) -> Callable[[Episode, Any], float]:
+    return lambda episode, config: float(np.mean(episode.terms[name]))
+
+
+def stopped(episode: Episode, config: Any) -> float:
+    """Return the share of trials that were stopped, since they oscillated or tripped; NaN if that costs nothing."""
+    if not config.abort_cost:
+        return float("nan")
+    return float(np.mean(np.asarray(episode.terms["abort"]) < 0.0))
+
+
+def total(episode: Episode, config: Any) -> float:
+    """Return the sum of rewards."""
+    return float(np.sum(episode.rewards))
+
+
+RETURN = Figure("return", total, lower_is_better=False)
+
+# Environment -> its figures; the first one is the score, but see `figures`.
+FIGURES: dict[str, tuple[Figure, ...]] = {
+    "ServoDrive/Tracking-v0": (
+        Figure("RMS following error [rev]", following_error),
+        Figure("RMS current [of the limit]", current),
+        Figure("RMS pole angle [rad]", pole),
+        Figure("time lasted [of the episode]", upright, lower_is_better=False),
+        RETURN,
+    ),
+    "ServoDrive/GainTuning-v0": (
+        Figure("hidden J over the rule's (emulator)", _told("hidden", ratio=True)),
+        Figure("J by measured terms over the rule's", _told("measured", ratio=True)),
+        Figure("J by measured terms", _told("measured", ratio=False)),
+        Figure("stopped trials [share]", stopped),
+        RETURN,
+    ),
+    "ServoDrive/GainScheduling-v0": (
+        Figure("tracking term [0...1]", _mean_term("tracking"), lower_is_better=False),
+        Figure("smoothness term [0...1]", _mean_term("smoothness"), lower_is_better=False),
+        RETURN,
+    ),
+}
+
+
+def figures(environment: str, config: Any) -> tuple[Figure, ...]:
+    """Return the figures of an environment, the score first: where a pole can fall, the time that it stood."""
+    found = FIGURES[environment]
+    if np.isfinite(getattr(getattr(config, "task", None), "fall", np.inf)):
+        found = tuple(sorted(found, key=lambda figure: figure.compute is not upright))
+    return found
+
+
+class Interval(NamedTuple):
+    """A mean over episodes with its 95 % confidence interval, and the median."""
+
+    mean: float
+    low: float
+    high: float
+    median: float
+    episodes: int
+
+
+def interval(values: Any, seed: int = 0, resamples: int = 2000) -> Interval:
+    """Return mean, percentile bootstrap interval (95 %) and median of a figure; NaN ones are left out."""
+    found = np.asarray(values, float)
+    found = found[np.isfinite(found)]
+    if not len(found):
+        return Interval(float("nan"), float("nan"), float("nan"), float("nan"), 0)
+    rng = np.random.default_rng(seed)
+    means = found[rng.integers(0, len(found), (resamples, len(found)))].mean(axis=1)
+    low, high = np.quantile(means, (0.025, 0.975))
+    return Interval(float(found.mean()), float(low), float(high), float(np.median(found)), len(found))

@@ -1,0 +1,90 @@
+"""Lanes while something trains on them: what episodes brought, reward terms, and the time that they took."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from drive_env.envs.lanes import Lanes
+
+EPISODES = 100  # the last ones, of which means are told
+
+
+class CountedLanes:
+    """Lanes that count: they behave as those that they hold.
+
+    Attributes:
+        episodes: Ended since the beginning.
+        steps: Of all lanes.
+        seconds: Spent in the environment.
+    """
+
+    def __init__(self, lanes: Lanes) -> None:
+        self.lanes = lanes
+        self.episodes = self.steps = 0
+        self.seconds = 0.0
+        self._returns = np.zeros(lanes.num_envs)
+        self._lengths = np.zeros(lanes.num_envs, np.int64)
+        self._ended: deque[tuple[float, int, bool]] = deque(maxlen=EPISODES)
+        self._terms: dict[str, float] = {}
+        self._term_steps = 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.lanes, name)
+
+    @property
+    def stage(self) -> float:
+        """Stage of the curriculum."""
+        return self.lanes.stage
+
+    @stage.setter
+    def stage(self, stage: float) -> None:
+        self.lanes.stage = stage
+
+    def reset(self, **options: Any) -> Any:
+        """Begin an episode in every lane; those that were under way do not count."""
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        start = time.perf_counter()
+        found = self.lanes.reset(**options)
+        self.seconds += time.perf_counter() - start
+        return found
+
+    def step(self, actions: Any) -> Any:
+        """Act in every lane."""
+        start = time.perf_counter()
+        stepped = self.lanes.step(actions)
+        self.seconds += time.perf_counter() - start
+        _, reward, terminated, truncated, info = stepped
+        self.steps += len(reward)
+        self._returns += reward
+        self._lengths += 1
+        for name, values in info.get("final_info", info).get("reward_terms", {}).items():
+            self._terms[name] = self._terms.get(name, 0.0) + float(np.sum(values))
+        self._term_steps += len(reward)
+        ended = terminated | truncated
+        if ended.any():
+            for lane in np.flatnonzero(ended):
+                self._ended.append((float(self._returns[lane]), int(self._lengths[lane]), bool(terminated[lane])))
+            self.episodes += int(ended.sum())
+            self._returns[ended] = 0.0
+            self._lengths[ended] = 0
+        return stepped
+
+    def take_terms(self) -> dict[str, float]:
+        """Return the mean of each reward term per step since the last call."""
+        count = max(self._term_steps, 1)
+        found = {name: total / count for name, total in self._terms.items()}
+        self._terms, self._term_steps = {}, 0
+        return found
+
+    def episode_means(self) -> dict[str, float]:
+        """Return mean return and length, and the share that terminated, of the last episodes; NaN before any."""
+        if not self._ended:
+            return {"return": np.nan, "length": np.nan, "terminated": np.nan}
+        rows = np.array(self._ended, float).mean(axis=0)
+        return {"return": float(rows[0]), "length": float(rows[1]), "terminated": float(rows[2])}

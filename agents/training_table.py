@@ -1,0 +1,39 @@
+"""What a training reached as it went on: a CSV that is appended to, row by row, and cut where a run is resumed."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+
+class TrainingTable:
+    """Rows of a CSV; the first one says which columns there are.
+
+    Args:
+        path: The file; what it held goes, but rows up to `keep`.
+        keep: Steps up to which earlier rows stay: those of a run that is resumed.
+    """
+
+    def __init__(self, path: Path, keep: int = 0) -> None:
+        self._path = path
+        rows = []
+        if keep and path.is_file():
+            with path.open(newline="", encoding="utf-8") as file:
+                rows = [row for row in csv.DictReader(file) if int(row["timesteps"]) <= keep]
+        self._columns: list[str] = []
+        path.unlink(missing_ok=True)
+        for row in rows:
+            self.add(row)
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Append a row; it is on the disk when this returns."""
+        first = not self._columns
+        if first:
+            self._columns = list(row)
+        with self._path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self._columns, restval="", extrasaction="ignore")
+            if first:
+                writer.writeheader()
+            writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})

@@ -1,0 +1,249 @@
+"""Training: one seed gives one agent, a resumed run equals an uninterrupted one, and every shipped YAML runs."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+
+from agents import checkpoint, hyperparameters, training
+from agents.baselines import baseline
+from agents.bundle import Bundle
+from agents.evaluation import evaluate
+from agents.hyperparameters import ALGORITHMS, HyperparameterError, read_value
+from agents.policies import open_policy
+from agents.policy import policy_of
+from agents.tasks import ENVIRONMENTS, environment_name, make_lanes
+from agents.training import AGENT, CHECKPOINT, TABLE, Run, train
+
+TINY = {"ServoDrive/Tracking-v0": {"duration": 0.01}, "ServoDrive/GainScheduling-v0": {"duration": 0.02},
+        "ServoDrive/GainTuning-v0": {"trials": 1}}  # fmt: skip
+
+
+def tiny(environment="tracking", algorithm="ppo", timesteps=192, **changes):
+    """A run of the shipped hyper-parameters, shrunk."""
+    name = environment_name(environment)
+    given = hyperparameters.load(name, algorithm, "quick")
+    hyperparameters.merge(
+        given, {"n_envs": 4, "n_timesteps": timesteps, "env_kwargs": {**TINY[name], "num_threads": 1}}
+    )
+    small = {"learning_starts": 8, "buffer_size": 500, "batch_size": 16, "gradient_steps": 1}
+    if algorithm != "sac":
+        small = {"n_steps": 8, "batch_size": 16, "n_epochs": 2}
+    hyperparameters.merge(given, small | changes)
+    return Run(name, algorithm, given, seed=3, segments=4)
+
+
+def weights(bundle):
+    return np.concatenate([np.asarray(array, float).ravel() for _, array in sorted(bundle.arrays.items())])
+
+
+# --- one seed, one agent ----------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_one_seed_gives_the_same_agent(algorithm, tmp_path):
+    one, two = (train(tiny(algorithm=algorithm), tmp_path / name) for name in "ab")
+    assert one.hash == two.hash and np.array_equal(weights(one), weights(two))
+    assert (tmp_path / "a" / AGENT).read_bytes() == (tmp_path / "b" / AGENT).read_bytes()
+
+
+def test_another_seed_gives_another_agent(tmp_path):
+    run = tiny()
+    other = Run(run.environment, run.algorithm, run.hyperparameters, seed=4, segments=4)
+    assert not np.array_equal(weights(train(run, tmp_path / "a")), weights(train(other, tmp_path / "b")))
+
+
+class StoppedError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_resumed_run_equals_an_uninterrupted_one(algorithm, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "ROWS", 1000)  # a row for each of the few rollouts
+    run = tiny(algorithm=algorithm, timesteps=480)
+    whole = train(run, tmp_path / "whole")
+    seen = []
+
+    def stop_later(progress):
+        seen.append(progress.timesteps)
+        if progress.timesteps >= 300:  # between the checkpoints after 240 and 360 steps
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        train(run, tmp_path / "cut", report=stop_later)
+    cut = checkpoint.read_run(tmp_path / "cut" / CHECKPOINT)["timesteps"]
+    assert 0 < cut < 300
+    resumed = train(run, tmp_path / "cut", resume=True)
+    assert np.array_equal(weights(resumed), weights(whole)) and resumed.hash == whole.hash
+    rows = [list(csv.DictReader((tmp_path / name / TABLE).open())) for name in ("whole", "cut")]
+    steps = [[int(row["timesteps"]) for row in table] for table in rows]
+    assert steps[1] == sorted(set(steps[1])) and steps[1][-1] == steps[0][-1] == 480
+
+
+def test_a_curriculum_goes_on_where_a_run_was_cut(tmp_path, monkeypatch):
+    stages = []
+    kind = type(make_lanes("tracking", 1, TINY["ServoDrive/Tracking-v0"]))
+    begin = kind._reset_lanes
+    monkeypatch.setattr(kind, "_reset_lanes", lambda self, *rest: (stages.append(self.stage), begin(self, *rest))[1])
+    schedule = {"steps": [0, 480], "stage": [0.0, 1.0]}
+    run = tiny(timesteps=480, env_kwargs={"distributions": {"include": ["two_mass"], "curriculum": schedule}})
+    whole = train(run, tmp_path / "whole")
+    expected, stages[:] = list(stages), []
+
+    def stop_later(progress):
+        if progress.timesteps >= 300:
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        train(run, tmp_path / "cut", report=stop_later)
+    stages.clear()
+    assert train(run, tmp_path / "cut", resume=True).hash == whole.hash
+    assert stages == expected[-len(stages) :] and min(stages) > 0.4
+
+
+def test_what_is_left_of_a_run(tmp_path):
+    told = []
+    bundle = train(tiny(), tmp_path, report=told.append)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {AGENT, CHECKPOINT, TABLE} < names and any(name.startswith("events.out.tfevents") for name in names)
+    table = list(csv.DictReader((tmp_path / TABLE).open()))
+    assert {"timesteps", "seconds", "return", "term tracking", "term effort", "steps/s"} <= set(table[0])
+    assert told[-1].timesteps == told[-1].total == 192 and 0.0 < told[-1].environment_share < 1.0
+    assert np.isfinite(told[-1].means["return"]) and "tracking" in told[-1].terms
+    assert bundle.card["seeds"] == {"training": 3} and "192 steps" in bundle.card["trained"]
+    assert json.dumps(bundle.card)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_bundle_acts_as_the_model(algorithm, tmp_path):
+    bundle = train(tiny(algorithm=algorithm), tmp_path)
+    model = open_policy(str(tmp_path / CHECKPOINT)).policy
+    ours = policy_of(bundle)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        rows = rng.standard_normal((4, 8)).astype(np.float32)
+        assert np.allclose(ours.act(rows), model.act(rows), atol=1e-5)
+
+
+def test_a_policy_begins_as_what_it_imitates(tmp_path):
+    small = {
+        "timesteps": 64,
+        "imitate": {"feed_forward": {"steps": 6000, "updates": 500}},
+        "learning_rate": 1e-9,
+        "policy_kwargs": {"log_std_init": -2.5},
+    }
+    run = tiny(**small, env_kwargs={"action": "offset", "mode": "csp", "duration": 0.2, "num_threads": 1}, n_steps=16)
+    bundle = train(run, tmp_path)
+    options = {"episodes": 4, "seed": 5}
+    lanes = make_lanes(run.environment, 1, bundle.configuration)
+    lanes.close()
+    teacher = baseline("feed_forward", run.environment, lanes.config, 1)
+    error = {
+        name: evaluate(policy, run.environment, bundle.configuration, **options).values["RMS following error [rev]"]
+        for name, policy in (
+            ("agent", policy_of(bundle)),
+            ("teacher", teacher),
+            ("nothing", baseline("nothing", run.environment, lanes.config, 1)),
+        )
+    }
+    assert np.mean(error["teacher"]) < 0.5 * np.mean(error["nothing"])
+    assert np.mean(error["agent"]) < np.mean(error["teacher"]) + 0.25 * np.mean(error["nothing"])
+
+
+# --- hyper-parameters -------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_there_are_hyperparameters_for_every_environment_and_algorithm(environment, algorithm, tmp_path):
+    quick, full = (hyperparameters.load(environment, algorithm, preset) for preset in ("quick", "full"))
+    assert quick["n_timesteps"] < full["n_timesteps"] and quick["policy"] == full["policy"]
+    run = tiny(environment, algorithm, timesteps=32)
+    _, env = training.make_env(run)
+    model, normaliser = training.make_model(run, env)  # the constructor takes them all
+    assert normaliser is not None and model.num_timesteps == 0
+    env.close()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("environment", ["gain_tuning", "gain_scheduling"])
+def test_every_environment_trains(environment, algorithm, tmp_path):
+    bundle = train(tiny(environment, algorithm, timesteps=64), tmp_path)
+    assert Bundle.load(tmp_path / AGENT).environment == bundle.environment
+
+
+def test_an_asymmetric_critic_sees_the_machine_and_the_actor_does_not(tmp_path):
+    bundle = train(tiny("gain_tuning", timesteps=32), tmp_path)
+    lanes = make_lanes("gain_tuning", 1, {"privileged": True})
+    seen, all_ = (lanes.single_observation_space[key].shape[0] for key in ("observation", "privileged"))
+    lanes.close()
+    assert bundle.arrays["weight_0"].shape[0] == seen
+    loaded = open_policy(str(tmp_path / CHECKPOINT)).policy
+    assert loaded.model.policy.mlp_extractor.value_net[0].in_features == seen + all_
+    rows = np.random.default_rng(0).standard_normal((3, seen)).astype(np.float32)
+    assert np.allclose(loaded.act(rows), policy_of(bundle).act(rows), atol=1e-5)
+    found = evaluate(policy_of(bundle), "gain_tuning", bundle.configuration, episodes=2)
+    assert np.isfinite(found.values["hidden J over the rule's (emulator)"]).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("dict(net_arch=[64, 64], activation_fn=nn.Tanh)", {"net_arch": [64, 64], "activation_fn": "nn.Tanh"}),
+        ("dict(net_arch=dict(pi=[256], vf=[256]))", {"net_arch": {"pi": [256], "vf": [256]}}),
+        ("{'norm_obs': True, 'norm_reward': False}", {"norm_obs": True, "norm_reward": False}),
+        ("1e-4", 1e-4), ("-2", -2.0), ("lin_3e-4", "lin_3e-4"), ("MlpPolicy", "MlpPolicy"), (5, 5),
+    ],
+)  # fmt: skip
+def test_zoo_entries_are_read(text, value):
+    assert read_value(text) == value
+
+
+@pytest.mark.parametrize("text", ["dict(a=open('x'))", "dict(net_arch=__import__('os'))", "[x for x in y]", "dict(a=1"])
+def test_nothing_of_a_yaml_is_evaluated(text):
+    with pytest.raises(HyperparameterError):
+        read_value(text)
+
+
+def test_a_schedule_falls_to_zero():
+    falling = hyperparameters.schedule("lin_3e-4")
+    assert falling(1.0) == 3e-4 and falling(0.5) == 1.5e-4 and falling(0.0) == 0.0
+    assert hyperparameters.schedule(0.2) == 0.2
+    with pytest.raises(HyperparameterError, match=r"e\.g\. lin_3e-4, not 'lin_x'"):
+        hyperparameters.schedule("lin_x")
+
+
+def test_a_section_of_a_load_replaces_the_environments(tmp_path):
+    found = hyperparameters.load("tracking", "ppo", "quick", section="gantry")
+    assert found["env_kwargs"]["load"] == "gantry" and found["n_timesteps"] == 3_000_000
+    assert found["policy_kwargs"]["net_arch"] == [64, 64]  # of the environment's own section
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("walking", "ppo"), "there is no environment 'walking'; there are ServoDrive/GainTuning-v0"),
+        (("tracking", "dqn"), "there is no algorithm 'dqn'; there are ppo, sac, recurrent_ppo"),
+        (("tracking", "ppo", "slow"), "there is no preset 'slow'; there are quick, full"),
+        (("tracking", "ppo", "quick", None, "moon"), "has no section moon; it has ServoDrive/Tracking-v0, quick"),
+        (("tracking", "ppo", "quick", "missing.yaml"), "there is no file missing.yaml"),
+    ],
+)
+def test_a_wrong_name_names_the_valid_ones(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        hyperparameters.load(*arguments)
+
+
+def test_hyperparameters_that_the_algorithm_does_not_take_are_told(tmp_path):
+    with pytest.raises(HyperparameterError, match=r"ppo does not take these hyper-parameters: .*'tau'"):
+        train(tiny(tau=0.1), tmp_path)
+
+
+def test_there_is_nothing_to_resume(tmp_path):
+    with pytest.raises(ValueError, match="there is no file"):
+        train(tiny(), tmp_path, resume=True)
+    (tmp_path / CHECKPOINT).write_bytes(b"no")
+    with pytest.raises(ValueError, match="is no checkpoint"):
+        train(tiny(), tmp_path, resume=True)
