@@ -142,6 +142,8 @@ def bristle_torque(v, other, J, h, z, s_0, s_1, coulomb, breakaway, stribeck, vi
         mean = constant + slope * u
         end = decay * z + h * phi * u
         miss = u - free + half * mean
+        if miss == 0.0:  # at rest on relaxed bristles; to go on would be to look for rounding errors
+            break
         if miss > 0.0:
             high = u
         else:

@@ -7,13 +7,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 
-from mechanics import loads
+from mechanics import friction, loads
 from mechanics.compiled import cached
-from mechanics.friction import friction_torque
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
 from mechanics.stepping import step
+
+
+@njit(error_model="numpy")
+def friction_torque(v, other, inertia, h, coulomb, breakaway, stribeck, viscous, drag):
+    """The stage, for Python."""
+    return friction.friction_torque(v, other, inertia, h, coulomb, breakaway, stribeck, viscous, drag)
+
 
 H = 200e-6
 J_M = 4.8e-6

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from numba import njit
 from scipy.integrate import solve_ivp
 
 from drive_env import EmulatedDrives
+from mechanics import friction as friction_laws
 from mechanics import loads
 from mechanics.compiled import cached
-from mechanics.friction import FRICTION_MODELS, bristle_torque, find_friction
+from mechanics.friction import FRICTION_MODELS, find_friction
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
 from mechanics.stepping import step
@@ -22,6 +24,14 @@ from mechanics.stepping import step
 H = 200e-6
 # The paper's parameters, for a mass of 1 kg.
 S_0, S_1, S_2, F_C, F_S, V_S, MASS = 1e5, math.sqrt(1e5), 0.4, 1.0, 1.5, 1e-3, 1.0
+
+
+@njit(error_model="numpy")
+def bristle_torque(v, other, mass, h, z, s_0, s_1, coulomb, breakaway, stribeck, viscous, drag):
+    """The stage, which kernels alone can call, for Python."""
+    return friction_laws.bristle_torque(v, other, mass, h, z, s_0, s_1, coulomb, breakaway, stribeck, viscous, drag)
+
+
 ROW = (S_0, S_1, F_C, F_S, V_S, S_2, 0.0)  # the order of bristle_torque
 J_M, J_L = 4.8e-6, 1e-5
 
