@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 
 import typer
 
@@ -24,9 +23,8 @@ PANELS = {
 }
 for panel, names in PANELS.items():
     for name in names:
-        if importlib.util.find_spec(f"agents.commands.{name}") is not None:
-            module = importlib.import_module(f"agents.commands.{name}")
-            app.command(name, rich_help_panel=panel)(getattr(module, name))
+        module = importlib.import_module(f"agents.commands.{name}")
+        app.command(name, rich_help_panel=panel)(getattr(module, name))
 
 
 @app.callback()

@@ -22,6 +22,7 @@ Array = NDArray[np.float32]
 KINDS: dict[str, str] = {
     "mlp": "agents.policy:MlpPolicy",
     "lstm": "agents.policy:LstmPolicy",
+    "surrogate": "agents.surrogate:SurrogatePolicy",
 }
 
 

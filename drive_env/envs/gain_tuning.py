@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import find_device
 from drive_env.envs.configuration import configured
@@ -171,8 +171,8 @@ class GainTuning(Lanes):
 
     `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (lanes, axes, 5) raw integers in the order of
     `Gains`; "measured", its J by measured terms, and "hidden", hidden J; "trial_hidden", that of this step's trial;
-    "aborted"; "faults", names of the trial's emergencies, tuples; "parameters", the true machine. Of given drives
-    there is nothing hidden.
+    "trial_gains", "trial_measured" and "aborted" too; "faults", names of the trial's emergencies, tuples; "parameters",
+    the true machine. Of given drives there is nothing hidden.
 
     Args:
         num_envs: Lanes.
@@ -181,6 +181,8 @@ class GainTuning(Lanes):
             of the configuration by default, of which every trial begins at rest at zero. On a bus the safety envelope
             stops all drives where one oscillates, with a SafetyError; `Limits(oscillation=False)` leaves that to the
             trial, which stops the lane alone.
+        reach: How far each rotor of given drives may turn from where it stands, with its sign [rad], shape
+            (num_axes,); by the configuration's load or travel if not given.
         autoreset_mode, render_mode: As `Lanes` takes them.
         options: Fields of the configuration that replace its own.
 
@@ -194,6 +196,7 @@ class GainTuning(Lanes):
         *,
         config: GainTuningConfig | Mapping[str, Any] | str | Path | None = None,
         drives: Any = None,
+        reach: ArrayLike | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         **options: Any,
@@ -212,12 +215,14 @@ class GainTuning(Lanes):
             self._axes = axes
             if self._owned:
                 self._make_world(num_envs)
+                if reach is not None:
+                    raise ValueError("reach is of given drives; give travel in the configuration, or leave it out")
             elif self.config.distributions is not None or self.config.privileged:
                 raise ValueError("given drives are taken as they are: leave distributions and privileged out")
             super().__init__(num_envs, *self._spaces(), autoreset_mode=autoreset_mode, render_mode=render_mode)
             if render_mode:
                 self._pictures = Pictures(self.drives, render_mode)
-            self._prepare()
+            self._prepare(reach)
         except BaseException:
             self._close_lanes()
             raise
@@ -255,13 +260,13 @@ class GainTuning(Lanes):
             observation = gymnasium.spaces.Dict({"observation": observation, "privileged": true})
         return observation, Box(-STEP, STEP, (self._axes * count,), np.float32)
 
-    def _prepare(self) -> None:
+    def _prepare(self, given_reach: ArrayLike | None) -> None:
         c, n, axes = self.config, self.num_envs, self.drives.num_axes
         t_0 = 4.0 * float(small_time_constants(self._device, self._device.stage["velocity_filter"].default))
         self._trials = Trials(self.drives, self.motor, self._axes, t_0)
         self._columns = np.array([ALL_GAINS.index(name) for name in c.gains])
         one = reach(c.load) if c.travel is None else np.full(self._axes, c.travel * 2.0 * math.pi)
-        self._reach = np.tile(one, n)
+        self._reach = np.tile(one, n) if given_reach is None else np.broadcast_to(np.asarray(given_reach, float), axes)
         zero = np.zeros(axes)
         self._identified = Identified(zero, zero, zero, zero)
         self._move = plan_move(self.motor, zero + self.motor.inertia, 1.0, zero)
@@ -342,6 +347,8 @@ class GainTuning(Lanes):
         self._left[active] -= 1
         info = self._told()
         info["reward_terms"] = terms
+        info["trial_gains"] = gains.reshape(n, self._axes, -1)
+        info["trial_measured"] = measured.copy()
         info["aborted"] = aborted
         info["faults"] = self._faults()
         if trial_hidden is not None:

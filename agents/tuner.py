@@ -1,0 +1,145 @@
+"""A trained tuner at work on a target: the environment's trials on given drives, and a policy that chooses them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.policy import PolicyError, load_policy
+from agents.shipped import TUNER, shipped
+
+if TYPE_CHECKING:
+    from tuning.target import Target
+    from tuning.tuners import Outcome
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL = 2, 3
+
+
+class TrialShown(NamedTuple):
+    """A trial of every machine of a target.
+
+    number: 0 is the fitted rule's gains.
+    gains: Raw integers, (num_axes, 5) in the order of `Gains`.
+    measured: J by measured terms of the machine's worst axis, (num_machines,).
+    aborted, better: Whether it was stopped; whether it became the incumbent, (num_machines,).
+    faults: Names of emergencies, a tuple for each machine.
+    """
+
+    number: int
+    gains: Integers
+    measured: Floats
+    aborted: Mask
+    better: Mask
+    faults: tuple[tuple[str, ...], ...]
+
+
+class Tuned(NamedTuple):
+    """What came of it: the incumbents' gains, raw (num_axes, 5), and all trials."""
+
+    gains: Integers
+    trials: tuple[TrialShown, ...]
+
+
+def tune_target(
+    target: Target, policy: Any, *, show: Callable[[TrialShown], None] = lambda trial: None, trials: int | None = None
+) -> Tuned:
+    """Let a policy for GainTuning tune a target; the drives have the answer's gains and are disabled afterwards.
+
+    Args:
+        target: The drives; they may have any gains, also none.
+        policy: What proposes, with its `bundle` for the configuration.
+        show: Called after every trial.
+        trials: How many; the agent's own number by default.
+
+    Raises:
+        PolicyError: If the policy gives no number: the drives are at rest and disabled.
+        RuntimeError: If a drive cannot be cleared any more.
+    """
+    from agents.guard import stopping
+    from drive_env import motion
+    from drive_env.envs.gain_tuning import GainTuning
+    from drive_env.gains import write_gains
+    from tuning.trial_bench import first_gains
+
+    drives, axes = target.drives, target.axes_per_machine
+    configuration = dict(policy.bundle.configuration) | ({} if trials is None else {"trials": trials})
+    write_gains(drives, first_gains(target))  # before anything is enabled: the drives may have any
+    reach = np.where(target.high >= -target.low, target.high, target.low)
+    env = GainTuning(
+        target.num_axes // axes,
+        drives=drives,
+        reach=reach,
+        device=target.device.name,
+        motor=target.motor.name,
+        **{name: value for name, value in configuration.items() if name not in NOT_OF_DRIVES},
+    )
+    shown = []
+    try:
+        with stopping(drives):
+            observation, info = env.reset(seed=0)
+            policy.reset()
+            none = np.zeros(env.num_envs, bool)
+            shown.append(TrialShown(0, _flat(info["gains"]), info["measured"], none, ~none, ((),) * env.num_envs))
+            show(shown[-1])
+            for number in range(1, env.config.trials + 1):
+                action = np.asarray(policy.act(observation))
+                if not np.isfinite(action).all():
+                    raise PolicyError("the agent's action is no number")
+                before = info["measured"]
+                observation, _, terminated, _, info = env.step(action)
+                shown.append(
+                    TrialShown(
+                        number,
+                        _flat(info["trial_gains"]),
+                        info["trial_measured"],
+                        info["aborted"],
+                        info["measured"] < before,
+                        tuple(info["faults"]),
+                    )
+                )
+                show(shown[-1])
+                if terminated.all():
+                    names = ", ".join(shown[-1].faults[0]) or "it stays disabled"
+                    raise RuntimeError(f"the drive cannot be cleared after trial {number}: {names}")
+            gains = _flat(info["gains"])
+            motion.disable(drives)
+            write_gains(drives, gains)
+    finally:
+        env.close()
+    return Tuned(gains, tuple(shown))
+
+
+# Options of the environment that are of random machines, or that the target says.
+NOT_OF_DRIVES = ("distributions", "privileged", "stage", "load", "motor", "device", "travel", "friction", "num_threads")
+
+
+def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
+    """Tune a target with the agent that ships, as `drive-tune compare` wants it (entry point `drive_env.tuners`)."""
+    from tuning.target import timed
+    from tuning.tuners import Outcome
+
+    with timed(target) as (watched, clock):
+        found = tune_target(watched, load_policy(shipped(TUNER)))
+    lanes = target.axes_per_machine
+    aborts = np.sum([trial.aborted for trial in found.trials], axis=0)
+    moves = MOVES_OF_IDENTIFICATION + MOVES_OF_TRIAL * len(found.trials)
+    zero = np.zeros(target.num_axes, np.int64)
+    return Outcome(
+        found.gains,
+        np.full(target.num_axes, clock.seconds),
+        zero + moves,
+        np.repeat(aborts, lanes),
+        zero,
+        ("",) * target.num_axes,
+    )
+
+
+def _flat(gains: NDArray[Any]) -> Integers:
+    return np.asarray(gains, np.int64).reshape(-1, gains.shape[-1])

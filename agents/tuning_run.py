@@ -1,0 +1,189 @@
+"""A whole run of a trained tuner on a drive: look, tune, show, prove, keep; or roll back, and say why."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.tuner import TrialShown, tune_target
+
+if TYPE_CHECKING:
+    from tuning.certificate import Certificate
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+FREE_WINDOW = 100  # turns of following error that trip while the drive is shaken: the error means nothing there
+FOLLOWING_WINDOW, POSITION, POSITION_SCALER = 0x6065, 0x6064, 0x2058
+
+
+class Run(NamedTuple):
+    """What became of a target: its certificate, the gains it has, raw (num_axes, 5), and whether they outlive power."""
+
+    certificate: Certificate
+    gains: Integers
+    trials: tuple[TrialShown, ...]
+    kept: bool
+
+
+def run(
+    target: Target,
+    policy: Any,
+    file: Path,
+    *,
+    name: str,
+    keep: bool = True,
+    show: Callable[[TrialShown], None] = lambda trial: None,
+    say: Callable[[str], None] = lambda what: None,
+) -> Run:
+    """Tune a target; what raises leaves the drives with what they had, at rest and disabled.
+
+    Args:
+        target: The drives.
+        policy: A policy for GainTuning.
+        file: Where the state before is left, for `drive-tune restore`.
+        name: Of the agent, for the certificate.
+        keep: Whether drives on a bus keep the gains over a power cycle.
+        show: Called after every trial.
+        say: Called with what is under way.
+
+    Raises:
+        PolicyError: If the policy gives no number; SafetyError, BusError, RuntimeError or TimeoutError for the drives.
+    """
+    from agents.guard import stopping
+    from drive_env.gains import write_gains
+    from tuning.brief import identify_briefly
+    from tuning.proving import shaken_on_purpose
+    from tuning.snapshot import Transaction
+    from tuning.target import timed
+
+    everywhere = np.ones(target.num_axes, bool)
+    with Transaction(target, file) as transaction, timed(target) as (watched, clock):
+        before = _gains(target)
+        origin = target.drives.read(POSITION)
+        with stopping(watched.drives), shaken_on_purpose(watched.drives):
+            say("checking the wiring and identifying")
+            identified = identify_briefly(watched, everywhere)
+            wrong = [one.estimates[key].reason for one in identified for key in ("pole_pairs", "encoder_direction")]
+            if any("expected" in reason or "wired" in reason for reason in wrong):
+                raise RuntimeError(f"the wiring is not as it should be: {next(filter(None, wrong))}")
+            say("trials")
+            tuned = tune_target(watched, policy, show=show)
+            say("a move for the record")
+            shown = _show(watched, identified, tuned.gains, origin)
+            say("the frequency response")
+            response, why = _response(watched, tuned.gains)
+        write_gains(target.drives, before)
+        transaction.roll_back()  # everything but the gains is as it was
+        write_gains(target.drives, tuned.gains)
+        kept = keep and transaction.store()
+        transaction.commit()
+    seconds, aborts = clock.seconds, np.sum([trial.aborted for trial in tuned.trials], axis=0)
+    made = _certificate(target, name, identified, before, tuned.gains, shown, response, why, seconds, aborts)
+    return Run(made, tuned.gains, tuned.trials, kept)
+
+
+def _gains(target: Target) -> Integers:
+    from tuning.trial_bench import read_gains
+
+    return read_gains(target)
+
+
+def _show(target: Target, identified: Any, gains: Integers, origin: Integers) -> Any:
+    from drive_env.positioning import wrapped
+    from tuning.linear_model import Plant
+    from tuning.proving import ProvingGround
+
+    plants = [
+        Plant.from_identification(target.device, target.motor, float(volts), one)
+        for volts, one in zip(target.supply, identified, strict=True)
+    ]
+    gone = wrapped(target.drives.read(POSITION) - origin) / target.increments()
+    room = (target.low - gone, target.high - gone)
+    return ProvingGround(target, plants, room, gains, gains).show(gains, np.ones(target.num_axes, bool))
+
+
+def _response(target: Target, gains: Integers) -> tuple[Any, str]:
+    """Return the velocity loop's response with the gains, or None and why there is none."""
+    from drive_env import motion
+    from drive_env.gains import write_gains
+    from drive_env.master.errors import BusError
+    from drive_env.safety import SafetyError
+    from tuning.frequency_response import measure
+
+    drives = target.drives
+    motion.disable(drives)
+    write_gains(drives, gains)
+    drives.write(FOLLOWING_WINDOW, FREE_WINDOW * drives.read(POSITION_SCALER))
+    try:
+        return measure(target, "velocity"), ""
+    except (ValueError, RuntimeError, TimeoutError) as error:
+        if isinstance(error, BusError | SafetyError):
+            raise
+        return None, f"no frequency response: {error}"
+    finally:
+        motion.disable(drives)
+
+
+def _certificate(
+    target: Target,
+    name: str,
+    identified: Any,
+    before: Integers,
+    after: Integers,
+    shown: Any,
+    response: Any,
+    why: str,
+    seconds: float,
+    aborts: NDArray[Any],
+) -> Certificate:
+    from tuning import certificate as c
+    from tuning.provenance import versions
+
+    axes = []
+    for axis, one in enumerate(identified):
+        supply = float(target.supply[axis])
+        move = c.StepResponse(
+            "move", True, "rad", shown.t, shown.demand[:, axis], shown.actual[:, axis], shown.current[:, axis],
+            {"largest following error [rad]": float(np.abs(shown.demand - shown.actual)[:, axis].max())},
+        )  # fmt: skip
+        loops: tuple[c.FrequencyResponse, ...] = ()
+        if response is not None:
+            loop = c.frequency_response(
+                "velocity loop", response.f, response.open_loop[:, axis], response.margins(axis), tuned=True,
+                coherence=response.coherence[:, axis], source="multisine, 1 kHz samples",
+            )  # fmt: skip
+            loops = (loop,)
+        axes.append(
+            c.AxisCertificate(
+                axis=axis,
+                accepted=True,
+                reason="the best of all trials by measured terms",
+                identified=c.identified(one),
+                before=tuple(map(int, before[axis])),
+                after=tuple(map(int, after[axis])),
+                before_si=c.si_gains(target.device, supply, before[axis]),
+                after_si=c.si_gains(target.device, supply, after[axis]),
+                steps=(move,),
+                frequency_responses=loops,
+                notes=(why,) if why else (),
+                hardware_seconds=seconds,
+                aborts=int(aborts[axis // target.axes_per_machine]),
+            )
+        )
+    return c.Certificate(
+        tuner=f"agent {name}",
+        device=target.device.name,
+        motor=target.motor.name,
+        machine=target.machine or "unnamed",
+        supply=float(target.supply[0]),
+        seed=0,
+        envelope=c.envelope(target),
+        axes=tuple(axes),
+        versions=versions(),
+    )

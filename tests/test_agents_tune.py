@@ -1,0 +1,140 @@
+"""`drive-agent tune`: a trained tuner on a drive that is reached over a bus, as a user meets it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from agents.cli import app
+from agents.policy import PolicyError, load_policy
+from agents.shipped import shipped
+from agents.tuner import surrogate, tune_target
+from agents.tuning_run import run as run_agent
+from drive_env.gains import GAIN_OBJECTS
+from drive_env.motion import OPERATION_ENABLED
+from tuning.certificate import load_certificate
+from tuning.snapshot import load_snapshot
+from tuning.target import emulated
+
+
+def command(*arguments):
+    result = CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1", "DRIVE_ENV_CHANNEL": ""}).invoke(
+        app, ["tune", *map(str, arguments)]
+    )
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def gains(target):
+    return np.stack([target.drives.read(name) for name in GAIN_OBJECTS], axis=-1)
+
+
+def is_enabled(target):
+    mask, value = OPERATION_ENABLED
+    return target.drives.read(0x6041) & mask == value
+
+
+class Broken:
+    """A tuner that is one for so many trials."""
+
+    def __init__(self, good):
+        self._good = good
+        self._policy = load_policy(shipped("gain_tuning"))
+        self.bundle = self._policy.bundle
+
+    def reset(self, mask=None):
+        self._policy.reset(mask)
+
+    def act(self, observation):
+        self._good -= 1
+        return self._policy.act(observation) if self._good >= 0 else np.full(3, np.nan)
+
+
+def test_it_tunes_an_emulated_drive_over_its_bus_and_certifies_it(tmp_path):
+    code, out, error = command("--trials", 2, "--out", tmp_path / "run")
+    assert (code, error) == (0, "")
+    lines = out.splitlines()
+    table = lines[lines.index("trial  velocity P  velocity I  position P        J") + 1 :][:3]
+    assert [row.split()[0] for row in table] == ["rule", "1", "2"]
+    certificate, unchanged = load_certificate(tmp_path / "run" / "certificate.json")
+    assert unchanged
+    (axis,) = certificate.axes
+    assert certificate.tuner == "agent gain_tuning"
+    assert "node 1 of socket://127.0.0.1:" in certificate.machine
+    assert axis.accepted and axis.after != axis.before
+    tried = [tuple(map(int, row.split()[1:4])) for row in table]
+    assert tuple(axis.after[2:]) in tried
+    assert axis.identified["inertia"].low < axis.identified["inertia"].value < axis.identified["inertia"].high
+    assert axis.frequency_responses[0].margins["phase margin [deg]"] > 10.0
+    assert axis.steps[0].actual[-1] == pytest.approx(axis.steps[0].reference[-1], rel=0.1)
+    before = load_snapshot(tmp_path / "run" / "before.toml")
+    assert tuple(before.axes[0][key] for key in GAIN_OBJECTS) == axis.before
+    assert (tmp_path / "run" / "report.html").is_file()
+
+
+def test_json_for_programs(tmp_path):
+    code, out, _ = command("--trials", 1, "--load", "inertia", "--json", "--out", tmp_path / "run")
+    found = json.loads(out)
+    assert code == 0
+    assert found["J"] <= found["J of the rule"]
+    assert found["stored"] is True  # the node keeps it: 1010h
+
+
+def test_a_dry_run_says_what_would_be_done_and_does_nothing(tmp_path):
+    code, out, _ = command("--dry-run", "--out", tmp_path / "run")
+    assert code == 0
+    assert "1 + 10 trials of 3 moves" in out
+    assert out.rstrip().endswith("Nothing was written.")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["nobody"], "no agent named 'nobody' ships; there are gain_tuning"),
+    (["nothing.npz"], "there is no file nothing.npz"),
+    (["tracking_gantry"], "acts in ServoDrive/Tracking-v0; a tuner acts in ServoDrive/GainTuning-v0"),
+    (["--channel", "can0"], "give its --interface, too"),
+    (["--interface", "virtual", "--channel", "none", "--seed", "1"], "--seed draws an emulated machine"),
+    (["--interface", "virtual", "--channel", "none"], "--travel is missing: how far may the motor turn?"),
+    (["--trials", "0"], "--trials 0 must be 1 or more"),
+    (["--load", "gantry"], "load 'gantry' has 2 drives; an agent tunes one"),
+    (["--load", "nothing"], "no load is named 'nothing'"),
+])  # fmt: skip
+def test_a_mistake_ends_with_code_2_and_one_line(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    code, _, error = command(*arguments)
+    assert (code, len(error.splitlines())) == (2, 1), error
+    assert message in error
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_policy_that_gives_no_number_leaves_the_drive_as_it_was_and_disabled(tmp_path):
+    with emulated("tmcm1636", "two_mass", "qbl4208") as target:
+        before = gains(target)
+        with pytest.raises(PolicyError, match="no number"):
+            run_agent(target, Broken(1), tmp_path / "before.toml", name="broken")
+        assert np.array_equal(gains(target), before)
+        assert not is_enabled(target).any()
+
+
+def test_it_starts_from_any_gains():
+    """Factory-fresh drives have none; others have what somebody left in them."""
+    with emulated("tmcm1636", "two_mass", "qbl4208", num_machines=2) as target:
+        for name in GAIN_OBJECTS:
+            target.drives.write(name, [0, 32767])
+        found = tune_target(target, load_policy(shipped("gain_tuning")), trials=3)
+        assert np.array_equal(gains(target), found.gains)
+        assert not is_enabled(target).any()
+        first, best = found.trials[0].measured, np.min([trial.measured for trial in found.trials], axis=0)
+    assert np.all(best <= first)
+    assert np.all(best < 5.0)
+
+
+def test_as_a_tuner_of_the_comparison_it_tells_its_costs():
+    with emulated("tmcm1636", "inertia", "qbl4208", num_machines=2) as target:
+        outcome = surrogate(target, np.random.default_rng(0))
+    assert outcome.gains.shape == (2, 5)
+    assert np.all(outcome.moves == 2 + 3 * 11)
+    assert np.all((outcome.drive_seconds > 8.0) & (outcome.drive_seconds < 20.0))
