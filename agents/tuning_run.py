@@ -57,6 +57,7 @@ def run(
     """
     from agents.guard import stopping
     from drive_env.gains import write_gains
+    from tuning.auto_checks import wrong_wiring
     from tuning.brief import identify_briefly
     from tuning.proving import shaken_on_purpose
     from tuning.snapshot import Transaction
@@ -69,9 +70,9 @@ def run(
         with stopping(watched.drives), shaken_on_purpose(watched.drives):
             say("checking the wiring and identifying")
             identified = identify_briefly(watched, everywhere)
-            wrong = [one.estimates[key].reason for one in identified for key in ("pole_pairs", "encoder_direction")]
-            if any("expected" in reason or "wired" in reason for reason in wrong):
-                raise RuntimeError(f"the wiring is not as it should be: {next(filter(None, wrong))}")
+            for one in identified:
+                if why := wrong_wiring(watched, one):
+                    raise RuntimeError(why)
             say("trials")
             tuned = tune_target(watched, policy, show=show)
             say("a move for the record")

@@ -175,6 +175,7 @@ class HiddenScore:
         lever = np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max()
         # Against the move, as a load that lies in the way does.
         self._load_torque = -LOAD_SHARE * self._drives.motor.rated_torque / float(lever)
+        self._constant: Floats = np.zeros(num_machines * len(self.variants))
         axes = (num_machines, len(self.variants), found.num_axes)
         self._factors = np.tile(np.repeat([v.velocity_p for v in self.variants], axes[2]), axes[0])
         self._axes = axes
@@ -203,6 +204,10 @@ class HiddenScore:
         filters = machine.parameters["stage.velocity_filter"]
         t_0 = 4.0 * small_time_constants(self._drives.device, filters)
         self._t_0 = np.repeat(t_0, self._axes[2])
+
+    def set_constant_load(self, torque: Floats) -> None:
+        """Take what pulls at the machines all the while [N*m], (num_machines,), signed as `machine.load_torque`."""
+        self._constant = np.repeat(np.asarray(torque, float), len(self.variants))
 
     def set_moves(self, move: Move, where: Mask | None = None) -> None:
         """Take the move of every axis of the machines, shape (num_machines * axes,)."""
@@ -242,7 +247,7 @@ class HiddenScore:
     def _run(self, gains: Integers) -> tuple[Terms, Floats]:
         """Return the terms of every axis without E_d/E_0, and E_d [rad s], (machines, variants, axes)."""
         drives, move = self._drives, self._move
-        drives.machine.load_torque = 0.0
+        drives.machine.load_torque = self._constant
         drives.machine.reset()
         raw = self._spread(np.asarray(gains, np.int64)).copy()
         raw[:, VELOCITY_P] = scaled(raw[:, VELOCITY_P], self._factors)
@@ -254,7 +259,7 @@ class HiddenScore:
             start(drives, move.distance)
             objects: list[ObjectName] = [POSITION, CURRENT, CURRENT_ERROR, STATUS]
             free = drives.record(objects, SETTLED * CYCLE)
-            drives.machine.load_torque = self._load_torque
+            drives.machine.load_torque = self._constant + self._load_torque
             loaded = drives.record(objects, (TRIAL - SETTLED) * CYCLE)
         current = (free[CURRENT] + free[CURRENT_ERROR]) * 1e-3
         direction = np.where(move.distance < 0, -1, 1)

@@ -16,12 +16,13 @@ from drive_env.motors import find_motor
 from drive_env.positioning import plan_move
 from drive_env.safety import SafetyError
 from drive_env.score import HiddenScore
-from mechanics.shaft import shaft_load
 from tuning import auto as auto_module
 from tuning.auto import BUDGET, auto, tune
 from tuning.auto_certificate import certificate
+from tuning.auto_checks import unsafe_gains
 from tuning.brief import identify_briefly
 from tuning.linear_model import Plant
+from tuning.moved_inertia import moved_inertia
 from tuning.proving import ProvingGround
 from tuning.rules import propose
 from tuning.snapshot import load_snapshot, restore
@@ -112,9 +113,47 @@ def test_the_certificate_says_what_was_done(five):
     assert all(axis.reason for axis in paper.axes)
     tuned = paper.axes[NORMAL]
     assert tuned.identified["inertia"].value == pytest.approx(1.48e-5, rel=0.1)
-    move = tuned.steps[0]
-    assert abs(move.reference[-1] - move.actual[-1]) < 0.05 * abs(move.reference[-1])
-    assert tuned.frequency_responses[0].margins["Ms"] <= auto_module.SENSITIVITY
+    assert "verified by a move, its reversal, and a move with 1.5 times velocity P" in tuned.reason
+    moves = [step for step in tuned.steps if step.name == "move"]
+    assert [move.tuned for move in moves] == [False, True]
+    before, now = moves
+    assert abs(now.reference[-1] - now.actual[-1]) < 0.05 * abs(now.reference[-1])
+    for name in ("largest following error [rad]", "error at the end [rad]"):
+        assert abs(now.figures[name]) < 0.5 * abs(before.figures[name])
+    old, new = tuned.frequency_responses
+    assert (old.tuned, new.tuned) == (False, True)
+    assert ("Ms" in tuned.reason) == (new.margins["Ms"] <= auto_module.SENSITIVITY)
+    assert np.isnan(old.coherence).all()
+    assert "model" in old.source
+    low = int(np.searchsorted(new.frequency, 20.0))
+    assert old.magnitude_db[low] < new.magnitude_db[low] - 1.0
+
+
+@pytest.mark.parametrize(("axis", "words"), [(EMPTY, "a P gain is 0, and a loop open"), (WILD, "dB and")])
+def test_gains_before_that_are_not_safe_are_not_moved_with_and_why_is_said(five, axis, words):
+    target, result, *_ = five
+    (note,) = [note for note in result.axes[axis].notes if note.startswith("no move with the gains before")]
+    assert words in note
+    steps = certificate(target, result, seed=1).axes[axis].steps
+    assert [step.tuned for step in steps if step.name == "move"] == [True]
+
+
+@pytest.mark.parametrize(
+    ("gains_before", "words"),
+    [
+        ((4021, 1573, 445, 329, 118), ""),  # the commissioning presets
+        ((4021, 1573, 445, 329, 0), "a P gain is 0"),
+        ((4021, 1573, 32767, 329, 118), "by the model the velocity loop has"),
+        ((4021, 1573, 445, 329, 2000), "by the model the position loop has"),
+        ((32767, 1573, 445, 329, 118), "by the model the current loop has"),
+    ],
+)
+def test_gains_are_safe_to_move_with_if_every_loop_has_its_margins(gains_before, words):
+    motor, device = find_motor("qbl4208"), find_device("tmcm1636")
+    plant = Plant.from_data_sheet(device, motor, 24.0, 3.0 * motor.inertia)
+    why = unsafe_gains(device, plant, auto_module.Gains(*gains_before))
+    assert why.startswith(words)
+    assert bool(why) == bool(words)
 
 
 # --- rolling back -----------------------------------------------------------------------------------------------------
@@ -142,7 +181,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(auto_module, "GENERATIONS", 3)
 
 
-@pytest.mark.parametrize("stage", ["compute", "prove", "measure"])
+@pytest.mark.parametrize("stage", ["compute", "prove", "show", "measure", "look_back"])
 def test_whatever_ends_it_the_gains_before_are_back(quick, monkeypatch, tmp_path, stage):
     def interrupted(self):
         write_gains(self._target.drives, np.full((1, 5), 77))
@@ -165,7 +204,8 @@ def test_gains_that_fail_every_trial_are_rolled_back_with_the_last_reason(quick,
 
     monkeypatch.setattr(auto_module, "RULES", dict.fromkeys(auto_module.RULES, shaky))
     monkeypatch.setattr(auto_module, "propose", lambda name, *plant: auto_module.RULES[name](*plant))
-    monkeypatch.setattr(auto_module, "cautious_gains", lambda target, inertia: np.full((1, 5), 32767))
+    monkeypatch.setattr(auto_module, "rule_gains", lambda *motor, **supply: np.full((1, 5), 32767))
+    monkeypatch.setattr(auto_module, "_calm_gains", lambda target, plant: np.full(5, 32767))
     monkeypatch.setattr(auto_module, "_scaled", lambda gains, factor: np.full_like(gains, 32767))
     with emulated(load="inertia", num_threads=1) as target:
         before = gains(target.drives)
@@ -189,7 +229,74 @@ def test_a_drive_fresh_from_the_factory_is_commissioned_first(tmp_path):
         assert drives.read(0x2050)[0] == 3
         assert drives.read(0x2056)[0] == motor.n_p
         assert any("fresh from the factory" in note for note in result.axes[0].notes)
+        assert any("both limit switches were active" in note for note in result.axes[0].notes)
+        assert np.ptp(result.shown.actual) > 0.1, "it did not move"
         motion.enable(drives, mode="pv", timeout=5.0)
+
+
+def answers(monkeypatch, change):
+    """Have what the frequency response measures changed."""
+    import tuning.frequency_response as module
+
+    measure = module.measure
+    called = []
+
+    def changed(target, *arguments, **options):
+        called.append(arguments)
+        return change(measure(target, *arguments, **options))
+
+    monkeypatch.setattr(module, "measure", changed)
+    return called
+
+
+def test_a_lively_loop_is_calmed_and_the_calmed_gains_are_tried_again(quick, monkeypatch, tmp_path):
+    tried = []
+    run = ProvingGround.run
+
+    def seen(self, gains, where):
+        tried.append(gains[0].copy())
+        return run(self, gains, where)
+
+    monkeypatch.setattr(ProvingGround, "run", seen)
+    monkeypatch.setattr(auto_module, "SOFTER", (1.0, 0.5))
+    calls = iter((9.0, 2.0))  # Ms of the loop, and at half of it
+
+    def margins(f, L, trusted):
+        return auto_margins(f, L, trusted)._replace(ms=next(calls))
+
+    auto_margins = auto_module.margins
+    monkeypatch.setattr(auto_module, "margins", margins)
+    with emulated(load="inertia", num_threads=1) as target:
+        result = auto(target, tmp_path / "before.toml", identify=standing_in)
+    (axis,) = result.axes
+    assert axis.accepted, axis.reason
+    assert any("calmed to 50 %" in note for note in axis.notes)
+    np.testing.assert_array_equal(tried[-1], axis.after)
+    earlier = [round(gains[2] / axis.after.velocity_p, 1) for gains in tried[:-1]]
+    assert 2.0 in earlier
+
+
+def test_too_few_coherent_lines_are_said_and_what_was_verified_instead(quick, monkeypatch, tmp_path):
+    answers(monkeypatch, lambda response: replace(response, coherence=0.1 * response.coherence))
+    with emulated(load="inertia", num_threads=1) as target:
+        result = auto(target, tmp_path / "before.toml", identify=standing_in)
+        paper = certificate(target, result, seed=0)
+    (axis,) = result.axes
+    assert axis.accepted, axis.reason
+    (note,) = [note for note in axis.notes if note.startswith("no margins were measured: 0 of its lines")]
+    assert "verified by a move, its reversal" in note
+    assert "frequency response" not in axis.verified
+    (_, shown) = paper.axes[0].frequency_responses
+    assert shown.coherence.max() <= 0.1
+    assert all(np.isnan(value) for value in shown.margins.values())
+
+
+def test_a_response_that_the_time_does_not_allow_is_said(quick, tmp_path):
+    with emulated(load="inertia", num_threads=1) as target:
+        result = auto(target, tmp_path / "before.toml", identify=standing_in, budget=2.5)
+    (axis,) = result.axes
+    assert axis.accepted, axis.reason
+    assert any("no margins were measured: the drive time was used up" in note for note in axis.notes)
 
 
 # --- trials -----------------------------------------------------------------------------------------------------------
@@ -295,7 +402,7 @@ def hidden_ratio(target, machines, found):
     score = HiddenScore(drives.device.name, drives.load.name, drives.motor.name, len(machines),
                         friction=machines[0].friction)  # fmt: skip
     score.set_machines(drives.machine.parameters, drives.machine.supply.reshape(-1, axes)[:, 0])
-    J = np.concatenate([(shaft_load(g.load).inertia + g.load.armature).reshape(-1) for g in drives._groups])
+    J = np.concatenate([moved_inertia(group.load).reshape(-1) for group in drives._groups])
     reach = np.where(target.high >= -target.low, target.high, target.low)
     score.set_moves(plan_move(drives.motor, J, drives.read((0x2058, 0)), reach))
     rule = [rule_gains(drives.device, drives.motor, j, supply=v)[0] for j, v in zip(J, target.supply, strict=True)]

@@ -30,12 +30,22 @@ def test_rules_show_gains_margins_and_what_a_relay_measured():
     assert axis["proposals"]["margin_45"]["velocity_margins"]["phase_deg"] == pytest.approx(45.0, abs=1.5)
 
 
+def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
+    done = drive_tune("rules", "simc", "--load", "two_mass", "--relay", "--json")
+    assert done.exit_code == 0, done.output
+    (axis,) = json.loads(done.stdout)
+    assert list(axis["proposals"]) == ["simc"]
+    assert "it swings with its load's resonance" in axis["no_relay"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("rules", "ziegler"), "no rule is named 'ziegler'; there are modulus_optimum"),
         (("rules", "--apply", "nichols"), "no rule is named 'nichols'"),
         (("rules", "--store"), "add --apply RULE"),
+        (("rules", "--snapshot", "before.toml"), "add --apply RULE"),
+        (("rules", "--bus", "--travel", "-1:1"), "will turn. Is its way clear? Nobody is there to ask; say --yes"),
         (("rules", "--load", "brick"), "no load is named 'brick'"),
         (("auto", "--motor", "brick"), "brick"),
         (("auto", "--node", "1"), "add --bus"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.metadata
 import json
+import tomllib
 
 import numpy as np
 import pytest
@@ -17,8 +18,10 @@ from tuning import compare as compare_module
 from tuning import tuners
 from tuning.cli import app
 from tuning.compare import compare, save
+from tuning.optimise import Optimised, Row, Settings
 from tuning.suite import load_suite, open_group
 from tuning.trial_bench import read_gains
+from tuning.trials_files import trials_figure
 from tuning.tuners import MissingTunerError, Outcome, find_tuner, search_tuner, tuner_rows
 
 RIGID = [m for m in load_suite() if m.load == "inertia" and m.motor == "qbl4208"]
@@ -291,6 +294,10 @@ def test_the_command_lists_tuners_and_suites():
         (("optimise", "--lanes", "0"), "--lanes must be 1 or more"),
         (("optimise", "--load", "pendulum"), "no load is named 'pendulum'"),
         (("optimise", "--bus"), "--travel is missing"),
+        (("optimise", "--lockstep"), "add --bus"),
+        (("optimise", "--bus", "--travel", "-1:1"), "will turn. Is its way clear? Nobody is there to ask"),
+        (("optimise", "--config", "nosuch.toml"), "cannot read nosuch.toml"),
+        (("optimise", "--cluster", "here"), "--cluster here must be the address of a Dask scheduler"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path):
@@ -317,3 +324,30 @@ def test_optimise_prints_and_writes_what_it_found(tmp_path):
     )
     best = min((row for row in rows if row["stopped"] == "False"), key=lambda row: float(row["cost"]))
     assert told["gains"][0][2:] == [int(best[name]) for name in ("velocity_p", "velocity_i", "position_p")]
+
+
+def test_a_search_repeats_from_its_settings_and_what_is_said_besides_takes_their_place(tmp_path):
+    first, again, other = tmp_path / "first", tmp_path / "again", tmp_path / "other"
+    options = ("--searches", 2, "--lanes", 2, "--load", "gantry", "--travel=-1:1,-0.5:0.5", "--seed", 5, "--gain",
+               "velocity_p", "--objective", "speed", "--objective", "current", "--width", 1.2)  # fmt: skip
+    assert run("optimise", "--trials", 3, *options, "--out", first).exit_code == 0
+    settings = first / "settings.toml"
+    assert run("optimise", "--config", settings, "--out", again).exit_code == 0
+    for name in ("trials.csv", "settings.toml", "trials.png"):
+        assert (first / name).read_bytes() == (again / name).read_bytes()
+    assert run("optimise", "--config", settings, "--trials", 1, "--out", other).exit_code == 0
+    changed = tomllib.loads((other / "settings.toml").read_text(encoding="utf-8"))
+    assert changed == tomllib.loads(settings.read_text(encoding="utf-8")) | {"trials": 1}
+
+
+def test_the_picture_shows_the_trials_of_every_search():
+    rows = [row(search, number, cost) for search, cost in ((0, 2.0), (1, 1.0)) for number in range(3)]
+    found = Optimised(np.ones((2, 5), int), np.ones((2, 5), int), np.array([2.0, 1.0]), tuple(rows), 0.0,
+                      np.zeros(2, int), np.zeros(2, int), ("", ""))  # fmt: skip
+    axes = trials_figure(found, Settings()).axes[0]
+    assert len(axes.collections[0].get_offsets()) == 6
+    assert [line.get_ydata().tolist() for line in axes.lines] == [[2.0] * 3, [1.0] * 3]
+
+
+def row(search, number, cost):
+    return Row(search, number, np.ones((1, 5), int), cost, (0.0, 0.0, 0.0), False)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
+from tuning.snapshot import load_snapshot
 
 
 def test_drives_come_up_commissioned_in_switch_on_disabled(axis):
@@ -136,6 +137,18 @@ def test_the_example_of_one_drive_runs():
     done = subprocess.run([sys.executable, script, "--machines", "2"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "positions reached [inc]: [" in done.stdout
+
+
+def test_the_example_that_tunes_a_drive_runs_and_leaves_the_way_back(tmp_path):
+    script = Path(__file__).parent.parent / "examples" / "tune_a_drive.py"
+    assert len(script.read_text(encoding="utf-8").splitlines()) < 40
+    run = [sys.executable, script, "--load", "inertia"]
+    done = subprocess.run(run, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert load_snapshot(tmp_path / "before.toml").axes[0][0x2042, 1] == 445  # the commissioning preset's
+    assert "velocity_p=" in done.stdout and "velocity_p=445" not in done.stdout
+    moved = int(done.stdout.split("moved by [inc]: [")[1].split("]")[0])
+    assert moved == pytest.approx(32_768, rel=0.03)  # the first millisecond is not in it
 
 
 def test_outputs_are_those_that_the_mask_lets_through(axis):

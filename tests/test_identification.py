@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,7 +28,10 @@ from tuning.working_state import CHANGED
 
 TURN = 2.0 * math.pi
 # How far a value may be off, as a share of it.
-ALLOWED = {"resistance": 0.05, "inductance": 0.05, "inertia": 0.05, "coulomb": 0.10, "resonance": 0.02}
+ALLOWED = {
+    "resistance": 0.05, "inductance": 0.05, "inertia": 0.05, "coulomb": 0.10, "viscous": 0.10, "resonance": 0.02,
+    "anti_resonance": 0.04,
+}  # fmt: skip
 
 
 def truth(drives, axis, offset):
@@ -43,12 +47,17 @@ def truth(drives, axis, offset):
         # What a screw or a gear carries at constant speed: gravity, or the friction behind it.
         carried = max(each[-1], abs(offset) * plant.torque_constant)
         dry += (1.0 / parameters["load.efficiency"][axis] - 1.0) * carried
+    viscous = plant.viscous
+    if "load.efficiency" in parameters and abs(offset) * plant.torque_constant < 2.0 * each[-1]:
+        # What lies behind the transmission is dearer by its losses, unless it is gravity that is carried.
+        viscous += (1.0 / parameters["load.efficiency"][axis] - 1.0) * (viscous - parameters["motor.viscous"][axis])
     K = plant.torque_constant
     return {
         "resistance": parameters["motor.R_s"][axis],
         "inductance": parameters["motor.L_q"][axis],
         "inertia": plant.inertia * drives.motor.torque_constant / K,
         "coulomb": dry / K,
+        "viscous": viscous / K,
         "resonance": plant.resonance,
         "anti_resonance": plant.anti_resonance,
     }
@@ -89,19 +98,43 @@ def test_known_machines_are_identified():
     assert inside >= 0.9 * known
 
 
+# What must be told of the suite's axes; the rest is refused. Dry friction hides behind a fan's drag, an arm's weight
+# and loose gears, viscous friction behind dry, a resonance behind backlash and behind coarse encoders.
+TOLD = {
+    "resistance": 0.9, "inductance": 0.95, "inertia": 0.95, "coulomb": 0.65, "viscous": 0.2, "resonance": 0.3,
+    "anti_resonance": 0.3,
+}  # fmt: skip
+
+
 @pytest.mark.slow
-def test_the_suite_is_identified_and_the_intervals_hold():
-    """Issue 7: each value inside its interval at least 90 % of the time."""
+@pytest.mark.parametrize("seed", [None, 301])
+def test_the_suite_is_identified_and_the_intervals_hold(seed):
+    """Issue 7: each value as near as asked, and inside its interval, at least 90 % of the time that it is given."""
+    machines = load_suite("public", seed=seed)
     tally = {}
-    for target, _ in open_machines(load_suite("public")):
+    for target, _ in open_machines([m for m in machines if seed is None or m.name.startswith("seed")]):
         compare(target, tally)
-    assert tally["resistance"][0] >= 40
-    # Of the values that are given; dry friction hides behind a fan's drag, an arm's weight and loose gears.
-    for name, told in (("resistance", 0.95), ("inductance", 0.95), ("inertia", 0.95), ("coulomb", 0.8)):
+    missed = []
+    for name, told in TOLD.items():
         axes, known, near, inside = tally[name]
-        assert known >= told * axes, name
-        assert near >= 0.9 * known, name
-        assert inside >= 0.9 * known, name
+        # 90 % of a sample of a few is missed by chance: one more may lie outside.
+        if known < told * axes or near < 0.9 * known - 1.0 or inside < 0.9 * known - 1.0:
+            missed.append((name, tally[name].tolist()))
+    assert not missed, "axes, told, near, inside"
+
+
+def test_of_two_springs_in_a_row_the_first_resonance_is_told():
+    target = emulated(load="three_mass", num_threads=1)
+    found, true = identify(target)[0], truth(target.drives, 0, 0.0)
+    assert found.value("resonance") == pytest.approx(true["resonance"], rel=0.02)
+    assert found.value("anti_resonance") == pytest.approx(true["anti_resonance"], rel=0.03)
+
+
+def test_with_backlash_a_resonance_is_refused_with_that_reason():
+    target = emulated(load="geared_joint", motor="ec_45_flat", parameters={"load.backlash": 2e-3}, num_threads=1)
+    resonance = identify(target)[0].estimates["resonance"]
+    assert not resonance.is_known
+    assert "coherent" in resonance.reason or "backlash" in resonance.reason
 
 
 def test_the_ripple_that_samples_hide_is_made_up_for():
@@ -192,6 +225,27 @@ def test_wrong_pole_pairs_are_found_before_torque_is_commanded():
     assert "4 pole pairs and 2056h says 7" in found.estimates["inertia"].reason
 
 
+@pytest.mark.parametrize(("name", "value", "reason"), [
+    ("ABN Encoder Settings.Encoder Direction", 1, "2080h:01"), ("Motor Pole Pairs", 7, "2056h says 7"),
+])  # fmt: skip
+def test_three_tenths_of_a_turn_are_enough_to_check_the_wiring(name, value, reason):
+    target = emulated(load="inertia", travel=(-0.15 * TURN, 0.15 * TURN), num_threads=1)
+    target.drives.write(name, value)
+    found = identify(target)[0]
+    assert reason in found.estimates["inertia"].reason
+    assert found.value("pole_pairs") == 4.0
+
+
+def test_no_torque_is_commanded_with_wiring_that_cannot_be_checked():
+    """Beside a limit the field might pull the rotor across it: nothing moves, and why is said."""
+    target = emulated(load="belt", travel=(0.0, 0.3 * TURN), num_threads=1)
+    found = identify(target)[0]
+    for name in ("resistance", "inertia", "pole_pairs"):
+        assert "begin in the middle of the travel" in found.estimates[name].reason, name
+    assert "not checked" in found.estimates["inertia"].reason
+    assert abs(float(target.drives.machine.rotor_angle[0])) < 0.01
+
+
 def test_a_blocked_rotor_is_said():
     target = emulated(load="inertia", num_threads=1)
     target.drives.machine.brake = "closed"
@@ -257,18 +311,19 @@ def test_only_the_chosen_axes_move():
 class Watched(EmulatedDrives):
     """Emulated drives that remember how far, fast and hard their rotors went, cycle by cycle."""
 
-    def _run_groups(self, start, end, *others):
+    def _run_groups(self, call, start, end, first, last):
         for cycle in range(start, end):
-            super()._run_groups(cycle, cycle + 1, *others)
+            super()._run_groups(call, cycle, cycle + 1, first and cycle == start, last and cycle == end - 1)
             angle, speed = float(self.machine.rotor_angle[0]), abs(float(self.machine.rotor_speed[0]))
             self.low, self.high = min(getattr(self, "low", 0.0), angle), max(getattr(self, "high", 0.0), angle)
             self.fastest = max(getattr(self, "fastest", 0.0), speed)
             torque = abs(float(self.machine.motor_torque[0])) / self.motor.torque_constant
             self.hardest = max(getattr(self, "hardest", 0.0), torque)
+        return False
 
 
 @pytest.mark.parametrize(("load", "low", "high"), [
-    ("vertical_screw", -0.3, 0.3), ("vertical_screw", -0.15, 0.15), ("inertia", -0.15, 0.15), ("belt", 0.0, 0.3),
+    ("vertical_screw", -0.3, 0.3), ("vertical_screw", -0.15, 0.15), ("inertia", -0.15, 0.15), ("belt", -0.15, 0.3),
 ])  # fmt: skip
 def test_travel_speed_and_current_are_respected(load, low, high):
     drives = Watched(load=load, num_threads=1)
@@ -296,17 +351,61 @@ def test_axes_that_pull_at_one_thing_move_together():
 
 
 # --- over the bus -----------------------------------------------------------------------------------------------------
-def test_over_the_bus_the_same_comes_out():
-    machine = {"load": "two_mass", "seed": 3}
-    with served("calls", **machine) as drives:
-        own = emulated("tmcm1636", "two_mass", "qbl4208", seed=3, num_threads=1)
+@pytest.mark.slow
+@pytest.mark.parametrize(("load", "motor", "seed"), [
+    ("two_mass", "qbl4208", 3), ("inertia", "ec_i_40", 4), ("vertical_screw", "qbl4208", 5),
+    ("winder", "faulhaber_3863", 6),
+])  # fmt: skip
+def test_over_the_bus_in_lockstep_the_same_comes_out(load, motor, seed):
+    """Issue 7: R and L within 10 % over the bus; all else as in-process, since the integers are the same."""
+    with served("calls", load=load, motor=motor, seed=seed) as drives:
+        own = emulated("tmcm1636", load, motor, seed=seed, num_threads=1)
         target = Target(drives, own.device, own.motor, own.supply, own.low, own.high, own.speed, own.current)
         on_bus = identify(target)[0]
         here = identify(own)[0]
+        true = truth(own.drives, 0, 0.0)
+    for name in ("resistance", "inductance"):
+        assert on_bus.value(name) == pytest.approx(true[name], rel=0.1), name
     for name in NAMES:
         a, b = on_bus.estimates[name], here.estimates[name]
         assert a.is_known == b.is_known, name
         assert a.value == pytest.approx(b.value, rel=0.02, nan_ok=True), name
+
+
+class Late:
+    """Drives in real time whose reads take their time: the clock goes on between two cycles."""
+
+    time_waits = False
+
+    def __init__(self, drives, clock, late):
+        self._drives, self._clock, self._late = drives, clock, late
+
+    def record(self, *arguments, **options):
+        self._clock.now += self._late
+        return self._drives.record(*arguments, **options)
+
+    def __getattr__(self, name):
+        return getattr(self._drives, name)
+
+
+class Clock:
+    now = 0.0
+
+    def perf_counter(self):
+        return self.now
+
+
+@pytest.mark.parametrize(("step", "told"), [(0.001, True), (0.0016, False)])
+def test_reads_out_of_step_with_the_drive_give_no_resistance(monkeypatch, step, told):
+    clock = Clock()
+    monkeypatch.setattr("tuning.winding.time", clock)
+    own = emulated(load="inertia", num_threads=1)
+    drives = Late(own.drives, clock, step)
+    found = identify(replace(own, drives=drives))[0]
+    for name in ("resistance", "inductance"):
+        assert found.estimates[name].is_known == told, name
+        assert told or "took 1.6 ms instead of 1" in found.estimates[name].reason
+    assert found.estimates["inertia"].is_known
 
 
 # --- pieces -----------------------------------------------------------------------------------------------------------

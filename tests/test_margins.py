@@ -64,6 +64,19 @@ def test_a_crossing_that_nobody_saw_gives_no_margin():
     assert found.gain_db == pytest.approx(20.0 * math.log10(125.0 / 20.0), abs=0.02)
 
 
+def test_a_phase_of_minus_180_degrees_that_nobody_saw_gives_no_gain_margin():
+    L = delayed_integrator(20.0, 2e-3)  # -180 degrees at 125 Hz, and again at 625
+    found = margins(F, L, (F < 110.0) | (F > 140.0))
+    assert math.isnan(found.gain_db)
+    assert found.phase_deg == pytest.approx(margins(F, L).phase_deg)
+
+
+def test_a_phase_that_nobody_saw_where_the_gain_is_less_than_where_it_was_seen_changes_nothing():
+    L = delayed_integrator(20.0, 2e-3)
+    hidden = (F > 600.0) & (F < 660.0)
+    assert margins(F, L, ~hidden).gain_db == pytest.approx(20.0 * math.log10(125.0 / 20.0), abs=0.02)
+
+
 def test_what_is_not_trusted_moves_nothing():
     L = delayed_integrator(20.0, 2e-3)
     seen = (F < 50.0) | (F > 60.0)

@@ -133,6 +133,14 @@ def test_travel_is_given_in_turns(text, ends):
     assert parse_travel(text) == pytest.approx(ends)
 
 
+def test_every_axis_of_a_machine_may_have_its_own_travel():
+    with open_target(load="gantry", travel="-0.2:0.1, 0:0.3", machines=2) as target:
+        assert target.low == pytest.approx(TURN * np.array([-0.2, 0.0, -0.2, 0.0]))
+        assert target.high == pytest.approx(TURN * np.array([0.1, 0.3, 0.1, 0.3]))
+    with pytest.raises(ValueError, match="3 ranges of travel are given"):
+        open_target(load="gantry", travel="-1:1,-1:1,-1:1")
+
+
 @pytest.mark.parametrize("text", ["", "0.3", "a:b", "1:2", "-2:-1", "0:0", "0.1:-0.1", "nan:1", "1:"])
 def test_a_travel_that_is_none_is_refused(text):
     with pytest.raises(ValueError, match=f"--travel {text}"):
@@ -149,6 +157,7 @@ def test_without_bus_the_drives_are_emulated_whatever_the_environment_says(monke
 @pytest.mark.parametrize(("options", "message"), [
     ({"nodes": [1]}, "--node, --bitrate and --lockstep are of drives on a bus; add --bus"),
     ({"lockstep": True}, "add --bus"),
+    ({"seed": -1}, "--seed must be 0 or more, not -1"),
     ({"bus": True}, "--travel is missing: how far may the motor turn"),
     ({"load": "abc"}, "no load is named 'abc'"),
     ({"motor": "abc"}, "no motor is named 'abc'"),

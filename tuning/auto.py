@@ -10,27 +10,29 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import motion
-from drive_env.gains import GAIN_OBJECTS, Gains, rule_gains, scaled, write_gains
+from drive_env.gains import GAIN_OBJECTS, Gains, gains_from_bandwidths, rule_gains, scaled, write_gains
 from drive_env.master.errors import BusError
 from drive_env.positioning import POSITION, wrapped
 from drive_env.safety import SafetyError
+from tuning.auto_checks import unsafe_gains, wrong_wiring
+from tuning.auto_result import AxisRun, Result
 from tuning.brief import identify_briefly
+from tuning.ladder import Ladder, Rung
 from tuning.linear_model import Plant
-from tuning.margins import Margins, margins
+from tuning.margins import margins
 from tuning.proving import ProvingGround, Shown, shaken_on_purpose
 from tuning.rules import RULES, propose
 from tuning.snapshot import Transaction, restore
 from tuning.target import Target, timed
 from tuning.twin import Twins, known_of, search
-from tuning.working_state import cautious_gains
+from tuning.working_state import BOTH_ENDS, INPUTS, LIMIT_SWITCHES, cautious_bandwidth
 
 if TYPE_CHECKING:
     from tuning.frequency_response import FrequencyResponse
@@ -43,14 +45,18 @@ Mask = NDArray[np.bool_]
 Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
 Identify = Callable[[Target, Mask], "list[Identification]"]  # of the axes where the mask is true
 
+SHOWINGS, AT_THE_EDGE = 3, 0.6  # moves for the record until one passes, and the factor of the gains between them
 BUDGET = 10.0  # s of drive time
 RESPONSE_TIME = 2.3  # s of it that a frequency response takes
 TRIAL_TIME = 0.85  # s that a trial takes, with what recovery takes
+MOVE_TIME, LOOK_BACK_TIME = 0.3, 0.75  # s that a move for the record takes, and one from where a response has ended
 LANES, GENERATIONS = 16, 24  # of the search on twins: sets of gains at once, and how often
+LOUD = 0.06  # RMS increment of the current over the rated one, from which on slower gains are tried, not faster ones
 SOFT = "margin_60"  # the rule that is tried when nothing faster passes: 60 degrees and 20 dB
-# Factors of the gains that the twin found, after so many failures; and once, if there was none. Then the soft rule's.
-LADDER, FASTER = (1.0, 0.8, 0.55), 1.15
+# The calmest gains: of the current loop, and shares of the velocity loop of `cautious_gains` and of this one's own.
+CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4
 LEAST_WAY = 0.2  # rad between the ends of the travel: finding the poles alone turns a rotor so far
+BY_TRIAL = "by a move, its reversal, and a move with 1.5 times velocity P"  # how gains are verified, at the least
 LEAST_LINES = 10  # of a frequency response, that are worth a judgement
 CALMED = [Gains._fields.index(name) for name in ("velocity_p", "position_p")]
 SCALED = [Gains._fields.index(name) for name in ("velocity_p", "velocity_i", "position_p")]
@@ -62,61 +68,6 @@ FREE_WINDOW = 100  # turns of following error that trip a frequency response: it
 # Objects that the trials change and that are put back, gains aside.
 FOLLOWING_WINDOW, MOTOR_TYPE, MODE = 0x6065, 0x2050, 0x6060
 ENCODER_INIT = "ABN Encoder Settings.Encoder Init Mode"  # presets take the encoder's offset as known; here nobody knows
-
-
-@dataclass
-class AxisRun:
-    """What became of one axis so far.
-
-    Attributes:
-        reason: Why it stopped; "" while it goes on.
-        notes: What else there is to say.
-        before, after: Raw gains.
-        identified: What its signals said, None before.
-        plant: What was made of that, None where nothing could be.
-        twin: Hidden J that the twin gives the gains it found.
-        proof: J by measured terms of the gains that were taken; nan before.
-        margins: Of the velocity loop as measured, None where nothing was.
-    """
-
-    before: Gains
-    after: Gains
-    reason: str = ""
-    notes: list[str] = field(default_factory=list)
-    identified: Identification | None = None
-    plant: Plant | None = None
-    twin: float = np.nan
-    proof: float = np.nan
-    margins: Margins | None = None
-
-    @property
-    def accepted(self) -> bool:
-        """Whether it got through everything."""
-        return not self.reason
-
-
-class Result(NamedTuple):
-    """What auto did: the axes, and its costs.
-
-    drive_seconds, moves, aborts and violations: Of each axis, (num_axes,). shown: A recorded move with the new gains,
-    None if none was made. response: The velocity loop's, likewise. file: The snapshot that brings everything back.
-    kept: Whether drives on a bus keep the gains over a power cycle.
-    """
-
-    axes: tuple[AxisRun, ...]
-    drive_seconds: Floats
-    moves: Integers
-    aborts: Integers
-    violations: Integers
-    shown: Shown | None
-    response: FrequencyResponse | None
-    file: Path
-    kept: bool
-
-    @property
-    def accepted(self) -> Mask:
-        """Which axes have new gains, shape (num_axes,)."""
-        return np.array([axis.accepted for axis in self.axes])
 
 
 def auto(
@@ -156,9 +107,12 @@ def auto(
         run.compute()
         say("trying gains on the drives", 0.7)
         run.prove()
+        run.show()
         say("measuring the frequency response", 0.85)
         run.measure()
-        say("writing", 0.95)
+        say("moving with the gains before", 0.95)
+        run.look_back()
+        say("writing", 0.96)
         accepted = run.write(transaction)
         kept = keep and bool(accepted.any()) and transaction.store(accepted)
         transaction.commit(accepted)
@@ -196,6 +150,7 @@ class _Run:
         self._axes = [AxisRun(Gains(*map(int, row)), Gains(*map(int, row))) for row in self._before]
         self._ground: ProvingGround | None = None
         self._shown: Shown | None = None
+        self._earlier: Shown | None = None
         self._response: FrequencyResponse | None = None
         self._fresh = np.zeros(target.num_axes, bool)
         self._modes = drives.read(MODE)
@@ -203,9 +158,9 @@ class _Run:
         self._spent = np.zeros(target.num_axes)
         n = target.num_axes
         self._gains, self._reference = (np.ones((n, len(Gains._fields)), np.int64) for _ in range(2))
-        # The soft rule's, and those with which axes were identified: slow enough for any load; what is stopped goes on
-        # with the latter.
-        self._safe = np.ones((2, n, len(Gains._fields)), np.int64)
+        # What is tried when the twin's gains fail: the fitted rule's; those before, or the soft rule's; and those
+        # that are slow enough for any load, with which what is stopped goes on.
+        self._fallbacks = np.ones((3, n, len(Gains._fields)), np.int64)
 
     @property
     def going(self) -> Mask:
@@ -241,7 +196,7 @@ class _Run:
         for axis in map(int, np.flatnonzero(self.going)):
             run, identified = self._axes[axis], found[axis]
             run.identified = identified
-            run.reason = _wiring(target, identified)
+            run.reason = wrong_wiring(target, identified)
             if not run.reason:
                 try:
                     run.plant = _plant(target, axis, identified)
@@ -261,6 +216,10 @@ class _Run:
             return
         for name, value in _commissioning(target).items():
             target.drives.write(name, value, where=self._fresh)
+        # No axis is at both ends: switches that say so are not there.
+        unwired = self._fresh & (target.drives.read(INPUTS) & BOTH_ENDS == BOTH_ENDS)
+        target.drives.write(LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
+        self._note(unwired, "both limit switches were active, which no axis can be at: they are ignored (2005h)")
         for axis in np.flatnonzero(self._fresh):
             self._axes[axis].notes.append(f"fresh from the factory: commissioned for {target.motor.name} first")
 
@@ -279,8 +238,12 @@ class _Run:
             known.append(known_of(plant, identified, float(reach[axis])))
             fitted = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)[0]
             proposals = {name: propose(name, target.device, target.motor, plant) for name in RULES}
-            self._safe[0, axis] = proposals[SOFT].gains
-            self._safe[1, axis] = cautious_gains(target, plant.inertia)[axis]
+            self._fallbacks[0, axis] = fitted
+            before = self._axes[axis].before
+            # What the drive had may be better than what is only soft.
+            trusted = not unsafe_gains(target.device, plant, before)
+            self._fallbacks[1, axis] = before if trusted else proposals[SOFT].gains
+            self._fallbacks[2, axis] = _calm_gains(target, plant)
             self._reference[axis] = fitted
             starts.append(np.array([fitted, *(proposal.gains for proposal in proposals.values())], np.int64))
         scaler = np.asarray(target.drives.read((0x2058, 0)), float)[chosen]
@@ -291,54 +254,59 @@ class _Run:
             self._axes[axis].twin = float(hidden)
 
     def prove(self) -> None:
-        """Try the twin's gains on the drives, slower ones until they pass, and faster ones if they did at once."""
+        """Try the twin's gains on the drives; slower ones until some pass, then their neighbours, the best is kept."""
         going = self.going
         if not going.any():
             return
-        drives, plants = self._target.drives, [axis.plant for axis in self._axes]
-        self._ground = ground = ProvingGround(self._target, plants, self._room(), self._safe[1], self._reference)
-        drives.write(FOLLOWING_WINDOW, WINDOW * np.abs(ground.move.distance) + drives.read((0x2058, 0)), where=going)
+        plants = [axis.plant for axis in self._axes]
+        self._ground = ground = ProvingGround(self._target, plants, self._room(), self._fallbacks[-1], self._reference)
+        self._watch_following(going)
         self._stop(going & ground.too_short(), "the travel is too short for a move that proves anything")
+        ladders = [Ladder(len(self._fallbacks)) for _ in self._axes]
         n = self._target.num_axes
-        best, cost = self._safe[1].copy(), np.full(n, np.inf)
-        failures, last = np.zeros(n, np.int64), [""] * n
-        open_, passed = self.going, np.zeros(n, bool)
+        best, cost, last = self._fallbacks[-1].copy(), np.full(n, np.inf), [""] * n
         while True:
-            # Time for a frequency response is kept, unless there is nothing yet to measure it with.
-            open_ &= self._affordable(TRIAL_TIME + np.where(passed, self._response_time, 0.0))
+            passed = np.array([ladder.passed for ladder in ladders])
+            open_ = self.going & np.array([ladder.rung is not None for ladder in ladders])
+            # Time for a response and a move is kept, unless there is nothing yet to make them with.
+            then = np.where(passed, self._response_time + MOVE_TIME, 0.0)
+            open_ &= self._affordable(TRIAL_TIME + ground.way_back() + then)
             if not open_.any():
                 break
-            factor = np.where(passed, FASTER, np.array(LADDER)[np.minimum(failures, len(LADDER) - 1)])
-            trusted = self._safe[np.clip(failures - len(LADDER), 0, len(self._safe) - 1), np.arange(n)]
-            tried = np.where((failures < len(LADDER))[:, None], _scaled(self._gains, factor), trusted)
+            tried = np.array([self._meant(axis, ladder.rung) for axis, ladder in enumerate(ladders)])
             with self._spending(open_):
                 proof = ground.run(tried, open_)
             better = open_ & proof.passed & (proof.cost < cost)
             best, cost = np.where(better[:, None], tried, best), np.where(better, proof.cost, cost)
-            for axis in np.flatnonzero(open_ & ~proof.passed & ~passed):
-                last[axis] = proof.reason[axis]
-            failed = open_ & ~proof.passed & ~passed
-            first = open_ & proof.passed & ~passed & (failures == 0)
-            passed |= open_ & proof.passed
-            failures += failed
-            open_ = first | (failed & (failures < len(LADDER) + len(self._safe)))
-        for axis in np.flatnonzero(self.going & ~passed):
-            why = last[axis] or "no drive time was left to try them"
-            self._axes[axis].reason = f"no gains passed the trial: with the last ones {why}"
+            for axis in map(int, np.flatnonzero(open_)):
+                if not proof.passed[axis] and not ladders[axis].passed:
+                    last[axis] = proof.reason[axis]
+                ladders[axis].step(bool(proof.passed[axis]), bool(better[axis]), bool(proof.ripple[axis] > LOUD))
+        for axis in map(int, np.flatnonzero(self.going)):
+            run, ladder = self._axes[axis], ladders[axis]
+            if not ladder.passed:
+                why = last[axis] or "no drive time was left to try them"
+                run.reason = f"no gains passed the trial: with the last ones {why}"
+                continue
+            run.proof, run.verified = float(cost[axis]), BY_TRIAL
+            if ladder.failures:
+                failed = ", ".join(rung.words for rung in ladder.failures)
+                run.notes.append(f"no pass with the {failed}: the last time {last[axis]}")
         self._gains = best
-        for axis in np.flatnonzero(self.going):
-            self._axes[axis].proof = float(cost[axis])
-        if self.going.any():
-            self._shown = self._show()
-            self._drop_faults("it moved with the new gains")
+
+    def _meant(self, axis: int, rung: Rung | None) -> Integers:
+        """Return the gains that a rung means for an axis; any, if nothing is to be tried on it."""
+        if rung is None:
+            return np.asarray(self._fallbacks[-1, axis])
+        if rung.fallback is not None:
+            return np.asarray(self._fallbacks[rung.fallback, axis])
+        return _scaled(self._gains[axis], rung.factor)
 
     def measure(self) -> None:
-        """Measure the velocity loop's response with the new gains; one without margins is refused."""
+        """Measure the velocity loop's response with the new gains; what comes too near to instability is calmed."""
         going = self.going
-        if not going.any():
-            return
         late = going & ~self._affordable(self._response_time)
-        self._note(late, "no frequency response: the drive time was used up")
+        self._without_response(late, "the drive time was used up")
         going &= ~late
         if not going.any():
             return
@@ -356,19 +324,29 @@ class _Run:
         except (ValueError, RuntimeError, TimeoutError) as error:
             if isinstance(error, BusError):
                 raise
-            self._note(going, f"no frequency response: {error}")
+            self._without_response(going, str(error))
             return
+        finally:
+            self._watch_following(going)
         self._drop_faults("its frequency response was measured")
-        for axis in np.flatnonzero(going & self.going):
-            self._calm(int(axis), response)
+        assert self._ground is not None, "proving makes it"
+        self._ground.begin_here(going)
+        calmed = np.zeros(self._target.num_axes, bool)
+        for axis in map(int, np.flatnonzero(going & self.going)):
+            calmed[axis] = self._calm(axis, response)
+        self._try_again(calmed & self.going)
 
-    def _calm(self, axis: int, response: FrequencyResponse) -> None:
-        """Lower the gains of an axis whose measured loop comes too near to instability; the loop scales with P."""
+    def _calm(self, axis: int, response: FrequencyResponse) -> bool:
+        """Lower the gains of an axis whose measured loop comes too near to instability; return whether it was so.
+
+        The loop scales with P.
+        """
         run, f, L = self._axes[axis], response.f, response.open_loop[:, axis]
         trusted = response.trusted[:, axis]
         if trusted.sum() < LEAST_LINES:
-            run.notes.append(f"no margins: {int(trusted.sum())} lines of the response are coherent")
-            return
+            why = f"{int(trusted.sum())} of its lines are coherent, and {LEAST_LINES} are needed"
+            self._without_response(_only(axis, self._target.num_axes), "; ".join([why, *response.notes[axis]]))
+            return False
         for factor in SOFTER:
             found = margins(f, factor * L, trusted)
             if found.ms <= SENSITIVITY:
@@ -377,13 +355,94 @@ class _Run:
             run.reason = (
                 f"the measured loop is {found.ms:.1f} times as sensitive as an open one: {SENSITIVITY:g} is most"
             )
-            return
+            return False
         run.margins = found
-        if factor < 1.0:
-            softer = self._gains[axis].copy()
-            softer[CALMED] = scaled(softer[CALMED], factor)
-            self._gains[axis] = softer
-            run.notes.append(f"calmed to {100.0 * factor:.0f} %: the measured loop came too near to instability")
+        run.verified = f"{BY_TRIAL}; and by the measured frequency response of the velocity loop, Ms {found.ms:.1f}"
+        if factor == 1.0:
+            return False
+        softer = self._gains[axis].copy()
+        softer[CALMED] = scaled(softer[CALMED], factor)
+        self._gains[axis] = softer
+        run.notes.append(
+            f"calmed to {100.0 * factor:.0f} %: the measured loop came too near to instability; margins are computed "
+            "from that response"
+        )
+        return True
+
+    def _try_again(self, calmed: Mask) -> None:
+        """Try gains that were calmed, and record a move with them; without time for a trial, that move must do."""
+        where = calmed & self._affordable(TRIAL_TIME)
+        self._note(calmed & ~where, "a move was the only trial of the calmed gains: the drive time was used up")
+        assert self._ground is not None, "proving makes it"
+        if where.any():
+            with self._spending(where):
+                proof = self._ground.run(self._gains, where)
+            for axis in map(int, np.flatnonzero(where)):
+                run = self._axes[axis]
+                run.proof = float(proof.cost[axis])
+                if not proof.passed[axis]:
+                    run.reason = f"the calmed gains failed their trial: {proof.reason[axis]}"
+        self.show(calmed & self.going)
+
+    def _without_response(self, where: Mask, why: str) -> None:
+        """Say why there is no frequency response, and what was verified instead."""
+        self._note(where, f"no margins were measured: {why}; verified {BY_TRIAL} instead")
+
+    def show(self, where: Mask | None = None) -> None:
+        """Record a move with the new gains, of all axes or some; one that fails is refused."""
+        going = self.going if where is None else where
+        if not going.any():
+            return
+        assert self._ground is not None, "proving makes it"
+        for attempt in range(SHOWINGS):
+            try:
+                with self._spending(going):
+                    shown = self._ground.show(self._gains, going)
+            except SafetyError as error:
+                self._stop(going, f"the envelope stopped the move with the new gains: {error}")
+                return
+            self._shown = shown if self._shown is None else self._shown.replaced(shown)
+            failed = going & np.array([bool(reason) for reason in shown.reason])
+            last = attempt == SHOWINGS - 1
+            for axis in map(int, np.flatnonzero(failed)):
+                # What passed once and fails now is at its edge.
+                self._gains[axis] = _scaled(self._gains[axis], AT_THE_EDGE)
+                run, why = self._axes[axis], shown.reason[axis]
+                if last or not self._affordable(MOVE_TIME)[axis]:
+                    run.reason = f"the move with the new gains failed: {why}"
+                else:
+                    run.notes.append(f"slowed to {100.0 * AT_THE_EDGE:.0f} % after the trial: in one more move {why}")
+            going = failed & self.going
+            if not going.any():
+                break
+        self._drop_faults("it moved with the new gains")
+
+    def look_back(self) -> None:
+        """Record a move with the gains before, where they are safe by the model; it decides nothing."""
+        going, n = self.going, self._target.num_axes
+        for axis in map(int, np.flatnonzero(going)):
+            plant = self._axes[axis].plant
+            assert plant is not None, "an axis that goes on has one"
+            why = unsafe_gains(self._target.device, plant, self._axes[axis].before)
+            if not why and not self._affordable(LOOK_BACK_TIME)[axis]:
+                why = "the drive time was used up"
+            if why:
+                going &= ~_only(axis, n)
+                self._axes[axis].notes.append(f"no move with the gains before, for comparison: {why}")
+        lanes = self._target.axes_per_machine
+        going &= np.repeat(going.reshape(-1, lanes).all(axis=1), lanes)
+        if not going.any():
+            return
+        assert self._ground is not None, "proving makes it"
+        try:
+            with self._spending(going):
+                self._earlier = earlier = self._ground.show(self._before, going)
+        except SafetyError as error:
+            self._note(going, f"the envelope stopped the move with the gains before: {error}")
+            return
+        for axis in map(int, np.flatnonzero(going)):
+            if earlier.reason[axis]:
+                self._axes[axis].notes.append(f"the move with the gains before: {earlier.reason[axis]}")
 
     def write(self, transaction: Transaction) -> Mask:
         """Leave the accepted axes with their gains and everything else as it was; return which they are."""
@@ -405,7 +464,7 @@ class _Run:
         for k, values in enumerate(transaction.before.axes):
             wanted = dict(values)
             if self._fresh[k]:
-                commissioned = _keys(self._target, _commissioning(self._target))
+                commissioned = [*_keys(self._target, _commissioning(self._target)), (LIMIT_SWITCHES, 0)]
                 wanted |= {key: int(drives.read(key)[k]) for key in commissioned if key in values}
             axes.append(wanted | {key: int(column[k]) for key, column in kept.items()})
         restore(drives, _with_axes(transaction, axes), going, whole=False)
@@ -417,18 +476,15 @@ class _Run:
         """Return what was done."""
         ground, zero = self._ground, np.zeros(self._target.num_axes, np.int64)
         counts = (zero, zero, zero) if ground is None else (ground.moves, ground.aborts, ground.violations)
-        return Result(tuple(self._axes), self._spent, *counts, self._shown, self._response, file, kept)
+        return Result(tuple(self._axes), self._spent, *counts, self._shown, self._earlier, self._response, file, kept)
 
     # --- parts ----------------------------------------------------------------------------------------------------
-    def _show(self) -> Shown | None:
+    def _watch_following(self, where: Mask) -> None:
+        """Have a following error trip the drive that trials cannot have."""
         assert self._ground is not None, "proving makes it"
-        going = self.going
-        try:
-            with self._spending(going):
-                return self._ground.show(self._gains, going)
-        except SafetyError as error:
-            self._stop(going, f"the envelope stopped the move with the new gains: {error}")
-            return None
+        drives = self._target.drives
+        window = WINDOW * np.abs(self._ground.move.distance) + drives.read((0x2058, 0))
+        drives.write(FOLLOWING_WINDOW, window, where=where)
 
     def _drop_faults(self, meanwhile: str) -> None:
         """Take out axes that went into fault, and say which."""
@@ -471,9 +527,9 @@ class _Run:
             self._axes[axis].notes.append(text)
 
 
-def _scaled(gains: Integers, factor: Floats) -> Integers:
+def _scaled(gains: Integers, factor: float) -> Integers:
     result = gains.copy()
-    result[:, SCALED] = scaled(gains[:, SCALED], factor[:, None])
+    result[SCALED] = scaled(gains[SCALED], factor)
     return result
 
 
@@ -495,18 +551,18 @@ def _with_axes(transaction: Transaction, axes: Sequence[dict[Any, int]]) -> Any:
     return replace(transaction.before, axes=tuple(axes))
 
 
-def _wiring(target: Target, identified: Identification) -> str:
-    """Return what is wrong with the wiring, "" if nothing is."""
-    direction, pairs = identified.estimates.get("encoder_direction"), identified.estimates.get("pole_pairs")
-    if direction is not None and direction.value < 0.0:
-        return "the encoder counts against the motor: swap two phases, or set the encoder's direction (2080h:01)"
-    if pairs is not None and pairs.is_known and round(pairs.value) != target.motor.n_p:
-        return (
-            f"the motor has {pairs.value:.0f} pole pairs, and {target.motor.name} has {target.motor.n_p}: "
-            "it is another motor; give --motor, or correct 2056h"
-        )
-    return ""
-
-
 def _plant(target: Target, axis: int, identified: Identification) -> Plant:
     return Plant.from_identification(target.device, target.motor, float(target.supply[axis]), identified)
+
+
+def _calm_gains(target: Target, plant: Plant) -> Gains:
+    """Return gains that suit the rotor alone, too: within backlash, and above a resonance, it has no load."""
+    velocity_hz = cautious_bandwidth(target.motor, plant.inertia) * ROTOR_SHARE
+    return gains_from_bandwidths(
+        target.device, target.motor, plant.inertia, current_hz=CALM_CURRENT_HZ, velocity_hz=velocity_hz,
+        position_hz=POSITION_SHARE * velocity_hz, supply=plant.supply,
+    )  # fmt: skip
+
+
+def _only(axis: int, count: int) -> Mask:
+    return np.asarray(np.arange(count) == axis)

@@ -17,11 +17,14 @@ from tuning.certificate import (
     identified,
     si_gains,
 )
+from tuning.linear_model import velocity_open_loop
 from tuning.load_step import load_step
+from tuning.margins import Margins, margins
 from tuning.provenance import versions
 
 if TYPE_CHECKING:
-    from tuning.auto import AxisRun, Result
+    from tuning.auto_result import AxisRun, Result
+    from tuning.proving import Shown
     from tuning.target import Target
 
 SETTLED = 0.01  # of the move: what counts as there
@@ -59,14 +62,14 @@ def _axis(target: Target, result: Result, axis: int, run: AxisRun, loaded: StepR
     return AxisCertificate(
         axis=axis,
         accepted=run.accepted,
-        reason=run.reason or "every check was passed",
+        reason=run.reason or f"every check was passed: the gains were verified {run.verified}",
         identified={} if run.identified is None else identified(run.identified),
         before=tuple(run.before),
         after=tuple(run.after),
         before_si=si_gains(target.device, supply, run.before),
         after_si=si_gains(target.device, supply, run.after),
         steps=(*_steps(result, axis), *([loaded] if loaded else [])) if run.accepted else (),
-        frequency_responses=_responses(result, axis, run) if run.accepted else (),
+        frequency_responses=_responses(target, result, axis, run) if run.accepted else (),
         notes=tuple(run.notes),
         hardware_seconds=float(result.drive_seconds[axis]),
         aborts=int(result.aborts[axis]),
@@ -74,12 +77,17 @@ def _axis(target: Target, result: Result, axis: int, run: AxisRun, loaded: StepR
 
 
 def _steps(result: Result, axis: int) -> tuple[StepResponse, ...]:
-    shown = result.shown
-    if shown is None:
-        return ()
-    demand, actual = shown.demand[:, axis], shown.actual[:, axis]
+    """Return the move with the gains before, if it was made, and that with the new ones."""
+    moves = ((False, result.earlier), (True, result.shown))
+    return tuple(_step(shown, axis, tuned) for tuned, shown in moves if shown is not None and shown.where[axis])
+
+
+def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
+    # From where the axis began, and in the direction in which it went: moves go there and back.
+    way = 1.0 if shown.demand[-1, axis] >= shown.demand[0, axis] else -1.0
+    demand, actual = (way * values[:, axis] for values in (shown.demand, shown.actual))
     size = max(float(np.abs(demand - demand[0]).max()), 1e-9)
-    beyond = (actual - demand[-1]) * np.sign(demand[-1] - demand[0])
+    beyond = actual - demand[-1]
     late = np.flatnonzero(np.abs(actual - demand[-1]) > SETTLED * size)
     there = np.flatnonzero(demand != demand[-1])
     settled = len(actual) - 1 not in late
@@ -90,21 +98,34 @@ def _steps(result: Result, axis: int) -> tuple[StepResponse, ...]:
         "largest following error [rad]": float(np.abs(demand - actual).max()),
         "error at the end [rad]": float(demand[-1] - actual[-1]),
     }
-    return (StepResponse("move", True, "rad", shown.t, demand, actual, shown.current[:, axis], figures),)
+    return StepResponse("move", tuned, "rad", shown.t, demand, actual, way * shown.current[:, axis], figures)
 
 
-def _responses(result: Result, axis: int, run: AxisRun) -> tuple[FrequencyResponse, ...]:
-    response, margins = result.response, run.margins
-    if response is None or margins is None:
+def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple[FrequencyResponse, ...]:
+    """Return the velocity loop as measured with the new gains, and as computed with those before."""
+    response = result.response
+    if response is None or not np.isfinite(response.open_loop[:, axis]).any():
         return ()
-    return (
-        frequency_response(
-            "velocity loop",
-            response.f,
-            response.open_loop[:, axis],
-            margins,
-            tuned=True,
-            coherence=response.coherence[:, axis],
-            source="multisine, 1 kHz samples",
-        ),
+    # Too few lines are coherent for margins: then they are shown as what they are.
+    found = Margins(*(np.nan,) * len(Margins._fields)) if run.margins is None else run.margins
+    measured = frequency_response(
+        "velocity loop",
+        response.f,
+        response.open_loop[:, axis],
+        found,
+        tuned=True,
+        coherence=response.coherence[:, axis],
+        source="multisine, 1 kHz samples",
     )
+    if run.plant is None or 0 in (run.before.torque_p, run.before.velocity_p):
+        return (measured,)  # an open loop has no response
+    L = velocity_open_loop(target.device, run.plant, run.before, response.f)
+    before = frequency_response(
+        "velocity loop",
+        response.f,
+        L,
+        margins(response.f, L),
+        tuned=False,
+        source="the linear model of what was identified, for the gains before",
+    )
+    return before, measured

@@ -43,17 +43,17 @@ def identify_briefly(
 class _Brief(Experiments):
     """Those experiments, with another middle."""
 
-    def _turn(self, working: Working) -> None:
+    def turn(self, working: Working) -> None:
         target, drives = working.target, working.target.drives
-        self._progress("winding", 0.3)
+        self.progress("winding", 0.3)
         enable(working, "csv")
-        holding = self._hold(working)
+        holding = self.hold(working)
         electrical = drives.read(ELECTRICAL_ANGLE) * (2.0 * math.pi / 65536.0)
         to_torque_mode(working, holding)
         pulses = pulse(working, holding)
         sign = 1.0 - 2.0 * float(drives.read(SHAFT_DIRECTION)[0])
-        self._take_windings(working, identify_winding(working, pulses, electrical, target.motor.n_p * sign))
-        self._progress("inertia and friction", 0.45)
+        self.take_windings(working, identify_winding(working, pulses, electrical, target.motor.n_p * sign))
+        self.progress("inertia and friction", 0.45)
         write_gains(drives, cautious_gains(target, GUESS * target.motor.inertia), working.where)
         motion.select_mode(drives, "pp", working.where)
         down, up = working.room()
@@ -61,25 +61,25 @@ class _Brief(Experiments):
         trials = Trials(drives, target.motor, target.axes_per_machine, 1.0)
         found, _ = trials.identify(np.where(up >= -down, up, down), working.where)
         for k in map(int, np.flatnonzero(working.where)):
-            self._found[k] |= {
+            self.found[k] |= {
                 "inertia": _about(found.inertia[k], INERTIA_ERROR, "kg*m^2"),
                 "coulomb": _about(found.coulomb[k], FRICTION_ERROR, "A"),
                 "viscous": _about(found.viscous[k], FRICTION_ERROR, "A*s/rad"),
                 "offset": _about(found.offset[k], FRICTION_ERROR, "A"),
             }
-        self._progress("resonance, delay, filter", 0.55)
+        self.progress("resonance, delay, filter", 0.55)
         switch_off(drives, working.where)
-        self._respond(working, np.asarray(found.inertia, float))
+        self.respond(working, np.asarray(found.inertia, float))
 
-    def _respond(self, working: Working, inertia: NDArray[np.float64]) -> None:
+    def respond(self, working: Working, inertia: NDArray[np.float64]) -> None:
         target, drives = working.target, working.target.drives
         fault = drives.read(STATUS) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1]
         able = working.where & ~fault
         for k in map(int, np.flatnonzero(working.where & fault)):
-            self._refuse(k, RESPONSE, "the drive is in fault; see its emergencies")
+            self.refuse(k, RESPONSE, "the drive is in fault; see its emergencies")
         if not able.any():
             return
-        write_gains(drives, self._response_gains(working, inertia), able)
+        write_gains(drives, self.response_gains(working, inertia), able)
         down, up = working.room()
         here = replace(target, low=np.minimum(down, 0.0), high=np.maximum(up, 1e-3))
         response = measure(here, "velocity", where=able)
@@ -87,9 +87,9 @@ class _Brief(Experiments):
             fit = response.fits[k]
             if fit is None or fit.reason:
                 why = "; ".join(response.notes[k]) or "the response was not measured"
-                self._refuse(k, RESPONSE, why if fit is None else fit.reason)
+                self.refuse(k, RESPONSE, why if fit is None else fit.reason)
                 continue
-            self._found[k] |= _guessed(fit)
+            self.found[k] |= _guessed(fit)
 
 
 def _guessed(fit: PlantFit) -> dict[str, Estimate]:

@@ -48,7 +48,11 @@ def bode_picture(responses: Sequence[FrequencyResponse]) -> Figure:
             trusted = np.isnan(found.coherence) | (found.coherence >= TRUSTED)
         doubtful = doubtful or not trusted.all()
         _curve(magnitude, found.frequency, found.magnitude_db, trusted, color, label)
-        _curve(phase, found.frequency, found.phase_deg, trusted, color, label)
+        # Within a turn: -540 degrees is as near to instability as -180.
+        turn = found.phase_deg % 360.0 - 360.0
+        jumps = np.flatnonzero(np.abs(np.diff(turn)) > 180.0) + 1
+        f, turn = np.insert(found.frequency, jumps, np.nan), np.insert(turn, jumps, np.nan)
+        _curve(phase, f, turn, np.insert(trusted, jumps, False), color, label)
         coherence.plot(found.frequency, found.coherence, color=color, linewidth=1.0)
         crossover = found.margins.get("crossover [Hz]", np.nan)
         if np.isfinite(crossover):
@@ -65,6 +69,8 @@ def bode_picture(responses: Sequence[FrequencyResponse]) -> Figure:
     magnitude.set_ylabel("magnitude [dB]")
     magnitude.legend(loc="best")
     phase.set_ylabel("phase [°]")
+    phase.set_ylim(-360.0, 0.0)
+    phase.set_yticks(range(-360, 1, 90))
     coherence.set_ylabel("coherence")
     coherence.set_ylim(0.0, 1.05)
     coherence.set_xlabel("frequency [Hz]")

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from drive_env.gains import Gains, rule_gains
 from drive_env.positioning import plan_move
 from drive_env.score import HiddenScore
-from mechanics.shaft import shaft_load
 from tuning.meter import KINDS, MeteredDrives
+from tuning.moved_inertia import moved_inertia
 from tuning.suite import Machine, groups, open_group
 from tuning.target import Target
 from tuning.toml_tables import toml
@@ -168,10 +168,13 @@ class _Yardstick:
 
 
 def _true_inertia(target: Target) -> Floats:
-    """Return the total inertia as a perfect identification finds it: over the true K_t, times the data sheet's."""
-    loads = [shaft_load(group.load).inertia + group.load.armature for group in target.drives._groups]
+    """Return the total inertia as a perfect identification finds it: over the true K_t, times the data sheet's.
+
+    The axes of a machine move together: an axis pushes its own inertia, and what the others' acceleration puts on it.
+    """
+    moved = np.concatenate([moved_inertia(group.load) for group in target.drives._groups])
     share = target.drives.machine.parameters["motor.psi_m"] / target.motor.psi_m
-    return np.asarray(np.concatenate(loads).reshape(-1) / np.repeat(share, target.axes_per_machine))
+    return np.asarray(moved.reshape(-1) / np.repeat(share, target.axes_per_machine))
 
 
 class _Tuned(NamedTuple):

@@ -37,6 +37,7 @@ FIELD_ANGLE, ENCODER_ANGLE = 0x2102, 0x2103  # 1/65536 electrical turn
 RAISE, REST, TURN = 20, 60, 240  # cycles: the current comes (gravity does not wait), the rotor rests, the field turns
 MOST_TURN, LEAST_TURN = 1.0, 0.2  # electrical turns of the field
 SHARE = 0.9  # of what current there is
+TOO_SHORT = "travel too short"  # how the reason begins where nothing was turned
 MARGIN = 0.1  # rad of room that stays free
 TOLERANCE = 0.35  # of a pole pair: from here on a ratio is no whole number
 STUCK = 0.25  # of the field's turn: a rotor that follows less does not follow
@@ -64,14 +65,14 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
         return [EncoderCheck(none, later)] * count
     configured = drives.read(POLE_PAIRS).astype(float)
     commutation = drives.read(COMMUTATION)
-    turn, where, reasons = _plan(working)
+    where, reasons = _able(working)
     if not where.any():
         return [EncoderCheck(refused("1", reason), refused("1", reason)) for reason in reasons]
     try:
         drives.write(COMMUTATION, BY_FIELD, where=where)
         drives.write(OPEN_LOOP_CURRENT, 0, where=where)
         enable(working, "csv", where)
-        away, back, field = _turn(working, where, turn, configured)
+        away, back, field, reasons = _turn(working, where, configured)
         alive = still_enabled(working, drives.read(STATUS))
     finally:
         switch_off(drives, where)
@@ -81,42 +82,51 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
     shaft = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
     found = []
     for k in range(count):
-        if not where[k]:
+        if not where[k] or reasons[k]:
             found.append(EncoderCheck(refused("1", reasons[k]), refused("1", reasons[k])))
         elif not alive[k]:
-            reason = "the drive switched off while the field turned; see its emergencies"
+            reason = (
+                "the axis was switched off while the field turned: it left its travel, or the drive did it itself; "
+                "see its emergencies"
+            )
             found.append(EncoderCheck(refused("1", reason), refused("1", reason)))
         else:
             found.append(_judge(field[k], shaft[k] * away[k], shaft[k] * back[k], target.motor.n_p))
     return found
 
 
-def _plan(working: Working) -> tuple[Floats, Mask, list[str]]:
-    """Return how far the fields turn [electrical rad, with the sign], which axes can, and why the others cannot."""
-    target = working.target
-    n_p = target.motor.n_p
+def _able(working: Working) -> tuple[Mask, list[str]]:
+    """Return which axes have the room to swing to the field, to either side, and why the others have not."""
     down, up = working.room()
-    # Switched on, the field pulls the rotor to itself: half an electrical turn at most.
-    swing = np.pi / n_p
-    sign = np.where(up >= -down, 1.0, -1.0)
-    room = np.where(sign > 0.0, up, -down) - MARGIN
-    other = np.where(sign > 0.0, -down, up) - MARGIN
-    way = np.minimum(room - swing, MOST_TURN * 2.0 * np.pi / n_p)
-    able = (way >= LEAST_TURN * 2.0 * np.pi / n_p) & (other >= swing)
-    needed = swing + LEAST_TURN * 2.0 * np.pi / n_p + MARGIN
+    # Switched on, the field pulls the rotor to itself: half an electrical turn at most. Wherever it then stands, the
+    # field can turn it back by as much.
+    needed = np.pi / working.target.motor.n_p + MARGIN
+    able = np.minimum(up, -down) >= needed
     reasons = [
         ""
         if able[k]
-        else f"travel too short: the rotor may swing by {swing:.2g} rad to the field and has to turn with it; that "
-        f"takes {swing + MARGIN:.2g} rad to one side and {needed:.2g} to the other, and there are {-down[k]:.2g} and "
-        f"{up[k]:.2g}"
-        for k in range(target.num_axes)
+        else f"{TOO_SHORT}: the field may pull the rotor {needed:.2g} rad to either side, and there are {-down[k]:.2g} "
+        f"and {up[k]:.2g}; begin in the middle of the travel"
+        for k in range(working.target.num_axes)
     ]
-    return sign * way * n_p, working.where & able, reasons
+    return np.asarray(working.where & able), reasons
 
 
-def _turn(working: Working, where: Mask, turn: Floats, configured: Floats) -> tuple[Floats, Floats, Floats]:
-    """Turn the fields there and back; return how far the rotors went [rad], there and back, and the field [rad]."""
+def _way(working: Working) -> tuple[Floats, Mask]:
+    """Return how far the fields turn from where the rotors stand now [electrical rad], and which of them can."""
+    n_p = working.target.motor.n_p
+    down, up = working.room()
+    sign = np.where(up >= -down, 1.0, -1.0)
+    way = np.minimum(np.where(sign > 0.0, up, -down) - MARGIN, MOST_TURN * 2.0 * np.pi / n_p)
+    return sign * way * n_p, np.asarray(way >= LEAST_TURN * 2.0 * np.pi / n_p)
+
+
+def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Floats, Floats, list[str]]:
+    """Turn the fields there and back.
+
+    Returns:
+        How far the rotors went [rad], there and back, and the fields [rad], and why an axis was not turned.
+    """
     drives = working.target.drives
     current = np.rint(1e3 * SHARE * working.current).astype(np.int64)
     for k in range(1, 5):
@@ -124,6 +134,8 @@ def _turn(working: Working, where: Mask, turn: Floats, configured: Floats) -> tu
         drives.advance(RAISE // 4 * CYCLE)
         _stay_inside(working, where)
     stands = [_rest(working)]
+    turn, able = _way(working)
+    turn = np.where(able, turn, 0.0)
     # Smooth, so that the rotor does not swing: a raised cosine of speed.
     shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(TURN) + 0.5) / TURN)
     fields = [_field(working)]
@@ -143,7 +155,9 @@ def _turn(working: Working, where: Mask, turn: Floats, configured: Floats) -> tu
         stands.append(_rest(working))
         if sign > 0.0:
             turned = passed
-    return stands[1] - stands[0], stands[2] - stands[1], turned
+    short = f"{TOO_SHORT}: the field pulled the rotor to where less than {LEAST_TURN:g} electrical turns are free"
+    reasons = [short if chosen and not can else "" for chosen, can in zip(where, able, strict=True)]
+    return stands[1] - stands[0], stands[2] - stands[1], turned, reasons
 
 
 def _stay_inside(working: Working, where: Mask) -> None:

@@ -47,36 +47,41 @@ RESPONSE = NAMES[NAMES.index("anti_resonance") :]
 
 
 class Experiments:
-    """One identification of some axes, side by side."""
+    """One identification of some axes, side by side; `tuning.brief` replaces what needs torque by less of it.
+
+    Attributes:
+        target, where, progress: As `tuning.identification.identify` takes them.
+        found: What is known so far of each axis, by the names of `NAMES`.
+    """
 
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
-        self._target, self._where, self._progress = target, where, progress
-        self._found: list[dict[str, Estimate]] = [
+        self.target, self.where, self.progress = target, where, progress
+        self.found: list[dict[str, Estimate]] = [
             {name: refused(UNITS[name], "not asked for") for name in NAMES} for _ in range(target.num_axes)
         ]
 
     def run(self) -> list[Identification]:
         """Do them all."""
-        with timed(self._target) as (target, clock), working_state(target, self._where) as working:
-            good = self._check(working)
+        with timed(self.target) as (target, clock), working_state(target, self.where) as working:
+            good = self.check(working)
             if good.any():
-                self._turn(replace(working, where=good))
-        self._progress("done", 1.0)
+                self.turn(replace(working, where=good))
+        self.progress("done", 1.0)
         return [Identification(found, clock.seconds if chosen else 0.0)
-                for found, chosen in zip(self._found, self._where, strict=True)]  # fmt: skip
+                for found, chosen in zip(self.found, self.where, strict=True)]  # fmt: skip
 
-    def _check(self, working: Working) -> Mask:
+    def check(self, working: Working) -> Mask:
         """Check the encoders and return the axes whose torque may be commanded."""
-        self._progress("pole pairs and encoder", 0.0)
+        self.progress("pole pairs and encoder", 0.0)
         checks: list[EncoderCheck] = check_encoders(working)
         good = working.where.copy()
         for k in np.flatnonzero(working.where):
             check = checks[k]
-            self._found[k] |= {"pole_pairs": check.pole_pairs, "encoder_direction": check.direction}
+            self.found[k] |= {"pole_pairs": check.pole_pairs, "encoder_direction": check.direction}
             reason = self._wrong(working, int(k), check)
             if reason:
                 good[k] = False
-                self._refuse(int(k), NAMES, reason)
+                self.refuse(int(k), NAMES, reason)
         return good
 
     def _wrong(self, working: Working, k: int, check: EncoderCheck) -> str:
@@ -94,15 +99,17 @@ class Experiments:
             )
         if "did not follow" in check.direction.reason or "switched off" in check.direction.reason:
             return check.direction.reason
+        if working.target.motor.kind != "dc" and not check.direction.is_known:
+            return f"{check.direction.reason}; torque with wiring that is not checked could make the motor run away"
         return ""
 
-    def _turn(self, working: Working) -> None:
+    def turn(self, working: Working) -> None:
         """Do what needs torque."""
         target, drives = working.target, working.target.drives
-        self._progress("winding", 0.15)
+        self.progress("winding", 0.15)
         enable(working, "csp")
         go_back(working, "csp")
-        holding = self._hold(working)
+        holding = self.hold(working)
         electrical = drives.read(ELECTRICAL_ANGLE) * (2.0 * np.pi / 65536.0)
         to_torque_mode(working, holding)
         with swinging_allowed(target.drives):
@@ -112,37 +119,38 @@ class Experiments:
         go_back(working, "csv")
         sign = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
         windings = identify_winding(working, pulses, electrical, float(target.motor.n_p) * float(sign[0]))
-        self._take_windings(working, windings)
-        self._progress("inertia and friction", 0.3)
+        self.take_windings(working, windings)
+        self.progress("inertia and friction", 0.3)
         mechanics, inertia = identify_mechanics(working, holding)
         self._take_mechanics(working, mechanics)
-        self._progress("resonance, delay, filter", 0.7)
-        self._respond(working, inertia)
+        self.progress("resonance, delay, filter", 0.7)
+        self.respond(working, inertia)
         on = working.where & still_enabled(working, drives.read(STATUS))
         if on.any():
             go_back(replace(working, where=on), "csv", to=0.0)
 
-    def _hold(self, working: Working) -> Floats:
+    def hold(self, working: Working) -> Floats:
         """Return what holds the axes [A], at rest in csp."""
         drives = working.target.drives
         trace = drives.record([CURRENT], HOLD * CYCLE)
         alive = still_enabled(working, drives.read(STATUS))
         for k in np.flatnonzero(working.where & ~alive):
-            self._refuse(int(k), NAMES[4:], "the drive switched off while it held the axis; see its emergencies")
+            self.refuse(int(k), NAMES[4:], "the drive switched off while it held the axis; see its emergencies")
         return np.asarray(trace[CURRENT][-STEADY:].mean(axis=0) * 1e-3)
 
-    def _take_windings(self, working: Working, windings: list[Winding]) -> None:
+    def take_windings(self, working: Working, windings: list[Winding]) -> None:
+        """Take resistance and inductance."""
         for k in np.flatnonzero(working.where):
-            self._found[k] |= {"resistance": windings[k].resistance, "inductance": windings[k].inductance}
+            self.found[k] |= {"resistance": windings[k].resistance, "inductance": windings[k].inductance}
             if working.target.motor.kind == "dc" and windings[k].follows:
                 # Speed followed torque: with a reversed encoder the loops would have run away by now.
-                self._found[k]["encoder_direction"] = Estimate(1.0, 1.0, 1.0, "1")
+                self.found[k]["encoder_direction"] = Estimate(1.0, 1.0, 1.0, "1")
 
     def _take_mechanics(self, working: Working, mechanics: list[Mechanics]) -> None:
         for k in np.flatnonzero(working.where):
-            self._found[k] |= mechanics[k]._asdict()
+            self.found[k] |= mechanics[k]._asdict()
 
-    def _respond(self, working: Working, inertia: Floats) -> None:
+    def respond(self, working: Working, inertia: Floats) -> None:
         """Measure the velocity loop's response, with loops fit for it, and take what it says."""
         target, drives = working.target, working.target.drives
         # Still enabled: an axis under gravity would fall between the experiments.
@@ -151,40 +159,41 @@ class Experiments:
         down, up = working.room()
         for k in np.flatnonzero(working.where):
             if not able[k]:
-                self._refuse(int(k), RESPONSE, "the drive switched off; see its emergencies")
+                self.refuse(int(k), RESPONSE, "the drive switched off; see its emergencies")
             elif max(up[k], -down[k]) < LEAST_ROOM:
                 able[k] = False
-                self._refuse(int(k), RESPONSE, (
+                self.refuse(int(k), RESPONSE, (
                     f"travel too short: {LEAST_ROOM:g} rad are needed to shake the axis while it moves, and there are "
                     f"{max(up[k], -down[k]):.2g}"
                 ))  # fmt: skip
         if not able.any():
             return
-        write_gains(drives, self._response_gains(working, inertia), able)
+        write_gains(drives, self.response_gains(working, inertia), able)
         here = replace(target, low=np.minimum(down, 0.0), high=np.maximum(up, 1e-3))
         with swinging_allowed(drives):
             response = measure(
                 here, "velocity", where=able, high=HIGHEST,
-                progress=lambda share: self._progress("resonance, delay, filter", 0.7 + 0.29 * share),
+                progress=lambda share: self.progress("resonance, delay, filter", 0.7 + 0.29 * share),
             )  # fmt: skip
         for k in np.flatnonzero(able):
             fit = response.fits[k]
             if fit is None:
-                self._refuse(int(k), RESPONSE, "; ".join(response.notes[k]) or "the response was not measured")
+                self.refuse(int(k), RESPONSE, "; ".join(response.notes[k]) or "the response was not measured")
                 continue
-            self._found[k] |= {name: fit.estimates[name] for name in RESPONSE}
+            self.found[k] |= {name: fit.estimates[name] for name in RESPONSE}
             if fit.misfit > WORST_MISFIT:
                 for name in RESPONSE:
-                    self._found[k][name] = refused(UNITS[name], (
+                    self.found[k][name] = refused(UNITS[name], (
                         f"the response is not that of one spring: the model is off by {fit.misfit:.1f} times what "
                         "noise explains (backlash, or several resonances)"
                     ))  # fmt: skip
 
-    def _response_gains(self, working: Working, inertia: Floats) -> NDArray[np.int64]:
+    def response_gains(self, working: Working, inertia: Floats) -> NDArray[np.int64]:
+        """Return raw gains for measuring a response, (num_axes, 5), for total inertias [kg*m^2]."""
         target, motor = working.target, working.target.motor
         rows = []
         for k in range(target.num_axes):
-            found = self._found[k]
+            found = self.found[k]
             R, L = found["resistance"], found["inductance"]
             known = motor._replace(R_s=R.value if R.is_known else motor.R_s, L_q=L.value if L.is_known else motor.L_q)
             rows.append(
@@ -200,8 +209,8 @@ class Experiments:
             )
         return np.array(rows, np.int64)
 
-    def _refuse(self, k: int, names: tuple[str, ...], reason: str) -> None:
+    def refuse(self, k: int, names: tuple[str, ...], reason: str) -> None:
         """Refuse what has no value yet."""
         for name in names:
-            if not self._found[k][name].is_known and self._found[k][name].reason in ("", "not asked for"):
-                self._found[k][name] = refused(UNITS[name], reason)
+            if not self.found[k][name].is_known and self.found[k][name].reason in ("", "not asked for"):
+                self.found[k][name] = refused(UNITS[name], reason)

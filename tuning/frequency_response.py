@@ -7,23 +7,24 @@ two cross-spectra with it, answer over error, without the bias that noise inside
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
+from scipy import signal, stats
 
 from drive_env.gains import GAIN_OBJECTS
 from tuning import margins as margins_
 from tuning.excitation import CREST, Lines, dimension, peak, plan_lines
 from tuning.held_samples import split, unhold
 from tuning.lags import velocity_noise
-from tuning.linear_model import Plant, controllers, velocity_open_loop
-from tuning.plant_fit import PlantFit, fit_plant
+from tuning.linear_model import Plant, controllers
+from tuning.plant_fit import FEWEST, PlantFit, fit_plant
 from tuning.shaking import CYCLE, RAMP, SETTLING, Pass, Shaker
 from tuning.target import timed
+from tuning.working_state import swinging_allowed
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -39,6 +40,7 @@ LOOPS = ("velocity", "position")
 RANGE = {"velocity": (5.0, 400.0), "position": (5.0, 50.0)}  # Hz
 RESOLUTION = 5.0  # Hz
 COHERENT = 0.95  # from which on a line is trusted
+FITTED = 0.5  # from which on it is fitted, with the weight that its noise leaves it, once enough can be trusted
 BUS_LIMIT = 400.0  # Hz; above, a bus's samples hold more of the images than of the line
 TRACED_TOP = 495.0  # Hz, of the set-points in a traced measurement
 TRACE_LIMIT = 1000.0  # Hz
@@ -46,6 +48,9 @@ FINE = 10  # points between two lines, where margins are looked for
 GOOD_MISFIT = 2.0  # of a fit that is good enough to read margins between lines by
 SMOOTHING = 1.5  # lines, standard deviation
 PASSES, PERIODS = 2, 3  # of a measurement; the trial before it has one of each
+
+STANDS = 1e-9  # of the set-point: an axis that answers less was not shaken
+DISTORTION_HIGH, TRIMMED = 200.0, 0.1  # Hz up to which passes are compared, and the share of lines left out at each end
 
 # How an axis is loaded, over its limits.
 TRIAL_SPEED, TRIAL_CURRENT = 0.1, 0.4
@@ -114,8 +119,7 @@ class FrequencyResponse:
             return self.f, L, good
         lines = np.arange(len(self.f))
         at = np.interp(np.arange(FINE * (len(self.f) - 1) + 1) / FINE, lines, self.f)
-        model = velocity_open_loop(self.device, fit.plant, self.gains[axis], self.f)
-        fine = velocity_open_loop(self.device, fit.plant, self.gains[axis], at)
+        model, fine = (fit.open_loop(self.device, self.gains[axis], x) for x in (self.f, at))
         # A line says as much as its coherence: its weight is one over its variance.
         clear = np.clip(self.coherence[:, axis], 0.0, 1.0 - 1e-6)
         certain = np.where(np.isfinite(L) & (clear > 0.5), clear / (1.0 - clear), 0.0)
@@ -183,10 +187,15 @@ def measure(
     # In a trace, what is held at f is seen at 1000 Hz - f, too: lines up to nearly half of it leave no gap.
     lines = plan_lines(bounds[0] if low is None else low, TRACED_TOP if traced else top, resolution, 1.0 / CYCLE)
     axes = np.ones(target.num_axes, bool) if where is None else np.asarray(where, bool)
+    if not axes.any():
+        raise ValueError("no axis is chosen")
+    closed = _closed_loops(target, loop)
+    if not (axes & closed).any():
+        raise ValueError("a P gain is 0 on every axis and the loop is open: give the drives gains first")
     position = np.arange(target.num_axes) % target.axes_per_machine
     results = []
     for k in range(target.axes_per_machine):
-        chosen = axes & (position == k)
+        chosen = axes & closed & (position == k)
         if chosen.any():
             measurement = _Measurement(target, loop, chosen, lines, top, kind, traced)
 
@@ -194,10 +203,20 @@ def measure(
                 if progress is not None:
                     progress((k + share) / target.axes_per_machine)
 
-            results.append(measurement.run(show))
-    if not results:
-        raise ValueError("no axis is chosen")
-    return _merge(results)
+            with swinging_allowed(target.drives):
+                results.append(measurement.run(show))
+    merged = _merge(results)
+    open_loop = "a gain is 0 and the loop is open: give the drive gains first"
+    notes = tuple(
+        (*own, open_loop) if without else own for own, without in zip(merged.notes, axes & ~closed, strict=True)
+    )
+    return replace(merged, notes=notes)
+
+
+def _closed_loops(target: Target, loop: str) -> Mask:
+    """Return which axes have the gains that the loop needs."""
+    needed = (0, 2) if loop == "velocity" else (0, 2, 4)
+    return np.asarray(np.all([target.drives.read(GAIN_OBJECTS[k]) > 0 for k in needed], axis=0))
 
 
 class _Measurement:
@@ -215,7 +234,7 @@ class _Measurement:
     def run(self, progress: Callable[[float], object]) -> FrequencyResponse:
         target = self._target
         self._gains = np.stack([target.drives.read(name) for name in GAIN_OBJECTS], axis=1)
-        where = self._with_gains()
+        where = self._where
         with timed(target) as (counted, clock):
             shaker = Shaker(counted, self._loop, where, self._lines, self._kind)
             with shaker:
@@ -239,17 +258,6 @@ class _Measurement:
         return result
 
     # --- how strongly ---------------------------------------------------------------------------------------------
-    def _with_gains(self) -> Mask:
-        gains = self._gains
-        closed = (gains[:, 0] > 0) & (gains[:, 2] > 0)
-        if self._loop == "position":
-            closed &= gains[:, 4] > 0
-        for axis in np.flatnonzero(self._where & ~closed):
-            self._notes[axis].append("a gain is 0 and the loop is open: give the drive gains first")
-        if not (self._where & closed).any():
-            raise ValueError("a P gain is 0 on every axis and the loop is open: give the drives gains first")
-        return np.asarray(self._where & closed)
-
     def _current_limit(self) -> Floats:
         """Return what may flow [A]: the user's limit, or the drive's own."""
         own = self._target.drives.read(self._device.master.current_limit) * 1e-3
@@ -327,14 +335,18 @@ class _Measurement:
         lines = self._lines._replace(f=self._lines.f[self._lines.f <= self._top])
         f = lines.f
         closed, coherence, spread = _transfer(seen.set_point, seen.answer, lines)
+        parts, distortion = _passes(seen.set_point, seen.answer, lines)
         open_loop = np.full(closed.shape, np.nan, complex)
         fits: list[PlantFit | None] = [None] * closed.shape[1]
         for axis in map(int, np.flatnonzero(where)):
             images = np.zeros(len(f), complex)
             if self._loop == "velocity":
-                fit = self._fit(self._gains[axis], f, closed[:, axis], coherence[:, axis], spread[:, axis], axis)
+                fit = self._fit(
+                    self._gains[axis], f, closed[:, axis], coherence[:, axis], spread[:, axis],
+                    [part[:, axis] for part in parts], float(distortion[axis]), axis,
+                )  # fmt: skip
                 fits[axis] = fit
-                images = split(self._device, f, _closed_by(self._device, fit.plant, self._gains[axis]))[1]
+                images = split(self._device, f, _closed_by(self._device, fit, self._gains[axis]))[1]
             T = unhold(self._device, f, closed[:, axis], images)
             open_loop[:, axis] = T / (1.0 - T)
         coherence = np.where(where, coherence, 0.0)
@@ -351,13 +363,18 @@ class _Measurement:
             seen.peak_current, self._drive_time, tuple(tuple(notes) for notes in self._notes),
         )  # fmt: skip
 
-    def _fit(self, gains: Integers, f: Floats, seen: Complex, coherence: Floats, spread: Floats, axis: int) -> PlantFit:
+    def _fit(
+        self, gains: Integers, f: Floats, seen: Complex, coherence: Floats, spread: Floats, parts: Sequence[Complex],
+        distortion: float, axis: int,
+    ) -> PlantFit:  # fmt: skip
         target = self._target
         start = Plant.from_data_sheet(
             self._device, target.motor, float(target.supply[axis]), 3.0 * target.motor.inertia
         )
-        good = coherence >= COHERENT
-        fit = fit_plant(self._device, gains, f[good], seen[good], spread[good], start)
+        good = coherence >= (FITTED if np.sum(coherence >= COHERENT) >= FEWEST else COHERENT)
+        fit = fit_plant(
+            self._device, gains, f[good], seen[good], spread[good], start, [part[good] for part in parts], distortion
+        )
         if not fit.reason and fit.misfit > GOOD_MISFIT:
             self._notes[axis].append(
                 f"the linear model is off by {fit.misfit:.1f} times the noise; margins are read from the lines alone"
@@ -367,9 +384,9 @@ class _Measurement:
         return fit
 
 
-def _closed_by(device: Device, plant: Plant, gains: Integers) -> Callable[[Floats], Complex]:
+def _closed_by(device: Device, fit: PlantFit, gains: Integers) -> Callable[[Floats], Complex]:
     def closed(at: Floats) -> Complex:
-        L = velocity_open_loop(device, plant, gains, at)
+        L = fit.open_loop(device, gains, at)
         return np.asarray(L / (1.0 + L))
 
     return closed
@@ -406,6 +423,26 @@ def _transfer(set_point: Floats, answer: Floats, lines: Lines) -> tuple[Complex,
     return to_answer / np.maximum(power, tiny), np.minimum(with_answer, with_error), spread
 
 
+def _passes(set_point: Floats, answer: Floats, lines: Lines) -> tuple[list[Complex], Floats]:
+    """Return set-point to answer of each pass, (n, axes), and the share by which the passes differ beyond noise.
+
+    Within a pass periods repeat but for noise; from pass to pass the excitation runs backwards, and what is not linear
+    answers otherwise (Pintelon and Schoukens, System Identification, 2nd ed., chapter 4).
+    """
+    periods = len(set_point) // lines.samples
+    if periods < 2 * PASSES:
+        return [], np.zeros(set_point.shape[1])
+    shape = (PASSES, periods // PASSES, lines.samples, -1)
+    into, out = (np.fft.rfft(x.reshape(shape), axis=2)[:, :, lines.bins] for x in (set_point, answer))
+    each = out / np.where(into == 0.0, np.inf, into)
+    passes = each.mean(axis=1)
+    noise = np.sum(np.abs(each - passes[:, None]) ** 2, axis=(0, 1)) / (PASSES * (shape[1] - 1)) / shape[1]
+    between = np.sum(np.abs(passes - passes.mean(axis=0)) ** 2, axis=0) / (PASSES - 1)
+    size = np.abs(passes.mean(axis=0))
+    excess = ((between - noise) / np.where(size > STANDS, size, np.inf) ** 2)[lines.f <= DISTORTION_HIGH]
+    return list(passes), np.sqrt(np.maximum(stats.trim_mean(excess, TRIMMED, axis=0), 0.0))
+
+
 def _fast(device: Device, seen: Pass, lines: Lines) -> tuple[Floats, Complex, Floats]:
     """Return frequencies above the bus's, open loop and coherence there, from the trace.
 
@@ -417,16 +454,14 @@ def _fast(device: Device, seen: Pass, lines: Lines) -> tuple[Floats, Complex, Fl
     bins = np.arange(first, last + 1)
     all_lines = Lines(bins * lines.rate / lines.samples, lines.samples * windows, lines.rate * windows)
     closed, coherence, _ = _transfer(seen.fast_set_point, seen.fast_answer, all_lines)
-    shaken = np.abs(np.fft.rfft(seen.fast_set_point[: all_lines.samples], axis=0))[bins]
-    # A bin without a line, or one whose image the holding takes out, holds rounding alone.
-    lit = (shaken > 1e-3 * shaken.max(axis=0)).any(axis=1)
+    # What is excited are the lines and their images; multiples of the bus's rate the holding takes out.
+    folded = np.minimum(bins % lines.samples, -bins % lines.samples)
+    lit = np.isin(folded, lines.bins)
     return all_lines.f[lit], (closed / (1.0 - closed))[lit], coherence[lit]
 
 
 def _merge(results: list[FrequencyResponse]) -> FrequencyResponse:
     """Put measurements of different axes together; each axis was in one of them."""
-    from dataclasses import replace
-
     whole = results[0]
     for other in results[1:]:
         mine = np.asarray(np.isfinite(other.open_loop).any(axis=0))

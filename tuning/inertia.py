@@ -51,8 +51,7 @@ STILL = 40  # cycles at rest in the beginning
 NUDGE = 1.0  # rad, of a move alone
 LINKED_CURRENT, LINKED_WAY = 0.08, 0.15  # of current and move: from here on another axis is pulled along
 LEAST_COUNTS = 40.0  # that a cruise must pass
-WIDEST = 0.25  # of a value: an interval that is wider says nothing
-SMALL = 0.01  # of the rated current: friction that is known so well is known, however small it is
+WIDEST, WIDEST_FRICTION = 0.25, 0.2  # half of an interval over its value: what is wider is no identification
 SLOPE, DRAG = 4, 5  # columns of the balance
 FEWEST_MOVES = 5  # with which more than the four is looked for
 CLEAR = 4.0  # times its deviation: from here on an effect that most loads do not have is one
@@ -340,10 +339,8 @@ def _balance(
         inertia = refused("kg*m^2", f"{why}: the interval would be {half[0] * K:.2g} around {J:.2g} kg*m^2")
     else:
         inertia = interval(J, float(half[0] * K), float(np.hypot(scale, _periodic(working, k, J, plan))), "kg*m^2")
-    small = SMALL * motor.rated_current
-    fastest = float(np.abs(plan.speed[:, k]).max())
-    coulomb = _friction(float(fit.mean[1]), float(half[1]), small, scale, "A", why)
-    viscous = _friction(float(fit.mean[2]), float(half[2]), small / max(fastest, 1.0), scale, "A*s/rad", why)
+    coulomb = _friction(float(fit.mean[1]), float(half[1]), scale, "A", why)
+    viscous = _friction(float(fit.mean[2]), float(half[2]), scale, "A*s/rad", why)
     # Offsets of the sensors turn with the field and average out; those of a brushed motor's one channel do not.
     sensor = 0.95 * abs(target.device.stage["adc_offset_a"].high) if motor.kind == "dc" else 0.0
     offset = interval(float(fit.mean[3]), float(half[3]), scale, "A", sensor)
@@ -368,10 +365,13 @@ def _periodic(working: Working, k: int, inertia: float, plan: Plan) -> float:
     return float(1.96 * ripple / max(accelerating, 1e-9) / averaged)
 
 
-def _friction(value: float, half: float, small: float, scale: float, unit: str, why: str) -> Estimate:
-    if half > max(WIDEST * abs(value), small):
-        return refused(unit, f"{why}: the interval would be {half:.2g} around {value:.2g} {unit}")
-    return interval(value, half, scale, unit)
+def _friction(value: float, half: float, scale: float, unit: str, why: str) -> Estimate:
+    found = interval(value, half, scale, unit)
+    if not value > 0.0 or found.high - value > WIDEST_FRICTION * value:
+        return refused(unit, (
+            f"{why}: {value:.2g} {unit} may be off by {half:.2g}; it is at most {max(found.high, 0.0):.2g} {unit}"
+        ))  # fmt: skip
+    return found
 
 
 def _windows(angle: Floats, current: Floats, k: int, plan: Plan) -> tuple[Floats, Floats, Floats, Integers]:

@@ -17,7 +17,8 @@ class Margins(NamedTuple):
 
     phase_deg: Least distance from -180 degrees where the gain is 1 [degrees]; negative is unstable.
     gain_db: Least factor, in dB, by which the gain may rise before the loop oscillates; infinite if the phase never
-        reaches -180 degrees with a gain below 1; negative is by how much it must fall for the loop to be stable.
+        reaches -180 degrees with a gain below 1; nan if it may do so with more gain where nothing is trusted; negative
+        is by how much it must fall for the loop to be stable.
     crossover_hz: Lowest frequency from which on the gain is below 1 until the next crossing [Hz].
     bandwidth_hz: Frequency at which the closed loop's gain has fallen by 3 dB [Hz].
     ms: Greatest sensitivity |1 / (1 + L)|.
@@ -71,6 +72,12 @@ def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None
         phase = math.nan
         crossover = math.nan if not crossover < at[unseen[0]] else crossover
     gain = _gain_margin(at, log_gain, off, phases)
+    left, right = known[:-1], known[1:]
+    hidden = (right - left > 1) & (off[left] * off[right] < 0.0) & (np.abs(off[left] - off[right]) < math.pi)
+    if hidden.any():
+        # The phase passes -180 degrees where nothing is trusted, and the gain there may be the greater of both ends'.
+        least = -20.0 / math.log(10.0) * float(np.maximum(log_gain[left], log_gain[right])[hidden].max())
+        gain = math.nan if least < gain else gain
     closed = np.where(good, np.abs(L / (1.0 + L)), math.nan)
     sensitivity = 1.0 / np.abs(1.0 + L[good]) if good.any() else np.array([math.nan])
     return Margins(phase, gain, crossover, _bandwidth(at, closed), float(sensitivity.max()))

@@ -2,12 +2,13 @@
 
 The linear model is fitted to what was measured, images of held set-points included, so nothing need be known above
 half the bus's rate. Weights are what coherence says of the noise. A rigid axis has three unknowns, one whose load
-swings has six; which of the two it is, the data decide, by Bayes's information criterion.
+swings has six, one with two springs in a row nine; which it is, the data decide, by Bayes's information criterion.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -36,7 +37,7 @@ SURE = 3.0  # standard deviations of a resonance's distance from its anti-resona
 # What repeats and is not in the linear model, as standard deviations: logarithms, and s of the delay. The bridge's dead
 # time swallows some of what small currents ask for, friction broadens a resonance.
 SYSTEMATIC = {
-    "inertia": 0.02, "velocity_filter": 0.01, "loop_delay": 10e-6, "anti_resonance": 0.006, "resonance": 0.002,
+    "inertia": 0.02, "velocity_filter": 0.04, "loop_delay": 15e-6, "anti_resonance": 0.008, "resonance": 0.004,
     "damping": 0.15,
 }  # fmt: skip
 # Half of an interval over the value, above which it is no identification.
@@ -46,24 +47,67 @@ WIDEST = {
 # s, standard deviation of what is expected of the delay before it is measured: without any, a few low frequencies
 # cannot tell it from the velocity filter, and both get lost.
 EXPECTED_DELAY = 50e-6
-RIGID_ENOUGH = 1.5  # misfit of a rigid axis up to which no resonance is looked for
+DISTORTED = 0.13  # share by which passes may differ beyond noise
+PAIR = ("anti_resonance", "resonance", "damping")
+DAMPED = {"anti_resonance": 0.03, "resonance": 0.03, "damping": 0.0}  # share of the damping that may move a pair
+SECONDS, SPACING = 6, 0.25  # beginnings that are tried for a second pair, and their distance, a logarithm
+RATIOS = (1.15, 1.4, 1.8, 2.6)  # of a resonance over its anti-resonance, where the search begins
+RIGID_ENOUGH = 1.5  # misfit up to which no further resonance is looked for
 NAMES = ("inertia", "velocity_filter", "loop_delay", "anti_resonance", "resonance", "damping")
 _UNITS = dict(zip(NAMES, ("kg*m^2", "Hz", "s", "Hz", "Hz", "1"), strict=True))
 _LOWEST_FILTER, _HIGHEST_FILTER, _LONGEST_DELAY = 50.0, 2000.0, 5e-3
 
 
+class Pair(NamedTuple):
+    """An anti-resonance and the resonance above it [Hz], and their damping, beyond those of a plant."""
+
+    anti_resonance: float
+    resonance: float
+    damping: float
+
+    def response(self, f: Floats) -> Complex:
+        """Return by what the pair multiplies the velocity that a torque makes; 1 far below."""
+        swing = 2.0 * self.damping * 1j * f / self.resonance
+        return np.asarray((1.0 - (f / self.anti_resonance) ** 2 + swing) / (1.0 - (f / self.resonance) ** 2 + swing))
+
+
 class PlantFit(NamedTuple):
-    """The fitted plant, and each parameter with its interval; `reason` says why there is none."""
+    """The fitted plant, and each parameter with its interval; `reason` says why there is none.
+
+    The plant has the first pair of anti-resonance and resonance; a second one, above it, is in `second`.
+    """
 
     plant: Plant
     estimates: dict[str, Estimate]
     misfit: float  # RMS of the residuals over what noise and LINEAR explain; about 1 if the model fits
     reason: str = ""
+    second: Pair | None = None
+
+    def open_loop(self, device: Device, gains: NDArray[np.int64], f: Floats) -> Complex:
+        """Return the velocity loop's open loop at frequencies [Hz], shape (n,)."""
+        return _open_loop(device, _Model(self.plant, self.second), gains, f)
+
+
+class _Model(NamedTuple):
+    plant: Plant
+    second: Pair | None = None
+
+
+class _Solution(NamedTuple):
+    model: _Model
+    residuals: Floats
+    jacobian: Floats  # their derivatives by the parameters, as `_unpack` takes them
+
+
+def _open_loop(device: Device, model: _Model, gains: NDArray[np.int64], f: Floats) -> Complex:
+    L = velocity_open_loop(device, model.plant, gains, f)
+    return L if model.second is None else L * model.second.response(f)
 
 
 def fit_plant(
-    device: Device, gains: NDArray[np.int64], f: Floats, seen: Complex, spread: Floats, start: Plant
-) -> PlantFit:
+    device: Device, gains: NDArray[np.int64], f: Floats, seen: Complex, spread: Floats, start: Plant,
+    parts: Sequence[Complex] = (), distortion: float = 0.0,
+) -> PlantFit:  # fmt: skip
     """Fit the plant of one axis to its closed velocity loop as a bus sees it.
 
     Args:
@@ -73,6 +117,9 @@ def fit_plant(
         seen: Set-point to velocity, both as on the bus, shape (n,).
         spread: Standard deviation of each line over its size, shape (n,).
         start: What the data sheet says.
+        parts: What single passes saw, which differ in direction and level, shape (n,) each. By what their resonances
+            differ, intervals are wider.
+        distortion: Share by which passes differ beyond noise; above `DISTORTED` resonances are refused.
     """
     if len(f) < FEWEST:
         return _refusal(start, f"only {len(f)} frequencies are coherent, of {FEWEST} that are needed")
@@ -82,47 +129,94 @@ def fit_plant(
     weight = 1.0 / np.sqrt(size**2 * (spread**2 / 2.0 + LINEAR**2) + (VALLEY * around) ** 2)
     rough = _rough_loop(device, gains, f, seen)
     begin = _with_inertia(start, device, gains, f, rough)
-    best = rigid = _solve(device, gains, f, seen, weight, begin)
+    loop = _Loop(device, gains, f, seen, weight)
+    best = rigid = _solve(loop, _Model(begin))
     if _misfit(rigid) > RIGID_ENOUGH:
-        for pair in _candidate_pairs(device, gains, f, seen, weight, rough, begin):
-            found = _solve(device, gains, f, seen, weight, pair)
-            least = LEAST_GAIN if best is rigid else 0.0
-            if _criterion(found) < _criterion(best) - least and _is_sure(found):
-                best = found
-    return _with_intervals(*best, f)
+        ones = [_solve(loop, _Model(pair)) for pair in _candidate_pairs(loop, rough, begin)]
+        best = _better(rigid, ones)
+        if _misfit(best) > RIGID_ENOUGH and len(f) > 2 * FEWEST:
+            best = _better(best, [_solve(loop, model) for model in _candidate_seconds(loop, ones)])
+    fit = _with_intervals(best, f, _scatter(loop, best, spread, parts))
+    return fit if distortion <= DISTORTED else _distorted(fit, distortion)
 
 
-def _solve(
-    device: Device, gains: NDArray[np.int64], f: Floats, seen: Complex, weight: Floats, start: Plant
-) -> tuple[Plant, Floats, Floats]:
-    """Return plant, residuals and their derivatives by the parameters, as `_unpack` takes them."""
+def _better(simple: _Solution, found: list[_Solution]) -> _Solution:
+    """Return the best of what was found, or the simpler one if the data do not clearly ask for more."""
+    sure = [solution for solution in found if _is_sure(solution)]
+    best = min(sure, key=_criterion, default=simple)
+    return best if _criterion(best) < _criterion(simple) - LEAST_GAIN else simple
 
+
+def _scatter(loop: _Loop, found: _Solution, spread: Floats, parts: Sequence[Complex]) -> Floats:
+    """Return by how much parameters differ between single passes, and between quiet lines and all: half of it each.
+
+    Those of the model, and of the resonance in the end, shape (parameters + 1,).
+    """
+    p = _pack(found.model)
+    if not found.model.plant.is_elastic or not parts:
+        return np.zeros(len(p) + 1)
+
+    def parameters(part: _Loop) -> Floats:
+        q = _pack(_solve(part, found.model).model)
+        return np.append(q, q[3] + q[4])  # the resonance is the sum of two
+
+    passes = [parameters(loop._replace(seen=part, weight=loop.weight / math.sqrt(len(parts)))) for part in parts]
+    quiet = spread <= np.median(spread)
+    fewer = parameters(loop._replace(f=loop.f[quiet], seen=loop.seen[quiet], weight=loop.weight[quiet]))
+    return np.asarray(0.5 * np.hypot(np.ptp(passes, axis=0), fewer - np.append(p, p[3] + p[4])))
+
+
+def _distorted(fit: PlantFit, distortion: float) -> PlantFit:
+    from tuning.identification import refused
+
+    reason = (
+        f"the response is another when it is shaken the other way round or less, by {100.0 * distortion:.0f} % beyond "
+        "noise: with backlash, or friction that sticks, a resonance depends on how strongly it is shaken"
+    )
+    return fit._replace(estimates=fit.estimates | {name: refused(_UNITS[name], reason) for name in NAMES[1:]})
+
+
+class _Loop(NamedTuple):
+    """A closed velocity loop as the bus sees it, and the weight of each line."""
+
+    device: Device
+    gains: NDArray[np.int64]
+    f: Floats
+    seen: Complex
+    weight: Floats
+
+
+def _solve(loop: _Loop, start: _Model) -> _Solution:
     def residuals(p: Floats) -> Floats:
-        off = _residuals(device, gains, f, seen, weight, _unpack(p, start))
-        return np.append(off, (p[2] / _SCALE - 1.0 / device.velocity_rate) / EXPECTED_DELAY)
+        off = _residuals(loop, _unpack(p, start))
+        return np.append(off, (p[2] / _SCALE - 1.0 / loop.device.velocity_rate) / EXPECTED_DELAY)
 
-    p = _pack(start)
-    low = np.array([p[0] - 5.0, math.log(_LOWEST_FILTER), -_SCALE * 1e-3, math.log(f[0] / 2), 0.005, math.log(1e-3)])
-    high = np.array([p[0] + 5.0, math.log(_HIGHEST_FILTER), _SCALE * _LONGEST_DELAY, math.log(2 * f[-1]), 3.0, 0.0])
+    p, f = _pack(start), loop.f
+    pair = (math.log(f[0] / 2), 0.005, math.log(1e-3)), (math.log(2 * f[-1]), 3.0, 0.0)
+    low = np.array([p[0] - 5.0, math.log(_LOWEST_FILTER), -_SCALE * 1e-3, *pair[0], *pair[0]])[: len(p)]
+    high = np.array([p[0] + 5.0, math.log(_HIGHEST_FILTER), _SCALE * _LONGEST_DELAY, *pair[1], *pair[1]])[: len(p)]
     result = least_squares(
         residuals,
-        np.clip(p, low[: len(p)] + 1e-6, high[: len(p)] - 1e-6),
-        bounds=(low[: len(p)], high[: len(p)]),
+        np.clip(p, low + 1e-6, high - 1e-6),
+        bounds=(low, high),
         loss="soft_l1",
-        max_nfev=30,
-        x_scale=np.array([0.1, 0.1, 0.1, 0.02, 0.05, 0.3])[: len(p)],
+        max_nfev=30 if len(p) < 9 else 60,
+        x_scale=np.array([0.1, 0.1, 0.1, 0.02, 0.05, 0.3, 0.02, 0.05, 0.3])[: len(p)],
     )
-    return _unpack(result.x, start), np.asarray(result.fun), np.asarray(result.jac)
+    found, jacobian = _unpack(result.x, start), np.asarray(result.jac)
+    if found.second is not None and found.second.anti_resonance < found.plant.anti_resonance:
+        first = Pair(found.plant.anti_resonance, found.plant.resonance, found.plant.damping)
+        found = _Model(replace(found.plant, **found.second._asdict()), first)
+        jacobian = jacobian[:, [0, 1, 2, 6, 7, 8, 3, 4, 5]]
+    return _Solution(found, np.asarray(result.fun), jacobian)
 
 
-def _residuals(
-    device: Device, gains: NDArray[np.int64], f: Floats, seen: Complex, weight: Floats, plant: Plant
-) -> Floats:
+def _residuals(loop: _Loop, model: _Model) -> Floats:
     def closed(at: Floats) -> Complex:
-        L = velocity_open_loop(device, plant, gains, at)
+        L = _open_loop(loop.device, model, loop.gains, at)
         return np.asarray(L / (1.0 + L))
 
-    off = (seen_by_bus(device, f, closed) - seen) * weight
+    off = (seen_by_bus(loop.device, loop.f, closed) - loop.seen) * loop.weight
     return np.asarray(np.nan_to_num(np.concatenate([off.real, off.imag]), nan=1e6, posinf=1e6, neginf=-1e6))
 
 
@@ -130,40 +224,44 @@ _BEYOND = 20.0  # uncertainty of a logarithm that is as good as infinite
 _SCALE = 1e4  # of the delay's parameter, 1/s
 
 
-def _pack(plant: Plant) -> Floats:
+def _pack(model: _Model) -> Floats:
+    plant = model.plant
     p = [math.log(plant.inertia), math.log(plant.velocity_filter), plant.delay * _SCALE]
     if plant.is_elastic:
-        p += [math.log(plant.anti_resonance), math.log(plant.resonance / plant.anti_resonance), math.log(plant.damping)]
+        p += _packed_pair(plant.anti_resonance, plant.resonance, plant.damping)
+    if model.second is not None:
+        p += _packed_pair(*model.second)
     return np.array(p)
 
 
-def _unpack(p: Floats, like: Plant) -> Plant:
+def _packed_pair(anti_resonance: float, resonance: float, damping: float) -> list[float]:
+    return [math.log(anti_resonance), math.log(resonance / anti_resonance), math.log(damping)]
+
+
+def _unpack(p: Floats, like: _Model) -> _Model:
     known = {"inertia": math.exp(p[0]), "velocity_filter": math.exp(p[1]), "delay": p[2] / _SCALE}
-    if len(p) == 6:
-        known |= {
-            "anti_resonance": math.exp(p[3]),
-            "resonance": math.exp(p[3] + p[4]),
-            "damping": math.exp(p[5]),
-        }
-    return replace(like, **known)
+    pairs = [Pair(math.exp(p[k]), math.exp(p[k] + p[k + 1]), math.exp(p[k + 2])) for k in range(3, len(p), 3)]
+    if pairs:
+        known |= pairs[0]._asdict()
+    return _Model(replace(like.plant, **known), pairs[1] if len(pairs) > 1 else None)
 
 
-def _misfit(solution: tuple[Plant, Floats, Floats]) -> float:
-    _, residuals, jacobian = solution
+def _misfit(solution: _Solution) -> float:
+    residuals, jacobian = solution.residuals, solution.jacobian
     return math.sqrt(float(np.sum(residuals**2)) / max(len(residuals) - jacobian.shape[1], 1))
 
 
-def _is_sure(solution: tuple[Plant, Floats, Floats]) -> bool:
-    """Return whether resonance and anti-resonance are apart for certain."""
-    plant, _, jacobian = solution
+def _is_sure(solution: _Solution) -> bool:
+    """Return whether every resonance is apart from its anti-resonance for certain."""
+    jacobian = solution.jacobian
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * max(_misfit(solution), 1.0) ** 2
-    return bool(math.log(plant.resonance / plant.anti_resonance) > SURE * math.sqrt(max(covariance[4, 4], 0.0)))
+    p = _pack(solution.model)
+    return all(bool(p[k] > SURE * math.sqrt(max(covariance[k, k], 0.0))) for k in range(4, len(p), 3))
 
 
-def _criterion(solution: tuple[Plant, Floats, Floats]) -> float:
-    _, residuals, jacobian = solution
-    n = len(residuals)
-    return float(n * math.log(float(np.mean(residuals**2))) + jacobian.shape[1] * math.log(n))
+def _criterion(solution: _Solution) -> float:
+    n = len(solution.residuals)
+    return float(n * math.log(float(np.mean(solution.residuals**2))) + solution.jacobian.shape[1] * math.log(n))
 
 
 # --- where to begin ---------------------------------------------------------------------------------------------------
@@ -181,16 +279,9 @@ def _with_inertia(plant: Plant, device: Device, gains: NDArray[np.int64], f: Flo
     return replace(plant, inertia=plant.inertia * float(np.median(ratio[: max(4, len(f) // 4)])))
 
 
-def _candidate_pairs(
-    device: Device,
-    gains: NDArray[np.int64],
-    f: Floats,
-    seen: Complex,
-    weight: Floats,
-    rough: Complex,
-    rigid: Plant,
-) -> list[Plant]:
+def _candidate_pairs(loop: _Loop, rough: Complex, rigid: Plant) -> list[Plant]:
     """Return plants with a pair to begin with: the deepest swing of the response, and the best of a coarse grid."""
+    device, gains, f = loop.device, loop.gains, loop.f
     level = 20.0 * np.log10(np.abs(rough / velocity_plant(device, rigid, gains, f)))
     pairs = []
     for valley in range(len(f) - 1):
@@ -199,10 +290,6 @@ def _candidate_pairs(
     _, low, high = max(pairs)
     plants = [replace(rigid, anti_resonance=float(low), resonance=float(high), damping=0.03)] if high > low else []
 
-    def cost(plant: Plant) -> float:
-        off = _residuals(device, gains, f, seen, weight, plant)
-        return float(np.sum(np.log1p(off**2)))  # a resonance a line beside the true one is not quite wrong
-
     def scaled(plant: Plant) -> Plant:
         ratio = float(np.median(np.abs(velocity_plant(device, plant, gains, f) / rough)))
         return replace(plant, inertia=plant.inertia * ratio)
@@ -210,49 +297,83 @@ def _candidate_pairs(
     grid = [
         scaled(replace(rigid, anti_resonance=float(low), resonance=float(low * ratio), damping=0.03))
         for low in np.geomspace(f[0], f[-1] * 0.8, 16)
-        for ratio in (1.15, 1.4, 1.8, 2.6)
+        for ratio in RATIOS
     ]
-    return plants + sorted(grid, key=cost)[:3]
+    return plants + sorted(grid, key=lambda plant: _cost(loop, _Model(plant)))[:3]
+
+
+def _candidate_seconds(loop: _Loop, ones: list[_Solution]) -> list[_Model]:
+    """Return models with two pairs to begin with: that of one spring, as it was found, and another below or above."""
+    models = []
+    for plant in {round(one.model.plant.resonance): one.model.plant for one in ones}.values():
+        mine = Pair(plant.anti_resonance, plant.resonance, min(plant.damping, 0.05))
+        for low in np.geomspace(2.0 * loop.f[0], loop.f[-1] * 0.9, 24):
+            for ratio in (1.08, *RATIOS):
+                first, second = sorted((mine, Pair(float(low), float(low * ratio), 0.03)))
+                models.append(_Model(replace(plant, **first._asdict()), second))
+    # Of two springs in a row the first resonance lies below the second anti-resonance.
+    apart = [m for m in models if m.second is not None and m.second.anti_resonance > m.plant.resonance]
+    chosen: list[_Model] = []
+    for model in sorted(apart, key=lambda model: _cost(loop, model)):
+        # From all over the range: the cheapest beginnings are often neighbours that lead nowhere.
+        if all(abs(math.log(_middle(model) / _middle(other))) > SPACING for other in chosen):
+            chosen.append(model)
+    return chosen[:SECONDS]
+
+
+def _middle(model: _Model) -> float:
+    """Return where a beginning puts its pairs [Hz^2]."""
+    assert model.second is not None
+    return model.second.anti_resonance * model.plant.anti_resonance
+
+
+def _cost(loop: _Loop, model: _Model) -> float:
+    return float(np.sum(np.log1p(_residuals(loop, model) ** 2)))  # a resonance a line off is not quite wrong
 
 
 # --- intervals --------------------------------------------------------------------------------------------------------
-def _with_intervals(plant: Plant, residuals: Floats, jacobian: Floats, f: Floats) -> PlantFit:
+def _with_intervals(solution: _Solution, f: Floats, scatter: Floats) -> PlantFit:
     from tuning.identification import Estimate, refused
 
+    (plant, second), residuals, jacobian = solution
     freedom = max(len(residuals) - jacobian.shape[1], 1)
     misfit = math.sqrt(float(np.sum(residuals**2)) / freedom)
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * max(misfit, 1.0) ** 2
     reach = float(student.ppf(0.975, freedom))
-    p = _pack(plant)
+    p = _pack(solution.model)
 
     def positive(name: str, row: list[float], unit: str) -> Estimate:
-        direction = np.array(row)
-        spread = math.sqrt(max(float(direction @ covariance @ direction), 0.0) + SYSTEMATIC[name] ** 2)
+        direction = np.array(row + [0.0] * (len(p) - len(row)))
+        variance = max(float(direction @ covariance @ direction), 0.0) + SYSTEMATIC[name] ** 2
+        if name in PAIR:
+            # Which bearing or spring takes the energy is not known: it moves a pair that is damped well.
+            passes = scatter[-1] if name == "resonance" else scatter[int(np.flatnonzero(direction)[0])]
+            variance += float(passes) ** 2 + (DAMPED[name] * plant.damping) ** 2
+        spread = math.sqrt(variance)
         half = min(reach * spread, _BEYOND)
         middle = float(direction @ p)
         return Estimate(math.exp(middle), math.exp(middle - half), math.exp(middle + half), unit)
 
-    rest = [0.0] * (len(p) - 3)
     estimates = {
-        "inertia": positive("inertia", [1.0, 0.0, 0.0, *rest], "kg*m^2"),
-        "velocity_filter": positive("velocity_filter", [0.0, 1.0, 0.0, *rest], "Hz"),
+        "inertia": positive("inertia", [1.0, 0.0, 0.0], "kg*m^2"),
+        "velocity_filter": positive("velocity_filter", [0.0, 1.0, 0.0], "Hz"),
     }
     half = reach * math.hypot(math.sqrt(max(float(covariance[2, 2]), 0.0)) / _SCALE, SYSTEMATIC["loop_delay"])
     estimates["loop_delay"] = Estimate(plant.delay, plant.delay - half, plant.delay + half, "s")
     if plant.is_elastic:
-        estimates["anti_resonance"] = positive("anti_resonance", [0.0, 0.0, 0.0, 1.0, 0.0, 0.0], "Hz")
-        estimates["resonance"] = positive("resonance", [0.0, 0.0, 0.0, 1.0, 1.0, 0.0], "Hz")
+        estimates["anti_resonance"] = positive("anti_resonance", [0.0, 0.0, 0.0, 1.0, 0.0], "Hz")
+        estimates["resonance"] = positive("resonance", [0.0, 0.0, 0.0, 1.0, 1.0], "Hz")
         estimates["damping"] = positive("damping", [0.0, 0.0, 0.0, 0.0, 0.0, 1.0], "1")
     else:
         reason = f"none shows between {f[0]:.0f} and {f[-1]:.0f} Hz"
         if misfit > RIGID_ENOUGH:
-            reason = f"the response from {f[0]:.0f} to {f[-1]:.0f} Hz is neither that of a rigid axis nor of one spring"
-        estimates |= {name: refused(_UNITS[name], reason) for name in ("anti_resonance", "resonance", "damping")}
+            reason = f"the response from {f[0]:.0f} to {f[-1]:.0f} Hz is not that of a rigid axis, one spring or two"
+        estimates |= {name: refused(_UNITS[name], reason) for name in PAIR}
     estimates |= {name: _checked(name, estimate) for name, estimate in estimates.items()}
     if plant.is_elastic and plant.resonance > f[-1]:
         reason = f"it lies above {f[-1]:.0f} Hz, up to which the axis could be seen"
         estimates |= {name: refused(_UNITS[name], reason) for name in ("resonance", "damping")}
-    return PlantFit(plant, estimates, misfit)
+    return PlantFit(plant, estimates, misfit, second=second)
 
 
 def _checked(name: str, estimate: Estimate) -> Estimate:

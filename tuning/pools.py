@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import re
 import signal
 import threading
 import warnings
@@ -142,6 +143,8 @@ def _cluster(address: str) -> Iterator[Pool]:
         from distributed import Client
     except ImportError:
         raise PoolError('--cluster needs dask.distributed; pip install "drive-env[cluster]"') from None
+    if not re.fullmatch(r"[a-z]+://.+:\d+", address):
+        raise ValueError(f"--cluster {address} must be the address of a Dask scheduler, as tcp://host:port")
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:

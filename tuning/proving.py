@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import motion
-from drive_env.envs.gain_trial import PHASES, Trial, Trials, measured_cost, softness
+from drive_env.envs.gain_trial import OSCILLATION, PHASES, WATCH, Trial, Trials, measured_cost, softness
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.positioning import (
     CURRENT,
     CYCLE,
     DEMAND,
     POSITION,
+    STATUS,
     TRIAL,
     Move,
     plan_move,
@@ -43,6 +44,8 @@ Mask = NDArray[np.bool_]
 ASTRAY = 0.2  # of the move: what is still farther away at a trial's end does not pass
 # Of the move, and of the encoder: an axis farther than both from where a trial starts is brought back first.
 NEAR, NEAR_COUNTS = 0.03, 5.0
+RETURN_MOVES, RETURN_SPEED = 3.0, 0.5  # moves that are as short a way as one; of the speed limit, on longer ones
+SETTLING = 0.03  # s at rest, once back
 RETURN_LOOKS, RETURN_LOOK = 8, 0.05  # looks whether it is back, and the time between them [s]
 OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
 ENABLING = 5.0  # s, the longest wait for an axis that is switched on: some align their encoder first
@@ -73,12 +76,27 @@ class Proof(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """A recorded move: times [s], (n,); demand and actual angle from its start [rad] and current [A], (n, num_axes)."""
+    """A recorded move: times [s], (n,); demand and actual angle from its start [rad] and current [A], (n, num_axes).
+
+    where: Axes that made it, (num_axes,). reason: Of each axis, why it does not pass, "" if it does.
+    """
 
     t: Floats
     demand: Floats
     actual: Floats
     current: Floats
+    where: Mask
+    reason: tuple[str, ...]
+
+    def replaced(self, later: Shown) -> Shown:
+        """Return this with the axes of a later recording in their place."""
+        demand, actual, current = (
+            np.where(later.where, new, old)
+            for new, old in ((later.demand, self.demand), (later.actual, self.actual), (later.current, self.current))
+        )
+        both = zip(later.where, self.reason, later.reason, strict=True)
+        reason = tuple(new if made else old for made, old, new in both)
+        return Shown(self.t, demand, actual, current, self.where | later.where, reason)
 
 
 @contextmanager
@@ -124,6 +142,8 @@ class ProvingGround:
         inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
         corner = [target.device.stage["velocity_filter"].default if p is None else p.velocity_filter for p in plants]
         self.move: Move = plan_move(motor, inertia, drives.read((0x2058, 0)), self.reach)
+        top = RETURN_SPEED * target.speed * self.move.increments
+        self._fastest: Floats = np.maximum(top / np.maximum(self.move.velocity, 1), 1.0)
         t_0 = 4.0 * small_time_constants(target.device, np.array(corner))
         self._trials = Trials(drives, motor, target.axes_per_machine, t_0)  # type: ignore[arg-type]
         self._origin = drives.read(POSITION)
@@ -137,6 +157,15 @@ class ProvingGround:
         """Return which axes have no way to go that would prove anything."""
         counts = np.abs(self.move.distance) / self.move.increments * self.move.counts
         return np.asarray(counts < SHORTEST)
+
+    def way_back(self) -> Floats:
+        """Return how long it may take to bring axes back before their next move [s], (num_axes,)."""
+        return np.where(self._shaken, RETURN_LOOKS * RETURN_LOOK + SETTLING, 0.0)
+
+    def begin_here(self, where: Mask) -> None:
+        """Take where axes are as where the next move begins, of those that turn freely; the others are brought back."""
+        free = where & np.isinf(self.target.low) & np.isinf(self.target.high)
+        self._origin = np.where(free, self.target.drives.read(POSITION), self._origin)
 
     def run(self, gains: Integers, where: Mask) -> Proof:
         """Try gains, raw integers of shape (num_axes, 5), on some axes; the others' figures mean nothing."""
@@ -157,19 +186,35 @@ class ProvingGround:
         return _merged(proofs)
 
     def show(self, gains: Integers, where: Mask) -> Shown:
-        """Record one move with gains that passed, for the record."""
-        drives = self.target.drives
+        """Record one move with gains, and judge it; what oscillates or trips gets gains that hold within 50 ms."""
+        drives, rated = self.target.drives, self.target.motor.rated_current
         self._begin(where)
         write_gains(drives, gains, where)
         write_profile(drives, self.move, where)
         away = self._origin + self._direction * self.move.distance
         start(drives, wrapped(away).astype(np.int64), where)
         self.moves[where] += 1
-        trace = drives.record([POSITION, DEMAND, CURRENT], TRIAL * CYCLE)
-        demand, actual = (wrapped(trace[name] - self._origin) / self.move.increments for name in (DEMAND, POSITION))
+        objects = [POSITION, DEMAND, CURRENT, STATUS]
+        traces, stopped = [], np.zeros(self.target.num_axes, bool)
+        mask, enabled = motion.OPERATION_ENABLED
+        for _ in range(TRIAL // WATCH):
+            traces.append(drives.record(objects, WATCH * CYCLE))
+            change = np.diff(traces[-1][CURRENT], axis=0) * 1e-3
+            shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * rated
+            new = where & ~stopped & (shaking | (traces[-1][STATUS][-1] & mask != enabled))
+            if new.any():
+                write_gains(drives, self.safe, new)
+                stopped |= new
+        position, demanded, current = (np.concatenate([part[name] for part in traces]) for name in objects[:3])
+        demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
+        error = wrapped(position - away) * np.sign(self._direction * self.move.distance)
+        size = np.maximum(np.abs(self.move.distance), 1)
+        reason = self._reasons(stopped[None], np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size)
+        self.aborts[stopped] += 1
+        self._shaken |= stopped
         self._origin = np.where(where, away, self._origin)
         self._direction = np.where(where, -self._direction, self._direction)
-        return Shown(trace.t, demand, actual, trace[CURRENT] * 1e-3)
+        return Shown(np.arange(len(demand), dtype=np.float64) * CYCLE, demand, actual, current * 1e-3, where, reason)
 
     def _run(self, gains: Integers, where: Mask) -> Trial:
         self._begin(where)
@@ -187,6 +232,7 @@ class ProvingGround:
         if down.any():
             write_gains(drives, self.safe, down)
             motion.enable(drives, mode="pp", where=down, timeout=ENABLING)
+        motion.select_mode(drives, "pp", where)
         self._return(where)
 
     def _return(self, where: Mask) -> None:
@@ -194,11 +240,17 @@ class ProvingGround:
         drives = self.target.drives
         near = np.maximum(NEAR * np.abs(self.move.distance), NEAR_COUNTS / self.move.counts * self.move.increments)
         off = np.abs(wrapped(drives.read(POSITION) - self._origin))
+        # A long way is not to take long.
+        faster = np.clip(off / (RETURN_MOVES * np.maximum(np.abs(self.move.distance), 1)), 1.0, self._fastest)
+        back = self.move._replace(
+            velocity=np.ceil(self.move.velocity * faster).astype(np.int64),
+            acceleration=np.ceil(self.move.acceleration * faster).astype(np.int64),
+        )
         astray = where & ((off > near) | self._shaken)
         if not astray.any():
             return
         write_gains(drives, self.safe, astray)
-        write_profile(drives, self.move, astray)
+        write_profile(drives, back, astray)
         start(drives, wrapped(self._origin).astype(np.int64), astray)
         self.moves[astray] += 1
         for _ in range(RETURN_LOOKS):
@@ -207,6 +259,10 @@ class ProvingGround:
             if not np.any(astray & (np.abs(wrapped(seen - self._origin)).max(axis=0) > near)):
                 break
         self._shaken &= ~astray
+        # What is left of the way would be a step for gains that are faster: the set-point goes where the axis is.
+        self._origin = np.where(astray, drives.read(POSITION), self._origin)
+        start(drives, wrapped(self._origin).astype(np.int64), astray)
+        drives.advance(SETTLING)
 
     def _refused(self, why: str, where: Mask) -> Proof:
         """Take note that the envelope stopped a trial."""
@@ -225,12 +281,35 @@ class ProvingGround:
         self.aborts[where & stopped] += 1
         self._shaken |= where & stopped
         overshoot = terms.overshoot[:2].max(axis=0)
-        left = np.abs(tried.error[TRIAL - 1])
+        # Behind its demand at the end of the move, or from where it should be now: a demand may stand still, too.
+        now = np.abs(wrapped(self.target.drives.read(POSITION) - self._origin)) / np.maximum(
+            np.abs(self.move.distance), 1
+        )
+        left = np.maximum(np.abs(tried.error[TRIAL - 1]), now)
+        in_probe_only: Mask = np.asarray(stopped & ~tried.aborted[:2].any(axis=0))
+        return Proof(
+            cost,
+            stopped,
+            in_probe_only,
+            self._reasons(tried.aborted, overshoot, left),
+            terms.noise.max(axis=0),
+            overshoot,
+            terms.settling[:2].mean(axis=0),
+        )
+
+    def _reasons(self, stopped: Mask, overshoot: Floats, left: Floats) -> tuple[str, ...]:
+        """Return why axes do not pass, "" where they do.
+
+        Args:
+            stopped: Whether they were stopped, a row for each phase, (phases, num_axes).
+            overshoot: Of the move, (num_axes,).
+            left: Of the move, what was missing at its end, (num_axes,).
+        """
         counts = np.maximum(np.abs(self.move.distance) / self.move.increments * self.move.counts, 1.0)
         reasons = []
         for axis in range(self.target.num_axes):
-            if stopped[axis]:
-                phase = PHASES[int(tried.aborted[:, axis].argmax())]
+            if stopped[:, axis].any():
+                phase = PHASES[int(stopped[:, axis].argmax())]
                 reason = f"it oscillated or tripped in the {phase} and was stopped within 50 ms"
             elif overshoot[axis] > OVERSHOOT:
                 reason = (
@@ -243,16 +322,7 @@ class ProvingGround:
             else:
                 reason = ""
             reasons.append(reason)
-        in_probe_only: Mask = np.asarray(stopped & ~tried.aborted[:2].any(axis=0))
-        return Proof(
-            cost,
-            stopped,
-            in_probe_only,
-            tuple(reasons),
-            terms.noise.max(axis=0),
-            overshoot,
-            terms.settling[:2].mean(axis=0),
-        )
+        return tuple(reasons)
 
 
 def _merged(proofs: Sequence[tuple[Mask, Proof]]) -> Proof:

@@ -80,7 +80,10 @@ def _summary(certificate: Certificate) -> str:
         "time on the drive [s]": _figure(max((axis.hardware_seconds for axis in axes), default=0.0)),
         "trials stopped": str(sum(axis.aborts for axis in axes)),
         "axes with new gains": f"{sum(axis.accepted for axis in axes)} of {len(axes)}",
-    } | {f"limit: {name}": _figure(value) for name, value in certificate.envelope.items()}
+    } | {
+        f"limit: {name}": _figure(value) if math.isfinite(value) else "none"
+        for name, value in certificate.envelope.items()
+    }
     return _pairs(rows) + f"<p>Hash of the certificate's content (SHA-256): <code>{certificate.hash()}</code></p>"
 
 
@@ -106,7 +109,7 @@ def _axis(axis: AxisCertificate) -> list[str]:
         parts += [f"<h3>Open {escape(name)}</h3>", _image(bode_picture(responses), f"Bode diagram of the open {name}")]
         if sources:
             parts.append(f"<p>From {escape(sources)}.</p>")
-        parts.append(_before_and_after([(found.tuned, found.margins) for found in responses]))
+        parts.append(_before_and_after([(found.tuned, found.margins) for found in responses], absent="not seen"))
     return parts
 
 
@@ -128,17 +131,19 @@ def _identified(axis: AxisCertificate) -> str:
             rows.append([words, "not identified", "", found.unit, found.reason])
         else:
             interval = f"{_figure(found.low)} to {_figure(found.high)}"
-            rows.append([words, _figure(found.value), interval, found.unit, found.reason])
+            rows.append([words, _figure(found.value), interval, "" if found.unit == "1" else found.unit, found.reason])
     return _table(("parameter", "value", "interval", "unit", ""), rows, numbers=(1,))
 
 
-def _before_and_after(found: Sequence[tuple[bool, Mapping[str, float]]]) -> str:
-    """Return a table of figures with a column each for the gains before and the new ones."""
+def _before_and_after(found: Sequence[tuple[bool, Mapping[str, float]]], absent: str = "–") -> str:  # noqa: RUF001
+    """Return a table of figures with a column each for the gains before and the new ones; `absent` is no figure."""
     names = list(dict.fromkeys(name for _, figures in found for name in figures))
     if not names:
         return ""
     heads = [("new gains" if tuned else "gains before") for tuned, _ in found]
-    rows = [[name, *(_figure(figures.get(name, math.nan)) for _, figures in found)] for name in names]
+    every = [[figures.get(name, math.nan) for _, figures in found] for name in names]
+    cells = [[_figure(value) if math.isfinite(value) else absent for value in row] for row in every]
+    rows = [[name, *row] for name, row in zip(names, cells, strict=True)]
     return _table(("", *heads), rows, numbers=range(1, len(heads) + 1))
 
 

@@ -108,7 +108,7 @@ def emulated(
     randomise: bool | Collection[str] = False,
     parameters: Mapping[str, ArrayLike] | None = None,
     supply: float | None = None,
-    travel: Travel | None = None,
+    travel: Travel | Iterable[Travel] | None = None,
     speed: float | None = None,
     current: float | None = None,
     factory_fresh: bool = False,
@@ -125,7 +125,8 @@ def emulated(
         randomise: Parameters to draw per machine: True for all, or names or groups.
         parameters: True machine parameters [SI] that replace defaults and draws: one value or one per machine.
         supply: Supply voltage [V]; the motor's by default. The machines have it, and the tuner is told.
-        travel: How far each rotor may turn [rad], less than the load lets it; the load's own by default.
+        travel: How far the rotors may turn [rad], less than the load lets them: one (low, high), or one per axis of a
+            machine; the load's own by default.
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
         factory_fresh: Leave the drives as they come out of the box, all gains 0; of the emulator's default motor only.
@@ -153,9 +154,9 @@ def emulated(
         **options,
     )
     own = way(one(drives.load))
-    narrow = FREE if travel is None else travel
-    low = np.tile(np.maximum(own.low, narrow[0]), num_machines)
-    high = np.tile(np.minimum(own.high, narrow[1]), num_machines)
+    narrow_low, narrow_high = _ways(FREE if travel is None else travel, drives.load.num_axes)
+    low = np.tile(np.maximum(own.low, narrow_low), num_machines)
+    high = np.tile(np.minimum(own.high, narrow_high), num_machines)
     volts = drives.motor.voltage if supply is None else supply
     limits = _limits(drives.motor, drives.num_axes, volts, speed, current)
     return Target(
@@ -210,8 +211,7 @@ def on_bus(
     numbers = tuple(nodes)
     drives = CanDrives(device, interface=interface, channel=channel, nodes=numbers, **options)
     try:
-        ways = np.asarray(list(travel), float)
-        low, high = np.broadcast_to(ways, (drives.num_axes, 2)).T.copy()
+        low, high = _ways(travel, drives.num_axes)
         assert drives.device is not None, "a device of a name is known"
         volts = row.voltage if supply is None else supply
         limits = _limits(row, drives.num_axes, volts, speed, current)
@@ -257,6 +257,17 @@ class _TimedDrives:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._drives, name)
+
+
+def _ways(travel: Travel | Iterable[Travel], num_axes: int) -> tuple[Floats, Floats]:
+    """Return lower and upper ends [rad] of the axes from one range for all or one for each, (num_axes,) each."""
+    ways = np.asarray(list(travel), float)
+    if ways.shape not in ((2,), (num_axes, 2)):
+        raise ValueError(
+            f"{len(ways)} ranges of travel are given, for {num_axes} axis/axes; give one for all, or one for each"
+        )
+    low, high = np.broadcast_to(ways, (num_axes, 2)).T.copy()
+    return low, high
 
 
 def _limits(

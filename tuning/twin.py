@@ -55,12 +55,16 @@ class Spread(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What a twin is made of: the axis, its friction, how far its rotor may turn, with the sign [rad]; and how sure."""
+    """What a twin is made of: the axis, its friction, how far its rotor may turn, with the sign [rad]; and how sure.
+
+    offset: Current that gravity or another constant load takes [A].
+    """
 
     plant: Plant
     friction: Friction
     reach: float
     spread: Spread = Spread()
+    offset: float = 0.0
 
 
 def known_of(plant: Plant, identified: Identification, reach: float) -> Known:
@@ -71,14 +75,14 @@ def known_of(plant: Plant, identified: Identification, reach: float) -> Known:
         identified: What was identified; friction that was refused counts as none.
         reach: How far the rotor may turn, with the sign [rad].
     """
-    values = (identified.estimates[name].value for name in ("coulomb", "viscous"))
-    friction = Friction(*(max(value, 0.0) if math.isfinite(value) else 0.0 for value in values))
+    found = (identified.estimates.get(name) for name in ("coulomb", "viscous", "offset"))
+    dry, viscous, offset = (0.0 if one is None or not one.is_known else one.value for one in found)
     widths = {"filter": UNKNOWN_FILTER}
     for field, name in _INTERVALS.items():
         estimate = identified.estimates.get(name)
         if estimate is not None and estimate.is_known:
             widths[field] = 0.5 * (estimate.high - estimate.low) / estimate.value
-    return Known(plant, friction, reach, Spread(**widths))
+    return Known(plant, Friction(max(dry, 0.0), max(viscous, 0.0)), reach, Spread(**widths), offset)
 
 
 _INTERVALS = {
@@ -102,6 +106,7 @@ class World(NamedTuple):
     resonance: float = 0.0
     filter: float = 0.0
     damping: float = 1.0  # over what was identified or taken
+    friction: float = 1.0  # dry, over what was identified
     adc_noise: float | None = None  # A
     cogging: float = 1.0  # over the data sheet's
     supply_resistance: float | None = None  # ohm
@@ -109,7 +114,8 @@ class World(NamedTuple):
 
 WORLDS = (
     World("as identified"),
-    World("rough", 0.05, -0.04, -0.03, -0.1, damping=0.7, adc_noise=0.05, cogging=1.7, supply_resistance=0.15),
+    # Dry friction holds a shaking axis still, and is what two short moves tell worst: drag and sticking pass for it.
+    World("rough", 0.05, -0.04, -0.03, -0.1, 0.7, friction=0.4, adc_noise=0.05, cogging=1.7, supply_resistance=0.15),
     World("smooth", -0.05, 0.03, 0.04, 0.1, damping=1.5, adc_noise=0.01, cogging=0.5),
 )
 FARTHEST = 0.6  # relative: an interval that says less than this says nothing
@@ -129,7 +135,7 @@ def twin_parameters(device: Device, motor: Motor, known: Known, world: World = W
     total = plant.inertia * _factor(world.inertia, spread.inertia)
     anti_resonance = plant.anti_resonance * _factor(world.anti_resonance, spread.anti_resonance)
     resonance = max(plant.resonance * _factor(world.resonance, spread.resonance), LEAST_RATIO * anti_resonance)
-    corner = plant.velocity_filter * _factor(world.filter, spread.filter)
+    corner = _corner(device, plant) * _factor(world.filter, spread.filter)
     values = {
         "motor.R_s": plant.R,
         "motor.L_d": plant.L,
@@ -151,7 +157,8 @@ def twin_parameters(device: Device, motor: Motor, known: Known, world: World = W
         load = max(total - motor.inertia, LEAST_LOAD * total)
         rotor = total - load
     values |= {"motor.inertia": rotor, "load.inertia": load}
-    dry, viscous = known.friction.coulomb * motor.torque_constant, known.friction.viscous * motor.torque_constant
+    dry = known.friction.coulomb * motor.torque_constant * world.friction
+    viscous = known.friction.viscous * motor.torque_constant
     # The bearings of the data sheet are the motor's, what is more belongs to the load.
     values["motor.coulomb"] = min(dry, motor.coulomb)
     values["load.coulomb"] = dry - values["motor.coulomb"]
@@ -159,6 +166,18 @@ def twin_parameters(device: Device, motor: Motor, known: Known, world: World = W
     values["motor.viscous"] = min(viscous, motor.viscous)
     values["load.viscous"] = viscous - values["motor.viscous"]
     return values
+
+
+def _corner(device: Device, plant: Plant) -> float:
+    """Return the corner of the velocity filter [Hz] that delays as much as filter and delay of an axis together.
+
+    An emulated drive has no other delay than its own; which of the two lags, low frequencies hardly tell.
+    """
+    from drive_env.parameters import VELOCITY_FILTER_DAMPING
+
+    lag = VELOCITY_FILTER_DAMPING / math.pi
+    more = plant.delay - 1.0 / device.velocity_rate
+    return lag / max(lag / plant.velocity_filter + more, 1e-6)
 
 
 def _factor(way: float, spread: float) -> float:
@@ -244,6 +263,9 @@ class _Part:
         }
         supply = np.array([one.plant.supply for one in known])
         self._hidden.set_machines(parameters, self._spread(supply))
+        # What the motor must push for is what the load pulls.
+        pull = np.array([-one.offset * motor.torque_constant for one in known])
+        self._hidden.set_constant_load(self._spread(pull))
         inertia = np.array([one.plant.inertia for one in known])
         move = plan_move(motor, inertia, scaler, np.array([one.reach for one in known]))
         distance, velocity, acceleration, increments = (self._spread(np.asarray(values)) for values in move[:-1])

@@ -14,6 +14,7 @@ little, and elsewhere the data says better.
 
 from __future__ import annotations
 
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -50,9 +51,14 @@ RESISTANCE_PRIOR, EMF_PRIOR = (1.1, 0.25), (0.965, 0.06)
 # Of R and L, 95 %: what the balance leaves out, as sag of the supply, lag of the encoder, what a tick hides.
 RESISTANCE_MODEL, INDUCTANCE_MODEL = 0.01, 0.02
 LEAST_NOISE = 0.005  # of the flux: a better fit than that is not taken for knowledge
+SATURATIONS = 8  # currents at which dead time may saturate that are tried
+MOST_ROUNDS, SETTLED = 12, 2e-3  # of the fit, and the share by which values still change in the end
 SUPPLY_IDLE = 0.1  # A, what logic draws through the supply line
-WIDEST = 0.25  # of the value: an interval that is wider says nothing
+WIDEST = 0.1  # half of an interval over its value: what is wider is no identification
 
+
+PROBE = 10  # rows at rest by which it is seen how long the reads take, on a bus in real time
+LATE, MOST_LATE = 1.5, 0.02  # cycles from row to row that are too many, and the share of rows that may have them
 
 TURN = 2  # column of the balance
 
@@ -66,6 +72,7 @@ class Pulses(NamedTuple):
     duty_sum: Floats  # n + 1
     block: NDArray[np.int64]  # n: which pulse
     alive: Mask  # num_axes: enabled to the end
+    step: float = CYCLE  # s from row to row; more if the reads were out of step with the drive
 
 
 class Winding(NamedTuple):
@@ -96,24 +103,34 @@ def pulse(working: Working, holding: Floats) -> Pulses:
     stiffness, damping = J * (2.0 * np.pi * HOLD_HZ) ** 2, 2.0 * HOLD_DAMPING * J * 2.0 * np.pi * HOLD_HZ
     room = np.maximum(working.current - np.abs(holding), 0.0)
     levels, blocks = _levels()
-    rows = len(levels)
-    demand = np.zeros((rows, count))
-    current, angle, duty_sum = (np.zeros((rows + 1, count)) for _ in range(3))
-    duty_sum[0] = drives.read(TORQUE_SUM)
-    angle[0] = working.angle(drives.read(POSITION))
-    for k in range(rows):
-        speed = (angle[k] - angle[max(k - 2, 0)]) / (2 * CYCLE)
-        steer = -stiffness * (angle[k] - working.base) - damping * speed
-        asked = np.clip(holding + levels[k] * room + steer, -working.current, working.current)
-        raw = np.where(working.where, np.rint(1e3 * asked), 0).astype(np.int64)
-        demand[k] = raw * 1e-3
-        trace = drives.record([POSITION, CURRENT], CYCLE, play={TARGET_TORQUE: raw[None, :]})
-        current[k] = trace[CURRENT][0] * 1e-3
-        duty_sum[k + 1] = drives.read(TORQUE_SUM)
-        angle[k + 1] = working.angle(drives.read(POSITION))
+    in_real_time = not getattr(drives, "time_waits", True)
+    # Where time does not wait for the reads, first only: how long do they take?
+    for played in (np.zeros(PROBE), levels) if in_real_time else (levels,):
+        rows = len(played)
+        demand = np.zeros((rows, count))
+        current, angle, duty_sum = (np.zeros((rows + 1, count)) for _ in range(3))
+        duty_sum[0] = drives.read(TORQUE_SUM)
+        angle[0] = working.angle(drives.read(POSITION))
+        times = np.zeros(rows + 1)
+        times[0] = time.perf_counter()
+        for k in range(rows):
+            speed = (angle[k] - angle[max(k - 2, 0)]) / (2 * CYCLE)
+            steer = -stiffness * (angle[k] - working.base) - damping * speed
+            asked = np.clip(holding + played[k] * room + steer, -working.current, working.current)
+            raw = np.where(working.where, np.rint(1e3 * asked), 0).astype(np.int64)
+            demand[k] = raw * 1e-3
+            trace = drives.record([POSITION, CURRENT], CYCLE, play={TARGET_TORQUE: raw[None, :]})
+            current[k] = trace[CURRENT][0] * 1e-3
+            duty_sum[k + 1] = drives.read(TORQUE_SUM)
+            angle[k + 1] = working.angle(drives.read(POSITION))
+            times[k + 1] = time.perf_counter()
+        late = float(np.mean(np.diff(times) > LATE * CYCLE)) if in_real_time else 0.0
+        if late > MOST_LATE:
+            break
     current[rows] = drives.read(CURRENT) * 1e-3
     alive = still_enabled(working, drives.read(STATUS))
-    return Pulses(demand, current, angle, duty_sum / (32768.0 * 256.0), blocks, alive)
+    step = (times[-1] - times[0]) / rows if late > MOST_LATE else CYCLE
+    return Pulses(demand, current, angle, duty_sum / (32768.0 * 256.0), blocks[:rows], alive, step)
 
 
 def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats, pole_pairs: float) -> list[Winding]:
@@ -125,6 +142,12 @@ def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats,
         electrical_angle: Where the rotors stood at the first row [rad], shape (num_axes,).
         pole_pairs: Electrical turns per turn in the direction of counting.
     """
+    if pulses.step > CYCLE:
+        return [_none(
+            f"the integrator of 2041h can only be read by SDO, and a cycle with its reads took {1e3 * pulses.step:.1f} "
+            f"ms instead of {1e3 * CYCLE:g}: in real time they are not in step with the current; resistance and "
+            "inductance need an emulator in lockstep (--lockstep) or a faster bus, or take the data sheet's"
+        )] * working.target.num_axes  # fmt: skip
     return [
         _winding(working, _of_axis(pulses, k), k, float(electrical_angle[k]), pole_pairs)
         if working.where[k] and pulses.alive[k]
@@ -172,21 +195,30 @@ def _winding(working: Working, axis: _Axis, k: int, electrical: float, pole_pair
     supply = float(target.supply[k])
     P_raw, I_raw = loop_gains(working)
     P, share = P_raw[k] / (256.0 * target.device.current_full_scale), I_raw / 65536.0
-    R, L, lost = motor.R_s, motor.L_q, 0.0
     emf = motor.torque_constant / (1.0 if motor.kind == "dc" else 1.5)
-    found = None
-    for _ in range(3):  # each round models what happens within a millisecond with the values of the one before
-        window = _window(working, axis, P, share, supply, R, L, emf, lost, electrical, pole_pairs)
-        found = _fit(working, window, axis.block, supply, emf)
-        (R, L), lost = found.mean[:2], found.mean[3]
-        R, L = max(R, 0.2 * motor.R_s), max(L, 0.2 * motor.L_q)
-    assert found is not None
-    return _judge(working, axis, found, window)
+    row = target.device.stage["dead_time_current"]
+    results: list[_Solved] = []
+    R, L, lost = motor.R_s, motor.L_q, 0.0
+    for saturation in np.geomspace(row.low, row.high, SATURATIONS):
+        # What happens within a millisecond is modelled with the values of the round before, until they stay.
+        for _ in range(MOST_ROUNDS):
+            before = np.array([R, L, lost])
+            window = _window(
+                working, axis, P, share, supply, R, L, emf, lost, float(saturation), electrical, pole_pairs
+            )
+            solved = _fit(working, window, axis.block, supply, emf, float(saturation))
+            R, L = max(float(solved.mean[0]), 0.2 * motor.R_s), max(float(solved.mean[1]), 0.2 * motor.L_q)
+            lost = float(solved.mean[3])
+            moved = np.abs(np.array([R, L, lost]) - before) / np.array([R, L, max(abs(lost), 0.01 * supply)])
+            if moved.max() < SETTLED:
+                break
+        results.append(solved)
+    return _judge(working, axis, _average(results, axis.block), window)
 
 
 def _window(
     working: Working, axis: _Axis, P: float, share: float, supply: float, R: float, L: float, emf: float, lost: float,
-    electrical: float, pole_pairs: float,
+    saturation: float, electrical: float, pole_pairs: float,
 ) -> _Window:  # fmt: skip
     device, motor = working.target.device, working.target.motor
     dt, ticks = 1.0 / device.current_rate, round(CYCLE * device.current_rate)
@@ -199,7 +231,9 @@ def _window(
     # A count is a large part of a millisecond's turn: smoothed, where it is only used to model.
     back = emf * np.convolve(np.pad(turn, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid") / CYCLE
     for _ in range(2):
-        path = _simulate(r, s_0, start, back, P, share, supply, R, L, lost, middle, dt, ticks, motor.kind == "dc")
+        path = _simulate(
+            r, s_0, start, back, P, share, supply, R, L, lost, saturation, middle, dt, ticks, motor.kind == "dc"
+        )
         start = np.append(axis.current[0], path[:-1, ticks])
     creep = np.append(0.0, path[:, ticks] - path[:, ticks - 1])  # between the last sample and the end
     ends = axis.current + creep
@@ -227,7 +261,7 @@ def _window(
 
 def _simulate(
     r: Floats, s_0: Floats, start: Floats, back: Floats, P: float, share: float, supply: float, R: float, L: float,
-    lost: float, angle: Floats, dt: float, ticks: int, brushed: bool,
+    lost: float, saturation: float, angle: Floats, dt: float, ticks: int, brushed: bool,
 ) -> Floats:  # fmt: skip
     """Return the current at every tick of every millisecond and at its end, shape (n, ticks + 1)."""
     path = np.empty((len(r), ticks + 1))
@@ -238,7 +272,7 @@ def _simulate(
         path[:, n] = i
         p = P * (r - i)
         s = s + share * p
-        u = supply * applied - back - lost * dead_time(angle, i, 0.3, brushed)
+        u = supply * applied - back - lost * dead_time(angle, i, saturation, brushed)
         i = decay * i + (1.0 - decay) / R * u
         applied = p + s
     path[:, ticks] = i
@@ -270,8 +304,18 @@ class _Fit(NamedTuple):
     freedom: int
 
 
-def _fit(working: Working, window: _Window, blocks: NDArray[np.int64], supply: float, emf: float) -> _Fit:
-    """Fit the balance for a grid of saturation currents, and average over them by their likelihood."""
+class _Solved(NamedTuple):
+    """The balance solved for one saturation current."""
+
+    mean: Floats
+    spread: Floats
+    rest: float  # sum of squares
+    penalty: float  # what the priors say against it
+
+
+def _fit(
+    working: Working, window: _Window, blocks: NDArray[np.int64], supply: float, emf: float, saturation: float
+) -> _Solved:
     stage, rate = working.target.device.stage, working.target.device.current_rate
     low, high = stage["dead_time"].low, stage["dead_time"].high
     R = working.target.motor.R_s
@@ -279,26 +323,26 @@ def _fit(working: Working, window: _Window, blocks: NDArray[np.int64], supply: f
     deviation = np.array(
         [RESISTANCE_PRIOR[1] * R, np.inf, EMF_PRIOR[1] * emf, (high - low) / 12**0.5 * rate * supply, np.inf]
     )
-    row = stage["dead_time_current"]
-    grid = np.geomspace(row.low, row.high, 8)
     brushed = working.target.motor.kind == "dc"
     count = 2.0 * np.pi / working.target.motor.encoder_counts
-    results = []
-    for saturation in grid:
-        lost = dead_time(window.angle[:, None], window.path[:, :-1], saturation, brushed).mean(1) * CYCLE
-        X = np.stack([window.charge, window.change, window.turn, lost, np.full(len(lost), CYCLE)], 1)
-        # The first pulse is left out: the loop settles. A sample's noise is in change, the model's is not: instrument.
-        Z = X.copy()
-        Z[1:, 1] = window.path[1:, -1] - window.path[:-1, -1]
-        keep = blocks > 0
-        results.append(_solve(X[keep], Z[keep], window.flux[keep], blocks[keep], prior, deviation, count))
+    lost = dead_time(window.angle[:, None], window.path[:, :-1], saturation, brushed).mean(1) * CYCLE
+    X = np.stack([window.charge, window.change, window.turn, lost, np.full(len(lost), CYCLE)], 1)
+    # A sample's noise is in change, the model's is not: instrument.
+    Z = X.copy()
+    Z[1:, 1] = window.path[1:, -1] - window.path[:-1, -1]
+    keep = blocks > 0  # the first pulse is left out: the loop settles
+    return _solve(X[keep], Z[keep], window.flux[keep], blocks[keep], prior, deviation, count)
+
+
+def _average(results: list[_Solved], blocks: NDArray[np.int64]) -> _Fit:
+    """Average over the saturation currents by their likelihood."""
+    rest, penalty = np.array([result.rest for result in results]), np.array([result.penalty for result in results])
     # Chi square over degrees of freedom that pulses, not milliseconds, have; and what the priors say.
-    rest, penalty = np.array([result[2] for result in results]), np.array([result[3] for result in results])
     freedom = int(blocks.max()) - 4
     misfit = freedom * rest / rest.min() + penalty
     weight = np.exp(-0.5 * (misfit - misfit.min()))
     weight /= weight.sum()
-    means, spreads = np.array([r[0] for r in results]), np.array([r[1] for r in results])
+    means, spreads = np.array([r.mean for r in results]), np.array([r.spread for r in results])
     mean = weight @ means
     spread = np.sqrt(weight @ (spreads**2 + (means - mean) ** 2))
     return _Fit(mean, spread, freedom)
@@ -312,7 +356,7 @@ def _solve(
     prior: Floats,
     deviation: Floats,
     count: float,
-) -> tuple[Floats, Floats, float, float]:
+) -> _Solved:
     """Return coefficients, deviations for errors alike within a pulse, the rest's square, and the priors' misfit."""
     scale = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-15)
     A, B = X / scale, Z / scale
@@ -334,7 +378,7 @@ def _solve(
     spread = np.sqrt(np.diag(inverse @ meat @ inverse.T))
     b, spread = b / scale, spread / scale
     penalty = float(np.sum(((b - prior)[known] / deviation[known]) ** 2))
-    return b, spread, float(rest @ rest) + len(y) * floor, penalty
+    return _Solved(b, spread, float(rest @ rest) + len(y) * floor, penalty)
 
 
 def _judge(working: Working, axis: _Axis, found: _Fit, window: _Window) -> Winding:
@@ -345,7 +389,7 @@ def _judge(working: Working, axis: _Axis, found: _Fit, window: _Window) -> Windi
     estimates = []
     for k, (unit, model) in enumerate((("ohm", RESISTANCE_MODEL), ("H", INDUCTANCE_MODEL))):
         value, half = float(found.mean[k]), t * float(found.spread[k])
-        if not value > 0.0 or half > WIDEST * value:
+        if not value > 0.0 or float(np.hypot(half / value, model)) > WIDEST:
             swing = float(np.ptp(axis.current))
             estimates.append(refused(unit, (
                 f"excitation too weak: the pulses of {swing:.2g} A peak to peak leave an interval of "

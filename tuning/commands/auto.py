@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,7 @@ from tuning.commands.options import (
     Interface,
     Json,
     LoadName,
+    Lockstep,
     Machines,
     MotorName,
     Nodes,
@@ -24,6 +26,7 @@ from tuning.commands.options import (
     Supply,
     TravelRange,
     Yes,
+    ask_to_turn,
     errors_as_exit_codes,
     open_target,
     print_json,
@@ -31,7 +34,7 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.auto import Result
+    from tuning.auto_result import Result
     from tuning.target import Target
 
 
@@ -47,6 +50,7 @@ def auto(
     channel: Channel = None,
     node: Nodes = None,
     bitrate: Bitrate = None,
+    lockstep: Lockstep = False,
     supply: Supply = None,
     travel: TravelRange = None,
     store: Annotated[
@@ -64,16 +68,16 @@ def auto(
     was, certificate.json and report.html. Exit code 1 if an axis was rolled back; why is said.
     """
     with errors_as_exit_codes():
-        from drive_env.tools.options import ask
         from tuning import provenance
 
         folder = provenance.run_folder("auto") if out is None else out
         provenance.check_folder(folder)
-        if bus:
-            ask(f"The motor of node {', '.join(map(str, node or [1]))} will turn. Is its way clear?", yes)
+        if bus and travel is not None:
+            ask_to_turn(node, yes)
         with open_target(
             bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
-            interface=interface, channel=channel, nodes=node, bitrate=bitrate, supply=supply, travel=travel,
+            interface=interface, channel=channel, nodes=node, bitrate=bitrate, lockstep=lockstep, supply=supply,
+            travel=travel,
         ) as target:  # fmt: skip
             result = _run(target, folder, seed, store)
             _report(target, result, folder, seed, json)
@@ -98,6 +102,7 @@ def _report(target: Target, result: Result, folder: Path, seed: int, json: bool)
                 "axis": k,
                 "accepted": axis.accepted,
                 "reason": axis.reason,
+                "verified": axis.verified,
                 "before": axis.before._asdict(),
                 "after": axis.after._asdict(),
                 "notes": axis.notes,
@@ -118,7 +123,7 @@ def _report(target: Target, result: Result, folder: Path, seed: int, json: bool)
     for k, axis in enumerate(result.axes):
         for name, gains in (("before", axis.before), ("after", axis.after)):
             found = axis.margins if name == "after" and axis.accepted else None
-            margins = ("", "") if found is None else (f"{found.phase_deg:.0f}", f"{found.gain_db:.0f}")
+            margins = ("", "") if found is None else (_margin(found.phase_deg), _margin(found.gain_db))
             pairs = f"{gains.torque_p}, {gains.torque_i}", f"{gains.velocity_p}, {gains.velocity_i}"
             table.add_row(str(k) if name == "before" else "", name, *pairs, str(gains.position_p), *margins)
     console = Console()
@@ -127,10 +132,19 @@ def _report(target: Target, result: Result, folder: Path, seed: int, json: bool)
     for k, axis in enumerate(result.axes):
         if not axis.accepted:
             lines.append(f"axis {k} was rolled back: {axis.reason}")
+        else:
+            lines.append(f"axis {k} was verified {axis.verified}")
         lines += [f"axis {k}: {note}" for note in axis.notes]
     kept = "; the drive keeps the gains" if result.kept else ""
-    lines.append(f"{result.drive_seconds.max():.1f} s of drive time, {int(result.aborts.sum())} trials stopped{kept}")
+    stopped = int(result.aborts.sum())
+    trials = f"{stopped} trial{'s' * (stopped != 1)} stopped"
+    lines.append(f"{result.drive_seconds.max():.1f} s of drive time, {trials}{kept}")
     lines.append(f"written to {folder}: before.toml, certificate.json, report.html")
     if target.bus:
         lines.append(f"drive-tune restore {result.file} brings back what was")
     console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+
+
+def _margin(value: float) -> str:
+    """Return a measured margin; what the coherent lines do not show, a phase of -180 degrees too, is not seen."""
+    return f"{value:.0f}" if math.isfinite(value) else "not seen"

@@ -98,7 +98,7 @@ def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
         pad_edge=False,
     )
     table.add_column("tuner", no_wrap=True)
-    for title in ("median", "p95", "> 5 %\nworse", "time\n\\[s]", "moves", "aborts", "vio-\nlations", "failed"):
+    for title in ("median", "p95", "> 5 %\nworse", "time\n\\[s]", "moves", "stops", "vio-\nlations", "gave\nup"):
         table.add_column(title, justify="right", no_wrap=True)
     for row in comparison.tuners:
         table.add_row(
@@ -106,7 +106,7 @@ def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
             f"{row.moves:.0f}", str(row.aborts), str(row.violations), str(row.failed),
         )  # fmt: skip
     console.print(table)
-    lines = ["Drive time and moves: median of a machine; aborts, violations: of all machines."]
+    lines = ["Drive time and moves: median of a machine; stops, violations, gave up: all machines."]
     lines += [f"left out: {text}" for text in left_out]
     failures = {(row.tuner, row.note) for row in comparison.rows if row.failed}
     lines += [f"{tuner} failed: {note}" for tuner, note in sorted(failures)]

@@ -26,6 +26,8 @@ from tuning.commands.options import (
     Seed,
     Supply,
     TravelRange,
+    Yes,
+    ask_to_turn,
     errors_as_exit_codes,
     open_target,
     print_json,
@@ -67,6 +69,7 @@ def identify(
     supply: Supply = None,
     travel: TravelRange = None,
     out: Annotated[Path | None, typer.Option("--out", help="File for the results (JSON).")] = None,
+    yes: Yes = False,
     json: Json = False,
 ) -> None:
     """Identify axes: winding, encoder, inertia, friction, gravity, resonance, delay and filter.
@@ -78,8 +81,12 @@ def identify(
     with errors_as_exit_codes():
         if out is not None and not out.parent.is_dir():
             raise ValueError(f"there is no folder {out.parent} for --out; make it first")
+        if out is not None and out.is_dir():
+            raise ValueError(f"{out} is a folder; give a file for --out, e.g. {out / 'identified.json'}")
         from tuning.identification import identify as run
 
+        if bus and travel is not None:
+            ask_to_turn(node, yes)
         with open_target(
             bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
             interface=interface, channel=channel, nodes=node, bitrate=bitrate, lockstep=lockstep, supply=supply,
@@ -120,6 +127,7 @@ def _print(found: list[Identification]) -> None:
         table = Table(box=box.SIMPLE_HEAD, title=f"{title}{one.drive_time:.1f} s of drive time", title_justify="left")
         for column in ("", "value", "95 % interval", "unit"):
             table.add_column(column, justify="right" if column == "value" else "left")
+        said = ""
         for name, estimate in one.estimates.items():
             if estimate.is_known:
                 table.add_row(
@@ -127,5 +135,6 @@ def _print(found: list[Identification]) -> None:
                     "" if estimate.unit == "1" else estimate.unit,
                 )  # fmt: skip
             else:
-                table.add_row(TITLES[name], "-", estimate.reason, "")
+                table.add_row(TITLES[name], "-", "as above" if estimate.reason == said else estimate.reason, "")
+                said = estimate.reason
         console.print(table)

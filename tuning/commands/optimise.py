@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from tuning.commands.options import (
+    INTERRUPTED,
     Bitrate,
     Bus,
     Channel,
@@ -17,6 +18,7 @@ from tuning.commands.options import (
     Interface,
     Json,
     LoadName,
+    Lockstep,
     MotorName,
     Nodes,
     Resume,
@@ -24,9 +26,13 @@ from tuning.commands.options import (
     Supply,
     TravelRange,
     Workers,
+    Yes,
+    ask_to_turn,
+    check_seed,
     errors_as_exit_codes,
+    fail,
     open_target,
-    parse_travel,
+    parse_travels,
     print_json,
     progress_bar,
 )
@@ -34,7 +40,25 @@ from tuning.commands.options import (
 STALL = 60.0  # s: so long a sampler may think while an axis stands still, enabled
 
 
+def _from_file(context: typer.Context, path: Path | None) -> Path | None:
+    """Take the defaults of all other options from settings.toml of a search."""
+    if path is not None:
+        with errors_as_exit_codes():
+            from tuning.trials_files import load_options
+
+            context.default_map = load_options(path)
+    return path
+
+
 def optimise(
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            is_eager=True,
+            callback=_from_file,
+            help="settings.toml of a search, which is repeated; other options take the place of what it says.",
+        ),
+    ] = None,
     sampler: Annotated[str, typer.Option(help="random, grid, tpe, cmaes or gp.")] = "tpe",
     trials: Annotated[int, typer.Option(help="Trials of the search; each takes 0.75 s of drive time.")] = 30,
     objectives: Annotated[
@@ -51,6 +75,12 @@ def optimise(
             "--gain",
             help="Gain that is searched, again for another.",
             show_default="velocity_p, velocity_i, position_p",
+        ),
+    ] = None,
+    width: Annotated[
+        float | None,
+        typer.Option(
+            help="The search reaches from the rule's gains over e^WIDTH to those times e^WIDTH.", show_default="ln 6"
         ),
     ] = None,
     safe: Annotated[
@@ -84,25 +114,32 @@ def optimise(
     channel: Channel = None,
     nodes: Nodes = None,
     bitrate: Bitrate = None,
+    lockstep: Lockstep = False,
     supply: Supply = None,
     travel: TravelRange = None,
+    yes: Yes = False,
     json: Json = False,
 ) -> None:
     """Search gains by trials: a move, its reversal, and the move with more gain, costed from what the drive shows.
 
     What oscillates is stopped within 50 ms and gets the last good gains back. Afterwards the drive has the best gains;
-    trials.csv, trials.png and settings.toml are written, and on a bus before.toml, from which drive-tune restore brings
-    back what was.
+    trials.csv, trials.png and settings.toml are written, from which `drive-tune optimise --config settings.toml`
+    repeats the search; on a bus also <out>-before.toml, from which drive-tune restore brings back what was.
     """
     with errors_as_exit_codes():
+        check_seed(seed)
         if lanes < 1:
             raise ValueError(f"--lanes must be 1 or more, not {lanes}")
+        if resume and out is None:
+            raise ValueError("--resume needs --out: the folder into which the search was to write")
         from tuning import provenance, unfinished
         from tuning.optimise import Settings
 
         folder = provenance.run_folder("optimise") if out is None else out
         provenance.check_folder(folder)
         chosen: dict[str, Any] = {"gains": tuple(gains)} if gains else {}
+        if width is not None:
+            chosen["width"] = width
         settings = Settings(
             sampler=sampler,
             trials=trials,
@@ -113,16 +150,27 @@ def optimise(
             **chosen,
         )
         where = "the bus" if bus else f"an emulated {load}"
+        common = {"device": device, "motor": motor, "supply": supply, "travel": travel}
         if not bus:
-            if nodes or bitrate is not None:
-                raise ValueError("--node and --bitrate are of drives on a bus; add --bus, or leave them out")
-            ends = None if travel is None else parse_travel(travel)
+            if nodes or bitrate is not None or lockstep:
+                raise ValueError(
+                    "--node, --bitrate and --lockstep are of drives on a bus; add --bus, or leave them out"
+                )
+            ends = None if travel is None else parse_travels(travel)
             machine = {
                 "device": device, "load": load, "motor": motor, "num_machines": lanes, "seed": seed, "supply": supply,
                 "travel": ends,
             }  # fmt: skip
-            found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
-            _report(found, settings, folder, None, where, json)
+            try:
+                found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
+            except KeyboardInterrupt:
+                if unfinished.unfinished_folder(folder).exists():
+                    going_on = f"; the searches that are done are kept; go on with --out {folder} --resume"
+                else:
+                    going_on = "; nothing was written"
+                fail(f"interrupted{going_on}", INTERRUPTED)
+            emulated = common | {"load": load, "lanes": lanes, "searches": searches}
+            _report(found, settings, folder, None, where, emulated, json)
             unfinished.discard(folder)
             return
         if searches != 1 or workers is not None or cluster is not None or resume:
@@ -130,6 +178,8 @@ def optimise(
                 "--searches, --workers, --cluster and --resume are of emulated machines; a search on a bus goes on "
                 "from its --journal"
             )
+        if travel is not None:
+            ask_to_turn(nodes, yes)
         target = open_target(
             bus=bus,
             device=device,
@@ -139,12 +189,14 @@ def optimise(
             channel=channel,
             nodes=nodes,
             bitrate=bitrate,
+            lockstep=lockstep,
             supply=supply,
             travel=travel,
         )
         with target:
             found, before = _search_bus(target, settings, folder)
-        _report(found, settings, folder, before, where, json)
+        on_bus = common | {"nodes": nodes or [1], "bitrate": bitrate, "lockstep": lockstep}
+        _report(found, settings, folder, before, where, on_bus | dict(target.bus), json)
 
 
 def _search_machine(
@@ -200,20 +252,29 @@ def leave_oscillations_to_trials(drives: Any) -> None:
         drives.safety = Envelope(replace(drives.safety.limits, oscillation=False, stall=STALL), drives)
 
 
-def _report(found: Any, settings: Any, folder: Path, before: Path | None, where: str, json: bool) -> None:
+def _report(
+    found: Any,
+    settings: Any,
+    folder: Path,
+    before: Path | None,
+    where: str,
+    options: dict[str, Any],
+    json: bool,
+) -> None:
     from dataclasses import asdict
 
     from tuning import provenance
     from tuning.trials_files import save
 
     with provenance.new_folder(folder) as partial:
-        save(found, settings, partial, provenance.versions())
+        save(found, settings, partial, options, provenance.versions())
     if json:
         print_json(
             {
                 "gains": found.gains.tolist(), "rule": found.rule.tolist(), "cost": found.cost.tolist(),
                 "drive_seconds": found.drive_seconds, "aborts": int(found.aborts.sum()), "notes": list(found.notes),
-                "settings": asdict(settings), "folder": str(folder), "before": str(before) if before else None,
+                "settings": asdict(settings), "machine": options, "folder": str(folder),
+                "before": str(before) if before else None,
             }
         )  # fmt: skip
         return
@@ -221,6 +282,7 @@ def _report(found: Any, settings: Any, folder: Path, before: Path | None, where:
 
 
 def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: str) -> None:
+    import numpy as np
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -235,25 +297,36 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
     for search in searches:
         rows = found.front(settings.objectives, search)[:10] if settings.objectives != (COST,) else []
         table = Table(
-            title=f"{kind} {search} of {where}" if len(searches) > 1 else f"Gains of {where}", box=box.SIMPLE_HEAD
+            title=f"{kind} {search} of {where}" if len(searches) > 1 else f"Gains of {where}",
+            title_justify="left",
+            box=box.SIMPLE_HEAD,
+            padding=(0, 1, 0, 0),
+            pad_edge=False,
         )
         table.add_column("", no_wrap=True)
         for name in (*Gains._fields, "ln J"):
             table.add_column(name.replace("_", "\n"), justify="right", no_wrap=True)
         first = next((row for row in found.rows if row.search == search), None)
         if first is not None:
-            table.add_row(
-                "safe start" if settings.safe else "fitted rule", *map(str, first.gains[0]), f"{first.cost:.2f}"
-            )
+            _add(table, "safe start" if settings.safe else "fitted rule", first.gains, first.cost)
         for row in rows:
-            table.add_row(f"front, trial {row.number}", *map(str, row.gains[0]), f"{row.cost:.2f}")
+            _add(table, f"front, trial {row.number}", row.gains, row.cost)
         cost = found.cost[search if len(found.cost) == len(searches) else 0]
-        table.add_row("[bold]best", *map(str, found.gains[search * axes]), f"{cost:.2f}")
+        _add(table, "[bold]best", found.gains[search * axes : (search + 1) * axes], cost)
         console.print(table)
     stopped = sum(row.aborted for row in found.rows)
     lines = [f"{len(found.rows)} trials, {stopped} of them stopped, in {found.drive_seconds:.1f} s of drive time."]
     lines += sorted({note for note in found.notes if note})
+    if before is None and len(searches) > 1 and np.isfinite(found.cost).any():
+        lines.append(f"search {int(np.nanargmin(found.cost))} found the best gains")
     lines.append(f"written to {folder}: trials.csv, trials.png, settings.toml")
     if before is not None:
         lines.append(f"drive-tune restore {before} brings back what the drives had")
     console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+
+
+def _add(table: Any, name: str, gains: Any, cost: float) -> None:
+    """Add the gains of a machine, a row for each of its axes."""
+    for axis, row in enumerate(gains):
+        title = name if axis == 0 else f"  axis {axis}"
+        table.add_row(title, *map(str, row), f"{cost:.2f}" if axis == 0 else "")

@@ -28,7 +28,7 @@ REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
 DeviceName = Annotated[str, typer.Option("--device", help="Drive by name.")]
 MotorName = Annotated[str, typer.Option("--motor", help="Motor by name; its data sheet values are taken.")]
 LoadName = Annotated[str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF.")]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random, 0 or more.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results, new or empty.")]
 Bus = Annotated[bool, typer.Option("--bus", help="Use the drives on a bus, inside the safety envelope.")]
 Lockstep = Annotated[bool, typer.Option("--lockstep", help="Let time pass by SYNC, for an emulator that is served so.")]
@@ -40,8 +40,8 @@ TravelRange = Annotated[
     str | None,
     typer.Option(
         "--travel",
-        help="How far the rotor may turn from where it stands [turns]: LOW:HIGH, e.g. -0.15:0.15, or free. "
-        "Needed on a bus; an emulated load knows its own.",
+        help="How far the rotor may turn from where it stands [turns]: LOW:HIGH, e.g. -0.15:0.15, or free; one for "
+        "all axes, or one for each with commas between. Needed on a bus; an emulated load knows its own.",
     ),
 ]
 Machines = Annotated[int, typer.Option("--machines", help="Emulated machines.")]
@@ -78,6 +78,37 @@ def parse_travel(text: str) -> tuple[float, float]:
     return ends
 
 
+def parse_travels(text: str) -> tuple[float, float] | list[tuple[float, float]]:
+    """Return how far the rotors may turn [rad]: one range for all of them, or one for each, with commas between.
+
+    Raises:
+        ValueError: For anything else.
+    """
+    ways = [parse_travel(part.strip()) for part in text.split(",")]
+    return ways[0] if len(ways) == 1 else ways
+
+
+def check_seed(seed: int) -> None:
+    """Raise ValueError for a seed below 0."""
+    if seed < 0:
+        raise ValueError(f"--seed must be 0 or more, not {seed}")
+
+
+def ask_to_turn(nodes: list[int] | None, yes: bool) -> None:
+    """Go on if the user lets the motors of a bus turn, or end the command."""
+    ask(f"The motor of node {', '.join(map(str, nodes or [1]))} will turn. Is its way clear?", yes)
+
+
+def ask(question: str, yes: bool) -> None:
+    """Go on if the user agrees, or end the command."""
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        fail(f"{question} Nobody is there to ask; say --yes")
+    if not typer.confirm(question):
+        fail("nothing was changed", REFUSED)
+
+
 def open_target(
     *,
     bus: bool = False,
@@ -102,11 +133,12 @@ def open_target(
     """
     from tuning.target import emulated, on_bus
 
+    check_seed(seed)
     # Interface and channel may stand in the environment: alone they say nothing, and a motor must not turn by surprise.
     if not bus:
         if nodes or bitrate is not None or lockstep:
             raise ValueError("--node, --bitrate and --lockstep are of drives on a bus; add --bus, or leave them out")
-        ends = None if travel is None else parse_travel(travel)
+        ends = None if travel is None else parse_travels(travel)
         return emulated(
             device, load, motor, num_machines=machines, seed=seed, randomise=randomise, supply=supply, travel=ends
         )
@@ -122,7 +154,7 @@ def open_target(
         channel=channel,
         nodes=nodes or (1,),
         supply=supply,
-        travel=parse_travel(travel),
+        travel=parse_travels(travel),
         **options,
     )
 

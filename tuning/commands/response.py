@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tuning.commands.options import (
+    REFUSED,
     Bitrate,
     Bus,
     Channel,
@@ -27,7 +28,9 @@ from tuning.commands.options import (
     Supply,
     TravelRange,
     Yes,
+    ask_to_turn,
     errors_as_exit_codes,
+    fail,
     open_target,
     print_json,
     progress_bar,
@@ -36,6 +39,7 @@ from tuning.commands.options import (
 if TYPE_CHECKING:
     from tuning.frequency_response import FrequencyResponse
 
+FEWEST = 0.1  # of an axis's frequencies must be coherent for its response to say anything
 COLUMNS = (
     "frequency [Hz]", "gain [dB]", "phase [deg]", "coherence", "trusted", "source",
 )  # fmt: skip
@@ -77,14 +81,17 @@ def response(
     picture and a CSV of each axis are written. What is not coherent is grey, and no margin is read from it.
     """
     with errors_as_exit_codes():
-        from drive_env.tools.options import ask
         from tuning import provenance
         from tuning.frequency_response import measure
 
         if out is not None:
             provenance.check_folder(out)
-        if bus:
-            ask(f"The motor of node {', '.join(map(str, node or [1]))} will turn. Is its way clear?", yes)
+        if trace and (bus or high is not None):
+            raise ValueError(
+                "--trace looks at emulated drives, up to 1000 Hz; leave --high and --bus out, or take no --trace"
+            )
+        if bus and travel is not None:
+            ask_to_turn(node, yes)
         with open_target(
             bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
             interface=interface, channel=channel, nodes=node, bitrate=bitrate, lockstep=lockstep, supply=supply,
@@ -99,6 +106,11 @@ def response(
             print_json(_as_json(measured))
         else:
             _print(measured, out)
+        if measured.trusted.mean(axis=0).min() < FEWEST:
+            late = "; or this computer or the drives' emulator is late: serve it with --lockstep" * (
+                bus and not lockstep
+            )
+            fail(f"less than a tenth of an axis's frequencies is coherent: it was shaken too little{late}", REFUSED)
 
 
 def _axes(measured: FrequencyResponse) -> range:

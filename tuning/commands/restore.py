@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tuning.commands.options import Channel, Interface, Json, Yes, errors_as_exit_codes, fail, print_json
+from tuning.commands.options import Channel, Interface, Json, Yes, ask, errors_as_exit_codes, fail, print_json
 
 
 def restore(
@@ -30,8 +30,6 @@ def restore(
     The file says which drives, on which bus; --interface and --channel say otherwise. Each axis is written all or none,
     and read back; it must not be enabled.
     """
-    from drive_env.tools.options import ask
-
     with errors_as_exit_codes():
         from tuning.snapshot import load_snapshot
 
@@ -49,7 +47,7 @@ def restore(
         return
     for axis, change in changed:
         print(f"axis {axis}: {change.entry.label}: {change.found} -> {change.wanted}")
-    print(f"{len(changed)} parameters restored" + ("; the drives keep them" if kept else ""))
+    print(f"{len(changed)} parameter{'s' * (len(changed) != 1)} restored" + ("; the drives keep them" if kept else ""))
 
 
 def _restore(snapshot: Any, address: dict[str, Any], store: bool) -> tuple[list[tuple[int, Any]], bool]:

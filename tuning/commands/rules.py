@@ -16,12 +16,17 @@ from tuning.commands.options import (
     Interface,
     Json,
     LoadName,
+    Lockstep,
+    Machines,
     MotorName,
     Nodes,
+    Randomise,
     Seed,
     Supply,
     TravelRange,
     Yes,
+    ask,
+    ask_to_turn,
     errors_as_exit_codes,
     open_target,
     print_json,
@@ -33,6 +38,7 @@ if TYPE_CHECKING:
     from tuning.proposal import Proposal
     from tuning.target import Target
 
+MEASURED = "relay, measured"
 POINTS = 1500  # frequencies at which margins are looked for
 
 
@@ -43,10 +49,13 @@ def rules(
     motor: MotorName = "qbl4208",
     load: LoadName = "two_mass",
     seed: Seed = 0,
+    machines: Machines = 1,
+    randomise: Randomise = False,
     interface: Interface = None,
     channel: Channel = None,
     node: Nodes = None,
     bitrate: Bitrate = None,
+    lockstep: Lockstep = False,
     supply: Supply = None,
     travel: TravelRange = None,
     relay: Annotated[bool, typer.Option("--relay", help="Swing the axis by a relay, too, and show what that says.")] = (
@@ -76,20 +85,28 @@ def rules(
                 raise ValueError(f"no rule is named {name!r}; there are {', '.join(RULES)}")
         if store and not apply:
             raise ValueError("--store keeps what --apply writes; add --apply RULE, or leave it out")
+        if snapshot is not None and not apply:
+            raise ValueError("--snapshot is where --apply keeps the state before; add --apply RULE, or leave it out")
+        if bus and travel is not None:
+            ask_to_turn(node, yes)
         with open_target(
-            bus=bus, device=device, motor=motor, load=load, seed=seed, interface=interface, channel=channel, nodes=node,
-            bitrate=bitrate, supply=supply, travel=travel,
+            bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
+            interface=interface, channel=channel, nodes=node, bitrate=bitrate, lockstep=lockstep, supply=supply,
+            travel=travel,
         ) as target:  # fmt: skip
             plants = _identified(target)
             proposals = [_propose(target, plant, chosen) for plant in plants]
-            if relay:
-                for rows, measured in zip(proposals, _swing(target, plants), strict=True):
-                    rows["relay, measured"] = measured
+            swung = _swing(target, plants) if relay else [""] * len(plants)
+            for rows, measured in zip(proposals, swung, strict=True):
+                if not isinstance(measured, str):
+                    rows[MEASURED] = measured
+            unswung = [measured if isinstance(measured, str) else "" for measured in swung]
+            axes = list(zip(plants, proposals, unswung, strict=True))
             if json:
-                print_json([_as_json(target, p, rows) for p, rows in zip(plants, proposals, strict=True)])
+                print_json([_as_json(target, *axis) for axis in axes])
             else:
-                for axis, (plant, rows) in enumerate(zip(plants, proposals, strict=True)):
-                    _print(target, plant, rows, axis if len(plants) > 1 else None)
+                for k, (plant, rows, reason) in enumerate(axes):
+                    _print(target, plant, rows, reason, k if len(plants) > 1 else None)
             if apply:
                 _apply(target, plants, apply, snapshot, store=store, yes=yes)
 
@@ -118,12 +135,8 @@ def _propose(target: Target, plant: Plant, names: Sequence[str]) -> dict[str, Pr
     return {name: propose(name, target.device, target.motor, plant) for name in names}
 
 
-def _swing(target: Target, plants: Sequence[Plant]) -> list[Proposal]:
-    """Return what relay experiments say, with the current loops that the rule computes.
-
-    Raises:
-        ValueError: If an axis does not swing.
-    """
+def _swing(target: Target, plants: Sequence[Plant]) -> list[Proposal | str]:
+    """Return what relay experiments say, with the current loops that the rule computes; or why one says nothing."""
     import numpy as np
 
     from drive_env.gains import write_gains
@@ -137,11 +150,14 @@ def _swing(target: Target, plants: Sequence[Plant]) -> list[Proposal]:
         swing = relay_experiment(target)
     finally:
         write_gains(target.drives, before)
-    found = []
+    found: list[Proposal | str] = []
     for axis, plant in enumerate(plants):
-        if swing.reason[axis]:
-            raise ValueError(f"axis {axis}: no relay experiment: {swing.reason[axis]}")
-        found.append(gains_from_swing(target.device, plant, float(swing.slope[axis]), swing.ultimate(axis)))
+        try:
+            if reason := swing.reason[axis]:
+                raise ValueError(reason)
+            found.append(gains_from_swing(target.device, plant, float(swing.slope[axis]), swing.ultimate(axis)))
+        except ValueError as error:  # also from gains_from_swing: it was the load's resonance that swung
+            found.append(str(error))
     return found
 
 
@@ -155,7 +171,7 @@ def _margins(target: Target, plant: Plant, proposal: Proposal) -> Any:
     return margins(f, velocity_open_loop(target.device, plant, proposal.gains, f))
 
 
-def _as_json(target: Target, plant: Plant, rows: Mapping[str, Proposal]) -> dict[str, Any]:
+def _as_json(target: Target, plant: Plant, rows: Mapping[str, Proposal], unswung: str) -> dict[str, Any]:
     from dataclasses import asdict
 
     return {
@@ -169,17 +185,18 @@ def _as_json(target: Target, plant: Plant, rows: Mapping[str, Proposal]) -> dict
             }
             for name, proposal in rows.items()
         },
-    }
+    } | ({"no_relay": unswung} if unswung else {})
 
 
-def _print(target: Target, plant: Plant, rows: Mapping[str, Proposal], axis: int | None) -> None:
+def _print(target: Target, plant: Plant, rows: Mapping[str, Proposal], unswung: str, axis: int | None) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
     head = "" if axis is None else f"axis {axis}: "
     pair = f", resonances at {plant.anti_resonance:.0f} and {plant.resonance:.0f} Hz" if plant.is_elastic else ", rigid"
-    table = Table(title=f"{head}inertia {plant.inertia:.3g} kg m^2{pair}", title_justify="left", box=box.SIMPLE_HEAD)
+    title = f"{head}inertia {plant.inertia:.3g} kg m^2{pair}"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for title in ("rule", "2041h\nP", "I", "2042h\nP", "I", "2043h\nP", "cross\nHz", "phase\ndeg", "gain\ndB"):
         table.add_column(title, justify="left" if title == "rule" else "right", no_wrap=True)
     for name, proposal in rows.items():
@@ -191,6 +208,8 @@ def _print(target: Target, plant: Plant, rows: Mapping[str, Proposal], axis: int
     for name, proposal in rows.items():
         for note in proposal.notes:
             console.print(f"{name}: {note}", highlight=False, markup=False, soft_wrap=True)
+    if unswung:
+        console.print(f"{MEASURED}: nothing: {unswung}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _apply(
@@ -199,13 +218,12 @@ def _apply(
     import numpy as np
 
     from drive_env.gains import write_gains
-    from drive_env.tools.options import ask
     from tuning.provenance import run_folder
     from tuning.rules import propose
     from tuning.snapshot import Transaction
 
     proposals = [propose(name, target.device, target.motor, plant) for plant in plants]
-    ask(f"Write the gains of {name} to {target.num_axes} axes?", yes)
+    ask(f"Write the gains of {name} to {'the axis' if target.num_axes == 1 else f'{target.num_axes} axes'}?", yes)
     file = run_folder("rules") / "before.toml" if snapshot is None else snapshot
     with Transaction(target, file) as transaction:
         write_gains(target.drives, np.array([proposal.gains for proposal in proposals], np.int64))

@@ -1,0 +1,68 @@
+"""The order in which gains are tried: down until some pass, then beside them."""
+
+from __future__ import annotations
+
+import pytest
+
+from tuning.ladder import MOST_TRIALS, Ladder, Rung
+
+
+def climb(outcomes, fallbacks=3):
+    """Return what is tried while trials have these outcomes: (passed, better, loud)."""
+    ladder, rungs = Ladder(fallbacks), []
+    for passed, better, loud in outcomes:
+        rungs.append(ladder.rung)
+        ladder.step(passed, better, loud)
+    return [*rungs, ladder.rung], ladder
+
+
+FAIL, BEST, BEST_LOUD, WORSE = (False, False, False), (True, True, False), (True, True, True), (True, False, False)
+F = Rung  # a factor
+NONE, RULE, SOFT, LAST = None, Rung(fallback=0), Rung(fallback=1), Rung(fallback=2)
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "rungs"),
+    [
+        ((BEST,), [F(1.0), F(1.15)]),  # what passes at once is tried faster
+        ((BEST_LOUD,), [F(1.0), F(0.8)]),  # slower if the current was noisy
+        ((BEST, BEST), [F(1.0), F(1.15), F(1.3225)]),  # farther the same way as long as it is better
+        ((BEST, BEST, BEST), [F(1.0), F(1.15), F(1.3225), NONE]),  # and no more than three trials
+        ((BEST, WORSE), [F(1.0), F(1.15), F(0.8)]),  # the other way if it was worse
+        ((BEST, FAIL), [F(1.0), F(1.15), F(0.8)]),  # or failed
+        ((BEST_LOUD, WORSE), [F(1.0), F(0.8), F(1.15)]),
+        ((FAIL,), [F(1.0), F(0.6)]),
+        ((FAIL, BEST), [F(1.0), F(0.6), F(0.8)]),  # below what failed: half way up again
+        ((FAIL, BEST, BEST), [F(1.0), F(0.6), F(0.8), NONE]),
+        ((FAIL, FAIL), [F(1.0), F(0.6), RULE]),
+        ((FAIL, FAIL, BEST), [F(1.0), F(0.6), RULE, NONE]),  # of a fallback that passes no neighbour is tried
+        ((FAIL, FAIL, FAIL, FAIL, FAIL), [F(1.0), F(0.6), RULE, SOFT, LAST, NONE]),
+    ],
+)
+def test_what_is_tried_next(outcomes, rungs):
+    found, _ = climb(outcomes)
+    for one, other in zip(found, rungs, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None:
+            assert one.fallback == other.fallback
+            assert one.fallback is not None or one.factor == pytest.approx(other.factor)
+
+
+def test_nothing_at_or_above_what_failed_is_tried_again():
+    ladder = Ladder(1)
+    tried = []
+    while ladder.rung is not None:
+        tried.append(ladder.rung)
+        fails = ladder.rung.fallback is None and ladder.rung.factor > 0.7
+        ladder.step(not fails, not fails, loud=False)
+    factors = [rung.factor for rung in tried]
+    assert factors == pytest.approx([1.0, 0.6, 0.8])
+    assert len(set(factors)) == len(factors) <= MOST_TRIALS
+    assert ladder.passed
+
+
+def test_what_failed_before_is_known():
+    _, ladder = climb((FAIL, FAIL, BEST))
+    assert [rung.words for rung in ladder.failures] == ["gains found, at 100 %", "gains found, at 60 %"]
+    assert ladder.passed
+    assert not climb((FAIL,) * 5)[1].passed

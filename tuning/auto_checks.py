@@ -1,0 +1,50 @@
+"""What auto looks at before anything is risked: the wiring, and gains that others left in a drive."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tuning.linear_model import OPEN_LOOPS
+from tuning.margins import margins
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.gains import Gains
+    from tuning.identification import Identification
+    from tuning.linear_model import Plant
+    from tuning.target import Target
+
+SAFE_GAIN_DB, SAFE_PHASE = 6.0, 25.0  # margins by the model, from which on gains are moved with
+LOOKED_AT = 400  # frequencies of the model
+
+
+def unsafe_gains(device: Device, plant: Plant, gains: Gains) -> str:
+    """Return why an axis is not to be moved with gains, "" if it may be."""
+    if 0 in (gains.torque_p, gains.velocity_p, gains.position_p):
+        return "a P gain is 0, and a loop open"
+    rates = {"current": device.current_rate}
+    for name, open_loop in OPEN_LOOPS.items():
+        f = np.geomspace(1.0, 0.49 * rates.get(name, device.velocity_rate), LOOKED_AT)
+        found = margins(f, open_loop(device, plant, gains, f))
+        # A loop whose gain is below 1 everywhere has all the phase there is.
+        if found.gain_db < SAFE_GAIN_DB or found.phase_deg < SAFE_PHASE:
+            return (
+                f"by the model the {name} loop has {found.gain_db:.0f} dB and {found.phase_deg:.0f} degrees of margin "
+                f"with them; {SAFE_GAIN_DB:g} dB and {SAFE_PHASE:g} degrees are needed"
+            )
+    return ""
+
+
+def wrong_wiring(target: Target, identified: Identification) -> str:
+    """Return what is wrong with the wiring, "" if nothing is."""
+    direction, pairs = identified.estimates.get("encoder_direction"), identified.estimates.get("pole_pairs")
+    if direction is not None and direction.value < 0.0:
+        return "the encoder counts against the motor: swap two phases, or set the encoder's direction (2080h:01)"
+    if pairs is not None and pairs.is_known and round(pairs.value) != target.motor.n_p:
+        return (
+            f"the motor has {pairs.value:.0f} pole pairs, and {target.motor.name} has {target.motor.n_p}: "
+            "it is another motor; give --motor, or correct 2056h"
+        )
+    return ""

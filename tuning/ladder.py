@@ -1,0 +1,93 @@
+"""Which gains are tried next on an axis: down until some pass, then beside what passed, as long as it gets better."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+# Factors of the gains that were found on a twin: how far down to go when they fail, and what is tried beside a pass.
+SLOWER, DOWN, UP = 0.6, 0.8, 1.15
+MOST_TRIALS = 3  # of an axis on which gains pass
+
+
+class Rung(NamedTuple):
+    """What is tried: the gains found, times a factor; or a fallback, by its number."""
+
+    factor: float = 1.0
+    fallback: int | None = None
+
+    @property
+    def words(self) -> str:
+        """Say which gains these are."""
+        return f"gains found, at {100.0 * self.factor:.0f} %" if self.fallback is None else "gains of a rule"
+
+
+class Ladder:
+    """The trials of one axis.
+
+    Args:
+        fallbacks: How many sets of gains there are to fall back on, the fastest first.
+
+    Attributes:
+        rung: What is to be tried next; None when it is over.
+        passed: Whether any gains have passed.
+        failures: What failed before that.
+    """
+
+    def __init__(self, fallbacks: int) -> None:
+        self.rung: Rung | None = Rung()
+        self.passed = False
+        self.failures: list[Rung] = []
+        self._fallbacks = fallbacks
+        self._trials = 0
+        self._best = 1.0  # factor
+        self._tried: list[float] = []
+        self._ceiling = float("inf")  # a factor that failed
+
+    def step(self, passed: bool, better: bool, loud: bool) -> None:
+        """Take note of how what was to be tried did, and choose what is next.
+
+        Args:
+            passed: Whether it passed.
+            better: Whether it is the best so far.
+            loud: Whether its current was noisy.
+        """
+        rung = self.rung
+        assert rung is not None, "nothing was to be tried"
+        self._trials += 1
+        self._tried.append(rung.factor)
+        if not passed:
+            self._ceiling = min(self._ceiling, rung.factor)
+        if self.passed:
+            self.rung = self._beside(rung, better)
+        elif not passed:
+            self.failures.append(rung)
+            self.rung = self._below(rung)
+        else:
+            self.passed = True
+            self._best = rung.factor
+            if rung.fallback is not None:
+                self.rung = None
+            else:
+                # Below gains that failed: half way up again.
+                up = DOWN if self.failures else UP
+                self.rung = self._open(DOWN * rung.factor if loud else up)
+
+    def _below(self, rung: Rung) -> Rung | None:
+        """Return what is slower than what failed."""
+        if rung.fallback is None:
+            return Rung(SLOWER) if rung.factor > SLOWER else Rung(fallback=0)
+        return Rung(fallback=rung.fallback + 1) if rung.fallback + 1 < self._fallbacks else None
+
+    def _beside(self, rung: Rung, better: bool) -> Rung | None:
+        """Return a neighbour of the best: farther the same way if that was better, the other way if not."""
+        if self._trials >= MOST_TRIALS:
+            return None
+        before, self._best = self._best, rung.factor if better else self._best
+        if better:
+            return self._open(rung.factor * rung.factor / before)
+        return self._open(self._best * (DOWN if rung.factor > before else UP))
+
+    def _open(self, factor: float) -> Rung | None:
+        """Return a factor as a rung, None if it was tried or is no lower than one that failed."""
+        known = any(abs(factor - tried) < 0.02 for tried in self._tried)
+        return None if known or factor >= self._ceiling else Rung(factor)

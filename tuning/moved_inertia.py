@@ -1,0 +1,30 @@
+"""What inertia an axis pushes while all axes of its machine accelerate alike, as they do in an identification's moves.
+
+`mechanics.shaft` says what an axis sees that turns alone; where axes are coupled the two differ.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mechanics.shaft import way
+
+if TYPE_CHECKING:
+    from mechanics.packed import PackedLoad
+
+LEAST_SHARE = 0.2  # of the inertia of an axis that turns alone: what others take off it is taken for no more than that
+
+
+def moved_inertia(load: PackedLoad) -> NDArray[np.float64]:
+    """Return total inertia, rotors and load [kg*m^2], of every copy's axes where the load starts, (copies, axes).
+
+    With B the ways of the axes and M the joints' mass matrix, tau = B M B^T alpha: for accelerations that are alike,
+    the rows of B M B^T summed.
+    """
+    turning = way(load).joints
+    at_axes = np.einsum("ad,cde,be->cab", turning, load.mass_matrix(), turning)
+    alone = np.einsum("caa->ca", at_axes)
+    return np.asarray(np.maximum(at_axes.sum(axis=2), LEAST_SHARE * alone))
