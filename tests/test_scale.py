@@ -219,7 +219,7 @@ def test_a_worker_that_dies_is_told_with_the_remedy():
     ({"workers": 0}, ValueError, "--workers 0 is below 1"),
     ({"workers": 1, "cluster": "tcp://127.0.0.1:1"}, ValueError, "choose --workers or --cluster"),
     ({"cluster": "tcp://127.0.0.1:1"}, PoolError, r"no Dask scheduler answers at tcp://127\.0\.0\.1:1"),
-    ({"cluster": "nonsense"}, PoolError, "no Dask scheduler answers at nonsense"),
+    ({"cluster": "nonsense"}, ValueError, "--cluster nonsense must be the address of a Dask scheduler, as tcp://host:port"),
 ])  # fmt: skip
 def test_a_pool_that_cannot_be_says_why(options, error, message, monkeypatch):
     monkeypatch.setattr("tuning.pools.CONNECT_TIMEOUT", 0.5)

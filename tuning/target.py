@@ -26,6 +26,8 @@ Travel = tuple[float, float]  # how far a rotor may turn from where it stands [r
 
 POSITION_SCALER = (0x2058, 0)
 FREE: Travel = (-math.inf, math.inf)
+# Of the travel, how far the envelope lets an axis overshoot it, and the least and the most of that [rad].
+SLACK, SLACK_ENDS = 0.05, (0.02 * 2.0 * np.pi, 0.5 * 2.0 * np.pi)
 
 
 @dataclass(frozen=True)
@@ -186,8 +188,8 @@ def on_bus(
 ) -> Target:
     """Return the drives of a bus as a target, inside the envelope.
 
-    The envelope holds the position to the travel of all axes together, unless `safety` says otherwise; a tuner keeps
-    each axis in its own.
+    The envelope holds the position to the travel of all axes together and a twentieth of it to either side, unless
+    `safety` says otherwise; a tuner keeps each axis in its own, overshoot aside.
 
     Args:
         device: Name of the device.
@@ -298,12 +300,13 @@ _ADDRESS = ("bitrate", "pace")
 
 
 def _hold_to_travel(target: Target) -> None:
-    """Have the envelope stop an axis that leaves what all axes together may use."""
+    """Have the envelope stop an axis that leaves what all axes together may use, by more than a move overshoots."""
     from drive_env.master.bounds import Limits
     from drive_env.safety import Envelope
 
     if not np.all(np.isfinite(target.low) & np.isfinite(target.high)):
         return
     here, scale = target.drives.read(0x6064), target.increments()
-    low, high = np.floor(here + target.low * scale), np.ceil(here + target.high * scale)
+    slack = np.clip(SLACK * (target.high - target.low), *SLACK_ENDS)
+    low, high = np.floor(here + (target.low - slack) * scale), np.ceil(here + (target.high + slack) * scale)
     target.drives.safety = Envelope(Limits(position=(int(low.min()), int(high.max()))), target.drives)
