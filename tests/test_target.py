@@ -99,7 +99,7 @@ def opened(channel, **options):
     return on_bus(interface="virtual", channel=channel, pace="lockstep", timeout=20.0, supply=24.0, **options)
 
 
-def test_the_envelope_holds_an_axis_of_a_bus_to_its_travel(channel):
+def test_the_envelope_holds_an_axis_of_a_bus_to_its_travel_and_some_overshoot(channel):
     with opened(channel, travel=(-0.5 * TURN, 0.25 * TURN)) as target:
         assert (target.low, target.high) == ([-0.5 * TURN], [0.25 * TURN])
         assert target.machine == f"{channel}, node 1"
@@ -108,10 +108,10 @@ def test_the_envelope_holds_an_axis_of_a_bus_to_its_travel(channel):
         motion.enable(drives, mode="pp")
         drives.write(0x6081, 100_000)
         drives.write(0x6083, 1_000_000)
-        motion.start_move(drives, here + 16_000)
+        motion.start_move(drives, here + 18_500)
         drives.advance(0.3)
         with pytest.raises(SafetyError, match="beyond the limits"):
-            motion.start_move(drives, here + 16_500)  # a quarter turn is 16384
+            motion.start_move(drives, here + 19_000)  # a quarter turn and a twentieth of the way are 18842
 
 
 def test_a_bus_that_says_nothing_of_its_channel_takes_it_from_the_environment(channel, monkeypatch):
