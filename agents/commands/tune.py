@@ -113,6 +113,7 @@ def _emulated_node(
     with emulated(device, load, motor, travel=None if travel is None else parse_travel(travel)) as own:
         ways = [(float(low), float(high)) for low, high in zip(own.low, own.high, strict=True)]
         name = own.machine
+        own.drives.advance(0.001)  # compiles the kernels, the first time: a node that does would not answer in time
     drives = EmulatedDrives(device, load, motor, supply=volts)
     if seed is not None:
         import numpy as np
