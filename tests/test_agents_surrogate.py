@@ -97,6 +97,19 @@ def test_a_trial_that_disappoints_moves_the_next_one(bundle):
     assert asked[1] > asked[0] + 1.0
 
 
+def test_it_stays_near_what_was_better_than_expected_and_leaves_what_was_worse(bundle):
+    """Networks that know nothing: only the process speaks, and its deviation where nothing was tried."""
+    blank = Bundle(bundle.kind, {name: 0.0 * array for name, array in bundle.arrays.items()}, bundle.settings, "none")
+    distance = {}
+    for surprise in (-3.0, 0.0, 3.0):
+        policy = SurrogatePolicy(blank)
+        policy.act(np.zeros(ENTRIES + 1, np.float32))
+        policy._worth[:] = surprise
+        distance[surprise] = np.linalg.norm(policy._propose(np.zeros((1, 3), np.float32)))
+    assert distance[-3.0] < 0.2
+    assert distance[0.0] > 0.9 and distance[3.0] > 0.9
+
+
 def test_lanes_know_nothing_of_each_other(bundle):
     steps = [observation(3, seed) for seed in range(4)]
     together = SurrogatePolicy(bundle)
