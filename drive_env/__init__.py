@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     from drive_env.can_drives import CanDrives as CanDrives
     from drive_env.dictionary.access import ObjectAccessError as ObjectAccessError
     from drive_env.drives import EmulatedDrives as EmulatedDrives
-    from drive_env.drives import Trace as Trace
     from drive_env.master.bounds import Limits as Limits
     from drive_env.safety import SafetyError as SafetyError
+    from drive_env.trace import Trace as Trace
 
 __all__ = ["CanDrives", "EmulatedDrives", "Limits", "ObjectAccessError", "SafetyError", "Trace", "motion"]
 
@@ -23,7 +23,7 @@ _HOMES = {
     "Limits": "master.bounds",
     "ObjectAccessError": "dictionary.access",
     "SafetyError": "safety",
-    "Trace": "drives",
+    "Trace": "trace",
 }
 
 register()

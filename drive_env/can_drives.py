@@ -26,7 +26,7 @@ from drive_env.dictionary.access import (
     checked_values,
 )
 from drive_env.dictionary.entries import Entry, ObjectName
-from drive_env.drives import EmergencyMessage, Trace
+from drive_env.emergency import EmergencyMessage
 from drive_env.master.bounds import Limits
 from drive_env.master.description import Description, check_timeout, describe
 from drive_env.master.dry_run import DryPort, DrySdoClient
@@ -39,6 +39,7 @@ from drive_env.master.process_data import ProcessData
 from drive_env.master.sampling import Bytes, Samples, run_cycles
 from drive_env.master.sdo import SdoClient
 from drive_env.safety import Envelope
+from drive_env.trace import Trace
 
 logger = logging.getLogger(__name__)
 

@@ -10,13 +10,14 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import Device, find_device
-from drive_env.dictionary.entries import ObjectDictionary, ObjectName
+from drive_env.dictionary.entries import ObjectName
+from drive_env.emergency import EmergencyMessage
 from drive_env.firmware import cycle
 from drive_env.firmware.cycle import Call
 from drive_env.firmware.protection import CAUSES
@@ -28,6 +29,7 @@ from drive_env.misfit import warn_of_misfits
 from drive_env.motors import find_motor
 from drive_env.parameters import apply_to_records, check_parameter, draw_parameters, parameter_table
 from drive_env.process_image import ProcessImage
+from drive_env.trace import Trace
 from mechanics.load import Load
 from mechanics.loads import find_load
 from mechanics.model import compile_packed, copies_per_model
@@ -42,35 +44,6 @@ SWITCHES = ("left", "right", "home")  # bits of 60FDh
 MOST_IMAGES = 64  # calls of record that are kept prepared: more than any loop makes in turn
 
 BRAKE_TORQUE = 2.0  # of the motor's rated torque, usual for holding brakes
-
-
-class EmergencyMessage(NamedTuple):
-    """An emergency of an axis: code, error register and the five additional bytes, as on the bus."""
-
-    axis: int
-    code: int
-    error_register: int
-    extra: tuple[int, ...]
-    name: str
-
-
-class Trace:
-    """A recorded move: sample times `t` [s], shape (n,), and each object's integers, shape (n, num_axes)."""
-
-    def __init__(self, t: Floats, values: dict[tuple[int, int], Integers], dictionary: ObjectDictionary) -> None:
-        self.t = t
-        self._values = values
-        self._dictionary = dictionary
-
-    def __getitem__(self, name: ObjectName) -> Integers:
-        entry = self._dictionary.find(name)
-        if (entry.index, entry.sub) not in self._values:
-            recorded = ", ".join(self._dictionary.find(key).label for key in self._values)
-            raise KeyError(f"{entry.label} was not recorded; there are {recorded}")
-        return self._values[entry.index, entry.sub]
-
-    def __len__(self) -> int:
-        return len(self.t)
 
 
 class EmulatedDrives:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import EmulatedDrives, motion
-from drive_env.drives import Trace
+from drive_env.trace import Trace
 from mechanics.loads import find_load
 from tuning import metrics, provenance
 from tuning.experiment import Experiment, Resolved, label, resolve
