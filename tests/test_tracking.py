@@ -132,7 +132,7 @@ def test_a_tripped_drive_terminates_its_lane_and_names_the_fault():
         if not terminated.any():  # the sample that shows it is the next one
             _, reward, terminated, truncated, info = lanes.step(given[11])
         assert terminated.tolist() == [False, True, False] and not truncated.any()
-        assert info["fault"][1] == "shutdown_switch" and info["fault"][0] is None
+        assert info["fault"][1] == "shutdown_switch" and info["fault"][0] == ""
         assert info["reward_terms"]["trip"].tolist() == [0.0, 1.0, 0.0] and reward[1] < -5.0
         lanes.drives.machine.enable_input = True
         for k in range(12, 30):

@@ -62,7 +62,7 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc]
                 infos[lane]["terminal_observation"] = info["final_obs"][lane]
                 infos[lane]["TimeLimit.truncated"] = bool(truncated[lane] and not terminated[lane])
                 fault = info["final_info"].get("fault")
-                if fault is not None and fault[lane] is not None:
+                if fault is not None and fault[lane]:
                     infos[lane]["fault"] = fault[lane]
         return observation, reward.astype(np.float32), ended, infos
 

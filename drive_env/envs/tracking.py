@@ -173,7 +173,7 @@ class Tracking(Lanes):
 
     The reward is the sum of weighted terms, each in 0...1 (`info["reward_terms"]`). `terminated`: a drive tripped, its
     machine left physics, or the pole fell; `truncated`: time ran out. `info`: "reward_terms"; "parameters" of lanes
-    that begin, the true machine, not on a bus; "fault" of lanes that ended so, a name or several.
+    that begin, the true machine, not on a bus; "fault" once a lane ended so, a name or several, "" of the others.
 
     Args:
         num_envs: Lanes.
@@ -444,13 +444,13 @@ class Tracking(Lanes):
                     raise
 
     def _faults(self, lanes: Mask) -> NDArray[np.object_]:
-        """Return what ended each lane: names of emergencies, "diverged", "fell", or "not enabled"."""
+        """Return what ended each lane: emergencies by name, "diverged", "fell", "not enabled"; "" where nothing did."""
         names: list[list[str]] = [[] for _ in range(self.num_envs)]
         for message in self.drives.emergencies():
             names[message.axis // self._axes].append(message.name)
         machine = getattr(self.drives, "machine", None)
         diverged = machine.diverged if machine is not None else np.zeros(self.num_envs, bool)
-        found = np.full(self.num_envs, None, object)
+        found = np.full(self.num_envs, "", object)
         for lane in np.flatnonzero(lanes):
             if diverged[lane]:
                 names[lane].append("diverged")
