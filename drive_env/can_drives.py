@@ -301,6 +301,11 @@ class CanDrives:
         """How punctual the SYNCs of the last `advance` or `record` were."""
         return self._pace.timing
 
+    @property
+    def total_timing(self) -> Timing:
+        """How punctual all SYNCs were since the drives were opened."""
+        return self._pace.total
+
     # --- what the envelope and the tools use ----------------------------------------------------------------------
     @property
     def description(self) -> Description:

@@ -26,6 +26,7 @@ CYCLE = 0.001  # s
 # In communication cycles: the profile, the end of the window in which it settles, and the trial.
 PROFILE, SETTLED, TRIAL = 60, 150, 250
 QUIET = (PROFILE + SETTLED) // 2  # where the ripple is looked at from
+WATCH = 25  # how often a trial looks whether the current swings
 ACCELERATION_SHARE = 0.4  # of the rated torque
 SPEED_SHARE, TRAVEL_SHARE = 0.5, 0.4  # of the rated speed at the profile's peak, of what there is to go
 BAND, BAND_COUNTS = 0.01, 3.0  # of the move, and of the encoder: the larger is what counts as settled
@@ -126,6 +127,17 @@ def move_terms(
     ripple = np.sqrt(np.mean(np.diff(current[QUIET:SETTLED], axis=0) ** 2, axis=0)) / rated_current
     beyond = np.maximum((-error * sign).max(axis=0), 0.0) / size
     return settling, ripple, beyond
+
+
+def swing(current: Floats, rated_current: float) -> Floats:
+    """Return the largest RMS increment of the current from ms to ms of any 25 ms, over the rated one, (num_axes,).
+
+    Args:
+        current: Of a move from its start on [A], a whole number of 25 ms, (cycles, num_axes).
+        rated_current: Of the motor, peak i_q [A].
+    """
+    windows = current.reshape(-1, WATCH, current.shape[1])
+    return np.asarray(np.sqrt(np.mean(np.diff(windows, axis=1) ** 2, axis=1)).max(axis=0) / rated_current)
 
 
 def wrapped(increments: Floats | Integers) -> Floats:

@@ -111,7 +111,7 @@ class Envelope:
             self._arm()
             self._check_start(raw, where)
         elif key == TARGET_POSITION:
-            self._check_position(entry, raw, where & (self._modes() == CSP))
+            self._check_position(entry, raw, where, (CSP,))
         else:
             self._check_magnitude(entry, raw, where)
 
@@ -139,9 +139,8 @@ class Envelope:
             if (entry.index, entry.sub) == TARGET_POSITION:
                 relative = words is not None and np.any(words & RELATIVE)
                 if not relative:
-                    axes = np.isin(self._modes(), (PP, CSP))
-                    self._check_position(entry, rows.min(axis=0), axes)
-                    self._check_position(entry, rows.max(axis=0), axes)
+                    for aim in (rows.min(axis=0), rows.max(axis=0)):
+                        self._check_position(entry, aim, everywhere, (PP, CSP))
             else:
                 self._check_magnitude(entry, np.abs(rows).max(axis=0), everywhere)
 
@@ -211,10 +210,11 @@ class Envelope:
     def close(self) -> None:
         """Stop what is enabled, end the lifeline and put the drives' error control back."""
         self.stop("the drives are closed while enabled")
-        self._disarm()
+        # Before the heartbeats end: a drive that waits for them would stop meanwhile, and answer no more.
         for control in self._controls:
             with _logged():
                 control.restore()
+        self._disarm()
 
     # --- commands -------------------------------------------------------------------------------------------------
     def _check_start(self, words: Integers, where: Mask) -> None:
@@ -231,12 +231,14 @@ class Envelope:
         relative = words & RELATIVE != 0
         if np.any(starts & relative):
             aim = np.where(relative, aim + self._drives.read_entry(self._known.find(DEMAND)), aim)
-        self._check_position(target, aim, starts)
+        self._check_position(target, aim, starts, (PP,))
 
-    def _check_position(self, entry: Entry, aim: Integers, axes: Mask) -> None:
+    def _check_position(self, entry: Entry, aim: Integers, axes: Mask, modes: tuple[int, ...]) -> None:
+        """Raise SafetyError for an aim beyond the limits of an axis in one of the modes."""
         bounds = self._limits_now()
-        wrong = np.flatnonzero(axes & ((aim < bounds.low) | (aim > bounds.high)))
-        if wrong.size:
+        beyond = axes & ((aim < bounds.low) | (aim > bounds.high))
+        # The mode is an SDO transfer away, half a millisecond of a policy's cycle: asked for only where it matters.
+        if beyond.any() and (wrong := np.flatnonzero(beyond & np.isin(self._modes(), modes))).size:
             axis = int(wrong[0])
             raise SafetyError(
                 f"axis {axis}: {entry.label} would lead to {aim[axis]}, beyond the limits {_text(bounds.low[axis])} to "

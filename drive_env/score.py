@@ -40,6 +40,7 @@ from drive_env.positioning import (
     plan_move,
     power_up,
     start,
+    swing,
     wrapped,
     write_profile,
 )
@@ -121,12 +122,14 @@ def hidden_cost(j: Floats) -> Floats:
 class Scores(NamedTuple):
     """Of every machine: hidden J (num_machines,), and J and its terms, (num_machines, variants).
 
-    A machine with several axes is as good as its worst.
+    A machine with several axes is as good as its worst. swing: What a trial's watch would see of it, the largest RMS
+    increment of the current over 25 ms until the load step, over the rated one, likewise; J does not count it.
     """
 
     hidden: Floats
     j: Floats
     terms: Terms
+    swing: Floats
 
 
 class HiddenScore:
@@ -244,8 +247,8 @@ class HiddenScore:
         full = (machines, variants, axes, *values.shape[1:])
         return np.broadcast_to(values.reshape(shape), full).reshape(-1, *values.shape[1:])
 
-    def _run(self, gains: Integers) -> tuple[Terms, Floats]:
-        """Return the terms of every axis without E_d/E_0, and E_d [rad s], (machines, variants, axes)."""
+    def _run(self, gains: Integers) -> tuple[Terms, Floats, Floats]:
+        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swing, (machines, variants, axes) each."""
         drives, move = self._drives, self._move
         drives.machine.load_torque = self._constant
         drives.machine.reset()
@@ -281,15 +284,17 @@ class HiddenScore:
         least = 0.5 / move.counts * (TRIAL - SETTLED) * CYCLE
         shape = self._axes
         terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
+        swings = swing(free[CURRENT].astype(float) * 1e-3, drives.motor.rated_current)
         return (
             terms.each(lambda value: value.reshape(shape)),
             np.maximum(error, least).reshape(shape),
+            swings.reshape(shape),
         )
 
-    def _scores(self, terms: Terms, disturbance: Floats) -> Scores:
+    def _scores(self, terms: Terms, disturbance: Floats, swings: Floats) -> Scores:
         terms = terms._replace(disturbance=disturbance / self._reference[:, None])
         j = cost(terms)
         worst = j.argmax(axis=-1)[..., None]
         of_worst = terms.each(lambda value: np.take_along_axis(value, worst, -1)[..., 0])
         j = j.max(axis=-1)
-        return Scores(hidden_cost(j), j, of_worst)
+        return Scores(hidden_cost(j), j, of_worst, swings.max(axis=-1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +27,14 @@ class Trace:
             recorded = ", ".join(self._dictionary.find(key).label for key in self._values)
             raise KeyError(f"{entry.label} was not recorded; there are {recorded}")
         return self._values[entry.index, entry.sub]
+
+    @classmethod
+    def joined(cls, traces: Sequence[Trace], period: float) -> Trace:
+        """Return as one what was recorded in parts, at least one, of the same objects at the same period [s]."""
+        first = traces[0]
+        values = {key: np.concatenate([trace._values[key] for trace in traces]) for key in first._values}
+        rows = sum(map(len, traces))
+        return cls(np.arange(rows, dtype=np.float64) * period, values, first._dictionary)
 
     def __len__(self) -> int:
         return len(self.t)

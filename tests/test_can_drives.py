@@ -199,6 +199,7 @@ def test_a_tpdo_is_remapped_off_empty_filled_counted_on(drives, bus):
         "601  40 00 18 01 00 00 00 00",
         "601  40 00 18 02 00 00 00 00",
         "601  40 00 1A 01 00 00 00 00",
+        "601  40 00 1A 02 00 00 00 00",  # not in use, and to be put back all the same
         "601  23 00 18 01 81 01 00 C0",  # off (bit 31); bit 30 stays
         "601  2F 00 18 02 01 00 00 00",  # at each SYNC
         "601  2F 00 1A 00 00 00 00 00",  # empty
@@ -248,7 +249,7 @@ def test_the_same_objects_again_cost_no_configuration(drives, bus):
 
 def test_pdos_are_as_before_when_closed(drive, bus):
     def pdos():
-        return {key: value for key, value in drive.values.items() if 0x1400 <= key[0] < 0x1B00 and key[1] < 2}
+        return {key: value for key, value in drive.values.items() if 0x1400 <= key[0] < 0x1B00}
 
     before = pdos()
     with CanDrives(bus=bus, pace="lockstep") as drives:

@@ -92,6 +92,20 @@ def test_an_action_is_a_change_of_the_logarithm_of_the_chosen_gains_from_the_inc
     env.close()
 
 
+def test_the_step_bounds_an_action_and_gains_of_says_what_one_means_without_trying_it():
+    for step in (0.2, 2.5):
+        env = GainTuning(2, step=step, **FEW)
+        _, before = env.reset(seed=0)
+        assert env.single_action_space.high == pytest.approx([step] * 3)
+        action = np.array([[9.0, 0.1, -9.0], [0.0, 0.0, 0.0]], np.float32)
+        meant = env.gains_of(action)
+        factors = np.exp([[0.0, 0.0, step, 0.1, -step], [0.0] * 5])
+        assert meant[:, 0] == pytest.approx(np.clip(np.rint(before["gains"][:, 0] * factors), 1, 32767), abs=1)
+        _, _, _, _, info = env.step(action)
+        np.testing.assert_array_equal(info["trial_gains"], meant)
+        env.close()
+
+
 def test_what_shakes_is_stopped_costs_and_leaves_the_incumbent(four):
     _, info = four.reset(seed=4)
     start = info["gains"]
@@ -263,6 +277,44 @@ def test_a_drive_that_trips_is_cleared_and_goes_on():
         assert next(m.name for m in drives.emergencies()) == "following_error"
 
 
+def test_on_a_bus_in_real_time_what_is_recorded_is_mapped_before_the_move_starts():
+    """Mapping takes some 10 ms, which the samples of the move would miss."""
+
+    class RealTime:
+        time_waits = False
+
+        def __init__(self, drives):
+            self.drives, self.calls = drives, []
+
+        def __getattr__(self, name):
+            return getattr(self.drives, name)
+
+        def write(self, name, value, where=None):
+            if name == 0x6040 and value == 0x1F:
+                self.calls.append("start")
+            self.drives.write(name, value, where=where)
+
+        def record(self, objects, duration, *rest, **options):
+            self.calls.append((tuple(objects), duration))
+            return self.drives.record(objects, duration, *rest, **options)
+
+    with EmulatedDrives(load="inertia", num_threads=1) as own:
+        power_up(own)
+        drives = RealTime(own)
+        trials = Trials(drives, own.motor, 1, 0.01)
+        everywhere = np.ones(1, bool)
+        trials.identify(reach("inertia"), everywhere)
+        gains = np.stack([own.read(name) for name in GAIN_OBJECTS], axis=-1)
+        move = plan_move(own.motor, np.array([3.0 * own.motor.inertia]), own.read((0x2058, 0)), reach("inertia"))
+        trials.run(gains, gains, move, own.read(0x6064), np.ones(1, np.int64), everywhere)
+    starts = [k for k, call in enumerate(drives.calls) if call == "start"]
+    assert len(starts) == 5
+    for first in starts:
+        objects, _ = next(call for call in drives.calls[first:] if call != "start")
+        assert any(call[0] == objects for call in drives.calls[:first] if call != "start")
+    assert (objects, 0.0) in drives.calls
+
+
 def test_softness_is_inverse_to_every_gain_of_the_cascade():
     gains = np.array([[1, 1, 100, 200, 300], [9, 9, 200, 200, 300], [1, 1, 100, 400, 600]])
     assert softness(gains) * 6e6 == pytest.approx([1.0, 0.5, 0.25])
@@ -373,6 +425,7 @@ def test_over_can_in_lockstep_the_observations_are_the_same(safety):
     ({"load": "three_masses"}, "two_mass"),
     ({"motor": "qbl"}, "qbl4208"),
     ({"trials": 0}, "1 or more"),
+    ({"step": 0.0}, "step must be finite and more than 0, not 0"),
     ({"stage": 2.0}, "0...1"),
     ({"waveform": 251}, "0...250"),
     ({"reward": 1}, "no option 'reward'.*gains"),

@@ -47,6 +47,17 @@ def sent_controlwords(bus):
     return [data[4] for data in bus.sent(0x601) if data[:4] == QUICK_STOP[:4]]
 
 
+def test_set_points_inside_their_limits_cost_no_transfer_and_one_outside_is_refused(bus):
+    """A policy plays one a millisecond: to ask for the mode each time would take it half of that."""
+    with enabled(bus, Limits(position=(-TURN, TURN)), mode="csp") as drives:
+        for _ in range(2):  # the first one maps
+            bus.log.clear()
+            drives.record([0x6064], 0.001, play={0x607A: [TURN]})
+        assert bus.sent(0x601) == []
+        with pytest.raises(SafetyError, match=r"607Ah:00 Target position would lead to 65537, beyond the limits"):
+            drives.record([0x6064], 0.001, play={0x607A: [TURN + 1]})
+
+
 # --- what is refused before it is sent ----------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("limits", "name", "value", "text"),

@@ -16,7 +16,7 @@ from drive_env.gains import (
     small_time_constants,
 )
 from drive_env.motors import MOTORS
-from drive_env.positioning import PROFILE, SETTLED, TRIAL, Move, move_terms, plan_move, reach, wrapped
+from drive_env.positioning import PROFILE, SETTLED, TRIAL, Move, move_terms, plan_move, reach, swing, wrapped
 from drive_env.score import VARIANTS, HiddenScore, Terms, cost, hidden_cost
 from tuning import fit_rule
 
@@ -295,3 +295,33 @@ def test_a_machine_is_as_good_as_its_worst_axis():
     gains[1, P] *= 20
     assert float(score.score(gains).hidden[0]) > 2.0 * equal
     score.close()
+
+
+def test_a_constant_load_pulls_in_every_variant_and_through_the_load_step():
+    """At rest the motor's torque is what pulls at it, whatever holds it: K_t i = -(constant + load step)."""
+    torque = np.array([0.03, -0.05])
+    hidden = HiddenScore("tmcm1636", "inertia", "qbl4208", 2, num_threads=1, friction="none")
+    with hidden._drives as drives:
+        machine = drives.machine
+        parameters = {name: np.full(2, value[0]) for name, value in machine.parameters.items()}
+        hidden.set_machines(parameters | {"motor.cogging_torque": np.zeros(2)}, np.full(2, MOTOR.voltage))
+        inertia = np.full(2, parameters["motor.inertia"] + parameters["load.inertia"])
+        hidden.set_moves(plan_move(MOTOR, inertia, np.full(2, 65536.0), np.full(2, np.inf)))
+        hidden.set_constant_load(torque)
+        hidden.set_reference(rule_gains(DEVICE, MOTOR, inertia))
+        at_rest = drives.record([0x6077], 0.25)[0x6077][-100:].mean(axis=0) * 1e-3
+    step = -0.3 * MOTOR.rated_torque
+    K_t = 1.5 * MOTOR.n_p * parameters["motor.psi_m"][0]
+    expected = np.repeat(-(torque + step) / K_t, len(hidden.variants))
+    assert at_rest == pytest.approx(expected, abs=0.03)
+
+
+def test_swing_is_the_worst_of_the_windows_of_a_watch():
+    """Two axes, 50 ms, rated 2 A: one alternates by +-0.5 A in its second half, one ramps by 10 mA per ms."""
+    t = np.arange(50)
+    alternating = np.where(t < 25, 0.0, 0.5 * (-1.0) ** t)
+    assert swing(np.stack([alternating, 0.01 * t], axis=1), 2.0) == pytest.approx([0.5, 0.005])
+
+
+def test_a_jump_between_two_windows_is_seen_by_neither():
+    assert swing(np.repeat([0.0, 5.0], 25)[:, None], 2.0) == pytest.approx([0.0])

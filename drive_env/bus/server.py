@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import gc
-import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from types import TracebackType
 
 from drive_env.bus.lateness import Lateness
 from drive_env.bus.transport import Transport
 from drive_env.bus.world import World
+from drive_env.undisturbed import undisturbed
 
 LONGEST_WAIT = 0.05  # s until a request to stop is seen
 MOST_BEHIND = 0.25  # s; a host that slept longer does not catch up, the time is skipped
 # s. select() wakes 80 to 110 us late (Linux, idle): what is due within that time happens at once. Measured on two idle
 # cores, 1 kHz SYNC with four PDOs: 2,150 instead of 1,950 SDO transfers/s, 0.43 instead of 0.59 ms from SYNC to TPDO.
 EARLY = 100e-6
-# s. A busy thread of the same process (a master on the virtual bus) gives the interpreter up that soon. Lateness of
-# cycles beside one, p99: with Python's 5 ms above 100 ms, with 0.5 ms 1.8 ms, with 0.1 ms 0.3 ms; it loses 5 %.
-SWITCH_INTERVAL = 0.0001
 
 
 class Server:
@@ -58,7 +53,7 @@ class Server:
             can.CanError: If a python-can interface fails.
         """
         self.world.power_on()
-        with _undisturbed() if not self.world.lockstep else nullcontext():
+        with undisturbed() if not self.world.lockstep else nullcontext():
             self._start = time.perf_counter() - self.world.time
             self._end = float("inf") if duration is None else time.perf_counter() + duration
             if self.world.lockstep:
@@ -140,21 +135,3 @@ class Server:
 
     def _count_lateness(self, due: float) -> None:
         self.lateness.add(self._now() - due)
-
-
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Keep garbage collection and long turns of other threads away.
-
-    A full collection takes 50 ms with the compiler and MuJoCo loaded; frozen, what exists now is never looked at
-    again, and collecting the rest takes microseconds.
-    """
-    interval = sys.getswitchinterval()
-    gc.collect()
-    gc.freeze()
-    sys.setswitchinterval(SWITCH_INTERVAL)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(interval)
-        gc.unfreeze()

@@ -23,6 +23,7 @@ from drive_env.positioning import (
     STATUS,
     TRIAL,
     VELOCITY,
+    WATCH,
     Move,
     move_terms,
     plan_move,
@@ -42,7 +43,6 @@ ALL = Gains._fields
 VELOCITY_P = ALL.index("velocity_p")
 
 # The watch looks every 25 ms at what has passed since its last look: what oscillates is stopped within 50 ms.
-WATCH = 25  # cycles
 # RMS change of the current from millisecond to millisecond, over the rated current. The edges of a profile make 0.1 on
 # a fast loop; a limit cycle, whose current goes from limit to limit, 1 and more.
 OSCILLATION = 0.4
@@ -139,6 +139,7 @@ class Trials:
         write_profile(drives, move, where)
         objects = [POSITION, VELOCITY, CURRENT]
         traces = []
+        self._prepare(objects)
         for target in (origin + move.distance, origin):
             start(drives, _on_the_counter(target), where)
             traces.append(self._record(objects, TRIAL))
@@ -211,6 +212,7 @@ class Trials:
         drives, to = self._drives, _on_the_counter(target)
         objects = [POSITION, DEMAND, CURRENT, STATUS]
         traces = []
+        self._prepare(objects)
         start(drives, to, where)
         for _ in range(TRIAL // WATCH):
             with warnings.catch_warnings():
@@ -230,6 +232,11 @@ class Trials:
                 start(drives, to, down)
         position, demand, current = (np.concatenate([trace[name] for trace in traces]) for name in objects[:3])
         return position, demand, current, stopped
+
+    def _prepare(self, objects: list[Any]) -> None:
+        """Have a bus map what will be recorded: in real time the samples of a move would miss the 10 ms that takes."""
+        if not getattr(self._drives, "time_waits", True):
+            self._drives.record(objects, 0.0)
 
     def _record(self, objects: list[Any], cycles: int) -> Mapping[Any, Integers]:
         """Let cycles pass, one by one where someone looks, and return the objects, (cycles, num_axes) each."""

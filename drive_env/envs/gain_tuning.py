@@ -27,7 +27,6 @@ from drive_env.score import HiddenScore
 
 Integers = NDArray[np.int64]
 
-STEP = 0.7  # largest change of a gain's logarithm
 LOG_MAX = math.log(RAW_MAX)
 ALL_GAINS = Gains._fields
 RATIO_MAX = 100.0  # of a true parameter over its default
@@ -67,6 +66,7 @@ class GainTuningConfig:
     load, device, motor, friction: As `EmulatedDrives` takes them.
     gains: Which gains the action changes: torque_p, torque_i, velocity_p, velocity_i, position_p.
     trials: Of an episode.
+    step: Largest change of a gain's logarithm; the reach of gains, 10.4, is the most that makes sense.
     distributions: The machines, as `randomisation.Distributions` takes them; None is the load's shipped set,
         {"parameters": {}} the default machine in every episode.
     stage: Of its curriculum, 0...1.
@@ -83,6 +83,7 @@ class GainTuningConfig:
     friction: str = "stribeck"
     gains: tuple[str, ...] = ("velocity_p", "velocity_i", "position_p")
     trials: int = 10
+    step: float = 0.7
     distributions: Any = None
     stage: float = 1.0
     abort_cost: float = 0.05
@@ -99,6 +100,8 @@ class GainTuningConfig:
             raise ValueError(f"gains must be different ones of {', '.join(ALL_GAINS)}, not {self.gains}")
         if self.trials < 1:
             raise ValueError(f"trials must be 1 or more, not {self.trials}")
+        if not 0.0 < self.step < math.inf:
+            raise ValueError(f"step must be finite and more than 0, not {self.step:g}")
         if not 0 <= self.waveform <= TRIAL:
             raise ValueError(f"waveform must be 0...{TRIAL} points, not {self.waveform}")
         if not 0.0 <= self.stage <= 1.0:
@@ -121,7 +124,7 @@ class GainTuning(Lanes):
     included. The pole of the inverted pendulum falls meanwhile, and shakes its cart.
 
     Action, float32, for each axis of the machine, with G gains of the configuration; gains are rounded and stay within
-    1...32767:
+    1...32767; the bounds are the configuration's `step`:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
@@ -258,7 +261,7 @@ class GainTuning(Lanes):
         if c.privileged:
             true = Box(-RATIO_MAX, RATIO_MAX, (len(self._defaults),), np.float32)
             observation = gymnasium.spaces.Dict({"observation": observation, "privileged": true})
-        return observation, Box(-STEP, STEP, (self._axes * count,), np.float32)
+        return observation, Box(-c.step, c.step, (self._axes * count,), np.float32)
 
     def _prepare(self, given_reach: ArrayLike | None) -> None:
         c, n, axes = self.config, self.num_envs, self.drives.num_axes
@@ -329,10 +332,7 @@ class GainTuning(Lanes):
         zero = np.zeros(n)
         if not active.any():  # the step between the end of all episodes and their autoreset
             return self._observe(), zero, np.zeros(n, bool), np.ones(n, bool), self._told()
-        change = np.nan_to_num(np.clip(np.asarray(action, float), -STEP, STEP)).reshape(-1, len(self._columns))
-        gains = self._best.copy()
-        chosen = gains[:, self._columns] * np.exp(change)
-        gains[:, self._columns] = np.clip(np.rint(chosen), 1, RAW_MAX).astype(np.int64)
+        gains = self._changed(action)
         tried = self._try(gains, active)
         measured = self._measure(gains, tried)
         better = active & (measured < self._measured)
@@ -355,6 +355,18 @@ class GainTuning(Lanes):
             info["trial_hidden"] = trial_hidden
         dead = zero.astype(bool) if self._owned else active & self._dead()
         return self._observe(), terms["tuning"] + terms["abort"], dead, self._left <= 0, info
+
+    def gains_of(self, action: ArrayLike) -> Integers:
+        """Return the gains that an action means now, without trying them: (lanes, axes, 5), as `info["gains"]`."""
+        return self._changed(action).reshape(self.num_envs, self._axes, -1)
+
+    def _changed(self, action: ArrayLike) -> Integers:
+        step = self.config.step
+        change = np.nan_to_num(np.clip(np.asarray(action, float), -step, step)).reshape(-1, len(self._columns))
+        gains: Integers = self._best.copy()
+        chosen = gains[:, self._columns] * np.exp(change)
+        gains[:, self._columns] = np.clip(np.rint(chosen), 1, RAW_MAX).astype(np.int64)
+        return gains
 
     # --- a trial --------------------------------------------------------------------------------------------------
     def _begin_trial(self, mask: Mask) -> None:

@@ -85,6 +85,10 @@ class DrySdoClient:
         self._request(struct.pack("<BHB4x", 0x40, index, sub))
         return self._values.get((index, sub), b"\0\0\0\0")
 
+    def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
+        """Keep a value that was there before."""
+        self.write(index, sub, data, label, timeout)
+
     def write(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
         """Keep a value."""
         if len(data) <= 4:

@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from drive_env.canopen.frames import ERROR_CONTROL
 from drive_env.dictionary.access import ObjectAccessError
@@ -17,6 +18,7 @@ from drive_env.master.description import Description
 from drive_env.master.errors import BusError
 from drive_env.master.port import Port
 from drive_env.master.sdo import SdoClient
+from drive_env.master.tidying import Tidying
 
 logger = logging.getLogger(__name__)
 
@@ -73,10 +75,20 @@ class ErrorControl:
             )
 
     def restore(self) -> None:
-        """Put the objects back as they were."""
-        for (index, sub), data in self._before.items():
-            self._sdo.write(index, sub, data, f"{index:04X}h:{sub:02X}", self._description.answer_timeout)
-        self._before.clear()
+        """Put the objects back as they were.
+
+        The master's heartbeats must go on until then: a drive that still waits for them, and misses them, stops, and
+        answers no more.
+
+        Raises:
+            BusError: If the drive did not take all of them.
+        """
+        before, self._before = self._before, {}
+        tidying = Tidying()
+        for (index, sub), data in before.items():
+            label = f"{index:04X}h:{sub:02X}"
+            tidying.step(partial(self._sdo.put_back, index, sub, data, label, self._description.answer_timeout))
+        tidying.end()
         self.kind = "none"
 
     def forget(self) -> None:

@@ -31,6 +31,7 @@ class Pace(Protocol):
     window: int  # SYNCs that may be out before their samples are in
     time_waits: bool  # whether no time passes while no SYNC is sent
     timing: Timing  # of the last run
+    total: Timing  # of all runs
 
     def begin(self) -> None:
         """Begin a run of cycles."""
@@ -58,7 +59,7 @@ class RealTimePace:
     def __init__(self, cycle: float) -> None:
         self._cycle = cycle
         self._due = 0.0
-        self.timing = Timing(0, 0, 0.0)
+        self.timing = self.total = Timing(0, 0, 0.0)
 
     def begin(self) -> None:
         """Begin now, or a cycle after the last SYNC if that is later."""
@@ -71,7 +72,9 @@ class RealTimePace:
         now = time.perf_counter()
         lateness = now - self._due
         late = lateness > self._cycle
-        self.timing = Timing(self.timing.cycles + 1, self.timing.late + late, max(self.timing.worst, lateness))
+        self.timing, self.total = (
+            Timing(one.cycles + 1, one.late + late, max(one.worst, lateness)) for one in (self.timing, self.total)
+        )
         self._due = (now if late else self._due) + self._cycle
         return int(lateness / self._cycle) if late else 0
 
@@ -92,7 +95,7 @@ class LockstepPace:
     time_waits = True
 
     def __init__(self) -> None:
-        self.timing = Timing(0, 0, 0.0)
+        self.timing = self.total = Timing(0, 0, 0.0)
 
     def begin(self) -> None:
         """Begin."""
@@ -101,7 +104,7 @@ class LockstepPace:
     def wait(self, receive: Receive) -> int:
         """Take in what has come; there is nothing to wait for, and nothing to miss."""
         _take_in(receive)
-        self.timing = Timing(self.timing.cycles + 1, 0, 0.0)
+        self.timing, self.total = (Timing(one.cycles + 1, 0, 0.0) for one in (self.timing, self.total))
         return 0
 
     def end(self, receive: Receive) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from drive_env.canopen.frames import EXTENDED, IDENTIFIER, INVALID, RPDO, TPDO
@@ -12,6 +13,7 @@ from drive_env.master.description import Description
 from drive_env.master.errors import BusError
 from drive_env.master.mapping import PDO_BITS, Slots, pack
 from drive_env.master.sdo import SdoClient
+from drive_env.master.tidying import Tidying
 
 SYNC_EVERY = 1  # transmission type of a TPDO: at each SYNC (CiA 301, table 74)
 
@@ -49,11 +51,12 @@ class Pdo(NamedTuple):
 
 
 class _Before(NamedTuple):
-    """A PDO as it was found."""
+    """A PDO as it was found; of its mapping all entries that we write, also beyond the `in_use` that are in force."""
 
     number: int
     cob_id: int
     kind: int
+    in_use: int
     mapping: tuple[int, ...]
 
 
@@ -155,10 +158,16 @@ class PdoConfiguration:
         return pdos
 
     def restore(self) -> None:
-        """Put every PDO back as it was found."""
-        for (name, _), before in list(self._before.items()):
-            self._put_back(INTO_DRIVE if name == INTO_DRIVE.name else OUT_OF_DRIVE, before)
-        self._before.clear()
+        """Put every PDO back as it was found.
+
+        Raises:
+            BusError: If not all of them could be.
+        """
+        found, self._before = self._before, {}
+        tidying = Tidying()
+        for (name, _), before in found.items():
+            tidying.step(partial(self._put_back, INTO_DRIVE if name == INTO_DRIVE.name else OUT_OF_DRIVE, before))
+        tidying.end()
 
     def forget(self) -> None:
         """Forget what was found: the node was reset and has its own configuration again."""
@@ -167,6 +176,7 @@ class PdoConfiguration:
     def _map(self, direction: Direction, number: int, axis: int, group: Sequence[Entry]) -> Pdo:
         label = f"{direction.name} {number + 1} of node {self._node}"
         before = self._before.get((direction.name, number)) or self._look(direction, number)
+        before = self._look_further(direction, before, len(group))
         self._before[direction.name, number] = before
         can_id = before.cob_id & IDENTIFIER
         if can_id == 0 and number < len(direction.identifiers):
@@ -187,7 +197,7 @@ class PdoConfiguration:
             start += size
         cob_id = before.cob_id & ~(INVALID | IDENTIFIER) | can_id
         kind = self._description.hints.rpdo_type if direction is INTO_DRIVE else SYNC_EVERY
-        self._write_all(direction, number, cob_id, kind, mapping)
+        self._write_all(direction, number, cob_id, kind, mapping, len(mapping), self._sdo.write)
         return Pdo(label, can_id, start, tuple(members))
 
     def _look(self, direction: Direction, number: int) -> _Before:
@@ -197,27 +207,47 @@ class PdoConfiguration:
             number,
             self._read(communication, 1),
             self._read(communication, 2),
+            count,
             tuple(self._read(mapping, sub) for sub in range(1, count + 1)),
         )
 
-    def _put_back(self, direction: Direction, before: _Before) -> None:
-        self._write_all(direction, before.number, before.cob_id, before.kind, before.mapping)
+    def _look_further(self, direction: Direction, before: _Before, entries: int) -> _Before:
+        """Return a PDO as it was found with so many entries of its mapping at least: ours overwrites them."""
+        more = range(len(before.mapping) + 1, entries + 1)
+        found = tuple(self._read(direction.mapping + before.number, sub) for sub in more)
+        return before._replace(mapping=before.mapping + found)
 
-    def _write_all(self, direction: Direction, number: int, cob_id: int, kind: int, mapping: Sequence[int]) -> None:
+    def _put_back(self, direction: Direction, before: _Before) -> None:
+        # Entries that are not in use are parameters, too: a backup has them.
+        self._write_all(
+            direction, before.number, before.cob_id, before.kind, before.mapping, before.in_use, self._sdo.put_back
+        )
+
+    def _write_all(
+        self,
+        direction: Direction,
+        number: int,
+        cob_id: int,
+        kind: int,
+        mapping: Sequence[int],
+        count: int,
+        write: Callable[[int, int, bytes, str, float], None],
+    ) -> None:
         """Remap in the order that CiA 301 demands: off, no entries, entries, their number, on."""
+
+        def put(index: int, sub: int, value: int, size: int) -> None:
+            label = f"{index:04X}h:{sub:02X} = {value:X}h"
+            write(index, sub, value.to_bytes(size, "little"), label, self._description.answer_timeout)
+
         communication = direction.communication + number
-        self._write(communication, 1, cob_id | INVALID, 4)
-        self._write(communication, 2, kind, 1)
-        self._write(direction.mapping + number, 0, 0, 1)
+        put(communication, 1, cob_id | INVALID, 4)
+        put(communication, 2, kind, 1)
+        put(direction.mapping + number, 0, 0, 1)
         for sub, value in enumerate(mapping, 1):
-            self._write(direction.mapping + number, sub, value, 4)
-        self._write(direction.mapping + number, 0, len(mapping), 1)
-        self._write(communication, 1, cob_id, 4)
+            put(direction.mapping + number, sub, value, 4)
+        put(direction.mapping + number, 0, count, 1)
+        put(communication, 1, cob_id, 4)
 
     def _read(self, index: int, sub: int) -> int:
         label = f"{index:04X}h:{sub:02X}"
         return int.from_bytes(self._sdo.read(index, sub, label, self._description.answer_timeout), "little")
-
-    def _write(self, index: int, sub: int, value: int, size: int) -> None:
-        label = f"{index:04X}h:{sub:02X} = {value:X}h"
-        self._sdo.write(index, sub, value.to_bytes(size, "little"), label, self._description.answer_timeout)

@@ -14,13 +14,15 @@ import canopen
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 from canopen.sdo.client import SdoClient as CanopenClient
 
-from drive_env.canopen.frames import SDO_REQUEST, SDO_RESPONSE
+from drive_env.canopen.frames import NMT, SDO_REQUEST, SDO_RESPONSE
 from drive_env.master.errors import BusError, NoAnswerError, refused
 from drive_env.master.port import Port
 
 _ABORT = 0x80
 _INITIATE = (0x40, 0x60)  # upload and download responses that name their object, upper three bits
 _TIMED_OUT = 0x05040000
+PRE_OPERATIONAL = 0x80  # NMT command (CiA 301, 7.2.8.3.1)
+PATIENT = 4.0  # times as long as usual is waited for what should not be left undone
 
 
 class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not typed
@@ -62,6 +64,22 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             NoAnswerError: If it does not answer within `timeout` [s]; the drive may have taken the value or not.
         """
         self._transfer(index, sub, data, f"the write of {label}", timeout)
+
+    def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
+        """Write what an object had before; where no answer comes it is written once more, and waited for longer.
+
+        A node that has missed its master's heartbeats may be stopped, where it answers no SDO: it is woken first, into
+        pre-operational.
+
+        Raises:
+            ObjectAccessError: With the abort code, if the drive refuses.
+            NoAnswerError: If it does not answer.
+        """
+        try:
+            self.write(index, sub, data, label, timeout)
+        except NoAnswerError:
+            self._port.send(NMT, bytes((PRE_OPERATIONAL, self._node)))
+            self.write(index, sub, data, label, PATIENT * timeout)
 
     def _transfer(self, index: int, sub: int, data: bytes | None, what: str, timeout: float) -> bytes:
         self._object = (index, sub)

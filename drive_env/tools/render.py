@@ -77,7 +77,7 @@ def _render(row: Any, film: Path | None, view: bool) -> None:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=console) as progress:
-        # The kernels compile once, on the first run ever: 40 seconds.
+        # The kernels compile once, on the first run ever: 30 seconds.
         task = progress.add_task("simulating", total=1.0)
         from drive_env.demonstration import perform
         from drive_env.render import render_run

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 PORT = 29636  # no service is registered there, and no system gives it to others
 LOOPBACK = "127.0.0.1"
 PATIENCE = 8.0  # s after which a user wants to know what takes so long
-COMPILING = "drive-env: compiling the kernels, once; about 40 seconds"
+COMPILING = "drive-env: compiling the kernels, once; about 30 seconds"
 # SDO of any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1 synchronous.
 WARM_UP_REQUESTS = tuple(
     bytes.fromhex(text)

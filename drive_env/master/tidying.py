@@ -1,0 +1,35 @@
+"""Putting a drive back as it was: every step is tried, whatever became of the others, and what failed is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from drive_env.dictionary.access import ObjectAccessError
+from drive_env.master.errors import BusError, NoAnswerError
+
+SILENT = 2  # steps in a row without an answer, after which a node is not asked any more: each takes seconds
+
+
+class Tidying:
+    """Steps of which none prevents another; all of them are tried unless the node is silent."""
+
+    def __init__(self) -> None:
+        self._failures: list[str] = []
+        self._silent = 0
+
+    def step(self, act: Callable[[], None]) -> None:
+        """Do a step; what fails is remembered."""
+        if self._silent >= SILENT:
+            return
+        try:
+            act()
+            self._silent = 0
+        except (BusError, ObjectAccessError) as error:
+            self._failures.append(str(error))
+            self._silent = self._silent + 1 if isinstance(error, NoAnswerError) else 0
+
+    def end(self) -> None:
+        """Raise BusError with what failed, in one line, if anything did."""
+        if self._failures:
+            more = f" (and {len(self._failures) - 1} more)" if len(self._failures) > 1 else ""
+            raise BusError(f"{self._failures[0]}{more}")
