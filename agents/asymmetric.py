@@ -45,12 +45,15 @@ class AsymmetricPolicy(MultiInputActorCriticPolicy):  # type: ignore[misc]
         ValueError: For an observation without the two entries.
     """
 
-    def _build_mlp_extractor(self) -> None:
-        spaces = getattr(self.observation_space, "spaces", {})
+    def __init__(self, observation_space: Any, *rest: Any, **options: Any) -> None:
+        spaces = getattr(observation_space, "spaces", {})
         if next(iter(spaces), None) != ACTOR or len(spaces) < 2:
             raise ValueError(
                 f"an asymmetric critic needs an observation with {ACTOR!r} first and more after it; give the "
-                "environment privileged: true (env_kwargs)"
+                "environment privileged: true (env_kwargs) if it has that, or take MlpPolicy"
             )
-        entries = int(torch.Size(spaces[ACTOR].shape).numel())
+        super().__init__(observation_space, *rest, **options)
+
+    def _build_mlp_extractor(self) -> None:
+        entries = int(torch.Size(self.observation_space.spaces[ACTOR].shape).numel())
         self.mlp_extractor = _Split(entries, self.features_dim, self.net_arch, self.activation_fn)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.bundle import plain
+from agents.guard import PATIENT, GuardedPolicy
 from agents.scores import Episode
 
 
@@ -64,14 +65,29 @@ def load(path: Path) -> Recording:
         raise ValueError(f"{path} holds no episodes; give the episodes.npz of `drive-agent evaluate --out`") from None
 
 
-def repeat(policy: Any, recording: Recording) -> Repeated:
-    """Return how far a policy's actions on the recorded observations lie from the recorded ones."""
+def repeat(policy: Any, recording: Recording, told: Callable[[float], None] = lambda share: None) -> Repeated:
+    """Return how far a policy's actions on the recorded observations lie from the recorded ones.
+
+    Args:
+        policy: What acts.
+        recording: What it is compared with.
+        told: Is told the share that is done, episode by episode.
+
+    Raises:
+        PolicyStoppedError: If the policy fails on what was recorded, or gives another number of actions.
+    """
+    unused = np.zeros(recording.actions[0].shape[1])  # nobody looks at it: what sticks does so in the recording, too
+    watched = GuardedPolicy(policy, unused, unused, 0.0, PATIENT)
     largest, squares, count = 0.0, 0.0, 0
-    for observations, actions in zip(recording.observations, recording.actions, strict=True):
-        policy.reset(None)
-        for seen, done in zip(observations, actions, strict=True):
-            difference = np.asarray(policy.act(seen[None]), float).reshape(-1) - done
-            largest = max(largest, float(np.abs(difference).max()))
-            squares += float(np.mean(np.square(difference)))
-            count += 1
+    try:
+        for number, (observations, actions) in enumerate(zip(recording.observations, recording.actions, strict=True)):
+            told(number / len(recording.actions))
+            watched.reset(None)
+            for seen, done in zip(observations, actions, strict=True):
+                difference = np.asarray(watched.act(seen[None]), float).reshape(-1) - done
+                largest = max(largest, float(np.abs(difference).max()))
+                squares += float(np.mean(np.square(difference)))
+                count += 1
+    finally:
+        watched.close()
     return Repeated(largest, float(np.sqrt(squares / max(count, 1))), count)

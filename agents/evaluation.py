@@ -10,22 +10,25 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agents.bundle import plain
-from agents.guard import GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
+from agents.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
 from agents.scores import Episode, Interval, figures, interval
 from agents.tasks import ENVIRONMENTS, configuration_of, environment_name, make_lanes
+from drive_env.undisturbed import undisturbed
 
 LANES = 64
 FIRST_SEED = 1_000_000  # far from those of a training
+TOLD = 0.5  # s between two looks at a progress bar, which takes a millisecond
 STEP_SECONDS: dict[str, Callable[[Any], float]] = {"ServoDrive/Tracking-v0": lambda config: 1.0 / config.rate,
                 "ServoDrive/GainScheduling-v0": lambda config: config.step,
                 "ServoDrive/GainTuning-v0": lambda config: 0.75}  # fmt: skip
+FIXED_STEPS = ("ServoDrive/Tracking-v0", "ServoDrive/GainScheduling-v0")  # a trial takes what clearing up takes besides
 
 
 @dataclass
@@ -41,7 +44,8 @@ class Evaluation:
         values: Figure -> value of each episode.
         lower_is_better: Figure -> direction.
         violations: What ended episodes early -> how often.
-        pace: Time that steps took over the time that they should; 1 where time waits.
+        pace: Time that steps took over the time that they should; 1 where time waits, or a step has no fixed time.
+        late: Share of the SYNCs within a step that were more than a cycle late; 0 where time waits.
         episodes: What was recorded; not saved with the report.
     """
 
@@ -54,6 +58,7 @@ class Evaluation:
     lower_is_better: dict[str, bool]
     violations: dict[str, int]
     pace: float = 1.0
+    late: float = 0.0
     episodes: list[Episode] = field(default_factory=list, repr=False)
 
     @property
@@ -115,7 +120,7 @@ def evaluate(
     sensor: Any = None,
     guard: GuardLimits | None = None,
     side: str | None = None,
-    told: Callable[[int, int], None] | None = None,
+    told: Callable[[float], None] = lambda share: None,
 ) -> Evaluation:
     """Run episodes and return what they say.
 
@@ -129,9 +134,10 @@ def evaluate(
         drives: Drives to act on, whose gains, offsets and mode are as before afterwards; emulated machines of the
             environment's own by default.
         sensor: As `Tracking` takes it.
-        guard: Limits of the policy; by default those of GuardLimits on given drives, and none on emulated machines.
+        guard: Limits of the policy; by default those of guard.LIMITS on given drives, and guard.PATIENT on emulated
+            machines.
         side: What the report calls the drives.
-        told: Is told how many episodes are over, of how many.
+        told: Is told the share that is done.
 
     Raises:
         PolicyStoppedError: If the policy did what it must not; given drives are at rest and disabled then.
@@ -154,22 +160,28 @@ def evaluate(
             care.enter_context(unchanged(drives))
             care.enter_context(stopping(drives))
         lanes = make_lanes(environment, count, options, **more)
+        if not getattr(drives, "time_waits", True):
+            care.enter_context(undisturbed())
         try:
             space: Any = lanes.single_action_space
-            limits = guard or (GuardLimits() if given else GuardLimits(saturation=None, stall=None))
-            if environment == "ServoDrive/GainTuning-v0":  # a trial's gains may well be at the end of their range
-                limits = GuardLimits(saturation=None, stall=limits.stall)
+            limits = guard or (LIMITS[environment] if given else PATIENT)
             step = STEP_SECONDS[environment](lanes.config)
             watched = GuardedPolicy(policy, space.low, space.high, step, limits)
+            care.callback(watched.close)
+            if given:
+                watched.warm_up(np.zeros(lanes.observation_space.shape, np.float32))
             for first in range(0, episodes, count):
                 seeds = [seed + first + lane for lane in range(count)]
                 wanted = min(count, episodes - first)
-                found_now, seconds = _episodes(watched, lanes, seeds, all_end=given)
+                steps = ENVIRONMENTS[environment].steps(lanes.config)
+
+                def tell(done: int, first: int = first, wanted: int = wanted, steps: int = steps) -> None:
+                    told((first + wanted * min(done / steps, 1.0)) / episodes)
+
+                found_now, seconds = _episodes(watched, lanes, seeds, all_end=given, told=tell)
                 recorded += found_now[:wanted]
                 spent += seconds
                 due += step * max(len(episode.rewards) for episode in found_now)
-                if told is not None:
-                    told(len(recorded), episodes)
             if given:
                 come_to_rest(drives)
             config = lanes.config
@@ -178,8 +190,30 @@ def evaluate(
             lanes.close()
     evaluation = summary(recorded, config, found, environment, name, side or ("bus" if given else "emulator"))
     if not getattr(drives, "time_waits", True):
-        evaluation.pace = spent / due
+        timing = drives.total_timing
+        evaluation.late = timing.late / max(timing.cycles, 1)
+        evaluation.pace = spent / due if environment in FIXED_STEPS else 1.0
     return evaluation
+
+
+def joined(parts: Sequence[Evaluation]) -> Evaluation:
+    """Return evaluations of one policy on one side, an episode after the other, as one."""
+    first = parts[0]
+    names = [name for name in first.values if all(name in part.values for part in parts)]
+    violations: dict[str, int] = {}
+    for part in parts:
+        for what, count in part.violations.items():
+            violations[what] = violations.get(what, 0) + count
+    return replace(
+        first,
+        seeds=[seed for part in parts for seed in part.seeds],
+        values={name: [value for part in parts for value in part.values[name]] for name in names},
+        lower_is_better={name: first.lower_is_better[name] for name in names},
+        violations=violations,
+        pace=float(np.mean([part.pace for part in parts])),
+        late=float(np.mean([part.late for part in parts])),
+        episodes=[episode for part in parts for episode in part.episodes],
+    )
 
 
 def summary(
@@ -201,7 +235,9 @@ def summary(
     )
 
 
-def _episodes(policy: Any, lanes: Any, seeds: Sequence[int], all_end: bool) -> tuple[list[Episode], float]:
+def _episodes(
+    policy: Any, lanes: Any, seeds: Sequence[int], all_end: bool, told: Callable[[int], None]
+) -> tuple[list[Episode], float]:
     """Return an episode of every lane, and the time that its steps took [s].
 
     Args:
@@ -209,11 +245,12 @@ def _episodes(policy: Any, lanes: Any, seeds: Sequence[int], all_end: bool) -> t
         lanes: The lanes.
         seeds: One for each lane.
         all_end: Whether every lane's episode ends with the first that does: beginning anew would move the others.
+        told: Is told how many steps are done, not more often than every TOLD.
     """
     count = lanes.num_envs
-    observation, told = lanes.reset(seed=list(seeds))
+    observation, begun = lanes.reset(seed=list(seeds))
     policy.reset(None)
-    first = [_of_lane(told, lane) for lane in range(count)]
+    first = [_of_lane(begun, lane) for lane in range(count)]
     rows: list[Any] = [_seen(observation)]
     actions: list[Any] = []
     rewards: list[Any] = []
@@ -223,7 +260,7 @@ def _episodes(policy: Any, lanes: Any, seeds: Sequence[int], all_end: bool) -> t
     faults: list[str] = [""] * count
     last: list[dict[str, Any]] = [{} for _ in range(count)]
     open_ = np.ones(count, bool)
-    start = time.perf_counter()
+    start = last_told = time.perf_counter()
     while open_.any():
         action = policy.act(rows[-1])
         observation, reward, terminated, truncated, info = lanes.step(action)
@@ -239,6 +276,9 @@ def _episodes(policy: Any, lanes: Any, seeds: Sequence[int], all_end: bool) -> t
             last[lane] = _of_lane(info, lane)
             faults[lane] = str(last[lane].get("fault", "") or "")
         open_ &= ~ended
+        if (now := time.perf_counter()) - last_told > TOLD:
+            last_told = now
+            told(len(rewards))
         if all_end and ended.any():
             for lane in map(int, np.flatnonzero(open_)):
                 last[lane] = _of_lane(info, lane)

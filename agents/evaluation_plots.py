@@ -25,6 +25,38 @@ def save(evaluation: Evaluation, folder: Path) -> list[Path]:
     return [_figures(evaluation, folder / "figures.png"), _episodes(evaluation, folder / "episodes.png")]
 
 
+def save_gap(first: Evaluation, second: Evaluation, folder: Path) -> Path:
+    """Write gap.png to a folder, the score of every episode on one side over that on the other; return its path."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    one, two = (np.array(side.values[first.score]) for side in (first, second))
+    figure, axis = pyplot.subplots(figsize=(4.8, 4.8), layout="constrained")
+    axis.scatter(one, two, s=18, color="C0", alpha=0.7, linewidths=0)
+    ends = [float(np.nanmin([one, two])), float(np.nanmax([one, two]))]
+    axis.plot(ends, ends, color="0.5", linewidth=0.8, zorder=0)
+    axis.scatter([np.nanmedian(one)], [np.nanmedian(two)], marker="+", s=160, color="black", label="medians")
+    axis.set(xlabel=f"{first.score}, {first.side}", ylabel=f"{second.score}, {second.side}",
+             title=f"{first.policy}, {len(one)} machines")  # fmt: skip
+    if ends[0] > 0.0 and ends[1] > 5.0 * ends[0]:
+        axis.set(xscale="log", yscale="log")
+        for side in (axis.xaxis, axis.yaxis):
+            side.set(
+                major_locator=LogLocator(subs=(1.0, 2.0, 5.0)),
+                major_formatter=FuncFormatter(lambda value, _: f"{value:g}"),
+            )
+            side.set_minor_locator(NullLocator())
+    axis.legend(fontsize=8)
+    axis.grid(alpha=0.3)
+    path = folder / "gap.png"
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)
+    return path
+
+
 def _figures(evaluation: Evaluation, path: Path) -> Path:
     from matplotlib import pyplot
 
@@ -60,7 +92,8 @@ def _episodes(evaluation: Evaluation, path: Path) -> Path:
         else:
             rows, label = np.cumsum(episode.rewards), "sum of rewards"
         axis.plot(np.arange(1, len(rows) + 1), rows, label=f"{name}, seed {episode.seed}", linewidth=1.0)
-    axis.set(xlabel="step", ylabel=label, title=f"{evaluation.policy} on {evaluation.side}")
+    axis.set_ylabel(label, fontsize=8)
+    axis.set(xlabel="step", title=f"{evaluation.policy} on {evaluation.side}")
     axis.legend(fontsize=8)
     axis.grid(alpha=0.3)
     figure.savefig(path, dpi=120)

@@ -5,17 +5,24 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.evaluation import Evaluation
 from agents.scores import Interval, interval
+
+Floats = NDArray[np.float64]
+
+RESAMPLES = 2000
 
 
 class Gap(NamedTuple):
     """A figure on two sides.
 
-    first, second: Means of the two.
+    first, second: Of the two sides.
     difference: Second less first, with its 95 % interval; paired by seed where both ran the same episodes.
     paired: Whether they did.
+    medians: (low, value, high) of the quotient of the medians less 1, second over first, with its 95 % interval; NaN
+        where the first one is 0.
     """
 
     figure: str
@@ -23,6 +30,7 @@ class Gap(NamedTuple):
     second: Interval
     difference: Interval
     paired: bool
+    medians: tuple[float, float, float]
 
 
 def compare(first: Evaluation, second: Evaluation) -> list[Gap]:
@@ -41,7 +49,8 @@ def compare(first: Evaluation, second: Evaluation) -> list[Gap]:
             continue
         one, two = np.array(first.values[name]), np.array(second.values[name])
         difference = interval(two - one) if paired else _unpaired(one, two)
-        found.append(Gap(name, first.interval(name), second.interval(name), difference, paired))
+        medians = _medians(one, two, paired)
+        found.append(Gap(name, first.interval(name), second.interval(name), difference, paired, medians))
     return found
 
 
@@ -50,19 +59,40 @@ def text(gaps: list[Gap], first: str, second: str) -> list[str]:
     lines = []
     for gap in gaps:
         share = f", {gap.difference.mean / abs(gap.first.mean):+.1%}" if gap.first.mean else ""
+        low, value, high = gap.medians
+        medians = "" if np.isnan(value) else f", {value:+.1%} (95 % of {low:+.1%} to {high:+.1%})"
         lines.append(
             f"gap of {gap.figure}: {first} {gap.first.mean:.4g}, {second} {gap.second.mean:.4g}, difference "
             f"{gap.difference.mean:+.3g} (95 % of {gap.difference.low:+.3g} to {gap.difference.high:+.3g}{share}; "
-            f"{'paired by seed' if gap.paired else 'not paired'})"
+            f"{'paired by seed' if gap.paired else 'not paired'}); medians {gap.first.median:.4g} and "
+            f"{gap.second.median:.4g}{medians}"
         )
     return lines
 
 
-def _unpaired(one: np.ndarray, two: np.ndarray, resamples: int = 2000) -> Interval:
+def _medians(one: Floats, two: Floats, paired: bool) -> tuple[float, float, float]:
+    """Return the quotient of medians less 1 between the ends of its bootstrap interval."""
+    rng = np.random.default_rng(0)
+    if paired:
+        both = np.isfinite(one) & np.isfinite(two)
+        one, two = one[both], two[both]
+    else:
+        one, two = one[np.isfinite(one)], two[np.isfinite(two)]
+    if not len(one) or not len(two) or np.median(one) == 0.0:
+        return float("nan"), float("nan"), float("nan")
+    drawn = rng.integers(0, len(one), (RESAMPLES, len(one)))
+    medians = np.median(one[drawn], axis=1)
+    others = np.median(two[drawn if paired else rng.integers(0, len(two), (RESAMPLES, len(two)))], axis=1)
+    held = medians != 0.0
+    low, high = np.quantile(others[held] / medians[held] - 1.0, (0.025, 0.975))
+    return float(low), float(np.median(two) / np.median(one) - 1.0), float(high)
+
+
+def _unpaired(one: Floats, two: Floats) -> Interval:
     """Return the difference of two means with a bootstrap interval."""
     one, two = one[np.isfinite(one)], two[np.isfinite(two)]
     rng = np.random.default_rng(0)
-    means = [x[rng.integers(0, len(x), (resamples, len(x)))].mean(axis=1) for x in (one, two)]
+    means = [x[rng.integers(0, len(x), (RESAMPLES, len(x)))].mean(axis=1) for x in (one, two)]
     low, high = np.quantile(means[1] - means[0], (0.025, 0.975))
     count = min(len(one), len(two))
     return Interval(

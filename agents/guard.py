@@ -1,22 +1,24 @@
 """A watch over a policy that acts on drives: one that gives no number, sticks at its limit or stalls is stopped.
 
-The safety envelope of a bus watches what the drives do; this watches what acts. While a policy stalls, the envelope's
-own thread quick-stops the drives (`Limits(stall=...)`); when it comes back at last, or does otherwise what it must not,
-`stop` brings the drives to rest and leaves them disabled.
+The safety envelope of a bus watches what the drives do; this watches what acts. A policy is asked in a thread of its
+own: when it has not answered in time it is given up, whether it is slow or never returns, and `stop` brings the drives
+to rest and leaves them disabled. The envelope's thread has quick-stopped them by then (`Limits(stall=...)`).
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from agents.deadline import Deadline, DeadlineError
 from agents.policy import PolicyError
 from drive_env import motion
 from drive_env.gains import GAIN_OBJECTS
@@ -38,8 +40,8 @@ class PolicyStoppedError(PolicyError):
 class GuardLimits:
     """What a policy may do; None for no limit.
 
-    saturation: Longest time with an action at the end of its range [s].
-    stall: Longest time for an action [s].
+    saturation: With an action at the end of its range for so long [s], a policy sticks.
+    stall: Without an action for so long [s], a policy stalls.
     """
 
     saturation: float | None = 0.1
@@ -52,8 +54,20 @@ class GuardLimits:
                 raise ValueError(f"{name} must be above 0 s, not {value:g} s; None for no limit")
 
 
+# Limits on given drives, by environment. A trial's gains may well be at the end of their range, and between two trials
+# the axes hold their position: a second to think is what the envelope of a bus grants by itself.
+LIMITS = {
+    "ServoDrive/Tracking-v0": GuardLimits(),
+    "ServoDrive/GainScheduling-v0": GuardLimits(),
+    "ServoDrive/GainTuning-v0": GuardLimits(saturation=None, stall=1.0),
+}
+# Where nothing is at stake but the user's patience: emulated machines, and a policy's first answer, for which it may
+# load and compile things.
+PATIENT = GuardLimits(saturation=None, stall=60.0)
+
+
 class GuardedPolicy:
-    """A policy under watch; it acts as the one that it holds.
+    """A policy under watch; it acts as the one that it holds, in a thread of its own if `limits` have a stall.
 
     Args:
         policy: What acts.
@@ -62,15 +76,26 @@ class GuardedPolicy:
         limits: What it may do.
     """
 
-    def __init__(self, policy: Any, low: NDArray[Any], high: NDArray[Any], step: float, limits: GuardLimits) -> None:
+    def __init__(self, policy: Any, low: ArrayLike, high: ArrayLike, step: float, limits: GuardLimits) -> None:
         self._policy, self._step, self._limits = policy, step, limits
-        self._middle, self._reach = (high + low) / 2.0, (high - low) / 2.0
-        self._at_limit = np.zeros((1, len(low)), np.int64)
+        least, most = np.asarray(low, float), np.asarray(high, float)
+        self._middle, self._reach = (most + least) / 2.0, (most - least) / 2.0
+        self._at_limit = np.zeros((1, len(least)), np.int64)
+        self._deadline = Deadline()
+
+    def warm_up(self, observation: Any) -> None:
+        """Ask once and forget the answer, before anything moves: what loads or compiles then is no stall.
+
+        Raises:
+            PolicyStoppedError: If it does not answer within PATIENT.stall.
+        """
+        self._ask(self._policy.act, observation, within=PATIENT.stall)
+        self._ask(self._policy.reset, None, within=PATIENT.stall)
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
         """Begin an episode."""
         self._at_limit[:] = 0
-        self._policy.reset(mask)
+        self._ask(self._policy.reset, mask, within=self._limits.stall)
 
     def act(self, observation: Any) -> Any:
         """Return the policy's action.
@@ -78,24 +103,9 @@ class GuardedPolicy:
         Raises:
             PolicyStoppedError: If it took too long, is no number, or has been at the end of its range for too long.
         """
-        start = time.perf_counter()
-        try:
-            action = np.asarray(self._policy.act(observation))
-        except PolicyStoppedError:
-            raise
-        except PolicyError as error:
-            raise PolicyStoppedError(str(error)) from error
-        took = time.perf_counter() - start
-        stall, saturation = self._limits.stall, self._limits.saturation
-        if stall is not None and took > stall:
-            raise PolicyStoppedError(
-                f"the policy took {1e3 * took:.0f} ms for an action, and its limit is {1e3 * stall:.0f} ms; "
-                "use a smaller network or a faster computer"
-            )
-        rows = action.reshape(-1, len(self._middle))
-        if not np.isfinite(rows).all():
-            lane, entry = np.argwhere(~np.isfinite(rows))[0]
-            raise PolicyStoppedError(f"entry {entry} of the policy's action is {rows[lane, entry]}, no number")
+        action = self._ask(self._policy.act, observation, within=self._limits.stall)
+        rows = self._checked(action, len(observation))
+        saturation = self._limits.saturation
         if saturation is not None:
             there = np.abs(rows - self._middle) >= AT_LIMIT * self._reach
             if self._at_limit.shape != there.shape:
@@ -110,7 +120,64 @@ class GuardedPolicy:
                     f"ms, and the limit is {1e3 * saturation:.0f} ms; train it on such a machine, or allow more "
                     "(--saturation)"
                 )
-        return action
+        return rows
+
+    def answer(self, observation: Any) -> Any:
+        """Return what a tuner would stay with after its last trial, as an action; None of a policy that does not say.
+
+        Raises:
+            PolicyStoppedError: If it took too long, or is no number.
+        """
+        answer = getattr(self._policy, "answer", None)
+        if answer is None:
+            return None
+        return self._checked(self._ask(answer, observation, within=self._limits.stall), len(observation))
+
+    def close(self) -> None:
+        """End the policy's thread."""
+        self._deadline.close()
+
+    def _checked(self, action: Any, lanes: int) -> NDArray[Any]:
+        """Return an action as rows, (lanes, actions)."""
+        entries = len(self._middle)
+        try:
+            rows = np.asarray(action)
+            finite = np.isfinite(rows)
+        except (TypeError, ValueError):
+            raise PolicyStoppedError(f"the policy's action is a {type(action).__name__}, no array of numbers") from None
+        if rows.size != lanes * entries:
+            raise PolicyStoppedError(
+                f"the policy's action has shape {rows.shape}; {lanes} lane(s) of this environment take "
+                f"({lanes}, {entries})"
+            )
+        rows, finite = rows.reshape(lanes, entries), finite.reshape(lanes, entries)
+        if not finite.all():
+            lane, entry = np.argwhere(~finite)[0]
+            raise PolicyStoppedError(f"entry {entry} of the policy's action is {rows[lane, entry]}, no number")
+        return rows
+
+    def _ask(self, function: Callable[[Any], Any], argument: Any, within: float | None) -> Any:
+        """Return what the policy answers; PolicyStoppedError if it does not in time, or raises what it may."""
+        try:
+            if within is None:
+                return function(argument)
+            start = time.perf_counter()
+            answer = self._deadline.call(function, argument, within=within)
+            if time.perf_counter() - start >= within:  # this thread, too, may be late
+                raise DeadlineError
+            return answer
+        except DeadlineError:
+            raise PolicyStoppedError(
+                f"the policy gave no answer for {1e3 * (within or 0.0):.0f} ms: it is too slow, or never returns; use "
+                "a smaller network or a faster computer, or allow more (--stall)"
+            ) from None
+        except PolicyError as error:
+            raise PolicyStoppedError(str(error)) from error
+        except Exception as error:  # anybody's code
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            raise PolicyStoppedError(
+                f"the policy failed: {type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
+            ) from error
 
 
 @contextmanager

@@ -57,7 +57,10 @@ def to_onnx(bundle: Bundle) -> Any:
     from onnx import checker, helper
 
     if bundle.kind not in _BODIES:
-        raise BundleError(f"an agent of kind {bundle.kind!r} cannot be exported; {', '.join(_BODIES)} can")
+        raise BundleError(
+            f"an agent of kind {bundle.kind!r} has no ONNX form, {', '.join(_BODIES)} have; its file acts with NumPy "
+            "alone: agents.policy.load_policy"
+        )
     graph = Graph()
     x = _enter(graph, bundle)
     x, inputs, outputs = _BODIES[bundle.kind](graph, bundle, x)

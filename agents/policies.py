@@ -1,6 +1,7 @@
 """Any policy as something that acts: our bundle, a checkpoint of Stable-Baselines3, ONNX, or a Python callable.
 
-How it is written says what it is: agent.npz, checkpoint.zip, agent.onnx, or module:function.
+How it is written says what it is: the name of an agent that ships, agent.npz, checkpoint.zip, agent.onnx, or
+module:function.
 """
 
 from __future__ import annotations
@@ -9,13 +10,14 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agents.policy import load_policy
+from agents.shipped import shipped, shipped_names
 
 ACTOR = "observation"  # the entry of a dict observation that the actor sees
 
@@ -54,8 +56,11 @@ def open_policy(text: str) -> LoadedPolicy:
             return opened(text)
     if ":" in text:
         return _callable(text)
+    if text in shipped_names():
+        return replace(_bundle(str(shipped(text))), name=text)
     raise PolicyNotFoundError(
-        f"{text!r} is no policy; give an agent ({', '.join(OPENERS)}) or a Python function (module:function)"
+        f"{text!r} is no policy; give an agent that ships ({', '.join(shipped_names())}), a file "
+        f"({', '.join(OPENERS)}) or a Python function (module:function)"
     )
 
 
@@ -130,8 +135,15 @@ def _checkpoint(text: str) -> LoadedPolicy:
     return LoadedPolicy(text, ModelPolicy(model, normaliser), run["environment"], run["configuration"], card)
 
 
-def _callable(text: str) -> LoadedPolicy:
-    module, _, name = text.partition(":")
+def find_object(text: str) -> Any:
+    """Return what module:name means; the present folder's modules count, too.
+
+    Raises:
+        PolicyNotFoundError: If there is no such thing, or its module cannot be imported.
+    """
+    module, colon, name = text.partition(":")
+    if not colon or not name:
+        raise PolicyNotFoundError(f"{text!r} must be module:function")
     folder = str(Path.cwd())
     if folder not in sys.path:  # a console script's path lacks it, and the user's function is there
         sys.path.insert(0, folder)
@@ -139,12 +151,21 @@ def _callable(text: str) -> LoadedPolicy:
         found = importlib.import_module(module)
     except ImportError as error:
         raise PolicyNotFoundError(f"{text}: module {module!r} cannot be imported: {error}") from None
+    except Exception as error:  # whatever somebody's module does when it is imported
+        raise PolicyNotFoundError(f"{text}: module {module!r} fails: {type(error).__name__}: {error}") from error
     if not hasattr(found, name):
         functions = [key for key, value in vars(found).items() if callable(value) and not key.startswith("_")]
         raise PolicyNotFoundError(f"{text}: {module} has no {name!r}; it has {', '.join(functions) or 'nothing'}")
-    policy = getattr(found, name)
+    return getattr(found, name)
+
+
+def _callable(text: str) -> LoadedPolicy:
+    policy = find_object(text)
     if inspect.isclass(policy):
-        policy = policy()
+        try:
+            policy = policy()
+        except TypeError as error:
+            raise PolicyNotFoundError(f"{text} cannot be made without arguments: {error}") from None
     if not hasattr(policy, "act"):
         if not callable(policy):
             raise PolicyNotFoundError(f"{text} is a {type(policy).__name__}; a policy is a function of an observation")

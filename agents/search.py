@@ -10,10 +10,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
 
 from agents.hyperparameters import merge
-from agents.training import ALGORITHMS, Run, train
+from agents.training import ALGORITHMS, DivergedError, Run, train
 
 JOURNAL, BEST = "study.log", "best.yaml"
 
@@ -28,9 +29,10 @@ class Row(NamedTuple):
     choices: tuple[Any, ...] = ()
 
 
+DISCOUNTS = (0.0, 0.95, 0.98, 0.99, 0.995, 1.0)  # 0: rewards that each step earns alone, as EachTrial's
 PPO = (
     Row("learning_rate", 3e-5, 3e-3, log=True),
-    Row("gamma", choices=(0.95, 0.98, 0.99, 0.995, 1.0)),
+    Row("gamma", choices=DISCOUNTS),
     Row("gae_lambda", choices=(0.9, 0.95, 1.0)),
     Row("clip_range", choices=(0.1, 0.2, 0.3)),
     Row("n_epochs", choices=(3, 5, 10)),
@@ -43,7 +45,7 @@ SPACES: dict[str, tuple[Row, ...]] = {
     "recurrent_ppo": (*PPO[:-1], Row("policy_kwargs.lstm_hidden_size", choices=(32, 64, 128))),
     "sac": (
         Row("learning_rate", 3e-5, 3e-3, log=True),
-        Row("gamma", choices=(0.95, 0.98, 0.99, 0.995, 1.0)),
+        Row("gamma", choices=DISCOUNTS),
         Row("tau", choices=(0.005, 0.01, 0.02)),
         Row("batch_size", choices=(128, 256, 512)),
         Row("policy_kwargs.net_arch", choices=("64,64", "128,128", "256,256")),
@@ -52,10 +54,10 @@ SPACES: dict[str, tuple[Row, ...]] = {
 
 
 class Trial(NamedTuple):
-    """A trial that is over: its number, score, and what was drawn."""
+    """A trial that is over: its number, score (None if the training diverged), and what was drawn."""
 
     number: int
-    score: float
+    score: float | None
     drawn: Mapping[str, Any]
 
 
@@ -68,9 +70,11 @@ def search(
     trials: int,
     seed: int = 0,
     episodes: int = 64,
-    told: Callable[[Trial, Trial], None] | None = None,
+    told: Callable[[Trial, Trial | None], None] | None = None,
 ) -> dict[str, Any]:
-    """Try hyper-parameters and return the best, RL-Zoo's way; the folder gets the study, and best.yaml.
+    """Try hyper-parameters and return the best, RL-Zoo's way; the folder gets the study, and best.yaml, trial by trial.
+
+    A search that is killed loses the trial under way: the next search in the folder goes on behind it.
 
     Args:
         environment: Name of the environment.
@@ -80,7 +84,10 @@ def search(
         trials: How many more.
         seed: Of trainings and of the search.
         episodes: Of a score.
-        told: Is told of each trial that is over, and of the best one.
+        told: Is told of each trial that is over, and of the best one; None before there is one.
+
+    Raises:
+        DivergedError: If no training at all gave an agent.
     """
     import optuna
     from optuna.storages import JournalStorage
@@ -91,17 +98,15 @@ def search(
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    optuna.logging.set_verbosity(optuna.logging.ERROR)  # what failed is told, in a line
     base = Run(environment, algorithm, hyperparameters)
     storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
-    study = optuna.create_study(
-        storage=storage,
-        study_name=f"{base.environment} {algorithm}",
-        sampler=optuna.samplers.TPESampler(seed=seed),
-        load_if_exists=True,
-    )
+    study = optuna.create_study(storage=storage, study_name=f"{base.environment} {algorithm}", load_if_exists=True)
 
     def objective(trial: Any) -> float:
+        # Seeded by trial: a search that is gone on with, or a second process, would draw the first ones again.
+        own = np.random.SeedSequence((seed, trial.number)).generate_state(1)[0]
+        study.sampler = optuna.samplers.TPESampler(seed=int(own))
         given = drawn(algorithm, hyperparameters, trial)
         run = Run(environment, algorithm, given, seed=seed, preset="search")
         bundle = train(run, folder / f"trial-{trial.number:03d}")
@@ -111,16 +116,29 @@ def search(
         mean = found.interval(found.score).mean
         return mean if found.lower_is_better[found.score] else -mean
 
-    def tell(study: Any, trial: Any) -> None:
-        if told is not None:
-            best = study.best_trial
-            told(Trial(trial.number, trial.value, trial.params), Trial(best.number, best.value, best.params))
+    done = (optuna.trial.TrialState.COMPLETE,)
 
-    study.optimize(objective, n_trials=trials, callbacks=[tell], catch=(FloatingPointError,))
+    def tell(study: Any, trial: Any) -> None:
+        best = study.best_trial if study.get_trials(deepcopy=False, states=done) else None
+        if best is not None:
+            _write(folder / BEST, base.environment, drawn(algorithm, hyperparameters, best), study, best)
+        if told is not None:
+            over, first = (None if one is None else Trial(one.number, one.value, one.params) for one in (trial, best))
+            assert over is not None
+            told(over, first)
+
+    # A training that diverges is a trial that failed: the next ones go elsewhere.
+    study.optimize(objective, n_trials=trials, callbacks=[tell], catch=(DivergedError,))
+    if not study.get_trials(deepcopy=False, states=done):
+        raise DivergedError(f"all {len(study.trials)} trainings diverged; give a smaller learning_rate (--config)")
     best: dict[str, Any] = drawn(algorithm, hyperparameters, study.best_trial)
-    text = yaml.safe_dump({base.environment: best, "quick": {}, "full": {}}, sort_keys=False)
-    (folder / BEST).write_text(f"# The best of {len(study.trials)} trials.\n\n{text}", encoding="utf-8")
     return best
+
+
+def _write(path: Path, environment: str, best: Mapping[str, Any], study: Any, trial: Any) -> None:
+    """Write hyper-parameters as a file that `drive-agent train --config` takes."""
+    text = yaml.safe_dump({environment: dict(best), "quick": {}, "full": {}}, sort_keys=False)
+    path.write_text(f"# Trial {trial.number}, the best of {len(study.trials)}.\n\n{text}", encoding="utf-8")
 
 
 def drawn(algorithm: str, hyperparameters: Mapping[str, Any], trial: Any) -> dict[str, Any]:

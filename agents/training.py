@@ -9,9 +9,11 @@ torch, which may add up in another order.
 from __future__ import annotations
 
 import importlib
+import inspect
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -42,6 +44,10 @@ EPISODES_PER_SEGMENT = 3  # of every lane, at least
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 # Keys whose value SB3 wants as a whole number, though YAML may say 1e5.
 _WHOLE = ("n_steps", "batch_size", "n_epochs", "buffer_size", "learning_starts", "train_freq", "gradient_steps")
+
+
+class DivergedError(ValueError):
+    """The networks hold what nothing can act with: the training is lost; the message says what to change."""
 
 
 class MissingPackageError(ImportError):
@@ -86,7 +92,10 @@ class Run:
 
 
 class Progress(NamedTuple):
-    """How far a training is: means of the last episodes and of each term per step; speed [steps/s]; time's shares."""
+    """How far a training is: means of the last episodes and of each term per step; speed [steps/s]; time's shares.
+
+    `imitated` is the share of what comes before it, if the policy begins as a teacher: all else is 0 until that is 1.
+    """
 
     timesteps: int
     total: int
@@ -95,6 +104,7 @@ class Progress(NamedTuple):
     terms: Mapping[str, float]
     speed: float
     environment_share: float
+    imitated: float = 1.0
 
 
 Report = Callable[[Progress], None]
@@ -112,6 +122,7 @@ def train(run: Run, folder: str | Path, *, report: Report | None = None, resume:
     Raises:
         CheckpointError: If there is nothing to resume; MissingPackageError without the extra `agents`.
         HyperparameterError: For hyper-parameters that the algorithm does not take.
+        DivergedError: If the networks come to hold what nothing can act with; the last checkpoint is from before.
     """
     import torch
     from stable_baselines3.common.logger import configure
@@ -119,7 +130,7 @@ def train(run: Run, folder: str | Path, *, report: Report | None = None, resume:
     folder = Path(folder)
     path = folder / CHECKPOINT
     if resume:
-        run = Run(**checkpoint.read_run(path)["run"])
+        run = run_to_resume(folder)
     threads = torch.get_num_threads()
     torch.set_num_threads(run.torch_threads)
     lanes, env = make_env(run)
@@ -128,8 +139,9 @@ def train(run: Run, folder: str | Path, *, report: Report | None = None, resume:
             model, normaliser = checkpoint.load(path, env)
         else:
             model, normaliser = make_model(run, env)
+            agent_of(model, normaliser, run, configuration_of(lanes))  # what no bundle holds is told now
             if run.hyperparameters.get("imitate"):
-                _imitate(run, model, lanes)
+                _imitate(run, model, lanes, report)
         folder.mkdir(parents=True, exist_ok=True)
         model.set_logger(configure(str(folder), ["tensorboard"]))
         segments = _segments_class()(run, folder, lanes, normaliser, report, resume)
@@ -142,7 +154,16 @@ def train(run: Run, folder: str | Path, *, report: Report | None = None, resume:
         _count_from(env, model.num_timesteps if resume else 0)
         left = run.total - (model.num_timesteps if resume else 0)
         if left > 0:
-            model.learn(left, callback=segments, log_interval=1, reset_num_timesteps=not resume)
+            try:
+                model.learn(left, callback=segments, log_interval=1, reset_num_timesteps=not resume)
+            except ValueError:  # torch's, of a distribution without a mean
+                if is_sound(model):
+                    raise
+            if not is_sound(model):
+                raise DivergedError(
+                    f"the training diverged: after {model.num_timesteps} steps its networks give no numbers any more. "
+                    "Use a smaller learning_rate or max_grad_norm; the checkpoint, if there is one, is from before"
+                )
             segments.finish()
         bundle = agent_of(model, normaliser, run, configuration_of(lanes))
         bundle.save(folder / AGENT)
@@ -150,6 +171,20 @@ def train(run: Run, folder: str | Path, *, report: Report | None = None, resume:
     finally:
         torch.set_num_threads(threads)
         env.close()
+
+
+def run_to_resume(folder: str | Path) -> Run:
+    """Return the run whose checkpoint a folder holds.
+
+    Raises:
+        CheckpointError: If it holds none.
+    """
+    path = Path(folder) / CHECKPOINT
+    if not path.is_file():
+        raise checkpoint.CheckpointError(
+            f"there is no file {path} to go on with: a run writes its first one after a tenth of its steps"
+        )
+    return Run(**checkpoint.read_run(path)["run"])
 
 
 def agent_of(model: Any, normaliser: Any, run: Run, configuration: Mapping[str, Any]) -> Bundle:
@@ -194,7 +229,8 @@ def make_env(run: Run) -> tuple[CountedLanes, Any]:
     wrapper = run.hyperparameters.get("vec_env_wrapper")
     if wrapper:
         name, settings = _named(wrapper)
-        env = found(name)(env, **settings)
+        with _settings_of(name):
+            env = found(name)(env, **settings)
     return counted, env
 
 
@@ -208,7 +244,8 @@ def make_model(run: Run, env: Any) -> tuple[Any, Any]:
     normaliser = None
     if normalize:
         wanted = dict(normalize) if isinstance(normalize, Mapping) else {}
-        normaliser = env = VecNormalize(env, gamma=float(options.get("gamma", 0.99)), **wanted)
+        with _settings_of("normalize"):
+            normaliser = env = VecNormalize(env, gamma=float(options.get("gamma", 0.99)), **wanted)
     for key in _SCHEDULED:
         if key in options:
             options[key] = schedule(options[key])
@@ -217,11 +254,18 @@ def make_model(run: Run, env: Any) -> tuple[Any, Any]:
             options[key] = int(options[key])
     if options.get("policy_kwargs"):
         options["policy_kwargs"] = _with_classes(options["policy_kwargs"])
-    try:
+    with _settings_of(run.algorithm):
         model = algorithm_class(run.algorithm)(_policy(given["policy"]), env, seed=run.seed, device="cpu", **options)
-    except TypeError as error:
-        raise HyperparameterError(f"{run.algorithm} does not take these hyper-parameters: {error}") from None
     return model, normaliser
+
+
+def is_sound(model: Any) -> bool:
+    """Return whether all weights of a model are numbers, and the deviation of its actions is one above 0."""
+    weights = list(model.policy.parameters())
+    if getattr(model.policy, "log_std", None) is not None:
+        deviation = model.policy.log_std.exp()
+        weights += [deviation, 1.0 / deviation]
+    return all(bool(weight.isfinite().all()) for weight in weights)
 
 
 def algorithm_class(name: str) -> Any:
@@ -249,7 +293,7 @@ def _count_from(env: Any, steps: int) -> None:
     env._steps = steps
 
 
-def _imitate(run: Run, model: Any, lanes: CountedLanes) -> None:
+def _imitate(run: Run, model: Any, lanes: CountedLanes, report: Report | None) -> None:
     """Have the model begin as the baseline that the hyper-parameters name."""
     from agents.baselines import baseline
     from agents.imitation import imitate
@@ -258,8 +302,25 @@ def _imitate(run: Run, model: Any, lanes: CountedLanes) -> None:
         raise HyperparameterError(f"imitate is of ppo; leave it out with {run.algorithm}")
     name, settings = _named(run.hyperparameters["imitate"])
     teacher = baseline(name, run.environment, lanes.config, int(model.action_space.shape[0]))
-    left = imitate(model, teacher, seed=segment_seed(run.seed, IMITATION), **settings)
+
+    def told(share: float) -> None:
+        if report is not None:
+            report(Progress(0, run.total, 0, {}, {}, 0.0, 0.0, share))
+
+    seed = segment_seed(run.seed, IMITATION)
+    with _settings_of(f"imitate {name}"):
+        wanted = inspect.signature(imitate).bind(model, teacher, seed=seed, told=told, **settings)
+    left = imitate(*wanted.args, **wanted.kwargs)
     logger.info("the policy begins as %s, its actions within %.3g", name, left)
+
+
+@contextmanager
+def _settings_of(name: str) -> Iterator[None]:
+    """Tell what a constructor does not take as a mistake in the hyper-parameters: SB3 asserts some of it."""
+    try:
+        yield
+    except (TypeError, AssertionError) as error:
+        raise HyperparameterError(f"{name} does not take these hyper-parameters: {error}") from None
 
 
 def _named(value: Any) -> tuple[str, dict[str, Any]]:

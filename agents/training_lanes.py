@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,12 +22,14 @@ class CountedLanes:
         episodes: Ended since the beginning.
         steps: Of all lanes.
         seconds: Spent in the environment.
+        told: The info of the last reset or step, of all lanes: Stable-Baselines3 gets none of it.
     """
 
     def __init__(self, lanes: Lanes) -> None:
         self.lanes = lanes
         self.episodes = self.steps = 0
         self.seconds = 0.0
+        self.told: Mapping[str, Any] = {}
         self._returns = np.zeros(lanes.num_envs)
         self._lengths = np.zeros(lanes.num_envs, np.int64)
         self._ended: deque[tuple[float, int, bool]] = deque(maxlen=EPISODES)
@@ -52,6 +55,7 @@ class CountedLanes:
         start = time.perf_counter()
         found = self.lanes.reset(**options)
         self.seconds += time.perf_counter() - start
+        self.told = found[1]
         return found
 
     def step(self, actions: Any) -> Any:
@@ -60,6 +64,7 @@ class CountedLanes:
         stepped = self.lanes.step(actions)
         self.seconds += time.perf_counter() - start
         _, reward, terminated, truncated, info = stepped
+        self.told = info
         self.steps += len(reward)
         self._returns += reward
         self._lengths += 1

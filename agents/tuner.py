@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.policy import PolicyError, load_policy
+from agents.policy import load_policy
 from agents.shipped import TUNER, shipped
 
 if TYPE_CHECKING:
+    from agents.guard import GuardLimits
     from tuning.target import Target
     from tuning.tuners import Outcome
 
@@ -20,6 +21,7 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL = 2, 3
+TRIAL_SECONDS = 0.75
 
 
 class TrialShown(NamedTuple):
@@ -41,7 +43,10 @@ class TrialShown(NamedTuple):
 
 
 class Tuned(NamedTuple):
-    """What came of it: the incumbents' gains, raw (num_axes, 5), and all trials."""
+    """What came of it: the answer's gains, raw (num_axes, 5), and all trials.
+
+    The answer is the policy's own choice (`answer`) where it makes one, else the best trial by measured terms.
+    """
 
     gains: Integers
     trials: tuple[TrialShown, ...]
@@ -59,10 +64,11 @@ def tune_target(
         trials: How many; the agent's own number by default.
 
     Raises:
-        PolicyError: If the policy gives no number: the drives are at rest and disabled.
+        PolicyStoppedError: If the policy gives no number, or no answer within the envelope's limit for a stall (on
+            emulated drives within `guard.PATIENT.stall`): the drives are at rest and disabled.
         RuntimeError: If a drive cannot be cleared any more.
     """
-    from agents.guard import stopping
+    from agents.guard import GuardedPolicy, stopping
     from drive_env import motion
     from drive_env.envs.gain_tuning import GainTuning
     from drive_env.gains import write_gains
@@ -80,18 +86,19 @@ def tune_target(
         motor=target.motor.name,
         **{name: value for name, value in configuration.items() if name not in NOT_OF_DRIVES},
     )
+    space: Any = env.single_action_space
+    watched = GuardedPolicy(policy, space.low, space.high, TRIAL_SECONDS, _limits_of(drives))
     shown = []
     try:
+        watched.warm_up(np.zeros(env.observation_space.shape or (), np.float32))
         with stopping(drives):
             observation, info = env.reset(seed=0)
-            policy.reset()
+            watched.reset()
             none = np.zeros(env.num_envs, bool)
             shown.append(TrialShown(0, _flat(info["gains"]), info["measured"], none, ~none, ((),) * env.num_envs))
             show(shown[-1])
             for number in range(1, env.config.trials + 1):
-                action = np.asarray(policy.act(observation))
-                if not np.isfinite(action).all():
-                    raise PolicyError("the agent's action is no number")
+                action = watched.act(observation)
                 before = info["measured"]
                 observation, _, terminated, _, info = env.step(action)
                 shown.append(
@@ -108,10 +115,12 @@ def tune_target(
                 if terminated.all():
                     names = ", ".join(shown[-1].faults[0]) or "it stays disabled"
                     raise RuntimeError(f"the drive cannot be cleared after trial {number}: {names}")
-            gains = _flat(info["gains"])
+            answer = watched.answer(observation)
+            gains = _flat(info["gains"] if answer is None else env.gains_of(answer))
             motion.disable(drives)
             write_gains(drives, gains)
     finally:
+        watched.close()
         env.close()
     return Tuned(gains, tuple(shown))
 
@@ -139,6 +148,14 @@ def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
         zero,
         ("",) * target.num_axes,
     )
+
+
+def _limits_of(drives: Any) -> GuardLimits:
+    """Return what a policy may do: it may stay at an end of its range, and think while an axis holds its position."""
+    from agents.guard import PATIENT, GuardLimits
+
+    envelope = getattr(drives, "safety", None)
+    return PATIENT if envelope is None else GuardLimits(saturation=None, stall=envelope.limits.stall)
 
 
 def _flat(gains: NDArray[Any]) -> Integers:

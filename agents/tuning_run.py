@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -74,11 +75,11 @@ def run(
                 if why := wrong_wiring(watched, one):
                     raise RuntimeError(why)
             say("trials")
-            tuned = tune_target(watched, policy, show=show)
-            say("a move for the record")
-            shown = _show(watched, identified, tuned.gains, origin)
+            tuned = tune_target(from_here(watched, origin), policy, show=show)
+            say("a move for the record, with the gains before and the new ones")
+            shown = _show(watched, identified, before, tuned.gains, origin)
             say("the frequency response")
-            response, why = _response(watched, tuned.gains)
+            response, why = _response(from_here(watched, origin), tuned.gains)
         write_gains(target.drives, before)
         transaction.roll_back()  # everything but the gains is as it was
         write_gains(target.drives, tuned.gains)
@@ -95,18 +96,38 @@ def _gains(target: Target) -> Integers:
     return read_gains(target)
 
 
-def _show(target: Target, identified: Any, gains: Integers, origin: Integers) -> Any:
-    from drive_env.positioning import wrapped
+def _show(
+    target: Target, identified: Any, before: Integers, after: Integers, origin: Integers
+) -> tuple[tuple[bool, Any], ...]:
+    """Return recorded moves, each with whether it was made with the new gains.
+
+    Axes whose gains before are none to move with are left out of the first one.
+    """
+    from drive_env.gains import Gains
+    from tuning.auto_checks import unsafe_gains
     from tuning.linear_model import Plant
     from tuning.proving import ProvingGround
 
+    here = from_here(target, origin)
     plants = [
         Plant.from_identification(target.device, target.motor, float(volts), one)
         for volts, one in zip(target.supply, identified, strict=True)
     ]
+    unsafe = [
+        unsafe_gains(target.device, plant, Gains(*map(int, gains))) for plant, gains in zip(plants, before, strict=True)
+    ]
+    ground = ProvingGround(target, plants, (here.low, here.high), after, after)
+    safe, everywhere = np.array([not why for why in unsafe]), np.ones(target.num_axes, bool)
+    first = ((False, ground.show(before, safe)),) if safe.any() else ()
+    return (*first, (True, ground.show(after, everywhere)))
+
+
+def from_here(target: Target, origin: Integers) -> Target:
+    """Return the target with its travel counted from where the axes stand now: trials have moved them."""
+    from drive_env.positioning import wrapped
+
     gone = wrapped(target.drives.read(POSITION) - origin) / target.increments()
-    room = (target.low - gone, target.high - gone)
-    return ProvingGround(target, plants, room, gains, gains).show(gains, np.ones(target.num_axes, bool))
+    return replace(target, low=np.minimum(target.low - gone, 0.0), high=np.maximum(target.high - gone, 0.0))
 
 
 def _response(target: Target, gains: Integers) -> tuple[Any, str]:
@@ -131,6 +152,16 @@ def _response(target: Target, gains: Integers) -> tuple[Any, str]:
         motion.disable(drives)
 
 
+def _move(shown: Any, axis: int, tuned: bool) -> Any:
+    """Return the move of an axis for the certificate, in its own direction: every other one goes back."""
+    from tuning.certificate import StepResponse
+
+    way = np.sign(shown.demand[-1, axis]) or 1.0
+    demand, actual, current = (way * rows[:, axis] for rows in (shown.demand, shown.actual, shown.current))
+    figures = {"largest following error [rad]": float(np.abs(demand - actual).max())}
+    return StepResponse("move", tuned, "rad", shown.t, demand, actual, current, figures)
+
+
 def _certificate(
     target: Target,
     name: str,
@@ -149,10 +180,7 @@ def _certificate(
     axes = []
     for axis, one in enumerate(identified):
         supply = float(target.supply[axis])
-        move = c.StepResponse(
-            "move", True, "rad", shown.t, shown.demand[:, axis], shown.actual[:, axis], shown.current[:, axis],
-            {"largest following error [rad]": float(np.abs(shown.demand - shown.actual)[:, axis].max())},
-        )  # fmt: skip
+        moves = tuple(_move(one, axis, tuned) for tuned, one in shown if one.where[axis])
         loops: tuple[c.FrequencyResponse, ...] = ()
         if response is not None:
             loop = c.frequency_response(
@@ -164,13 +192,13 @@ def _certificate(
             c.AxisCertificate(
                 axis=axis,
                 accepted=True,
-                reason="the best of all trials by measured terms",
+                reason="the best of all trials, as the agent judges them",
                 identified=c.identified(one),
                 before=tuple(map(int, before[axis])),
                 after=tuple(map(int, after[axis])),
                 before_si=c.si_gains(target.device, supply, before[axis]),
                 after_si=c.si_gains(target.device, supply, after[axis]),
-                steps=(move,),
+                steps=moves,
                 frequency_responses=loops,
                 notes=(why,) if why else (),
                 hardware_seconds=seconds,

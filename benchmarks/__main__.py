@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks import bus, environments, gain_tuning, sweeps
+from benchmarks import bus, environments, gain_tuning, sweeps, training
 from drive_env import EmulatedDrives, motion
 from drive_env.firmware import cycle
 from mechanics.loads import LOADS
@@ -173,7 +173,8 @@ def main() -> None:
     console = Console()
     sizes = SIZES[:-1] if options.quick else SIZES
     with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("firmware, bound, loads, bus, environments, sweeps, start-up", total=6 + len(LOADS))
+        parts = "firmware, bound, loads, bus, environments, training, sweeps, start-up"
+        task = progress.add_task(parts, total=parts.count(",") + len(LOADS))
         result: dict[str, Any] = {"ns per drive and tick": ticks()}
         progress.advance(task)
         result["us per axis and ms, 64 machines, 1 thread"] = bound()
@@ -186,6 +187,8 @@ def main() -> None:
         progress.advance(task)
         result["environments"] = environments.figures() | gain_tuning.figures()
         progress.advance(task)
+        result["training"] = training.figures()
+        progress.advance(task)
         result["sweeps"] = sweeps.figures(options.quick)
         progress.advance(task)
         if not options.quick:
@@ -197,6 +200,7 @@ def main() -> None:
         "us per axis and ms, 64 machines, 1 thread",
         "bus",
         "environments",
+        "training",
         "sweeps",
         "start-up",
     ):

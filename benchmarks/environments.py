@@ -1,4 +1,4 @@
-"""Figures of the environments: Tracking in lanes and alone, its share of a training's time, its memory.
+"""Figures of the environments: Tracking in lanes and alone, GainScheduling, memory.
 
 What is compared is measured in turn, so that a slower moment of the machine slows both.
 """
@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -113,34 +112,6 @@ def alone() -> dict[str, float]:
     return {"Tracking, single Env.step/s": 1.0 / step, "Tracking, single, bare advance/s": 1.0 / advance}
 
 
-def share_of_training() -> dict[str, float]:
-    """Return the environment's share of the wall time of SB3's PPO with its default network; nothing without SB3."""
-    if find_spec("stable_baselines3") is None:
-        return {}
-    from stable_baselines3 import PPO
-
-    from drive_env.envs.stable_baselines import LanesVecEnv
-
-    env = LanesVecEnv(Tracking(LANES, num_threads=1, autoreset_mode="SameStep"))
-    spent = 0.0
-    step_wait = env.step_wait
-
-    def timed() -> Any:
-        nonlocal spent
-        start = time.perf_counter()
-        found = step_wait()
-        spent += time.perf_counter() - start
-        return found
-
-    env.step_wait = timed  # type: ignore[method-assign]
-    model = PPO("MlpPolicy", env, n_steps=256, batch_size=2048, device="cpu", seed=0)
-    start = time.perf_counter()
-    model.learn(256 * LANES * 3)
-    wall = time.perf_counter() - start
-    env.close()
-    return {"PPO on 64 lanes: the environment's share of wall time": spent / wall}
-
-
 def memory() -> dict[str, float]:
     """Return the largest memory of a process with many lanes, and of one with a single lane [MB]; on Linux alone."""
     if sys.platform != "linux":
@@ -159,7 +130,6 @@ def figures() -> dict[str, float]:
         **vectorised(MANY_LANES, (1, 2), 20),
         **alone(),
         **gain_scheduling(),
-        **share_of_training(),
         **memory(),
     }
 

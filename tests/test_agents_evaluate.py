@@ -11,13 +11,17 @@ from test_agents_bundle import ENTRIES, bundle, observations
 from test_parity import WorldBus
 from typer.testing import CliRunner
 
-from agents import episode_log, gap
+from agents import episode_log, evaluation_plots, gap
+from agents.both_sides import HIDDEN, on_both_sides
 from agents.bundle import Bundle, BundleError
 from agents.cli import app
 from agents.evaluation import AsOnABus, Evaluation, evaluate
+from agents.guard import GuardLimits
 from agents.policies import PolicyNotFoundError, open_policy
 from agents.policy import PolicyError, policy_of
 from agents.scores import interval
+from agents.served import draw_machines, emulated
+from agents.tasks import make_lanes
 from drive_env import CanDrives, EmulatedDrives, Limits, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
@@ -26,6 +30,7 @@ from drive_env.bus.world import World
 SHORT = {"load": "two_mass", "mode": "csp", "action": "offset", "duration": 0.05}
 SCORE = "RMS following error [rev]"
 TURN = 65536
+PATIENT = GuardLimits(saturation=None, stall=30.0)
 
 
 class Gentle:
@@ -38,6 +43,10 @@ class Gentle:
 
 def gentle(observation):  # module:function of the command line
     return Gentle().act(observation)
+
+
+def broken(observation):
+    return {}["speed"]
 
 
 def agent(path, **changes):
@@ -153,18 +162,89 @@ def test_a_report_is_saved_and_loaded(tmp_path):
 def test_over_can_in_lockstep_actions_and_figures_are_the_same():
     found = {}
     with EmulatedDrives(load="two_mass", num_threads=1) as emulated:
-        found["emulator"] = evaluate(Gentle(), "tracking", SHORT, drives=AsOnABus(emulated), episodes=2, side="one")
+        found["emulator"] = evaluate(
+            Gentle(), "tracking", SHORT, drives=AsOnABus(emulated), episodes=2, side="one", guard=PATIENT
+        )
     world = World(lockstep=True)
     world.add(EmulatedDrives(load="two_mass", num_threads=1), [1])
     bus = WorldBus(world)
     with CanDrives(bus=bus, pace="lockstep", safety=Limits(velocity=100 * TURN)) as drives:
-        found["bus"] = evaluate(Gentle(), "tracking", SHORT, drives=drives, episodes=2)
+        found["bus"] = evaluate(Gentle(), "tracking", SHORT, drives=drives, episodes=2, guard=PATIENT)
     bus.shutdown()
     world.close()
     for one, two in zip(found["emulator"].episodes, found["bus"].episodes, strict=True):
         assert np.array_equal(one.actions, two.actions) and np.array_equal(one.observations, two.observations)
     for row in gap.compare(found["emulator"], found["bus"]):
         assert row.paired and row.difference[:3] == (0.0, 0.0, 0.0)
+
+
+class Acting(Gentle):
+    """Acts on what it sees, in any environment."""
+
+    def __init__(self, actions):
+        self._weights = 0.2 * np.random.default_rng(3).standard_normal((64, actions))
+
+    def act(self, observation):
+        return np.clip(observation @ self._weights[: observation.shape[1]], -0.7, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("environment", "options", "actions", "score"),
+    [
+        ("tracking", SHORT, 1, SCORE),
+        ("tracking", {"load": "inverted_pendulum", "duration": 0.05}, 1, "time lasted [of the episode]"),
+        ("gain_scheduling", {"load": "belt", "duration": 0.1}, 3, "tracking term [0...1]"),
+        ("gain_scheduling", {"load": "two_mass", "mode": "csv", "excitation": "sine", "duration": 0.1}, 3,
+         "tracking term [0...1]"),
+        ("gain_tuning", {"trials": 2}, 3, HIDDEN),
+    ],
+)  # fmt: skip
+def test_on_the_same_drawn_machines_the_gap_in_lockstep_is_nothing(environment, options, actions, score):
+    """Each machine in this process and behind its own hub, for all environments, sensors and modes."""
+    both = on_both_sides(Acting(actions), environment, options, machines=2, seed=5, lockstep=True, guard=PATIENT)
+    assert both.missing == {} and both.inside.score == score and both.inside.seeds == [5, 6]
+    first, second = both.inside.values[score]
+    assert first != second or score.startswith("time")  # other machines
+    for one, two in zip(both.inside.episodes, both.bus.episodes, strict=True):
+        assert np.array_equal(one.actions, two.actions) and np.array_equal(one.observations, two.observations)
+    assert both.bus.values == both.inside.values
+
+
+def test_a_machine_that_cannot_be_judged_is_missing_on_both_sides():
+    class Wild(Gentle):
+        runs = 0
+
+        def reset(self, mask=None):
+            self.runs += 1
+
+        def act(self, observation):
+            last_one = self.runs > 10  # two machines, twice each: warm-up and episodes
+            return np.full((len(observation), 1), np.nan if last_one else 0.1)
+
+    both = on_both_sides(Wild(), "tracking", SHORT, machines=3, lockstep=True, guard=PATIENT)
+    assert list(both.missing) == [2] and "is nan, no number" in both.missing[2]
+    assert both.inside.seeds == both.bus.seeds == [0, 1]
+
+
+def test_in_real_time_machines_are_served_by_processes_of_their_own(tmp_path):
+    """How large the gap is a busy computer may say as it likes; that both sides are the same machine it may not."""
+    both = on_both_sides(Gentle(), "tracking", SHORT, machines=1, seed=3, guard=GuardLimits(saturation=None, stall=30))
+    if not both.missing:
+        assert both.bus.side == "bus" and both.again is not None
+        assert both.inside.values[SCORE] != both.again.values[SCORE]  # other noise
+        assert both.bus.values[SCORE][0] == pytest.approx(both.inside.values[SCORE][0], rel=20.0)
+        path = evaluation_plots.save_gap(both.inside, both.bus, tmp_path)
+        assert path.stat().st_size > 10_000
+
+
+def test_drawn_machines_are_those_of_the_seed_and_number():
+    config = make_lanes("tracking", 1, SHORT | {"distributions": "two_mass"}).config
+    three, five = draw_machines(config, 3, 7), draw_machines(config, 5, 7)
+    assert five[:3] == three and three[0].parameters != three[1].parameters
+    assert draw_machines(config, 1, 8)[0] != three[0]
+    with emulated(three[1], 0) as drives:
+        found = drives.machine.parameters
+    assert {name: float(found[name][0]) for name in three[1].parameters} == pytest.approx(three[1].parameters)
 
 
 def test_a_gap_is_found_and_told():
@@ -176,6 +256,9 @@ def test_a_gap_is_found_and_told():
     [row] = gap.compare(one, two)
     assert row.paired and row.difference[:3] == (0.5, 0.5, 0.5)
     assert "difference +0.5 (95 % of +0.5 to +0.5, +25.0%; paired by seed)" in gap.text([row], "a", "b")[0]
+    low, value, high = row.medians
+    assert value == pytest.approx(0.25) and pytest.approx(high) == 1.5 / 1.0 - 1.0 and low == pytest.approx(1.0 / 6.0)
+    assert "medians 2 and 2.5, +25.0% (95 % of +16.7% to +50.0%)" in gap.text([row], "a", "b")[0]
     two.environment = "ServoDrive/GainTuning-v0"
     with pytest.raises(ValueError, match="they are different tasks"):
         gap.compare(one, two)
@@ -189,7 +272,8 @@ def test_the_command_on_both_sides_and_the_gap(tmp_path, served):
     assert found.exit_code == 0 and re.search(r"RMS following error \[rev\]: \S+ \(95 % of", found.output)
     names = {"report.json", "episodes.npz", "figures.png", "episodes.png"}
     assert {one.name for one in (tmp_path / "one").iterdir()} == names
-    found = run("evaluate", path, "--episodes", 1, "--channel", channel, "--lockstep", "--against", "emulator")
+    bus = ("--channel", channel, "--lockstep", "--stall", 30)
+    found = run("evaluate", path, "--episodes", 1, *bus, "--against", "emulator")
     assert found.exit_code == 0, found.output
     assert "on the bus, 1 episodes" in found.output and "violations: 0" in found.output
     assert "difference +0 (95 % of +0 to +0, +0.0%; paired by seed)" in found.output
@@ -210,7 +294,7 @@ def test_a_policy_that_sticks_ends_the_command_with_a_line(tmp_path, served):
     made = Bundle.load(path)
     stuck = bundle(arrays=dict(made.arrays) | {"bias_0": np.full(1, 9.0, np.float32)}, configuration=made.configuration)
     stuck.save(path)
-    found = run("evaluate", path, "--channel", channel, "--lockstep")
+    found = run("evaluate", path, "--channel", channel, "--lockstep", "--stall", 30)
     assert found.exit_code == 1 and "Traceback" not in found.output
     assert "drive-agent: entry 0 of the policy's action has been at the end of its range for 100 ms" in found.output
     assert int(emulated.read(0x6041)[0]) & 0x4F == 0x40
@@ -230,6 +314,12 @@ def test_recorded_episodes_are_repeated(tmp_path):
     assert episode_log.repeat(Other(), episode_log.load(path))[:2] == pytest.approx((0.25, 0.25))
     told = run("evaluate", agent(tmp_path / "agent.npz"), "--replay", path)
     assert told.exit_code == 0 and "100 recorded steps: the policy's actions lie within" in told.output
+    told = run("evaluate", "test_agents_evaluate:gentle", "--replay", path, "--json")  # its environment is recorded
+    assert json.loads(told.output) == {"largest": 0.0, "rms": 0.0, "steps": 100}
+    told = run("evaluate", "gain_tuning", "--replay", path)
+    assert told.exit_code == 2 and "was recorded in ServoDrive/Tracking-v0, and gain_tuning acts in" in told.output
+    told = run("evaluate", "tracking_gantry", "--replay", path)  # two axes
+    assert told.exit_code == 1 and "the policy takes 16 entries" in told.output
 
 
 def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
@@ -261,6 +351,15 @@ def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
         (("nothing", "-e", "tracking", "--load", "moon"), "moon"),
         (("nothing", "-e", "tracking", "--replay", "no.npz"), "there is no file no.npz"),
         (("nothing", "-e", "tracking", "--channel", "socket://127.0.0.1:9"), "nobody answers at socket://127.0.0.1:9"),
+        (("nothing", "-e", "tracking", "--lockstep"), "--lockstep is of a bus; give its --channel, or --gap"),
+        (("nothing", "-e", "tracking", "--gap", "0"), "--gap 0 is too small"),
+        (("nothing", "-e", "tracking", "--gap", "2", "--node", "1"), "leave --node out"),
+        (("tracking_inverted_pendulum", "--gap", "2"), "judge it with --lockstep"),
+        (("nothing", "-e", "tracking", "--stall", "-1"), "--stall -1 must be a time [s], 0 for any"),
+        (("nothing", "-e", "tracking", "--seed", "-3"), "--seed -3 is too small"),
+        (("gain_tuning", "-e", "tracking"), "acts in ServoDrive/GainTuning-v0, not in ServoDrive/Tracking-v0"),
+        (("nobody",), "give an agent that ships (gain_tuning, tracking_"),
+        (("test_agents_evaluate:gentle", "--card"), "has no card"),
     ],
 )
 def test_a_mistake_is_told_in_one_line(arguments, message):
@@ -279,6 +378,38 @@ def test_python_functions_and_classes_are_policies(spec, environment, tmp_path):
     assert found.exit_code == 0 and f"{spec} in ServoDrive/Tracking-v0 on the emulator, 2 episodes" in found.output
     with pytest.raises(PolicyNotFoundError):
         open_policy("test_agents_evaluate:TURN")
+
+
+def test_an_agent_that_ships_goes_by_its_name_and_shows_its_card():
+    found = run("evaluate", "tracking_two_mass", "--card")
+    assert found.exit_code == 0 and "environment: ServoDrive/Tracking-v0" in found.output
+    assert "trained: ppo of Stable-Baselines3" in found.output and "RMS following error [rev]:" in found.output
+    assert json.loads(run("evaluate", "gain_tuning", "--card", "--json").output)["machines"] > 1000
+    assert run("evaluate", "tracking_two_mass", "--episodes", 1).exit_code == 0
+
+
+def test_another_load_brings_its_own_machines():
+    found = run("evaluate", "tracking_two_mass", "--load", "belt", "--episodes", 1)
+    assert found.exit_code == 0, found.output
+
+
+def test_what_the_policy_breaks_is_told_in_one_line():
+    found = run("evaluate", "test_agents_evaluate:broken", "-e", "tracking", "--episodes", 1)
+    assert found.exit_code == 1 and "Traceback" not in found.output
+    assert "the policy failed: KeyError: 'speed'" in found.output and "test_agents_evaluate.py, line" in found.output
+
+
+def test_the_gap_as_a_command(tmp_path):
+    path = agent(tmp_path / "agent.npz")
+    found = run("evaluate", path, "--gap", 2, "--lockstep", "--stall", 30, "--out", tmp_path / "out")
+    assert found.exit_code == 0, found.output
+    assert "on the bus, 2 episodes" in found.output
+    assert "difference +0 (95 % of +0 to +0, +0.0%; paired by seed)" in found.output
+    assert {"gap.png", "gap.txt", "report.json", "report-in-process.json"} <= {
+        p.name for p in (tmp_path / "out").iterdir()
+    }
+    stored = [Evaluation.load(tmp_path / "out" / name) for name in ("report.json", "report-in-process.json")]
+    assert stored[0].values == stored[1].values and stored[0].side != stored[1].side
 
 
 # --- ONNX -------------------------------------------------------------------------------------------------------------
@@ -314,7 +445,7 @@ def test_an_onnx_policy_refuses_what_is_no_number(tmp_path):
         OnnxPolicy(tmp_path / "no.onnx")
 
 
-def test_the_export_command_prints_differences_and_latency(tmp_path):
+def test_the_export_command_prints_differences_and_latency(tmp_path, monkeypatch):
     pytest.importorskip("onnxruntime")
     path = agent(tmp_path / "agent.npz")
     found = run("export", path)
@@ -323,3 +454,5 @@ def test_the_export_command_prints_differences_and_latency(tmp_path):
     assert (tmp_path / "agent.onnx").is_file()
     assert run("export", path, "--out", tmp_path / "agent.txt").exit_code == 2
     assert run("evaluate", tmp_path / "agent.onnx", "--episodes", 1).exit_code == 0
+    monkeypatch.chdir(tmp_path)  # one that ships is written here, not beside the package's file
+    assert run("export", "tracking_gantry").exit_code == 0 and (tmp_path / "tracking_gantry.onnx").is_file()

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
+import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from test_parity import WorldBus
 
+from agents.deadline import Deadline, DeadlineError
 from agents.evaluation import AsOnABus, evaluate
 from agents.guard import KEPT, GuardedPolicy, GuardLimits, PolicyStoppedError, stop
 from agents.policy import PolicyError
@@ -21,6 +26,12 @@ SWITCH_ON_DISABLED = (0x4F, 0x40)
 TURN = 65536
 OPTIONS = {"load": "inertia", "mode": "csv", "duration": 1.0}
 LOW, HIGH = np.array([-1.0, -0.5]), np.array([1.0, 0.5])
+
+
+# A busy computer answers late, too: only what is to be stopped for it may be.
+PATIENCE = 30.0
+PATIENT = GuardLimits(stall=PATIENCE)
+IMPATIENT = GuardLimits(stall=2.0)
 
 
 class Scripted:
@@ -38,27 +49,36 @@ class Scripted:
         pass
 
 
-def stall(seconds):
-    def then():
-        time.sleep(seconds)
-        return 0.3
-
-    return then
-
-
-def fail():
+def no_number():
     raise PolicyError("the policy's output is no number")
 
 
-WRONGS = [
-    (lambda: np.nan, r"entry 0 of the policy's action is nan, no number"),
-    (lambda: np.inf, r"entry 0 of the policy's action is inf, no number"),
-    (fail, "the policy's output is no number"),
-    (lambda: 1.0, r"at the end of its range for 100 ms, and the limit is 100 ms; .*--saturation"),
-    (lambda: -1.7, r"at the end of its range for 100 ms"),
-    (stall(0.12), r"the policy took 1\d\d ms for an action, and its limit is 100 ms; use a smaller network"),
-]
-NAMES = ["nan", "inf", "no number inside", "saturates", "saturates below", "stalls"]
+def fail():
+    return [0.3][7]
+
+
+def compute_for_ever():
+    while True:
+        pass
+
+
+def deadlock():
+    lock = threading.Lock()
+    lock.acquire()
+    lock.acquire()
+
+
+WRONGS = {
+    "nan": (lambda: np.nan, PATIENT, r"entry 0 of the policy's action is nan, no number"),
+    "inf": (lambda: np.inf, PATIENT, r"entry 0 of the policy's action is inf, no number"),
+    "no number inside": (no_number, PATIENT, "the policy's output is no number"),
+    "fails": (fail, PATIENT, r"the policy failed: IndexError: list index out of range \(.*guard.py, line \d+\)"),
+    "saturates": (lambda: 1.0, PATIENT, r"at the end of its range for 100 ms, and the limit is 100 ms; .*--saturation"),
+    "saturates below": (lambda: -1.7, PATIENT, r"at the end of its range for 100 ms"),
+    "computes for ever": (compute_for_ever, IMPATIENT, r"no answer for 2000 ms: it is too slow, or never returns"),
+    "deadlock": (deadlock, IMPATIENT, r"no answer for 2000 ms: it is too slow, or never returns; .*--stall"),
+}
+wrong_policies = pytest.mark.parametrize(("wrong", "guard", "message"), WRONGS.values(), ids=WRONGS)
 
 
 def is_disabled(drives):
@@ -67,8 +87,8 @@ def is_disabled(drives):
 
 
 # --- on drives --------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(("wrong", "message"), WRONGS, ids=NAMES)
-def test_over_can_the_drive_is_stopped_and_left_disabled(wrong, message):
+@wrong_policies
+def test_over_can_the_drive_is_stopped_and_left_disabled(wrong, guard, message):
     world = World(lockstep=True)
     emulated = EmulatedDrives(load="inertia", num_threads=1)
     world.add(emulated, [1])
@@ -79,19 +99,79 @@ def test_over_can_the_drive_is_stopped_and_left_disabled(wrong, message):
         CanDrives(bus=bus, pace="lockstep", safety=Limits(velocity=100 * TURN)) as drives,
         pytest.raises(PolicyStoppedError, match=message),
     ):
-        evaluate(Scripted(wrong), "tracking", OPTIONS, drives=drives, episodes=1)
+        evaluate(Scripted(wrong), "tracking", OPTIONS, drives=drives, episodes=1, guard=guard)
     assert max(speeds) > 2 * TURN  # it turned
     assert is_disabled(emulated) and abs(int(emulated.read(0x606C)[0])) < TURN // 4
     bus.shutdown()
     world.close()
 
 
-@pytest.mark.parametrize(("wrong", "message"), WRONGS[::3], ids=NAMES[::3])
-def test_drives_without_an_envelope_are_stopped_too(wrong, message):
+@wrong_policies
+def test_drives_in_this_process_are_stopped_too(wrong, guard, message):
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
         with pytest.raises(PolicyStoppedError, match=message):
-            evaluate(Scripted(wrong), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=1)
+            evaluate(Scripted(wrong), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=1, guard=guard)
         assert is_disabled(emulated) and abs(int(emulated.read(0x606C)[0])) < TURN // 4
+
+
+@pytest.mark.parametrize("wrong", [lambda: np.nan, fail], ids=["nan", "fails"])
+def test_on_emulated_machines_the_run_ends_as_well(wrong):
+    with pytest.raises(PolicyStoppedError):
+        evaluate(Scripted(wrong, after=5), "tracking", OPTIONS, episodes=2)
+
+
+def test_a_policy_that_fails_at_once_enables_nothing():
+    with EmulatedDrives(load="inertia", num_threads=1) as emulated:
+        words = []
+        write = emulated.write
+
+        def watch(name, value, **options):
+            words.append((name, value))
+            write(name, value, **options)
+
+        emulated.write = watch
+        with pytest.raises(PolicyStoppedError, match="IndexError"):
+            evaluate(Scripted(fail, after=0), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=1)
+        assert {value for name, value in words if name == 0x6040} <= {0x00, 0x02}  # disable voltage, quick stop
+
+
+def test_a_first_answer_may_take_its_time():
+    """What a policy loads or compiles for it; nothing is enabled yet."""
+    policy = Scripted(lambda: 0.3, after=0)
+
+    def load_first():
+        if policy.steps == 1:
+            time.sleep(0.5)
+        return 0.3
+
+    policy.then = load_first
+    with EmulatedDrives(load="inertia", num_threads=1) as emulated:
+        limits = GuardLimits(stall=0.4)
+        found = evaluate(policy, "tracking", OPTIONS | {"duration": 0.01}, drives=AsOnABus(emulated), episodes=1,
+                         guard=limits)  # fmt: skip
+    assert len(found.seeds) == 1
+
+
+def test_the_command_ends_though_the_policy_never_does(tmp_path):
+    (tmp_path / "hangs.py").write_text(
+        "import numpy as np\nasked = 0\n\n\ndef policy(observation):\n    global asked\n    asked += 1\n"
+        "    while asked > 200:\n        pass\n    return np.full((len(observation), 1), 0.3)\n"
+    )
+    (tmp_path / "tracking.toml").write_text('load = "inertia"\nmode = "csv"\n')
+    world = World(lockstep=True)
+    emulated = EmulatedDrives(load="inertia", num_threads=1)
+    world.add(emulated, [1])
+    hub = Hub()
+    with Server(world, hub):
+        command = ("evaluate", "hangs:policy", "-e", "tracking", "--config", "tracking.toml", "--lockstep", "--stall",
+                   "2", "--interface", "slcan", "--channel", hub.channel)  # fmt: skip
+        ended = subprocess.run(
+            [sys.executable, "-m", "agents.cli", *command], cwd=tmp_path, capture_output=True, text=True, timeout=300
+        )
+    assert ended.returncode == 1, ended.stderr
+    assert "drive-agent: the policy gave no answer for 2000 ms" in ended.stderr and "Traceback" not in ended.stderr
+    assert is_disabled(emulated)
+    world.close()
 
 
 def test_the_stop_is_a_ramp_and_not_a_coasting():
@@ -110,7 +190,9 @@ def test_the_stop_is_a_ramp_and_not_a_coasting():
 
 def test_after_the_evaluation_the_drive_is_at_rest_and_disabled():
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
-        found = evaluate(Scripted(None, after=10**6), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=2)
+        found = evaluate(
+            Scripted(None, after=10**6), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=2, guard=PATIENT
+        )
         assert is_disabled(emulated) and len(found.seeds) == 2 and not found.violations
 
 
@@ -130,7 +212,7 @@ def test_gains_offsets_and_mode_are_as_before(environment, options, then):
         policy = Acting(then, after=10**6 if then is None else 5)
         options = {"load": "inertia", "duration": 0.1, **options}
         with contextlib.nullcontext() if then is None else pytest.raises(PolicyStoppedError):
-            evaluate(policy, environment, options, drives=AsOnABus(emulated), episodes=1)
+            evaluate(policy, environment, options, drives=AsOnABus(emulated), episodes=1, guard=PATIENT)
         assert [int(emulated.read(name)[0]) for name in KEPT] == before and is_disabled(emulated)
 
 
@@ -140,44 +222,36 @@ def test_an_interrupt_stops_the_drive_too():
 
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
         with pytest.raises(KeyboardInterrupt):
-            evaluate(Scripted(interrupt), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=1)
+            evaluate(Scripted(interrupt), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=1, guard=PATIENT)
         assert is_disabled(emulated)
 
 
-def test_while_a_policy_stalls_in_real_time_the_envelope_has_stopped_the_drive_already():
-    """Not when it comes back: a policy may never do so."""
+def test_in_real_time_the_drive_stops_while_the_policy_still_stalls():
+    """A policy that comes back after all finds the drive disabled."""
     world = World(lockstep=False)
     emulated = EmulatedDrives(load="inertia", num_threads=1)
     world.add(emulated, [1])
     hub = Hub()
-    seen = []
-
-    def then():
-        before = time.monotonic()
-        while time.monotonic() - before < 5.0:  # long: a busy computer's threads come late
-            time.sleep(0.05)
-            if is_disabled(emulated) and time.monotonic() - before > 0.3:
-                break
-        seen.append(is_disabled(emulated))
-        return 0.3
-
-    limits = GuardLimits(saturation=None, stall=0.1)
+    stopped = threading.Event()
+    policy = Scripted(lambda: stopped.wait(PATIENCE) and 0.3, after=50)
     try:
         with (
             Server(world, hub),
-            CanDrives(channel=hub.channel, safety=Limits(velocity=100 * TURN, stall=0.1)) as drives,
-            pytest.raises((PolicyStoppedError, SafetyError)) as told,
+            CanDrives(channel=hub.channel, safety=Limits(velocity=100 * TURN, stall=1.0)) as drives,
         ):
-            evaluate(Scripted(then, after=50), "tracking", OPTIONS, drives=drives, episodes=1, guard=limits)
-        assert seen in ([True], []), "the drive went on while the policy stalled"
-        assert "quick-stopped" in str(told.value) or "the policy took" in str(told.value)
-        assert is_disabled(emulated)
+            with pytest.raises((PolicyStoppedError, SafetyError), match=r"gave no answer|quick-stopped"):
+                evaluate(policy, "tracking", OPTIONS, drives=drives, episodes=1, guard=GuardLimits(stall=1.0))
+            assert is_disabled(emulated) and not stopped.is_set()
     finally:
+        stopped.set()
         world.close()
 
 
 # --- the watch alone --------------------------------------------------------------------------------------------------
-def watched(actions, limits=None, step=0.01):
+OBSERVATION = np.zeros((1, 3))
+
+
+def watched(actions, limits=PATIENT, step=0.01):
     rows = iter(actions)
 
     class Listed:
@@ -187,7 +261,7 @@ def watched(actions, limits=None, step=0.01):
         def reset(self, mask=None):
             pass
 
-    return GuardedPolicy(Listed(), LOW, HIGH, step, limits or GuardLimits())
+    return GuardedPolicy(Listed(), LOW, HIGH, step, limits)
 
 
 @pytest.mark.parametrize(
@@ -205,9 +279,9 @@ def test_saturation_is_counted_in_steps(actions, steps):
     for k in range(20):
         if steps is not None and k == steps - 1:
             with pytest.raises(PolicyStoppedError, match="end of its range"):
-                policy.act(None)
+                policy.act(OBSERVATION)
             return
-        policy.act(None)
+        policy.act(OBSERVATION)
 
 
 def test_a_new_episode_counts_anew():
@@ -215,18 +289,111 @@ def test_a_new_episode_counts_anew():
     for k in range(18):
         if k == 9:
             policy.reset(None)
-        policy.act(None)
+        policy.act(OBSERVATION)
 
 
 def test_one_action_is_no_sticking_however_long_its_step():
     policy = watched([[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]], step=0.75)
     for _ in range(3):
-        policy.act(None)
+        policy.act(OBSERVATION)
 
 
 def test_limits_can_be_lifted_and_are_checked():
     policy = watched([[1.0, 0.5]] * 500, GuardLimits(saturation=None, stall=None))
     for _ in range(500):
-        policy.act(None)
+        policy.act(OBSERVATION)
     with pytest.raises(ValueError, match="stall must be above 0 s, not 0 s; None for no limit"):
         GuardLimits(stall=0.0)
+
+
+def test_an_answer_that_takes_just_the_limit_is_late():
+    policy = GuardedPolicy(Scripted(lambda: time.sleep(0.1) or 0.3, after=0), LOW[:1], HIGH[:1], 0.001, GuardLimits())
+    with pytest.raises(PolicyStoppedError, match="no answer for 100 ms"):
+        policy.act(OBSERVATION)
+    patient = GuardedPolicy(Scripted(lambda: time.sleep(0.1) or 0.3, after=0), LOW[:1], HIGH[:1], 0.001, PATIENT)
+    assert patient.act(OBSERVATION) == np.float32(0.3)
+    patient.close()
+
+
+def test_an_answer_that_is_taken_late_is_late_whoever_was_slow(monkeypatch):
+    clock = iter([0.0, 0.099, 1.0, 1.1])
+    monkeypatch.setattr("agents.guard.time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    policy = GuardedPolicy(Scripted(None, after=9), LOW[:1], HIGH[:1], 0.001, GuardLimits(stall=0.1))
+    monkeypatch.setattr(policy._deadline, "call", lambda function, argument, within: function(argument))
+    policy.act(OBSERVATION)
+    with pytest.raises(PolicyStoppedError, match="no answer for 100 ms"):
+        policy.act(OBSERVATION)
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (np.zeros((1, 3)), r"has shape \(1, 3\); 1 lane\(s\) of this environment take \(1, 2\)"),
+        ("left", "is a str, no array of numbers"),
+        (None, "is a NoneType, no array of numbers"),
+        ([[0.1], [0.2, 0.3]], "is a list, no array of numbers"),
+    ],
+)
+def test_an_action_of_another_kind_is_told(answer, message):
+    class Odd:
+        def act(self, observation):
+            return answer
+
+        def reset(self, mask=None):
+            pass
+
+    with pytest.raises(PolicyStoppedError, match=message):
+        GuardedPolicy(Odd(), LOW, HIGH, 0.01, PATIENT).act(OBSERVATION)
+
+
+# --- the deadline -----------------------------------------------------------------------------------------------------
+@pytest.fixture
+def threads():
+    """Returns the threads of policies that this test began."""
+    before = set(threading.enumerate())
+    return lambda: [thread for thread in set(threading.enumerate()) - before if thread.name == "policy"]
+
+
+def wait_for(condition):
+    until = time.monotonic() + PATIENCE
+    while not condition() and time.monotonic() < until:
+        time.sleep(0.01)
+    return condition()
+
+
+def test_a_call_returns_what_it_returns_and_raises_what_it_raises(threads):
+    deadline = Deadline()
+    with np.errstate(divide="raise"):
+        assert deadline.call(divmod, 7, 2, within=PATIENCE) == (3, 1)
+        with pytest.raises(ZeroDivisionError):
+            deadline.call(divmod, 7, 0, within=PATIENCE)
+        with pytest.raises(FloatingPointError):  # the thread's handling of errors is the caller's
+            deadline.call(np.divide, np.ones(1), np.zeros(1), within=PATIENCE)
+    assert len(threads()) == 1
+    deadline.close()
+    assert not threads()
+
+
+def test_a_call_that_is_late_is_given_up_and_what_it_says_then_is_no_answer_to_the_next(threads):
+    deadline, go = Deadline(), threading.Event()
+    with pytest.raises(DeadlineError, match=r"no answer within 0\.05 s"):
+        deadline.call(lambda: go.wait(PATIENCE) and "late", within=0.05)
+    go.set()
+    assert wait_for(lambda: not threads())
+    assert deadline.call(lambda: "next", within=PATIENCE) == "next"
+    deadline.close()
+
+
+def test_a_thread_that_computes_for_ever_does_not(threads):
+    deadline = Deadline()
+    with pytest.raises(DeadlineError):
+        deadline.call(compute_for_ever, within=0.05)
+    assert wait_for(lambda: not threads())
+
+
+def test_a_policy_that_nobody_holds_any_more_leaves_no_thread(threads):
+    policy = GuardedPolicy(Scripted(None, after=9), LOW[:1], HIGH[:1], 0.001, PATIENT)
+    policy.act(OBSERVATION)
+    assert len(threads()) == 1
+    del policy
+    assert wait_for(lambda: not threads())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,15 +12,17 @@ import pytest
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
-from agents import checkpoint, hyperparameters, training
+from agents import checkpoint, hyperparameters, search, training
 from agents.baselines import baseline
 from agents.bundle import Bundle
 from agents.evaluation import evaluate
 from agents.hyperparameters import ALGORITHMS, HyperparameterError, read_value
+from agents.imitation import imitate
 from agents.policies import open_policy
 from agents.policy import policy_of
+from agents.shipped import TUNER, shipped
 from agents.tasks import ENVIRONMENTS, environment_name, make_lanes
-from agents.training import AGENT, CHECKPOINT, TABLE, Run, train
+from agents.training import AGENT, CHECKPOINT, TABLE, DivergedError, Run, train
 
 TINY = {"ServoDrive/Tracking-v0": {"duration": 0.01}, "ServoDrive/GainScheduling-v0": {"duration": 0.02},
         "ServoDrive/GainTuning-v0": {"trials": 1}}  # fmt: skip
@@ -32,6 +35,7 @@ def tiny(environment="tracking", algorithm="ppo", timesteps=192, **changes):
     hyperparameters.merge(
         given, {"n_envs": 4, "n_timesteps": timesteps, "env_kwargs": {**TINY[name], "num_threads": 1}}
     )
+    given["imitate"] = None  # takes longer than all the rest
     small = {"learning_starts": 8, "buffer_size": 500, "batch_size": 16, "gradient_steps": 1}
     if algorithm != "sac":
         small = {"n_steps": 8, "batch_size": 16, "n_epochs": 2}
@@ -137,7 +141,10 @@ def test_a_policy_begins_as_what_it_imitates(tmp_path):
         "policy_kwargs": {"log_std_init": -2.5},
     }
     run = tiny(**small, env_kwargs={"action": "offset", "mode": "csp", "duration": 0.2, "num_threads": 1}, n_steps=16)
-    bundle = train(run, tmp_path)
+    told = []
+    bundle = train(run, tmp_path, report=told.append)
+    shares = [progress.imitated for progress in told if not progress.timesteps]
+    assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == 1.0 and len(shares) > 100
     options = {"episodes": 4, "seed": 5}
     lanes = make_lanes(run.environment, 1, bundle.configuration)
     lanes.close()
@@ -152,6 +159,86 @@ def test_a_policy_begins_as_what_it_imitates(tmp_path):
     }
     assert np.mean(error["teacher"]) < 0.5 * np.mean(error["nothing"])
     assert np.mean(error["agent"]) < np.mean(error["teacher"]) + 0.25 * np.mean(error["nothing"])
+
+
+class Constant:
+    """A teacher that always does the same, and what it was shown."""
+
+    def __init__(self, action):
+        self.action, self.entries = action, set()
+
+    def act(self, observation):
+        self.entries.add(observation.shape[1])
+        return np.tile(self.action, (len(observation), 1))
+
+    def reset(self, mask=None):
+        pass
+
+
+def test_an_asymmetric_critic_learns_from_the_machine_while_the_actor_imitates():
+    teacher = Constant(np.float32([0.3, -0.2, 0.1]))
+    run = tiny("gain_tuning")
+    lanes, env = training.make_env(run)
+    model, _ = training.make_model(run, env)
+    actor, critic = (model.policy.mlp_extractor.policy_net[0].weight, model.policy.mlp_extractor.value_net[0].weight)
+    seen, before = actor.shape[1], critic.detach().clone()
+    assert imitate(model, teacher, seed=1, steps=24, updates=200) < 0.02
+    lanes.close()
+    assert teacher.entries == {seen}  # not the true machine
+    moved = (critic - before).abs().max(dim=0).values
+    assert moved[seen:].max() > 1e-3
+
+
+def test_the_shipped_tuner_is_a_baseline_of_its_own_gains():
+    lanes = make_lanes("gain_tuning", 1, {"num_threads": 1})
+    policy = baseline("surrogate", "gain_tuning", lanes.config, 3)
+    lanes.close()
+    ships = Bundle.load(shipped(TUNER))
+    assert all(np.array_equal(policy.bundle.arrays[name], array) for name, array in ships.arrays.items())
+    assert policy.bundle.settings == {**ships.settings, "step": lanes.config.step}  # the action's bound
+    with pytest.raises(ValueError, match="surrogate changes the gains velocity_p, velocity_i, position_p"):
+        baseline("surrogate", "gain_tuning", replace(lanes.config, gains=("position_p", "velocity_p", "velocity_i")), 3)
+
+
+# --- rewards ----------------------------------------------------------------------------------------------------------
+def both(environment, options, wrapper):
+    """Lanes as they are, and the same behind a reward of agents.rewards."""
+    plain = make_lanes(environment, 4, {**options, "num_threads": 1}, autoreset_mode="SameStep")
+    name = environment_name(environment)
+    settings = {"n_envs": 4, "env_kwargs": {**options, "num_threads": 1}, "vec_env_wrapper": wrapper}
+    _, env = training.make_env(Run(name, "ppo", settings))
+    env.seed(7)
+    return plain, plain.reset(seed=7), env, env.reset()
+
+
+def test_each_trial_earns_its_own_hidden_j_over_the_rules():
+    lanes, (_, told), env, _ = both("gain_tuning", {"trials": 2}, {"agents.rewards:EachTrial": {"limit": 0.4}})
+    rng, rule, limited = np.random.default_rng(0), told["hidden"], 0
+    for _ in range(4):  # two episodes: the second one's machines have other rules
+        action = rng.uniform(-0.7, 0.7, (4, 3)).astype(np.float32)
+        _, _, _, ended, told = lanes.step(action)
+        gained = np.log(rule) - np.log(told.get("final_info", told)["trial_hidden"])
+        env.step_async(action)
+        assert env.step_wait()[1] == pytest.approx(np.clip(gained, -0.4, 0.4), rel=1e-5)
+        limited += np.sum(np.abs(gained) > 0.4)
+        rule = told["hidden"] if ended.all() else rule
+    lanes.close(), env.close()
+    assert 0 < limited < 16
+
+
+def test_small_errors_cost_thousandths_of_the_amplitude():
+    settings = {"error": 0.002, "effort": 3.0, "smoothness": 5.0}
+    lanes, (rows, _), env, _ = both("tracking", {"duration": 0.004}, {"agents.rewards:SmallErrors": settings})
+    rng = np.random.default_rng(0)
+    for step in range(8):
+        action, before = rng.uniform(-0.3, 0.3, (4, 1)).astype(np.float32), rows[:, 7]
+        rows, _, _, ended, told = lanes.step(action)
+        final = np.stack(told["final_obs"]) if ended.all() else rows
+        cost = np.abs(final[:, 0]) / 0.002 + 3.0 * final[:, 4] ** 2 + 5.0 * (final[:, 7] - before) ** 2
+        env.step_async(action)
+        assert env.step_wait()[1] == pytest.approx(-cost, rel=1e-4)
+        assert ended.all() == (step % 4 == 3)
+    lanes.close(), env.close()
 
 
 # --- hyper-parameters -------------------------------------------------------------------------------------------------
@@ -241,8 +328,100 @@ def test_hyperparameters_that_the_algorithm_does_not_take_are_told(tmp_path):
         train(tiny(tau=0.1), tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"n_steps": 0}, "ppo does not take these hyper-parameters: .*n_steps=0"),
+        ({"normalize": {"norm_foo": 1}}, "normalize does not take these hyper-parameters: .*'norm_foo'"),
+        ({"vec_env_wrapper": {"agents.rewards:SmallErrors": {"foo": 1}}}, "SmallErrors does not take .*'foo'"),
+        ({"imitate": {"nothing": {"stepz": 1}}}, "imitate nothing does not take these hyper-parameters: .*'stepz'"),
+        ({"policy": "agents.asymmetric:AsymmetricPolicy"}, "needs an observation with 'observation' first .*MlpPolicy"),
+        ({"policy_kwargs": {"activation_fn": "nn.Sigmoid"}}, "Sigmoid between its layers; a bundle holds one of Tanh"),
+        ({"learning_rate": 1e6}, "the training diverged: .*Use a smaller learning_rate"),
+    ],
+)
+def test_what_cannot_be_trained_is_told_and_leaves_no_agent(changes, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        train(tiny(**changes), tmp_path)
+    assert not (tmp_path / AGENT).exists() and not (tmp_path / CHECKPOINT).exists()
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("n_envs: 2.5", "n_envs must be a whole number of 1 or more, not 2.5"),
+        ("n_envs: -1", "n_envs must be a whole number of 1 or more, not -1"),
+        ("n_timesteps: many", "n_timesteps must be a whole number of 1 or more, not 'many'"),
+        ("normalize: 'no'", "normalize is true, false or VecNormalize's settings, not 'no'"),
+        ("policy: null", "policy is missing"),
+    ],
+)
+def test_a_wrong_entry_is_told_with_its_file(entry, message, tmp_path):
+    path = tmp_path / "own.yaml"
+    rows = {"n_envs": "n_envs: 1", "n_timesteps": "n_timesteps: 1e3", "policy": "policy: MlpPolicy"}
+    rows[entry.partition(":")[0]] = entry
+    path.write_text("ServoDrive/Tracking-v0:\n" + "".join(f"  {row}\n" for row in rows.values()))
+    with pytest.raises(HyperparameterError, match=f"own.yaml: {message}"):
+        hyperparameters.load("tracking", "ppo", path=path)
+
+
+# --- search -----------------------------------------------------------------------------------------------------------
+def drawn_in(folder):
+    """State, learning rate and score of a study's trials."""
+    optuna = pytest.importorskip("optuna")
+    journal = optuna.storages.journal
+    storage = optuna.storages.JournalStorage(journal.JournalFileBackend(str(folder / search.JOURNAL)))
+    study = optuna.load_study(study_name="ServoDrive/Tracking-v0 ppo", storage=storage)
+    return [(trial.state.name, trial.params["learning_rate"], trial.value) for trial in study.trials]
+
+
+def test_a_killed_search_goes_on_behind_the_lost_trial_and_draws_anew(tmp_path, monkeypatch):
+    run, trained = tiny(timesteps=32), []
+
+    def killed_in_the_third(one, folder):
+        trained.append(folder)
+        if len(trained) == 3:
+            raise SystemExit  # nothing of the trial is told to the journal
+        return train(one, folder)
+
+    monkeypatch.setattr(search, "train", killed_in_the_third)
+    options = {"seed": 4, "episodes": 2}
+    with pytest.raises(SystemExit):
+        search.search(run.environment, "ppo", run.hyperparameters, tmp_path, trials=5, **options)
+    assert "learning_rate" in (tmp_path / search.BEST).read_text()  # of the two that are over
+    best = search.search(run.environment, "ppo", run.hyperparameters, tmp_path, trials=2, **options)
+    rows = drawn_in(tmp_path)
+    assert [state for state, _, _ in rows] == ["COMPLETE", "COMPLETE", "RUNNING", "COMPLETE", "COMPLETE"]
+    assert len({rate for _, rate, _ in rows}) == 5
+    assert best["learning_rate"] == min((value, rate) for _, rate, value in rows if value is not None)[1]
+    other = tmp_path / "again"
+    monkeypatch.setattr(search, "train", train)
+    search.search(run.environment, "ppo", run.hyperparameters, other, trials=2, **options)
+    assert drawn_in(other) == rows[:2]  # one seed, one search
+
+
+def test_a_training_that_diverges_is_a_trial_that_failed(tmp_path, monkeypatch):
+    run, told = tiny(timesteps=32), []
+    trained = iter([{"learning_rate": 1e6}, {}])
+
+    def train_so(one, folder):
+        return train(replace(one, hyperparameters={**one.hyperparameters, **next(trained)}), folder)
+
+    monkeypatch.setattr(search, "train", train_so)
+    search.search(run.environment, "ppo", run.hyperparameters, tmp_path, trials=2, episodes=2,
+                  told=lambda trial, best: told.append((trial.score, best)))  # fmt: skip
+    assert told[0] == (None, None) and told[1][1].number == 1 and told[1][1].score == told[1][0]
+
+
+def test_a_search_without_any_agent_says_so(tmp_path, monkeypatch):
+    run = tiny(timesteps=32, max_grad_norm=1e9)
+    monkeypatch.setitem(search.SPACES, "ppo", (search.Row("learning_rate", choices=(1e6,)),))
+    with pytest.raises(DivergedError, match="all 1 trainings diverged; give a smaller learning_rate"):
+        search.search(run.environment, "ppo", run.hyperparameters, tmp_path, trials=1)
+
+
 def test_there_is_nothing_to_resume(tmp_path):
-    with pytest.raises(ValueError, match="there is no file"):
+    with pytest.raises(ValueError, match=r"no file .*checkpoint\.zip to go on with: a run writes its first"):
         train(tiny(), tmp_path, resume=True)
     (tmp_path / CHECKPOINT).write_bytes(b"no")
     with pytest.raises(ValueError, match="is no checkpoint"):

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import threading
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from agents.cli import app
+from agents.commands.tune import _emulated_node
+from agents.guard import PolicyStoppedError
 from agents.policy import PolicyError, load_policy
 from agents.shipped import shipped
 from agents.tuner import surrogate, tune_target
+from agents.tuning_run import from_here
 from agents.tuning_run import run as run_agent
+from drive_env import motion
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.motion import OPERATION_ENABLED
 from tuning.certificate import load_certificate
@@ -69,7 +74,14 @@ def test_it_tunes_an_emulated_drive_over_its_bus_and_certifies_it(tmp_path):
     assert tuple(axis.after[2:]) in tried
     assert axis.identified["inertia"].low < axis.identified["inertia"].value < axis.identified["inertia"].high
     assert axis.frequency_responses[0].margins["phase margin [deg]"] > 10.0
-    assert axis.steps[0].actual[-1] == pytest.approx(axis.steps[0].reference[-1], rel=0.1)
+    assert [step.tuned for step in axis.steps] == [False, True]  # the same move, with the gains before and the new ones
+    for step in axis.steps:
+        assert step.actual[-1] == pytest.approx(step.reference[-1], rel=0.1) and step.reference[-1] > 0.0
+    before, after = (step.figures["largest following error [rad]"] for step in axis.steps)
+    assert after < 0.5 * before  # the commissioned gains are slow
+    assert "agent gain_tuning tunes tmcm1636 with qbl4208: two_mass, emulated" in lines[0]
+    assert any(line.startswith("velocity loop: phase margin") for line in lines)
+    assert "the drive keeps the new gains over a power cycle" in lines
     before = load_snapshot(tmp_path / "run" / "before.toml")
     assert tuple(before.axes[0][key] for key in GAIN_OBJECTS) == axis.before
     assert (tmp_path / "run" / "report.html").is_file()
@@ -81,14 +93,6 @@ def test_json_for_programs(tmp_path):
     assert code == 0
     assert found["J"] <= found["J of the rule"]
     assert found["stored"] is True  # the node keeps it: 1010h
-
-
-def test_a_dry_run_says_what_would_be_done_and_does_nothing(tmp_path):
-    code, out, _ = command("--dry-run", "--out", tmp_path / "run")
-    assert code == 0
-    assert "1 + 10 trials of 3 moves" in out
-    assert out.rstrip().endswith("Nothing was written.")
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
@@ -117,6 +121,55 @@ def test_a_policy_that_gives_no_number_leaves_the_drive_as_it_was_and_disabled(t
             run_agent(target, Broken(1), tmp_path / "before.toml", name="broken")
         assert np.array_equal(gains(target), before)
         assert not is_enabled(target).any()
+
+
+def test_a_tuner_that_never_returns_ends_the_run_and_leaves_the_drive_of_a_bus_as_it_was(tmp_path):
+    class Hanging(Broken):
+        def act(self, observation):
+            self._good -= 1
+            if self._good < -1:  # it was asked once before anything moved
+                threading.Event().wait(600.0)
+            return self._policy.act(observation)
+
+    with _emulated_node("tmcm1636", "qbl4208", "inertia", None, None, None) as target:
+        before = gains(target)
+        with pytest.raises(PolicyStoppedError, match="no answer for 1000 ms: it is too slow, or never returns"):
+            run_agent(target, Hanging(1), tmp_path / "before.toml", name="hanging")
+        assert np.array_equal(gains(target), before) and not is_enabled(target).any()
+
+
+def test_the_travel_is_counted_from_where_trials_have_left_the_axis():
+    turn = 2.0 * np.pi
+    with emulated("tmcm1636", "inertia", "qbl4208", travel=(-turn, 2.0 * turn)) as target:
+        origin = target.drives.read(0x6064)
+        motion.enable(target.drives, mode="pp")
+        motion.move_to(target.drives, origin + 65536 // 2)
+        here = from_here(target, origin)
+    assert (here.low[0], here.high[0]) == pytest.approx((-1.5 * turn, 1.5 * turn), rel=1e-2)
+
+
+class Contrary:
+    """A tuner that lowers all gains, and answers those of its first look."""
+
+    def __init__(self):
+        self.bundle = load_policy(shipped("gain_tuning")).bundle
+
+    def reset(self, mask=None):
+        pass
+
+    def act(self, observation):
+        return np.full((len(observation), 3), -0.2, np.float32)
+
+    def answer(self, observation):
+        return -observation[:, 7:10]  # ln of the incumbent's gains over the rule's
+
+
+def test_the_answer_is_the_tuners_own_where_it_makes_one():
+    with emulated("tmcm1636", "inertia", "qbl4208") as target:
+        found = tune_target(target, Contrary(), trials=1)
+        assert np.array_equal(gains(target), found.gains)
+    assert np.array_equal(found.gains, found.trials[0].gains)
+    assert not np.array_equal(found.gains, found.trials[1].gains)
 
 
 def test_it_starts_from_any_gains():

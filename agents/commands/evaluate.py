@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import sys
+import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from agents.commands.options import (
+    REFUSED,
     Bitrate,
     Channel,
     Interface,
@@ -17,14 +19,18 @@ from agents.commands.options import (
     Nodes,
     Seed,
     errors_as_exit_codes,
+    fail,
     new_folder,
     print_json,
+    progress_bar,
 )
 
 EMULATOR = "emulator"
 BUS_EPISODES, EPISODES = 8, 64
-LATE = 1.05  # times the time that steps should take: worth a word
-BUS_OPTIONS = ("interface", "channel", "node")
+# Times the time that steps should take; share of SYNCs (each tears a hole into a move): from here on worth a word.
+SLOW, LATE = 1.05, 0.0005
+BUS_OPTIONS = ("bus", "interface", "channel", "node")
+NOT_OF_A_GAP = (*BUS_OPTIONS, "bitrate", "device", "episodes", "against", "replay", "sensor")
 
 
 def evaluate(
@@ -32,8 +38,8 @@ def evaluate(
     policy: Annotated[
         str,
         typer.Argument(
-            help="agent.npz, checkpoint.zip, agent.onnx, module:function, or a baseline: nothing, feed_forward, "
-            "state_feedback."
+            help="An agent that ships, by name, agent.npz, checkpoint.zip, agent.onnx, module:function, or a baseline: "
+            "nothing, feed_forward, state_feedback."
         ),
     ],
     environment: Annotated[
@@ -59,17 +65,36 @@ def evaluate(
     sensor: Annotated[
         str | None, typer.Option("--sensor", help="module:function that returns the pendulum's angles [rad] on a bus.")
     ] = None,
-    stall: Annotated[float, typer.Option(help="Longest time for an action on a bus [s]; 0 for any.")] = 0.1,
+    stall: Annotated[
+        float | None,
+        typer.Option(
+            help="On a bus, time without an action [s] after which a policy stalls; 0 for any.",
+            show_default="0.1, between trials of gains 1",
+        ),
+    ] = None,
     saturation: Annotated[
-        float, typer.Option(help="Longest time with an action at the end of its range on a bus [s]; 0 for any.")
-    ] = 0.1,
+        float | None,
+        typer.Option(
+            help="On a bus, time with an action at the end of its range [s] after which a policy sticks; 0 for any.",
+            show_default="0.1, for trials of gains any",
+        ),
+    ] = None,
     against: Annotated[
         str | None, typer.Option("--against", help="Report the gap to this report.json, or to the `emulator`.")
+    ] = None,
+    gap: Annotated[
+        int | None,
+        typer.Option(
+            "--gap",
+            help="Judge it on so many drawn machines twice, in this process and over CAN, each served by a "
+            "`drive-env serve` of its own in real time (with --lockstep without), and report the gap.",
+        ),
     ] = None,
     replay: Annotated[
         Path | None,
         typer.Option("--replay", help="Act on nothing: repeat an episodes.npz, or a CSV of `drive-env scope`."),
     ] = None,
+    card: Annotated[bool, typer.Option("--card", help="Print the agent's card, and stop.")] = False,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for report, episodes and pictures, new or empty.")
     ] = None,
@@ -77,22 +102,36 @@ def evaluate(
 ) -> None:
     """Run episodes of a policy: score with a 95 % interval, violations, pictures; on both sides the same command.
 
-    On a bus it acts inside the safety envelope; a policy that gives no number, sticks at its limit or stalls is
-    stopped, and the drives are left at rest and disabled. `--out` keeps report.json, episodes.npz and pictures.
+    On a bus it acts inside the safety envelope; a policy that gives no number, sticks at its limit, stalls or never
+    returns is stopped, and the drives are left at rest and disabled. `--out` keeps report.json, episodes.npz and
+    pictures. In real time other programs disturb: on Linux, `chrt -f 10 drive-agent evaluate ...` goes before them.
     """
     with errors_as_exit_codes():
-        for name, value in (("--episodes", episodes), ("--seed", seed + 1)):
+        for name, value in (("--episodes", episodes), ("--gap", gap), ("--seed", seed + 1)):
             if value is not None and value < 1:
-                raise ValueError(f"{name} {value} is too small")
-        if stall < 0.0 or saturation < 0.0:
-            raise ValueError("--stall and --saturation are times [s], 0 for any")
-        loaded, configuration = _open(policy, environment, load, config)
+                raise ValueError(f"{name} {value - (name == '--seed')} is too small")
+        for name, limit in (("--stall", stall), ("--saturation", saturation)):
+            if limit is not None and not 0.0 <= limit < math.inf:
+                raise ValueError(f"{name} {limit:g} must be a time [s], 0 for any")
+        if card:
+            _tell_card(policy, json)
+            return
+        on_bus = any(_was_typed(context, one) for one in BUS_OPTIONS)
+        if lockstep and not on_bus and gap is None:
+            raise ValueError("--lockstep is of a bus; give its --channel, or --gap")
+        if gap is not None and (extra := [one for one in NOT_OF_A_GAP if _was_typed(context, one)]):
+            raise ValueError(f"--gap serves machines of its own, an episode each; leave --{extra[0]} out")
+        recording = None if replay is None or replay.suffix.lower() == ".csv" else _recording(replay)
+        recorded = None if recording is None else recording.environment
+        loaded, configuration = _open(policy, environment, load, config, recorded)
         if replay is not None:
-            _replay(loaded, configuration, replay, json)
+            _replay(loaded, configuration, replay, recording, json)
             return
         folder = None if out is None else new_folder(out, "evaluate")
-        on_bus = bus or any(_was_typed(context, one) for one in BUS_OPTIONS)
-        guard = _guard(stall, saturation)
+        guard = _guard(loaded.environment, stall, saturation)
+        if gap is not None:
+            _both_sides(loaded, configuration, gap, seed, lockstep, guard, folder, json)
+            return
         count = episodes or (BUS_EPISODES if on_bus else EPISODES)
         options = {"episodes": count, "seed": seed, "guard": guard, "name": policy}
         found = (
@@ -103,32 +142,31 @@ def evaluate(
         )  # fmt: skip
         gaps: list[str] = []
         if against is not None:
-            from agents import gap
-            from agents.evaluation import Evaluation
-
-            other = (
-                _on_emulator(loaded, configuration, options, as_on_a_bus=True)
-                if against == EMULATOR
-                else Evaluation.load(against)
-            )
-            gaps = gap.text(gap.compare(other, found), other.side, found.side)
+            gaps = _against(loaded, configuration, options, against, found)
         _tell(found, gaps, json)
         if folder is not None:
-            _save(found, folder, gaps)
+            _save(found, folder, gaps, json)
 
 
-def _open(text: str, environment: str | None, load: str | None, config: Path | None) -> tuple[Any, dict[str, Any]]:
-    """Return the policy, its environment filled in, and the environment's options."""
+def _open(
+    text: str, environment: str | None, load: str | None, config: Path | None, otherwise: str | None = None
+) -> tuple[Any, dict[str, Any]]:
+    """Return the policy, its environment filled in (`otherwise` if nobody says it), and the environment's options."""
     import tomllib
 
     from agents.baselines import BASELINES, baseline
     from agents.policies import LoadedPolicy, open_policy
     from agents.tasks import environment_name, make_lanes
+    from drive_env.envs.randomisation import shipped as shipped_distributions
 
     names = {name for rows in BASELINES.values() for name in rows}
     loaded = LoadedPolicy(text, None) if text in names else open_policy(text)
     if environment is not None:
-        loaded.environment = environment_name(environment)
+        wanted = environment_name(environment)
+        if loaded.environment not in (None, wanted):
+            raise ValueError(f"{text} acts in {loaded.environment}, not in {wanted}; leave --environment out")
+        loaded.environment = wanted
+    loaded.environment = loaded.environment or otherwise
     if loaded.environment is None:
         raise ValueError(f"{text} does not say its environment; give --environment")
     configuration = dict(loaded.configuration)
@@ -138,6 +176,8 @@ def _open(text: str, environment: str | None, load: str | None, config: Path | N
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ValueError(f"--config {config} is no TOML: {error}") from None
     if load is not None:
+        if configuration.get("distributions") == configuration.get("load"):  # the old load's own
+            configuration["distributions"] = load if load in shipped_distributions() else None
         configuration["load"] = load
     if loaded.policy is None:
         lanes: Any = make_lanes(loaded.environment, 1, configuration)
@@ -147,19 +187,75 @@ def _open(text: str, environment: str | None, load: str | None, config: Path | N
     return loaded, configuration
 
 
+def _against(
+    loaded: Any, configuration: dict[str, Any], options: dict[str, Any], against: str, found: Any
+) -> list[str]:
+    """Return the gap of what was found to the emulator, or to an earlier report."""
+    from agents import gap
+    from agents.evaluation import Evaluation
+
+    other = (
+        _on_emulator(loaded, configuration, options, as_on_a_bus=True)
+        if against == EMULATOR
+        else Evaluation.load(against)
+    )
+    return gap.text(gap.compare(other, found), other.side, found.side)
+
+
+def _both_sides(
+    loaded: Any,
+    configuration: dict[str, Any],
+    machines: int,
+    seed: int,
+    lockstep: bool,
+    guard: Any,
+    folder: Path | None,
+    json: bool,
+) -> None:
+    """Judge a policy on machines in this process and over their bus, and tell the gap."""
+    from agents import evaluation_plots, gap
+    from agents.both_sides import on_both_sides
+
+    with progress_bar(f"{machines} machines, in this process and over CAN") as show:
+        both = on_both_sides(
+            loaded.policy, loaded.environment, configuration, machines=machines, seed=seed, name=loaded.name,
+            lockstep=lockstep, guard=guard, told=show,
+        )  # fmt: skip
+    gaps = gap.text(gap.compare(both.inside, both.bus), "in process", "over CAN")
+    if both.again is not None:  # of the score alone: how much of its gap is chance
+        chance = gap.compare(both.inside, both.again)[:1]
+        gaps += [f"noise alone: {line}" for line in gap.text(chance, "in process", "in process with other noise")]
+    _tell(both.bus, gaps, json, missing=both.missing)
+    if folder is not None:
+        _save(both.bus, folder, gaps, json)
+        both.inside.save(folder / "report-in-process.json")
+        evaluation_plots.save_gap(both.inside, both.bus, folder)
+    if both.missing:
+        fail(
+            f"{len(both.missing)} of {machines} machines could not be judged over the bus; of the first: "
+            f"{next(iter(both.missing.values()))}",
+            REFUSED,
+        )
+
+
 def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, Any], as_on_a_bus: bool = False) -> Any:
     from agents.evaluation import AsOnABus
     from agents.evaluation import evaluate as run
 
+    title = f"{loaded.name} on the emulator"
     if not as_on_a_bus:
-        return run(loaded.policy, loaded.environment, configuration, **{**options, "guard": None}, told=_told())
+        with progress_bar(title) as show:
+            return run(loaded.policy, loaded.environment, configuration, **{**options, "guard": None}, told=show)
     from agents.tasks import make_lanes
     from drive_env.drives import EmulatedDrives
 
     lanes: Any = make_lanes(loaded.environment, 1, configuration)
     config = lanes.config
     lanes.close()
-    with EmulatedDrives(config.device, config.load, config.motor, 1, friction=config.friction) as drives:
+    with (
+        EmulatedDrives(config.device, config.load, config.motor, 1, friction=config.friction) as drives,
+        progress_bar(title) as show,
+    ):
         joint = getattr(getattr(config, "task", None), "joint", None)
         sensor = None if joint is None else lambda: drives.machine.joint_positions[:, joint]
         return run(
@@ -169,6 +265,7 @@ def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, 
             drives=AsOnABus(drives),
             sensor=sensor,
             side="emulator as on a bus",
+            told=show,
             **options,
         )
 
@@ -178,27 +275,36 @@ def _on_bus(
 ) -> Any:
     from agents.evaluation import evaluate as run
     from agents.on_the_bus import drives_for
+    from agents.policies import find_object
 
-    function = None
-    if sensor is not None:
-        from agents.training import found
-
-        function = found(sensor)
-    with drives_for(loaded.environment, configuration, options["guard"], **where) as drives:
+    function = None if sensor is None else find_object(sensor)
+    with (
+        drives_for(loaded.environment, configuration, options["guard"], **where) as drives,
+        progress_bar(f"{loaded.name} on the bus") as show,
+    ):
         return run(
-            loaded.policy, loaded.environment, configuration, drives=drives, sensor=function, told=_told(), **options
+            loaded.policy, loaded.environment, configuration, drives=drives, sensor=function, told=show, **options
         )
 
 
-def _replay(loaded: Any, configuration: dict[str, Any], path: Path, json: bool) -> None:
+def _recording(path: Path) -> Any:
+    from agents import episode_log
+
+    return episode_log.load(path)
+
+
+def _replay(loaded: Any, configuration: dict[str, Any], path: Path, recording: Any, json: bool) -> None:
     """Say what the policy would have done in recorded episodes, or how far the emulator lies from a recorded move."""
-    if path.suffix.lower() == ".csv":
+    if recording is None:
         _replay_move(configuration, path, json)
         return
     from agents import episode_log
 
-    recording = episode_log.load(path)
-    found = episode_log.repeat(loaded.policy, recording)
+    if recording.environment != loaded.environment:
+        raise ValueError(f"{path} was recorded in {recording.environment}, and {loaded.name} acts in "
+                         f"{loaded.environment}")  # fmt: skip
+    with progress_bar("repeating") as show:
+        found = episode_log.repeat(loaded.policy, recording, told=show)
     if json:
         print_json(found._asdict())
         return
@@ -228,16 +334,14 @@ def _replay_move(configuration: dict[str, Any], path: Path, json: bool) -> None:
         )
 
 
-def _guard(stall: float, saturation: float) -> Any:
-    from agents.guard import GuardLimits
+def _guard(environment: str, stall: float | None, saturation: float | None) -> Any:
+    """Return the limits of a policy on given drives: the environment's own, but what the user says."""
+    from dataclasses import replace
 
-    return GuardLimits(saturation=saturation or None, stall=stall or None)
+    from agents.guard import LIMITS
 
-
-def _told() -> Any:
-    if not sys.stderr.isatty():
-        return None
-    return lambda done, total: print(f"\r{done} of {total} episodes", end="", file=sys.stderr, flush=True)
+    given = {"stall": stall, "saturation": saturation}
+    return replace(LIMITS[environment], **{name: value or None for name, value in given.items() if value is not None})
 
 
 def _was_typed(context: typer.Context, name: str) -> bool:
@@ -246,7 +350,7 @@ def _was_typed(context: typer.Context, name: str) -> bool:
     return source is not None and source.name == "COMMANDLINE"
 
 
-def _tell(found: Any, gaps: list[str], json: bool) -> None:
+def _tell(found: Any, gaps: list[str], json: bool, missing: Mapping[int, str] | None = None) -> None:
     if json:
         print_json(
             {
@@ -256,7 +360,9 @@ def _tell(found: Any, gaps: list[str], json: bool) -> None:
                 "figures": {name: found.interval(name)._asdict() for name in found.values},
                 "violations": found.violations,
                 "pace": found.pace,
+                "late": found.late,
                 "gap": gaps,
+                "missing": dict(missing or {}),
             }
         )
         return
@@ -267,16 +373,17 @@ def _tell(found: Any, gaps: list[str], json: bool) -> None:
     count = sum(found.violations.values())
     which = "".join(f", {number} x {name}" for name, number in found.violations.items())
     print(f"violations: {count}{which}")
-    if found.pace > LATE:
+    if found.pace > SLOW or found.late > LATE:
         print(
-            f"steps took {found.pace:.2f} times the time that they should: this computer is too slow or too busy, and "
-            "the figures show that; end other programs, or take a lower rate or a smaller network"
+            f"steps took {found.pace:.2f} times the time that they should, {found.late:.1%} of the SYNCs in them were "
+            "more than a cycle late: this computer is too slow or too busy, and the figures show that; end other "
+            "programs, put `chrt -f 10` before the command (Linux), or take a lower rate or a smaller network"
         )
     for line in gaps:
         print(line)
 
 
-def _save(found: Any, folder: Path, gaps: list[str]) -> None:
+def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
     from agents import episode_log, evaluation_plots
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -285,4 +392,30 @@ def _save(found: Any, folder: Path, gaps: list[str]) -> None:
     evaluation_plots.save(found, folder)
     if gaps:
         (folder / "gap.txt").write_text("\n".join(gaps) + "\n", encoding="utf-8")
-    print(f"written to {folder}")
+    if not json:
+        print(f"written to {folder}")
+
+
+def _tell_card(text: str, json: bool) -> None:
+    """Print how an agent was trained and what it reaches."""
+    from agents.policies import open_policy
+
+    loaded = open_policy(text)
+    about = {"environment": loaded.environment, **loaded.card}
+    if not loaded.card:
+        raise ValueError(f"{text} has no card: it was not made by drive-agent")
+    if json:
+        print_json(about)
+        return
+    for line in _lines(about):
+        print(line)
+
+
+def _lines(table: Mapping[str, Any], indent: str = "") -> Iterator[str]:
+    for name, value in table.items():
+        if isinstance(value, Mapping):
+            yield f"{indent}{name}:"
+            yield from _lines(value, indent + "  ")
+        else:
+            number = f"{value:.4g}" if isinstance(value, float) else value
+            yield f"{indent}{name}: {', '.join(map(str, value)) if isinstance(value, list) else number}"

@@ -11,7 +11,7 @@ from agents.commands.options import Json, errors_as_exit_codes, print_json
 
 
 def export(
-    agent: Annotated[str, typer.Argument(help="agent.npz or checkpoint.zip.")],
+    agent: Annotated[str, typer.Argument(help="agent.npz, checkpoint.zip, or an agent that ships, by name.")],
     out: Annotated[Path | None, typer.Option("--out", help="The .onnx file.", show_default="beside the agent")] = None,
     json: Json = False,
 ) -> None:
@@ -26,9 +26,11 @@ def export(
         from agents.onnx_policy import OnnxPolicy
         from agents.policies import open_policy
         from agents.policy import measure_latency, policy_of
+        from agents.shipped import shipped_names
 
-        if not agent.lower().endswith((".npz", ".zip")):
-            raise ValueError(f"{agent} must be an agent (.npz) or a checkpoint (.zip)")
+        if agent not in shipped_names() and not agent.lower().endswith((".npz", ".zip")):
+            raise ValueError(f"{agent} must be an agent (.npz), a checkpoint (.zip), or one that ships: "
+                             f"{', '.join(shipped_names())}")  # fmt: skip
         path = Path(agent).with_suffix(".onnx") if out is None else out
         if path.suffix.lower() != ".onnx":
             raise ValueError(f"--out {path} must end in .onnx")

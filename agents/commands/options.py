@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -20,6 +20,9 @@ from drive_env.tools.options import print_json as print_json
 
 # Whatever takes long to import (torch, the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
 REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
+# Packages of the extra `agents`, which training and ONNX need.
+OF_EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard", "onnx", "onnxruntime", "yaml")
+EXTRA = "pip install 'drive-env[agents]'"
 
 Environment = Annotated[str, typer.Argument(help="gain_tuning, gain_scheduling or tracking.")]
 Algorithm = Annotated[str, typer.Option("--algorithm", "-a", help="ppo, sac or recurrent_ppo.")]
@@ -47,6 +50,18 @@ def new_folder(path: Path | None, name: str) -> Path:
 
 
 @contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
+    """Show a bar on stderr while something long goes on, if that is a terminal; what is given takes the share done."""
+    if not sys.stderr.isatty():
+        yield lambda share: None
+        return
+    from tuning.commands.options import progress_bar as bar
+
+    with bar(title) as show:
+        yield show
+
+
+@contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: 1 for what drive, bus or the watch say, 2 for the user's mistake, 130 for Ctrl-C."""
     from agents.policy import PolicyError
@@ -60,6 +75,9 @@ def errors_as_exit_codes() -> Iterator[None]:
         fail(error)
     except (PolicyError, SafetyError, BusError, TimeoutError) as error:
         fail(error, REFUSED)
+    except ModuleNotFoundError as error:
+        remedy = f"; {EXTRA}" if (error.name or "").partition(".")[0] in OF_EXTRA else ""
+        fail(f"{error}{remedy}")
     except (ObjectAccessError, ValueError, ImportError) as error:
         fail(error)
     except RuntimeError as error:  # motion: an axis is in fault

@@ -45,8 +45,10 @@ def search(
         short = ENVIRONMENTS[environment_name(environment)].short
         folder = Path("runs") / f"search-{short}-{algorithm}" if out is None else out
 
-        def tell(trial: Trial, best: Trial) -> None:
-            print(f"trial {trial.number}: {trial.score:.4g}; best {best.score:.4g} of trial {best.number}", flush=True)
+        def tell(trial: Trial, best: Trial | None) -> None:
+            score = "diverged" if trial.score is None else f"{trial.score:.4g}"
+            so_far = "none yet" if best is None else f"{best.score:.4g} of trial {best.number}"
+            print(f"trial {trial.number}: {score}; best {so_far}", flush=True)
 
         run_search(environment, algorithm, given, folder, trials=trials, seed=seed, told=tell)
         print(f"written to {folder / BEST}")

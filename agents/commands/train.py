@@ -33,6 +33,7 @@ LINES = 10  # of progress where nobody watches a terminal
 
 
 def train(
+    context: typer.Context,
     environment: Environment = "gain_tuning",
     algorithm: Algorithm = "ppo",
     preset: Preset = "quick",
@@ -50,7 +51,7 @@ def train(
     """
     with errors_as_exit_codes():
         from agents.tasks import ENVIRONMENTS
-        from agents.training import AGENT, CHECKPOINT, Run, with_figures
+        from agents.training import AGENT, CHECKPOINT, Run, run_to_resume, with_figures
         from agents.training import train as run_training
 
         if resume is None:
@@ -62,12 +63,11 @@ def train(
             run = Run(environment, algorithm, given, seed=seed, preset=preset)
             folder = new_folder(out, f"{ENVIRONMENTS[run.environment].short}-{algorithm}")
         else:
-            from agents import checkpoint
-
-            if out is not None or load is not None or config is not None or steps is not None:
-                raise ValueError("--resume goes on as the run began; leave --out, --load, --config and --steps out")
+            given_too = [name for name in given_options(context) if name != "--resume"]
+            if given_too:
+                raise ValueError(f"--resume goes on with the run as it began; leave {', '.join(given_too)} out")
             folder = resume
-            run = Run(**checkpoint.read_run(folder / CHECKPOINT)["run"])
+            run = run_to_resume(folder)
         try:
             with progress(f"{run.environment} {run.algorithm}") as report:
                 bundle = run_training(run, folder, report=report, resume=resume is not None)
@@ -84,6 +84,12 @@ def train(
             found = evaluation.interval(name)
             print(f"{name}: {found.mean:.4g} (95 % of {found.low:.4g} to {found.high:.4g}), median {found.median:.4g}")
         print(f"written to {folder / AGENT}")
+
+
+def given_options(context: typer.Context) -> list[str]:
+    """Return the options and arguments that the user gave, as they are written."""
+    sources = ((one, context.get_parameter_source(str(one.name))) for one in context.command.params)
+    return [one.opts[0] for one, source in sources if source is not None and source.name == "COMMANDLINE"]
 
 
 def judge(bundle: Any) -> Any:
@@ -109,8 +115,9 @@ def with_load(
 
 @contextmanager
 def progress(title: str) -> Iterator[Report]:
-    """Show how far a training is, with speed and reward terms: a line that changes, or some lines in a file."""
-    from rich.console import Console
+    """Show how far a training is, with speed and reward terms: a bar with a line below, or some lines in a file."""
+    from rich.console import Console, Group
+    from rich.live import Live
     from rich.progress import (
         BarColumn,
         Progress,
@@ -119,6 +126,7 @@ def progress(title: str) -> Iterator[Report]:
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.text import Text
 
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -139,15 +147,25 @@ def progress(title: str) -> Iterator[Report]:
         TaskProgressColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[text]}"),
     )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task(title, total=1.0, text="")
-        yield lambda state: bar.update(task, completed=state.timesteps / max(state.total, 1), text=text(state))
+    bar = Progress(*columns, console=console)
+    task = bar.add_task(title, total=1.0)
+    with Live(bar, console=console) as live:
+
+        def show(state: Any) -> None:
+            bar.update(task, completed=state.timesteps / max(state.total, 1))
+            # On a line of its own: beside the bar a terminal of 80 columns would cut the terms off.
+            live.update(Group(bar, Text(text(state))))
+
+        yield show
 
 
 def text(state: Progress) -> str:
     """Return speed, share of the environment, mean return and reward terms in words."""
+    if state.imitated < 1.0:
+        return f"it learns what its teacher does: {state.imitated:.0%}"
+    if not state.means:
+        return "it has learnt what its teacher does"
     terms = ", ".join(f"{name} {value:.3g}" for name, value in state.terms.items())
     return (
         f"{state.speed:,.0f} steps/s ({state.environment_share:.0%} environment), "

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from agents.commands.options import (
+    REFUSED,
     Bitrate,
     Channel,
     Interface,
@@ -17,11 +19,15 @@ from agents.commands.options import (
     Nodes,
     Out,
     errors_as_exit_codes,
+    fail,
     new_folder,
     print_json,
 )
 from drive_env.tools.options import DeviceName, Yes
 from tuning.commands.options import MotorName, Supply, TravelRange
+
+PATIENCE = 30.0  # s, for a node in this process: one that is slow says that the computer is busy, not that it is gone
+GAIN_NAMES = ("torque P", "torque I", "velocity P", "velocity I", "position P")
 
 if TYPE_CHECKING:
     from agents.tuner import TrialShown
@@ -86,10 +92,13 @@ def tune(
             if interface is None:
                 target = stack.enter_context(_emulated_node(device, motor, load, seed, supply, travel))
             else:
+                if dry_run:
+                    _look_first(interface, channel, node or [1], bitrate, device)
                 target = stack.enter_context(_on_bus(interface, channel, node, bitrate, lockstep, device, motor, supply,
                                                      travel))  # fmt: skip
             if dry_run:
-                _tell_plan(target, policy)
+                if not _tell_plan(target, policy, store, json):
+                    fail("a run would not begin: see the lines with 'no'", REFUSED)
                 return
             if interface is not None:
                 ask(f"The motor of node {', '.join(map(str, node or [1]))} will turn. Is its way clear?", yes)
@@ -129,7 +138,8 @@ def _emulated_node(
     hub = Hub()
     try:
         with Server(world, hub), on_bus(
-            device, motor, interface="slcan", channel=hub.channel, nodes=[1], supply=volts, travel=ways, pace="lockstep"
+            device, motor, interface="slcan", channel=hub.channel, nodes=[1], supply=volts, travel=ways,
+            pace="lockstep", timeout=PATIENCE,
         ) as target:  # fmt: skip
             from dataclasses import replace
 
@@ -159,22 +169,59 @@ def _on_bus(
         yield target
 
 
-def _tell_plan(target: Target, policy: Any) -> None:
-    """Print what a run would do; the drive is read, and nothing else."""
-    from drive_env.gains import Gains
-    from tuning.trial_bench import first_gains, read_gains
+def _look_first(interface: str, channel: str | None, nodes: list[int], bitrate: int | None, device: str) -> None:
+    """Raise NoAnswerError for a node that is silent: to open it as drives would send it an NMT command."""
+    from drive_env.master.description import describe
+    from drive_env.master.errors import NoAnswerError
+    from drive_env.master.port import Port, open_bus
+    from drive_env.master.sdo import SdoClient
 
-    has, begins = Gains(*map(int, read_gains(target)[0])), Gains(*map(int, first_gains(target)[0]))
+    port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
+    try:
+        for node in nodes:
+            SdoClient(port, node).read(0x1000, 0, "1000h:00 Device type", describe(device, None).answer_timeout)
+    except NoAnswerError as error:
+        raise NoAnswerError(f"{error}; if it is stopped (NMT), a run would take it to pre-operational") from None
+    finally:
+        port.close()
+
+
+def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:
+    """Print what was found and what a run would do; the drive is read, and nothing else. Return whether it would."""
+    from agents.rehearsal import rehearse
+
+    found = rehearse(target, keep=keep)
     trials = policy.bundle.configuration["trials"]
-    print(f"drive: {target.device.name}, motor {target.motor.name}, {target.machine}")
-    print(f"gains that it has: {_gains_text(has)}")
-    print(f"travel {target.low[0]:.3g} to {target.high[0]:.3g} rad from here, at most {target.speed:.4g} rad/s, "
-          f"{target.current:.3g} A")  # fmt: skip
-    print(f"it would begin with {_gains_text(begins)}, identify, and make 1 + {trials} trials of 3 moves of 250 ms;")
-    print(
-        "what oscillates would be stopped within 50 ms; gains lie within 1...32767; profile 6081h, 6083h, 6084h, mode"
-    )
-    print("6060h and controlword 6040h would be written. Nothing was written.")
+    if json:
+        print_json(
+            {
+                "would run": not found.refused,
+                "checks": [check._asdict() for check in found.checks],
+                "writes": [write._asdict() for write in found.writes],
+            }
+        )
+        return not found.refused
+    print(f"dry run on {target.device.name}, {target.motor.name}, {target.machine}: the drive is read, nothing else")
+    for check in found.checks:
+        print(f"  {check.verdict:<4}  {check.what}: {check.found}")
+    print(f"a run would identify (about 4 s), make 1 + {trials} trials of 3 moves of 250 ms, what oscillates stopped "
+          "within 50 ms,")  # fmt: skip
+    print("show a move and measure the frequency response; then the drive keeps the best gains. It would write:")
+    for _, group in groupby(found.writes, key=lambda write: write.why):
+        _tell_writes(list(group))
+    print("What does not stay is put back at the end, and all of it if something goes wrong.")
+    print("Nothing was written.")
+    return not found.refused
+
+
+def _tell_writes(group: list[Any]) -> None:
+    """Print objects that are written for the same thing: which, what they hold now, and to what."""
+    first = group[0]
+    objects = ", ".join(f"{index:04X}h:{sub:02X}" for index, sub in (write.key for write in group))
+    values = [value for write in group for value in write.present or ()]
+    now = ", ".join(f"{value:X}h" if first.key[0] < 0x2000 else str(value) for value in values) or "not there"
+    to = f", then {first.values}" if first.values else ""
+    print(f"  {objects}: {first.why}; now {now}{to}{'; stays' if first.stays else ''}")
 
 
 def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, json: bool) -> Run:
@@ -183,11 +230,15 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
     def show(trial: TrialShown) -> None:
         if json:
             return
-        mark = "stopped: it oscillated or tripped" if trial.aborted[0] else "better" if trial.better[0] else ""
-        what = "rule" if trial.number == 0 else f"{trial.number}"
+        mark = "better" if trial.better[0] else ""
+        if trial.number == 0:
+            mark = "the fitted rule's gains, from which the agent sets out"
+        elif trial.aborted[0]:
+            mark = "stopped: it oscillated or tripped"
         velocity_p, velocity_i, position_p = trial.gains[0, 2:]
         print(
-            f"{what:>5} {velocity_p:>11} {velocity_i:>11} {position_p:>11} {trial.measured[0]:>8.3f}  {mark}",
+            f"{trial.number or 'rule':>5} {velocity_p:>11} {velocity_i:>11} {position_p:>11} "
+            f"{trial.measured[0]:>8.3f}  {mark}".rstrip(),
             flush=True,
         )
 
@@ -195,8 +246,12 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
         if not json:
             print(what, flush=True)
             if what == "trials":
+                print("J, less is better, counts settling time, stiffness, noise and overshoot of a move, its reversal")
+                print("and the move with 1.5 times velocity P, which shows how near to oscillation the gains are.")
                 print("trial  velocity P  velocity I  position P        J")
 
+    if not json:
+        print(f"agent {agent} tunes {target.device.name} with {target.motor.name}: {target.machine}")
     folder.mkdir(parents=True, exist_ok=True)
     return run(target, policy, folder / "before.toml", name=agent, keep=store, show=show, say=say)
 
@@ -204,7 +259,8 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
 def _report(result: Run, folder: Path, json: bool) -> None:
     certificate, report = result.certificate.save(folder)
     axis = result.certificate.axes[0]
-    first, best = result.trials[0].measured[0], min(float(trial.measured[0]) for trial in result.trials)
+    first = result.trials[0].measured[0]
+    best = next(float(one.measured[0]) for one in reversed(result.trials) if (one.gains[0] == axis.after).all())
     if json:
         print_json(
             {
@@ -214,16 +270,13 @@ def _report(result: Run, folder: Path, json: bool) -> None:
             }
         )  # fmt: skip
         return
-    from drive_env.gains import Gains
-
-    print(f"before: {_gains_text(Gains(*axis.before))}")
-    print(f"after:  {_gains_text(Gains(*axis.after))}")
-    print(f"J by measured terms {best:.3f}, {100.0 * best / first:.0f} % of the fitted rule's {first:.3f}; "
+    print(f"{'':<7}{''.join(f'{name:>12}' for name in GAIN_NAMES)}")
+    for name, gains in (("before", axis.before), ("after", axis.after)):
+        print(f"{name:<7}{''.join(f'{value:>12}' for value in gains)}")
+    print(f"J {best:.3f}, {100.0 * best / first:.0f} % of the fitted rule's {first:.3f}; "
           f"{axis.hardware_seconds:.1f} s of drive time, {axis.aborts} trials stopped")  # fmt: skip
-    print(f"written to {folder}: before.toml, certificate.json, report.html")
-
-
-def _gains_text(gains: Any) -> str:
-    return ", ".join(
-        f"{name.replace('_p', ' P').replace('_i', ' I')} {value}" for name, value in gains._asdict().items()
-    )
+    for loop in axis.frequency_responses:
+        print(f"{loop.name}: " + ", ".join(f"{name} {value:.3g}" for name, value in loop.margins.items()))
+    print("the drive keeps the new gains over a power cycle" if result.kept else "the drive has the new gains until it "
+          "is switched off")  # fmt: skip
+    print(f"written to {folder}: report.html to read, certificate.json, before.toml for `drive-tune restore`")

@@ -58,10 +58,13 @@ def load(
     for key in chosen:
         merge(found, {name: read_value(value) for name, value in (table.get(key) or {}).items()})
     for key in ("n_envs", "n_timesteps", "policy"):
-        if key not in found:
+        if found.get(key) is None:
             raise HyperparameterError(f"{file}: {key} is missing in section {name}")
     for key in ("n_envs", "n_timesteps"):
-        found[key] = int(found[key])
+        found[key] = _whole(file, key, found[key])
+    normalize = found.get("normalize")
+    if not isinstance(normalize, (bool, Mapping, type(None))):
+        raise HyperparameterError(f"{file}: normalize is true, false or VecNormalize's settings, not {normalize!r}")
     return found
 
 
@@ -122,6 +125,12 @@ class Linear:
     def __call__(self, remaining: float) -> float:
         """Return the value when so much of the run is left, 1...0."""
         return self.first * remaining
+
+
+def _whole(file: Path, key: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != round(value) or value < 1:
+        raise HyperparameterError(f"{file}: {key} must be a whole number of 1 or more, not {value!r}")
+    return int(value)
 
 
 def _file(environment: str, algorithm: str, path: str | Path | None) -> Path:
