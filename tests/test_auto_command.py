@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from drive_env.gains import RAW_MAX
-from tuning import auto as auto_module
+from tuning import auto_search, auto_settings
 from tuning.certificate import is_unchanged
 from tuning.cli import app
 from tuning.snapshot import load_snapshot
@@ -70,7 +70,7 @@ def test_auto_does_not_write_into_a_folder_with_something_in_it(tmp_path):
 
 
 def test_auto_leaves_the_way_back_a_certificate_and_a_report(tmp_path, monkeypatch):
-    monkeypatch.setattr(auto_module, "GENERATIONS", 4)
+    monkeypatch.setattr(auto_search, "GENERATIONS", 4)
     out = tmp_path / "run"
     done = drive_tune("auto", "--load", "inertia", "--out", out, "--json")
     assert done.exit_code == 0, done.output
@@ -85,7 +85,7 @@ def test_auto_leaves_the_way_back_a_certificate_and_a_report(tmp_path, monkeypat
 
 
 def test_auto_ends_with_1_and_says_why_where_it_rolled_back(tmp_path, monkeypatch):
-    monkeypatch.setattr(auto_module, "LEAST_WAY", 1e9)
+    monkeypatch.setattr(auto_settings, "LEAST_WAY", 1e9)
     done = drive_tune("auto", "--load", "belt", "--out", tmp_path / "run")
     assert done.exit_code == 1
     assert "axis 0 was rolled back: the travel is too short" in " ".join(done.stdout.split())

@@ -19,6 +19,7 @@ from tuning import tuners
 from tuning.cli import app
 from tuning.compare import compare, save
 from tuning.optimise import Optimised, Row, Settings
+from tuning.shard_log import ShardLog
 from tuning.suite import load_suite, open_group
 from tuning.trial_bench import read_gains
 from tuning.trials_files import trials_figure
@@ -154,6 +155,58 @@ def test_a_comparison_follows_from_its_seed_and_from_nothing_else():
     assert [row.velocity_p for row in alone] != [row.velocity_p for row in other]
 
 
+class KilledError(Exception):
+    """Raised in place of a kill."""
+
+
+def test_a_comparison_that_was_killed_goes_on_to_the_same_figures(tmp_path):
+    machines = [*RIGID[:2], *SHORT]
+    calls = []
+
+    def noted(name):
+        def tuner(target, rng):
+            calls.append((name, target.machine))
+            return moves_and_slows(target, rng)
+
+        return tuner
+
+    names = {name: noted(name) for name in ("a", "b")} | {"broken": breaks, "simc": find_tuner("simc")}
+    whole = compare(machines, names, seed=3)
+    calls.clear()
+    steps = []
+
+    def progress(what, share):
+        steps.append(what)
+        if len(steps) == 4:  # the first group has been tuned by three
+            raise KilledError
+
+    with pytest.raises(KilledError), ShardLog(tmp_path / "log", "x") as log:
+        compare(machines, names, seed=3, log=log, progress=progress)
+    with ShardLog(tmp_path / "log", "x") as log:
+        assert sorted(log.done) == [0, 1, 2]
+        resumed = compare(machines, names, seed=3, log=log)
+    assert resumed == whole
+    assert calls == [("a", "inertia"), ("b", "inertia"), ("a", "belt"), ("b", "belt")]  # none of them twice
+
+
+# --- machines of several axes -------------------------------------------------------------------------------------
+@pytest.mark.parametrize("load", ["gantry", pytest.param("robot", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["factory", "fitted", "simc", "auto", "random", "tpe-safe"])
+def test_machines_of_several_axes_are_tuned_by_everybody(load, name):
+    machines = [m for m in load_suite() if m.load == load][:1]
+    (row,) = compare(machines, {name: find_tuner(name)}).rows
+    axes = {"gantry": 2, "robot": 6}[load]
+    assert not row.failed, row.note
+    assert 0.0 < row.relative < 30.0
+    assert row.violations == 0 or name in ("random", "factory"), row.kinds
+    if name == "fitted":
+        assert row.moves == 2 * axes and row.relative < 1.3
+    if name == "auto":
+        assert row.drive_seconds < 10.0 * axes
+    if name not in ("factory", "fitted"):
+        assert 5 * axes <= row.moves <= 100 * axes
+
+
 # --- the registry -------------------------------------------------------------------------------------------------
 def test_the_tuners_of_the_issue_are_there():
     names = set(tuner_rows())
@@ -270,7 +323,7 @@ def test_the_command_prints_the_table_and_writes_the_folder(tmp_path):
     assert result.exit_code == 0
     assert "Hidden J over the fitted rule's on 3 machines" in result.output
     names = {path.name for path in folder.iterdir()}
-    assert names == {"tuners.csv", "machines.csv", "comparison.png", "settings.toml"}
+    assert names == {"tuners.csv", "rivals.csv", "machines.csv", "comparison.png", "settings.toml"}
     told = run("compare", "-t", "fitted", "--count", 3, "--json", "--out", tmp_path / "again")
     first = list(csv.DictReader((folder / "tuners.csv").open(encoding="utf-8")))
     (row,) = json.loads(told.stdout)["tuners"]
@@ -279,7 +332,7 @@ def test_the_command_prints_the_table_and_writes_the_folder(tmp_path):
 
 def test_the_command_lists_tuners_and_suites():
     output = run("compare", "--list").output
-    assert "cmaes" in output and "public" in output and "46 machines" in output
+    assert "cmaes" in output and "public" in output and "51 machines" in output
 
 
 @pytest.mark.parametrize(

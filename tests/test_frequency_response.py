@@ -1,6 +1,8 @@
 """Frequency responses measured on emulated axes, in process and over a bus, against the linear model of the truth."""
 
 import math
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +12,10 @@ from drive_env.devices import find_device
 from drive_env.gains import FITTED_RULE, rule_gains, write_gains
 from drive_env.motors import find_motor
 from tuning.frequency_response import COHERENT, measure
+from tuning.held_samples import seen_by_bus
 from tuning.linear_model import Plant, position_open_loop, velocity_open_loop
 from tuning.margins import margins
+from tuning.plant_fit import Seen, fit_plant
 from tuning.target import Target, emulated
 
 SOFT = FITTED_RULE._replace(speed=0.1)  # crossover at about 20 Hz
@@ -279,6 +283,74 @@ def test_only_the_chosen_axes_are_measured():
     assert response.trusted[:, 1].any()
     assert not response.trusted[:, [0, 2]].any()
     assert target.drives.read(0x6064)[0] == 0
+
+
+# --- confirmed by a weaker shaking ------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def looked_at():
+    """What a bus would see of a two-mass axis whose resonance is moved by a factor: factor, lines -> Seen."""
+    target, plants, gains = tuned("two_mass", num_threads=1)
+    start = Plant.from_data_sheet(target.device, target.motor, 24.0, 3.0 * target.motor.inertia)
+    rng = np.random.default_rng(7)
+
+    def seen(factor=1.0, lines=80, noise=0.01):
+        f = np.arange(1, lines + 1) * 5.0
+        moved = replace(
+            plants[0], anti_resonance=factor * plants[0].anti_resonance, resonance=factor * plants[0].resonance
+        )
+
+        def closed(at):
+            L = velocity_open_loop(target.device, moved, gains[0], at)
+            return L / (1.0 + L)
+
+        T = seen_by_bus(target.device, f, closed)
+        return Seen(f, T * (1.0 + noise * rng.standard_normal(lines)), np.full(lines, noise))
+
+    return seen, lambda full, less: fit_plant(target.device, gains[0], *full, start, less=less), plants[0]
+
+
+def test_a_resonance_that_a_weaker_shaking_confirms_is_told(looked_at):
+    seen, fit, plant = looked_at
+    found = fit(seen(), seen(noise=0.03)).estimates["resonance"]
+    assert found.value == pytest.approx(plant.resonance, rel=0.01)
+    assert found.low < plant.resonance < found.high
+
+
+@pytest.mark.parametrize("factor", [0.85, 0.95, 1.1])
+def test_a_resonance_that_moves_with_the_strength_of_the_shaking_is_refused(looked_at, factor):
+    """As with backlash: neither of the two is the axis's."""
+    seen, fit, plant = looked_at
+    estimates = fit(seen(), seen(factor)).estimates
+    for name in ("resonance", "anti_resonance", "damping"):
+        assert not estimates[name].is_known
+        assert "backlash" in estimates[name].reason
+    weaker = re.search(r"at ([\d.]+) Hz where the axis is shaken less", estimates["resonance"].reason)
+    assert float(weaker[1]) == pytest.approx(factor * plant.resonance, rel=0.01)
+    assert estimates["velocity_filter"].is_known
+
+
+def test_by_what_it_moves_a_little_the_interval_is_wider(looked_at):
+    seen, fit, _ = looked_at
+    alike, other = (fit(seen(), seen(factor)).estimates["resonance"] for factor in (1.0, 1.015))
+    assert other.high - other.low > 1.5 * (alike.high - alike.low)
+
+
+def test_what_cannot_be_confirmed_is_refused(looked_at):
+    seen, fit, _ = looked_at
+    assert "only 8 frequencies are coherent" in fit(seen(), seen(lines=8)).estimates["resonance"].reason
+    assert "does not confirm it" in fit(seen(), seen(noise=1.5)).estimates["resonance"].reason
+
+
+@pytest.mark.parametrize("dead_time", [100e-9, 600e-9])
+def test_dead_time_is_not_taken_for_a_slower_velocity_filter(dead_time):
+    """A small motor, whose current loop dead time slows down: without knowing, 400 Hz look like 280."""
+    known = {"stage.dead_time": dead_time, "stage.velocity_filter": 400.0}
+    target, _, _ = tuned("inertia", motor="ec_i_40", num_machines=2, seed=2, parameters=known, num_threads=1)
+    response = measure(target, confirmed=True)
+    for axis in range(2):
+        found = response.estimates(axis)["velocity_filter"]
+        assert found.low < 400.0 < found.high
+        assert found.value == pytest.approx(400.0, rel=0.15)
 
 
 # --- mistakes ---------------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ eigenvectors (tuning/true_plant.py), dry friction from every bearing, guide and 
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from dataclasses import replace
 
@@ -19,7 +20,7 @@ from drive_env.drives import EmulatedDrives
 from drive_env.gains import GAIN_OBJECTS, write_gains
 from drive_env.misfit import MisfitWarning
 from mechanics.shaft import way
-from tuning import identification, winding
+from tuning import identification
 from tuning.identification import NAMES, identify
 from tuning.suite import load_suite, open_group, open_machines
 from tuning.target import Target, emulated
@@ -101,8 +102,8 @@ def test_known_machines_are_identified():
 # What must be told of the suite's axes; the rest is refused. Dry friction hides behind a fan's drag, an arm's weight
 # and loose gears, viscous friction behind dry, a resonance behind backlash and behind coarse encoders.
 TOLD = {
-    "resistance": 0.9, "inductance": 0.95, "inertia": 0.95, "coulomb": 0.65, "viscous": 0.2, "resonance": 0.3,
-    "anti_resonance": 0.3,
+    "resistance": 0.95, "inductance": 0.95, "inertia": 0.95, "coulomb": 0.65, "viscous": 0.2, "resonance": 0.4,
+    "anti_resonance": 0.4,
 }  # fmt: skip
 
 
@@ -113,7 +114,8 @@ def test_the_suite_is_identified_and_the_intervals_hold(seed):
     machines = load_suite("public", seed=seed)
     tally = {}
     for target, _ in open_machines([m for m in machines if seed is None or m.name.startswith("seed")]):
-        compare(target, tally)
+        if target.axes_per_machine == 1:  # `truth` knows one axis
+            compare(target, tally)
     missed = []
     for name, told in TOLD.items():
         axes, known, near, inside = tally[name]
@@ -223,6 +225,21 @@ def test_wrong_pole_pairs_are_found_before_torque_is_commanded():
     found = identify(target)[0]
     assert found.value("pole_pairs") == 4.0
     assert "4 pole pairs and 2056h says 7" in found.estimates["inertia"].reason
+
+
+@pytest.mark.parametrize("steps", [3584, 4681])  # of 4096: electrical turns of 3.5 and 4.57 per turn that is counted
+def test_a_ratio_that_is_no_whole_number_fails_the_check_and_no_torque_is_commanded(steps):
+    target = emulated(load="inertia", num_threads=1)
+    target.drives.write("ABN Encoder Settings.Encoder Steps", steps)
+    found = identify(target)[0]
+    assert not found.estimates["pole_pairs"].is_known
+    for name in ("pole_pairs", "resistance", "inertia", "resonance"):
+        ratio = re.search(r"electrical turns are ([\d.]+) \(", found.estimates[name].reason)
+        assert float(ratio[1]) == pytest.approx(4.0 * steps / 4096.0, rel=0.02), name
+        assert "no whole number: check the encoder's steps, 2080h:02" in found.estimates[name].reason, name
+    # The field turned it there and back; torque with half an angle too much would have sent it away.
+    assert np.abs(target.drives.machine.rotor_speed[0]) < 1.0
+    assert abs(float(target.drives.machine.rotor_angle[0])) < TURN
 
 
 @pytest.mark.parametrize(("name", "value", "reason"), [
@@ -396,31 +413,19 @@ class Clock:
 
 
 @pytest.mark.parametrize(("step", "told"), [(0.001, True), (0.0016, False)])
-def test_reads_out_of_step_with_the_drive_give_no_resistance(monkeypatch, step, told):
+def test_reads_out_of_step_with_the_drive_give_no_inductance(monkeypatch, step, told):
     clock = Clock()
     monkeypatch.setattr("tuning.winding.time", clock)
     own = emulated(load="inertia", num_threads=1)
     drives = Late(own.drives, clock, step)
     found = identify(replace(own, drives=drives))[0]
-    for name in ("resistance", "inductance"):
-        assert found.estimates[name].is_known == told, name
-        assert told or "took 1.6 ms instead of 1" in found.estimates[name].reason
+    assert found.estimates["inductance"].is_known == told
+    assert told or "took 1.6 ms instead of 1" in found.estimates["inductance"].reason
+    assert found.estimates["resistance"].is_known
     assert found.estimates["inertia"].is_known
 
 
 # --- pieces -----------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("angle", np.linspace(0.0, TURN, 7))
-def test_dead_time_costs_four_thirds_of_a_phase_at_most_along_the_current(angle):
-    """Saturated, the lost voltage turns in steps of 60 degrees: along the current 2 / sqrt(3) to 4 / 3."""
-    lost = float(winding.dead_time(np.array([angle]), np.array([100.0]), 0.3, False)[0])
-    assert 2.0 / math.sqrt(3.0) - 1e-9 <= lost <= 4.0 / 3.0 + 1e-9
-    assert float(winding.dead_time(np.array([angle]), np.array([-100.0]), 0.3, False)[0]) == pytest.approx(-lost)
-
-
-def test_dead_time_of_a_brushed_motor_is_that_of_two_legs():
-    assert winding.dead_time(np.zeros(3), np.array([-1.0, 0.15, 1.0]), 0.3, True).tolist() == [-2.0, 1.0, 2.0]
-
-
 def test_a_refusal_has_no_value_and_a_reason():
     none = identification.refused("ohm", "too cold")
     assert not none.is_known

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tuning.ladder import MOST_TRIALS, Ladder, Rung
+from tuning.ladder import BOLD, MOST_TRIALS, SLIPPERY, Ladder, Rung
 
 
 def climb(outcomes, fallbacks=3):
@@ -18,19 +18,20 @@ def climb(outcomes, fallbacks=3):
 
 FAIL, BEST, BEST_LOUD, WORSE = (False, False, False), (True, True, False), (True, True, True), (True, False, False)
 F = Rung  # a factor
+B, S = Rung(other=BOLD), Rung(other=SLIPPERY)
 NONE, RULE, SOFT, LAST = None, Rung(fallback=0), Rung(fallback=1), Rung(fallback=2)
 
 
 @pytest.mark.parametrize(
     ("outcomes", "rungs"),
     [
-        ((BEST,), [F(1.0), F(1.15)]),  # what passes at once is tried faster
-        ((BEST_LOUD,), [F(1.0), F(0.8)]),  # slower if the current was noisy
-        ((BEST, BEST), [F(1.0), F(1.15), F(1.3225)]),  # farther the same way as long as it is better
-        ((BEST, BEST, BEST), [F(1.0), F(1.15), F(1.3225), NONE]),  # and no more than three trials
-        ((BEST, WORSE), [F(1.0), F(1.15), F(0.8)]),  # the other way if it was worse
-        ((BEST, FAIL), [F(1.0), F(1.15), F(0.8)]),  # or failed
-        ((BEST_LOUD, WORSE), [F(1.0), F(0.8), F(1.15)]),
+        ((BEST,), [F(1.0), B]),  # what passes at once is followed by the bold ones
+        ((BEST_LOUD,), [F(1.0), S]),  # by those for less friction if it hunts
+        ((BEST_LOUD, WORSE), [F(1.0), S, F(1.15)]),
+        ((BEST, BEST), [F(1.0), B, NONE]),  # if they are better, nothing lies beyond them
+        ((BEST, WORSE), [F(1.0), B, F(1.15)]),  # if they are not, the first ones are tried faster
+        ((BEST, FAIL), [F(1.0), B, F(1.15)]),  # also if they fail, which says nothing of the others
+        ((BEST, WORSE, BEST), [F(1.0), B, F(1.15), NONE]),  # and no more than three trials
         ((FAIL,), [F(1.0), F(0.6)]),
         ((FAIL, BEST), [F(1.0), F(0.6), F(0.8)]),  # below what failed: half way up again
         ((FAIL, BEST, BEST), [F(1.0), F(0.6), F(0.8), NONE]),
@@ -44,7 +45,7 @@ def test_what_is_tried_next(outcomes, rungs):
     for one, other in zip(found, rungs, strict=True):
         assert (one is None) == (other is None)
         if one is not None:
-            assert one.fallback == other.fallback
+            assert (one.fallback, one.other) == (other.fallback, other.other)
             assert one.fallback is not None or one.factor == pytest.approx(other.factor)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from drive_env import motion
 from drive_env.gains import GAIN_OBJECTS, write_gains
+from tuning.identification import identify
 from tuning.meter import KINDS, MeteredDrives
 from tuning.target import emulated
 
@@ -53,18 +54,27 @@ def test_time_counts_until_an_axis_is_last_written_to(meter):
     assert meter.seconds == pytest.approx([began + 0.1, began])
 
 
-def test_moves_are_rising_edges_of_the_set_point_bit_and_what_is_played(meter):
+def test_moves_are_those_that_an_engineer_counts(meter):
     motion.enable(meter, mode="pp")
     assert meter.moves.tolist() == [0, 0]
     move(meter, 1000)
     move(meter, 0, where=np.array([False, True]))
     assert meter.moves.tolist() == [1, 2]
     motion.select_mode(meter, "csv")
-    meter.record([0x606C], 0.01, play={0x60FF: np.zeros(10, int)})
+    there_and_back = np.repeat([0, 300_000, -300_000, 0], 20)
+    for part in np.split(there_and_back, 8):  # in however many records
+        meter.record([0x606C], 0.01, play={0x60FF: part})
     assert meter.moves.tolist() == [2, 3]
-    motion.select_mode(meter, "pv")
-    meter.write("Target velocity", 5000)
-    assert meter.moves.tolist() == [3, 4]
+    began = meter.elapsed
+    meter.record([0x606C], 0.1, play={0x60FF: np.stack([np.zeros(100, int), np.full(100, 90_000)], axis=1)})
+    assert meter.moves.tolist() == [2, 4]
+    assert meter.seconds[0] <= began < meter.seconds[1]  # an axis that rests meanwhile is not in use
+
+
+def test_an_identification_is_a_dozen_moves_or_two(target):
+    meter = MeteredDrives(target)
+    identify(replace(target, drives=meter))
+    assert np.all((meter.moves >= 5) & (meter.moves <= 40))
 
 
 def test_leaving_the_travel_counts_each_time(meter):

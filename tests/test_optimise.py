@@ -93,6 +93,61 @@ def test_what_oscillates_is_stopped_and_has_the_last_good_gains_again(rigid):
     assert np.all(enabled == motion.OPERATION_ENABLED[1])
 
 
+class Chart:
+    """Drives that are drawn millisecond by millisecond: the current of each axis [A], and the gains in force."""
+
+    def __init__(self, drives):
+        self._drives = drives
+        self.current, self.gains = [], []
+
+    def __getattr__(self, name):
+        return getattr(self._drives, name)
+
+    def advance(self, duration):
+        if duration > 0.0:
+            self.record([0x6077], duration)
+
+    def record(self, objects, duration, *rest, **options):
+        gains = np.stack([self._drives.read(name) for name in GAIN_OBJECTS], axis=-1)
+        trace = self._drives.record([*objects, *({0x6077} - set(objects))], duration, *rest, **options)
+        self.current.extend(trace[0x6077] * 1e-3)
+        self.gains.extend([gains] * len(trace))
+        return trace
+
+    def stopped_after(self, axis, rated_current):
+        """Return for how long an axis oscillated each time until it had other gains [ms], and which those were."""
+        change = np.diff(np.array(self.current)[:, axis], append=self.current[-1][axis])
+        gains = np.array(self.gains)[:, axis]
+        found, t = [], 0
+        while t < len(change) - 25:
+            if math.sqrt(np.mean(change[t : t + 25] ** 2)) > 0.4 * rated_current:
+                end = t
+                while end < len(gains) and np.array_equal(gains[end], gains[t]):
+                    end += 1
+                found.append((end - t, gains[min(end, len(gains) - 1)].tolist()))
+                t = end + 25  # until it has died away
+            t += 1
+        return found
+
+
+def test_what_oscillates_has_the_last_good_gains_within_50_ms_of_drive_time(rigid):
+    chart = Chart(rigid.drives)
+    bench = TrialBench(replace(rigid, drives=chart))
+    bench.identify()
+    bench.run(bench.rule)
+    bench.incumbent = bench.rule.copy()  # as a search does with what was good
+    chart.current.clear(), chart.gains.clear()
+    gains = np.where(np.array([[True], [True], [False], [True]]), WILD, bench.rule)
+    tried = bench.run(gains)
+    assert tried.aborted.tolist() == [True, True, False, True]
+    for axis, aborted in enumerate(tried.aborted):
+        stops = chart.stopped_after(axis, rigid.motor.rated_current)
+        assert bool(stops) == aborted
+        for milliseconds, after in stops:
+            assert milliseconds <= 50
+            assert after == bench.rule[axis].tolist()
+
+
 def test_what_shakes_on_with_the_last_good_gains_is_calmed_and_said():
     machines = [m for m in load_suite() if m.load == "inertia" and m.motor == "qbl4208"][:2]
     with open_group(machines) as target:
@@ -218,6 +273,30 @@ def test_robustness_is_worst_of_what_was_stopped():
     k = OBJECTIVES.index("robustness")
     assert {row.objectives[k] for row in stopped} == {math.log(30.0)}
     assert all(0.0 <= row.objectives[k] < math.log(30.0) for row in found.rows if not row.aborted)
+
+
+# --- machines of several axes -------------------------------------------------------------------------------------
+@pytest.mark.parametrize("load", ["gantry", "robot"])
+def test_the_axes_of_a_machine_are_searched_as_one(load):
+    machines = [m for m in load_suite() if m.load == load][:1]
+    with open_group(machines) as target:
+        found = optimise(target, replace(FEW, trials=5, safe=True))
+        np.testing.assert_array_equal(read_gains(target), found.gains)
+    axes = len(found.rule)
+    assert axes == {"gantry": 2, "robot": 6}[load]
+    assert [row.gains.shape for row in found.rows] == [(axes, 5)] * len(found.rows)
+    for row in found.rows:  # each axis has its rule's gains times what all of them have
+        factors = row.gains[:, 2:] / found.rule[:, 2:]
+        np.testing.assert_allclose(factors, np.broadcast_to(factors.mean(axis=0), factors.shape), rtol=0.02)
+    (best,) = [row for row in found.rows if np.array_equal(row.gains, found.gains)][:1]
+    assert not best.aborted
+    assert found.cost[0] == min(row.cost for row in found.rows if not row.aborted)
+
+
+def test_a_grid_of_a_machine_of_several_axes_is_a_grid():
+    with open_group([m for m in load_suite() if m.load == "gantry"][:1]) as target:
+        found = optimise(target, Settings(sampler="grid", trials=9))
+    assert len({row.gains.tobytes() for row in found.rows}) == 9  # the rule and 2 levels of 3 gains
 
 
 # --- the safe search ----------------------------------------------------------------------------------------------

@@ -7,19 +7,17 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tuning import pools, searches, sweep
+from tuning import pools, sweep
 from tuning.experiment import load_experiment
-from tuning.optimise import Settings, optimise
 from tuning.pools import PoolError, in_order, open_pool
 from tuning.shard_log import ShardLog, ShardLogError
-from tuning.target import emulated
 from tuning.unfinished import SHARDS, shard_log, unfinished_folder
 
 ROOT = Path(__file__).parent.parent
@@ -262,6 +260,59 @@ def test_a_cluster_that_loses_one_of_two_workers_gives_the_digits_of_one_process
     assert contents(result.save(tmp_path / "run")) == saved
 
 
+@pytest.fixture
+def small_cluster():
+    distributed = pytest.importorskip("distributed")
+    options = {
+        "n_workers": 1,
+        "threads_per_worker": 1,
+        "processes": False,
+        "protocol": "tcp://",
+        "dashboard_address": "127.0.0.1:0",
+    }
+    with distributed.LocalCluster(host="127.0.0.1", silence_logs="CRITICAL", **options) as cluster:
+        yield cluster
+
+
+def test_a_scheduler_that_goes_is_told_with_the_remedy(small_cluster):
+    address = small_cluster.scheduler_address
+    with (
+        pytest.raises(PoolError, match=rf"connection to the Dask scheduler at {address} was lost.*--resume"),
+        open_pool(cluster=address) as pool,
+    ):
+        for _ in pool.unordered(time.sleep, [0.0, PATIENCE]):
+            small_cluster.close(timeout=PATIENCE)
+
+
+def test_a_cluster_without_workers_is_told_and_waited_for(small_cluster, monkeypatch, caplog):
+    monkeypatch.setattr(pools, "WORKERS_PERIOD", 0.05)
+    with open_pool(cluster=small_cluster.scheduler_address) as pool:
+        small_cluster.scale(0)
+        deadline = time.monotonic() + PATIENCE
+        results = pool.unordered(square, [3, 4])
+
+        def scale_up_once_told():
+            while "has no workers left; waiting for one: `dask worker tcp://" not in caplog.text:
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            small_cluster.scale(1)
+
+        with ThreadPoolExecutor(1) as executor:
+            told = executor.submit(scale_up_once_told)
+            assert sorted(results) == [(0, 9), (1, 16)]
+            told.result(PATIENCE)
+    assert caplog.text.count("has no workers left") == 1
+
+
+def test_a_worker_without_the_package_is_told():
+    class Client:
+        def run(self, function):
+            raise ModuleNotFoundError("No module named 'tuning'")
+
+    with pytest.raises(PoolError, match=r"cannot run this: No module named 'tuning'; install drive-env where it runs"):
+        pools._Dask(Client(), 1, "tcp://a:1").differences()
+
+
 def test_workers_of_another_version_are_told():
     class Client:
         def run(self, function):
@@ -270,73 +321,6 @@ def test_workers_of_another_version_are_told():
 
     (line,) = pools._Dask(Client(), 2).differences()
     assert line == f"worker tcp://b:2 has numpy 0.9, here it is {np.__version__}: last digits may differ"
-
-
-# --- searches -----------------------------------------------------------------------------------------------------
-MACHINE = {"load": "inertia", "num_machines": 3, "seed": 5}
-FEW = Settings(sampler="random", trials=4, seed=7)
-
-
-def found(parts, pool, path):
-    with ShardLog(path, "searches") as log:
-        return searches.run(parts, pool, log)
-
-
-def same(one, other):
-    assert one.gains.tolist() == other.gains.tolist() and one.rule.tolist() == other.rule.tolist()
-    assert one.cost.tobytes() == other.cost.tobytes()
-    assert [row.gains.tolist() for row in one.rows] == [row.gains.tolist() for row in other.rows]
-    assert [row[1:2] + row[3:] for row in one.rows] == [row[1:2] + row[3:] for row in other.rows]
-    assert (one.drive_seconds, one.notes) == (other.drive_seconds, other.notes)
-    assert one.moves.tolist() == other.moves.tolist() and one.aborts.tolist() == other.aborts.tolist()
-
-
-def test_searches_are_the_search_with_one_seed_after_the_other(tmp_path):
-    results = found(searches.searches(MACHINE, FEW, 2), None, tmp_path / "log")
-    for k, result in enumerate(results):
-        with emulated(**MACHINE) as target:
-            alone = optimise(target, replace(FEW, seed=7 + k), shared=True, anew=True)
-        assert {row.search for row in result.rows} == {k}
-        same(
-            result,
-            replace(alone, gains=alone.gains[:1], rule=alone.rule[:1], cost=alone.cost[:1], notes=alone.notes[:1]),
-        )
-    assert results[0].rows[1].gains.tolist() != results[1].rows[1].gains.tolist()
-    together = searches.joined(results)
-    assert together.gains.tolist() == [result.gains[0].tolist() for result in results]
-    assert together.drive_seconds == sum(result.drive_seconds for result in results)
-    assert len(together.rows) == 8 and together.cost.shape == (2,)
-
-
-def test_searches_on_workers_and_resumed_are_the_searches_of_one_process(tmp_path):
-    parts = searches.searches(MACHINE, FEW, 3)
-    whole = found(parts, None, tmp_path / "whole")
-    with ShardLog(tmp_path / "whole", "searches") as log, ShardLog(tmp_path / "begun", "searches") as begun:
-        begun.append(1, log.done[1])
-    with open_pool(2) as pool:
-        resumed = found(parts, pool, tmp_path / "begun")
-    for one, other in zip(whole, resumed, strict=True):
-        same(one, other)
-
-
-@pytest.mark.parametrize(("count", "settings", "message"), [
-    (0, FEW, "--searches 0 is below 1"),
-    (2, replace(FEW, journal=Path("x")), "a journal keeps one search"),
-])  # fmt: skip
-def test_searches_that_cannot_be_are_refused(count, settings, message):
-    with pytest.raises(ValueError, match=message):
-        searches.searches(MACHINE, settings, count)
-
-
-def test_another_seed_trial_or_machine_makes_another_run():
-    texts = {
-        searches.description(searches.searches(machine, settings, count))
-        for machine, settings, count in [
-            (MACHINE, FEW, 2), (MACHINE, FEW, 3), (MACHINE | {"seed": 6}, FEW, 2), (MACHINE, replace(FEW, trials=5), 2),
-            (MACHINE | {"travel": (-1.0, 1.0)}, FEW, 2), (MACHINE, replace(FEW, safe=True), 2),
-        ]
-    }  # fmt: skip
-    assert len(texts) == 6
 
 
 # --- the command --------------------------------------------------------------------------------------------------

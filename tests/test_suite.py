@@ -24,7 +24,7 @@ supply = [24, 20]
 travel = [0.3, 2]
 [group.parameters]
 "load.inertia" = [1e-5, 2e-5]
-[generated]
+[[generated]]
 count = 3
 groups = [["two_mass", "qbl4208"], ["inertia", "ec_i_40"]]
 """
@@ -161,7 +161,8 @@ def test_few_machines_are_taken_from_all_groups():
         ('"inertia"\nmotor', '"pendulum"\nmotor', r"no load is named 'pendulum'"),
         ("count = 3", "number = 3", r"key 'number' is unknown; there are count, groups"),
         ('"tmcm1636"', "1", r"device = 1 is a whole number; it must be a text"),
-        ("[generated]", "[generated", r"is no TOML"),
+        ("[[generated]]", "[generated", r"is no TOML"),
+        ("[[generated]]", "[generated]", r"generated is a table; write one table \[\[generated\]\]"),
     ],
 )
 def test_a_mistake_in_the_file_is_one_line_with_what_is_right(small, wrong, right, message):
@@ -171,9 +172,9 @@ def test_a_mistake_in_the_file_is_one_line_with_what_is_right(small, wrong, righ
 
 
 def test_two_groups_of_one_kind_are_refused(small):
-    table = SMALL[SMALL.index("[[group]]") : SMALL.index("[generated]")]
+    table = SMALL[SMALL.index("[[group]]") : SMALL.index("[[generated]]")]
     with pytest.raises(ExperimentError, match=r"two machines are named 'inertia-qbl4208-0'; make one group"):
-        load_suite(small(SMALL.replace("[generated]", table + "[generated]")))
+        load_suite(small(SMALL.replace("[[generated]]", table + "[[generated]]")))
 
 
 def test_unknown_suites_are_refused_with_those_that_ship():

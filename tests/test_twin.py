@@ -8,10 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drive_env import EmulatedDrives
+from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.dictionary.units import RPM
+from drive_env.envs.gain_trial import OSCILLATION
 from drive_env.gains import Gains, rule_gains
 from drive_env.motors import find_motor
+from tuning import twin
 from tuning.identification import Estimate, Identification, refused
 from tuning.linear_model import Plant
 from tuning.twin import LEAST, WORLDS, Friction, Known, Spread, Twins, World, known_of, search, twin_parameters
@@ -39,6 +42,38 @@ def test_the_twin_is_the_plant_that_was_identified(plant):
     assert true.viscous == pytest.approx(2e-4 * MOTOR.torque_constant, rel=0.01)
     dry = values["motor.coulomb"] + values["load.coulomb"]
     assert dry == pytest.approx(0.1 * MOTOR.torque_constant)
+
+
+def at_speed(load, parameters, torque, speed_rpm):
+    """Return the mean current [A] of an emulated machine that turns steadily in pv with a load torque."""
+    with EmulatedDrives(load=load, parameters=parameters, supply=RIGID.supply, num_threads=1) as drives:
+        drives.machine.load_torque = torque
+        drives.write(0x6083, 10_000_000)
+        motion.enable(drives, mode="pv")
+        drives.write(0x60FF, round(speed_rpm / 60.0 * 65536.0))
+        drives.advance(1.0)
+        return float(drives.record([0x6077], 1.0)[0x6077].mean()) * 1e-3
+
+
+@pytest.mark.parametrize("plant", [RIGID, ELASTIC], ids=["rigid", "elastic"])
+def test_the_twin_takes_the_current_that_was_identified(plant):
+    """i = offset + coulomb sign(omega) + viscous omega, of a machine that is measured like any other."""
+    coulomb, viscous, offset = 0.2, 4e-3, 0.5
+    known = KNOWN._replace(plant=plant, friction=Friction(coulomb, viscous), offset=offset)
+    with Twins(DEVICE, MOTOR, [known], scaler(), 1, worlds=ONE) as twins:
+        pull = float(twins._parts[0]._hidden._constant[0])
+    values = twin_parameters(DEVICE, MOTOR, known) | {"motor.cogging_torque": 0.0}
+    load = "two_mass" if plant.is_elastic else "inertia"
+    for rpm in (600.0, -600.0, 1500.0):
+        expected = offset + math.copysign(coulomb, rpm) + viscous * rpm * RPM
+        assert at_speed(load, values, pull, rpm) == pytest.approx(expected, abs=0.03)
+
+
+def test_friction_is_what_a_rough_world_has_less_of():
+    rough = twin_parameters(DEVICE, MOTOR, KNOWN, World("rough", friction=0.4))
+    dry = rough["motor.coulomb"] + rough["load.coulomb"]
+    assert dry == pytest.approx(0.4 * 0.1 * MOTOR.torque_constant)
+    assert rough["load.breakaway"] == pytest.approx(1.5 * rough["load.coulomb"])
 
 
 def test_a_resonance_too_fast_for_the_physics_is_taken_as_rigid():
@@ -78,6 +113,14 @@ def test_intervals_become_the_twins_doubt_and_what_was_refused_the_greatest():
     assert without.spread.filter == 0.5
 
 
+def test_the_twin_swings_as_long_as_the_axis_does():
+    pair = {"anti_resonance": (70.0, 0.05), "resonance": (141.0, 0.05), "damping": (0.3, 0.3)}
+    plant = Plant.from_identification(DEVICE, MOTOR, 22.0, identification(**pair))
+    values = twin_parameters(DEVICE, MOTOR, known_of(plant, identification(**pair), math.inf))
+    with EmulatedDrives(load="two_mass", parameters=values, supply=22.0, num_threads=1) as drives:
+        assert Plant.from_machine(drives).damping == pytest.approx(0.3, rel=0.01)
+
+
 def test_scores_do_not_depend_on_the_lane_nor_on_the_other_axes():
     rule = rule_gains(DEVICE, MOTOR, RIGID.inertia, supply=RIGID.supply)[0]
     slow = np.rint(0.7 * rule).astype(int)
@@ -97,6 +140,32 @@ def test_the_worlds_count_by_their_geometric_mean():
             scores.append(float(twins.score(rule[:, None])[0, 0]))
     assert scores[2] == pytest.approx(math.sqrt(scores[0] * scores[1]), rel=1e-9)
     assert scores[0] != scores[1]
+
+
+def test_as_many_worlds_as_there_are_gains_are_worlds_all_the_same():
+    rule = rule_gains(DEVICE, MOTOR, RIGID.inertia, supply=RIGID.supply)
+    scores = []
+    for worlds in (ONE, ONE * len(Gains._fields)):
+        with Twins(DEVICE, MOTOR, [KNOWN], scaler(), 1, worlds=worlds) as twins:
+            scores.append(float(twins.score(rule[:, None])[0, 0]))
+    assert scores[1] == pytest.approx(scores[0], rel=1e-9)
+
+
+def test_gains_that_a_trial_would_stop_count_for_worse(monkeypatch):
+    """Hidden J looks at the current at rest only; a trial looks at all of the move, and at the probe."""
+    rule = rule_gains(DEVICE, MOTOR, RIGID.inertia, supply=RIGID.supply)[0]
+    wild = rule.copy()
+    wild[Gains._fields.index("velocity_p")] *= 5
+    both = np.array([[rule, wild]])
+    worth = {}
+    with Twins(DEVICE, MOTOR, [KNOWN], scaler(), 2, worlds=ONE) as twins:
+        swings = twins._parts[0]._hidden.score(both[0]).swing.max(axis=1)
+        for limit in (0.8 * OSCILLATION, math.inf):
+            monkeypatch.setattr(twin, "MOST_SWING", limit)
+            worth[limit] = twins.score(both)[0]
+    assert swings[0] < 0.8 * OSCILLATION < OSCILLATION < swings[1]
+    assert worth[0.8 * OSCILLATION][0] == worth[math.inf][0]
+    assert worth[0.8 * OSCILLATION][1] > worth[math.inf][1] * (OSCILLATION / (0.8 * OSCILLATION)) ** 2
 
 
 def test_the_search_finds_better_gains_and_what_it_says_of_them_is_what_the_twin_says():

@@ -104,7 +104,7 @@ def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
 def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple[FrequencyResponse, ...]:
     """Return the velocity loop as measured with the new gains, and as computed with those before."""
     response = result.response
-    if response is None or not np.isfinite(response.open_loop[:, axis]).any():
+    if response is None or run.is_kept or not np.isfinite(response.open_loop[:, axis]).any():
         return ()
     # Too few lines are coherent for margins: then they are shown as what they are.
     found = Margins(*(np.nan,) * len(Margins._fields)) if run.margins is None else run.margins

@@ -37,6 +37,7 @@ class AxisRun:
         proof: J by measured terms of the gains that were taken; nan before.
         verified: How the gains were verified, in words; "" where they were not.
         margins: Of the velocity loop as measured, None where nothing was.
+        is_kept: Whether the gains before were better, and are the ones after.
     """
 
     before: Gains
@@ -49,6 +50,7 @@ class AxisRun:
     proof: float = np.nan
     verified: str = ""
     margins: Margins | None = None
+    is_kept: bool = False
 
     @property
     def accepted(self) -> bool:
@@ -77,5 +79,5 @@ class Result(NamedTuple):
 
     @property
     def accepted(self) -> Mask:
-        """Which axes have new gains, shape (num_axes,)."""
+        """Which axes have gains that passed, new ones or those before, shape (num_axes,)."""
         return np.array([axis.accepted for axis in self.axes])

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from drive_env import motion
 from drive_env.envs.gain_trial import Trials
 from drive_env.gains import write_gains
-from tuning.experiments import RESPONSE, Experiments
+from tuning.experiments import MECHANICS, PULSED, RESPONSE, Experiments
 from tuning.frequency_response import measure
-from tuning.identification import Estimate, Identification, Progress
+from tuning.identification import NAMES, Estimate, Identification, Progress
+from tuning.oscillation_watch import shaken
 from tuning.target import Target
-from tuning.winding import identify_winding, pulse, to_torque_mode
+from tuning.winding import BRIEFLY, identify_winding, pulse, to_torque_mode
 from tuning.working_state import GUESS, STATUS, Working, cautious_gains, enable, switch_off
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
 
 INERTIA_ERROR, FRICTION_ERROR = 0.15, 0.3  # relative: what two moves tell it to
 # Half of an interval over its value, of what a fit gives and would refuse to state.
-DOUBT = {"inertia": 0.2, "velocity_filter": 0.4, "anti_resonance": 0.1, "resonance": 0.1}
+DOUBT = {"inertia": 0.2, "velocity_filter": 0.4, "anti_resonance": 0.1, "resonance": 0.1, "damping": 0.5}
+ANOTHER = 2.5  # times the inertia that two moves tell: a response that says more is that of another axis
 ELECTRICAL_ANGLE, SHAFT_DIRECTION = 0x2103, 0x2057
 
 
@@ -43,17 +45,21 @@ def identify_briefly(
 class _Brief(Experiments):
     """Those experiments, with another middle."""
 
+    thorough = False
+
     def turn(self, working: Working) -> None:
         target, drives = working.target, working.target.drives
-        self.progress("winding", 0.3)
+        self.begin("current pulses", 0.3, NAMES)
         enable(working, "csv")
         holding = self.hold(working)
         electrical = drives.read(ELECTRICAL_ANGLE) * (2.0 * math.pi / 65536.0)
         to_torque_mode(working, holding)
-        pulses = pulse(working, holding)
+        with shaken(drives, PULSED * working.current):
+            pulses = pulse(working, holding, BRIEFLY)
+        working = self.calm(working)
         sign = 1.0 - 2.0 * float(drives.read(SHAFT_DIRECTION)[0])
         self.take_windings(working, identify_winding(working, pulses, electrical, target.motor.n_p * sign))
-        self.progress("inertia and friction", 0.45)
+        self.begin("inertia and friction", 0.45, MECHANICS)
         write_gains(drives, cautious_gains(target, GUESS * target.motor.inertia), working.where)
         motion.select_mode(drives, "pp", working.where)
         down, up = working.room()
@@ -67,7 +73,8 @@ class _Brief(Experiments):
                 "viscous": _about(found.viscous[k], FRICTION_ERROR, "A*s/rad"),
                 "offset": _about(found.offset[k], FRICTION_ERROR, "A"),
             }
-        self.progress("resonance, delay, filter", 0.55)
+        working = self.calm(working)
+        self.begin("resonance, delay, filter", 0.55, RESPONSE)
         switch_off(drives, working.where)
         self.respond(working, np.asarray(found.inertia, float))
 
@@ -82,12 +89,17 @@ class _Brief(Experiments):
         write_gains(drives, self.response_gains(working, inertia), able)
         down, up = working.room()
         here = replace(target, low=np.minimum(down, 0.0), high=np.maximum(up, 1e-3))
-        response = measure(here, "velocity", where=able)
+        response = measure(here, "velocity", where=able, softened=True)
         for k in map(int, np.flatnonzero(able)):
             fit = response.fits[k]
             if fit is None or fit.reason:
                 why = "; ".join(response.notes[k]) or "the response was not measured"
                 self.refuse(k, RESPONSE, why if fit is None else fit.reason)
+                continue
+            ratio = fit.plant.inertia / self.found[k]["inertia"].value
+            if not 1.0 / ANOTHER < ratio < ANOTHER:
+                # A fit of few lines may come to rest anywhere, and the two moves went well enough.
+                self.refuse(k, RESPONSE, f"the response would be that of {ratio:.2g} times the inertia that was moved")
                 continue
             self.found[k] |= _guessed(fit)
 
@@ -97,7 +109,7 @@ def _guessed(fit: PlantFit) -> dict[str, Estimate]:
     found = dict(fit.estimates)
     values = {"inertia": fit.plant.inertia, "velocity_filter": fit.plant.velocity_filter}
     if fit.plant.is_elastic:
-        values |= {"anti_resonance": fit.plant.anti_resonance, "resonance": fit.plant.resonance}
+        values |= {name: getattr(fit.plant, name) for name in ("anti_resonance", "resonance", "damping")}
     for name, value in values.items():
         estimate = found[name]
         if not estimate.is_known:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.envs.gain_trial import OSCILLATION, WATCH
+from drive_env.envs.gain_trial import OSCILLATION
 from drive_env.gains import write_gains
-from drive_env.positioning import CURRENT
+from drive_env.positioning import CURRENT, WATCH
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -31,7 +31,7 @@ class CalmedDrives:
 
     Attributes:
         calm: Gains to calm with, (num_axes, 5), or None as long as none are known.
-        calmed: Axes that got them since the mask was last cleared, (num_axes,).
+        calmed: Axes that got them since the last `begin`, (num_axes,).
     """
 
     def __init__(self, drives: Any, rated_current: float) -> None:
@@ -43,6 +43,11 @@ class CalmedDrives:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._drives, name)
+
+    def begin(self) -> None:
+        """Forget what was before a trial."""
+        self.calmed[:] = False
+        self._windows[:] = 0
 
     def record(self, objects: Any, duration: float, *arguments: Any, **options: Any) -> Any:
         """Let time pass while objects are recorded; calm what has shaken too long."""

@@ -8,10 +8,12 @@ inertia; a tuner never sees the score.
 from __future__ import annotations
 
 import csv
+import json
 import warnings
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,6 +25,7 @@ from drive_env.positioning import plan_move
 from drive_env.score import HiddenScore
 from tuning.meter import KINDS, MeteredDrives
 from tuning.moved_inertia import moved_inertia
+from tuning.shard_log import Arrays, ShardLog
 from tuning.suite import Machine, groups, open_group
 from tuning.target import Target
 from tuning.toml_tables import toml
@@ -44,7 +47,8 @@ class MachineRow:
     """What a tuner made of a machine.
 
     hidden, relative: Hidden J, and over that of the fitted rule. rule: That of the fitted rule.
-    drive_seconds: Until the drive was last written to [s]. moves: What moved the axis. aborts: As the tuner says.
+    drive_seconds: Until the drive was last written to or moved [s], waits for the machines beside it included.
+    moves: Of all its axes, each from standstill to standstill (moves.py). aborts: As the tuner says.
     violations: Of all kinds. torque_p ... position_p: Raw gains of the machine's first axis.
     note: What the tuner says, or why it failed; then the gains are those that it left behind.
     """
@@ -107,6 +111,7 @@ def compare(
     *,
     seed: int = 0,
     num_threads: int | None = None,
+    log: ShardLog | None = None,
     progress: Progress = lambda what, share: None,
 ) -> Comparison:
     """Have every tuner tune every machine.
@@ -114,31 +119,43 @@ def compare(
     Args:
         machines: The suite.
         tuners: By name.
-        seed: What the tuners draw from; the same machine and tuner see the same chances whatever else is compared.
+        seed: What the tuners draw from; the same machines and tuner see the same chances whatever else is compared.
         num_threads: As `EmulatedDrives` takes it.
+        log: What tuners made of machines already, and where what is to come is kept.
         progress: Called with what is under way and the share that is done.
     """
-    members = groups(machines)
+    tasks = [(indices, name) for indices in groups(machines) for name in tuners]
+    logged = {} if log is None else {k: _rows_of(arrays) for k, arrays in log.done.items()}
     done, total = 0, max(len(machines) * len(tuners), 1)
     found: dict[tuple[str, int], MachineRow] = {}
-    for indices in members:
-        group = [machines[k] for k in indices]
-        yardstick, bench = _Yardstick(group, num_threads), _Bench(group, seed, num_threads)
-        try:
-            for name, tuner in tuners.items():
-                progress(f"{name} on {group[0].load}, {group[0].motor}", done / total)
-                rows_of_group = _rows(name, group, bench.tune(name, tuner), yardstick)
-                found.update({(name, index): row for index, row in zip(indices, rows_of_group, strict=True)})
-                done += len(group)
-        finally:
-            yardstick.close()
+    with ExitStack() as open_now:
+        yardstick: Yardstick | None = None
+        for k, (indices, name) in enumerate(tasks):
+            group = [machines[index] for index in indices]
+            progress(f"{name} on {group[0].load}, {group[0].motor}", done / total)
+            if k % len(tuners) == 0:
+                open_now.close()
+                yardstick = None
+            if k not in logged:
+                if yardstick is None:
+                    yardstick, bench = Yardstick(group, num_threads), _Bench(group, seed, num_threads)
+                    open_now.callback(yardstick.close)
+                logged[k] = _rows(name, group, bench.tune(name, tuners[name]), yardstick)
+                if log is not None:
+                    log.append(k, {"rows": np.array(json.dumps([asdict(row) for row in logged[k]]))})
+            found.update({(name, index): row for index, row in zip(indices, logged[k], strict=True)})
+            done += len(group)
     progress("", 1.0)
     rows = tuple(found[name, k] for name in tuners for k in range(len(machines)))
     summaries = [_summary(name, [row for row in rows if row.tuner == name]) for name in tuners]
     return Comparison(rows, tuple(sorted(summaries, key=lambda row: (row.median, row.tuner))))
 
 
-class _Yardstick:
+def _rows_of(arrays: Arrays) -> list[MachineRow]:
+    return [MachineRow(**row) for row in json.loads(str(arrays["rows"]))]
+
+
+class Yardstick:
     """Hidden J of a group of machines, and that of the fitted rule with their true inertia."""
 
     def __init__(self, group: Sequence[Machine], num_threads: int | None) -> None:
@@ -164,6 +181,7 @@ class _Yardstick:
         return self._hidden.score(gains).hidden
 
     def close(self) -> None:
+        """Give the machines back."""
         self._hidden.close()
 
 
@@ -221,7 +239,7 @@ class _Bench:
         return tuner.propose(target, found, before, seconds), meter
 
 
-def _rows(name: str, group: Sequence[Machine], tuned: _Tuned, yardstick: _Yardstick) -> list[MachineRow]:
+def _rows(name: str, group: Sequence[Machine], tuned: _Tuned, yardstick: Yardstick) -> list[MachineRow]:
     """Return what a tuner made of every machine of a group."""
     hidden, outcome, meter = yardstick.score(tuned.gains), tuned.outcome, tuned.meter
     per_machine = len(tuned.gains) // len(group)
@@ -279,17 +297,25 @@ def _summary(name: str, rows: Sequence[MachineRow]) -> TunerRow:
 
 # --- files ------------------------------------------------------------------------------------------------------------
 def save(comparison: Comparison, folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write tuners.csv, machines.csv, comparison.png and settings.toml into a folder that exists."""
+    """Write tuners.csv, rivals.csv, machines.csv, comparison.png and settings.toml into a folder that exists."""
     from tuning.comparison_picture import draw
+    from tuning.rivals import RivalRow, all_rivals
 
     _write_csv(folder / "tuners.csv", comparison.tuners, TunerRow)
+    _write_csv(folder / "rivals.csv", all_rivals(comparison), RivalRow)
     _write_csv(folder / "machines.csv", comparison.rows, MachineRow)
-    lines = [f"{name} = {_toml(value)}" for name, value in settings.items() if value is not None]
-    (folder / "settings.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / "settings.toml").write_text(settings_text(settings), encoding="utf-8", newline="\n")
     draw(comparison, folder / "comparison.png")
 
 
+def settings_text(settings: Mapping[str, Any]) -> str:
+    """Return settings as TOML; what is None is left out."""
+    return "".join(f"{name} = {_toml(value)}\n" for name, value in settings.items() if value is not None)
+
+
 def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
     return f"[{', '.join(map(toml, value))}]" if isinstance(value, list | tuple) else toml(value)
 
 

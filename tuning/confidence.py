@@ -21,14 +21,14 @@ def t_quantile(freedom: float) -> float:
     return float(stats.t.ppf(0.5 * (1.0 + LEVEL), max(freedom, 1.0)))
 
 
-def gain_error(device: Device, motor: Motor) -> float:
+def gain_error(device: Device, motor: Motor, *, turns: bool = True) -> float:
     """Return by what share a measured current may be wrong altogether: the gain errors of the sensors, 95 %.
 
     No signal of the drive shows it: whatever is measured in amperes has it. The two channels of a three-phase motor
-    are averaged, whose error has a triangular distribution.
+    are averaged, whose error has a triangular distribution, unless its field stands and one of them sees it all.
     """
     worst = max(abs(device.stage["adc_gain_error_a"].low), abs(device.stage["adc_gain_error_a"].high))
-    if motor.kind == "dc":
+    if motor.kind == "dc" or not turns:
         return LEVEL * worst
     return (1.0 - math.sqrt(1.0 - LEVEL)) * worst
 

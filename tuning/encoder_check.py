@@ -8,6 +8,7 @@ right before any torque is commanded: a reversed encoder makes a motor run away.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -48,11 +49,18 @@ class EncoderCheck(NamedTuple):
 
     pole_pairs: Estimate
     direction: Estimate
+    ratio: float = math.nan  # of the field's turns to the encoder's, where the rotor followed
 
     @property
     def is_good(self) -> bool:
         """Whether torque may be commanded: nothing speaks against the drive's own settings."""
         return not self.direction.is_known or self.direction.value > 0.0
+
+    def is_whole(self, configured: int) -> bool:
+        """Return whether the ratio is a whole number, or so near to the drive's own that it may be that."""
+        if self.pole_pairs.is_known or not math.isfinite(self.ratio):
+            return True
+        return abs(abs(self.ratio) - configured) <= _tolerance(configured)
 
 
 def check_encoders(working: Working) -> list[EncoderCheck]:
@@ -65,7 +73,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
         return [EncoderCheck(none, later)] * count
     configured = drives.read(POLE_PAIRS).astype(float)
     commutation = drives.read(COMMUTATION)
-    where, reasons = _able(working)
+    where, reasons = able(working)
     if not where.any():
         return [EncoderCheck(refused("1", reason), refused("1", reason)) for reason in reasons]
     try:
@@ -95,7 +103,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
     return found
 
 
-def _able(working: Working) -> tuple[Mask, list[str]]:
+def able(working: Working) -> tuple[Mask, list[str]]:
     """Return which axes have the room to swing to the field, to either side, and why the others have not."""
     down, up = working.room()
     # Switched on, the field pulls the rotor to itself: half an electrical turn at most. Wherever it then stands, the
@@ -132,7 +140,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     for k in range(1, 5):
         drives.write(OPEN_LOOP_CURRENT, current * k // 4, where=where)
         drives.advance(RAISE // 4 * CYCLE)
-        _stay_inside(working, where)
+        stay_inside(working, where)
     stands = [_rest(working)]
     turn, able = _way(working)
     turn = np.where(able, turn, 0.0)
@@ -150,7 +158,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
             now = _field(working)
             passed += (now - before + np.pi) % (2.0 * np.pi) - np.pi
             before = now
-            _stay_inside(working, where)
+            stay_inside(working, where)
         fields.append(before)
         stands.append(_rest(working))
         if sign > 0.0:
@@ -160,7 +168,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     return stands[1] - stands[0], stands[2] - stands[1], turned, reasons
 
 
-def _stay_inside(working: Working, where: Mask) -> None:
+def stay_inside(working: Working, where: Mask) -> None:
     """Switch off an axis that left its travel: it slipped from the field, and falls."""
     down, up = working.room()
     out = where & ((up < 0.0) | (down > 0.0))
@@ -193,10 +201,14 @@ def _judge(field: float, away: float, back: float, expected: int) -> EncoderChec
     # Where the rotor rests depends on friction: by half of what it went differently there and back.
     spread = abs(away + back) / 2.0 / abs(rotor) * abs(ratio)
     nearest = round(abs(ratio))
-    if nearest < 1 or abs(abs(ratio) - nearest) + spread > max(TOLERANCE, 0.02 * nearest):
+    if nearest < 1 or abs(abs(ratio) - nearest) + spread > _tolerance(nearest):
         reason = (
             f"the field's electrical turns are {abs(ratio):.2f} (give or take {spread:.2f}) of those that the encoder "
             "counts, which is no whole number: check the encoder's steps, 2080h:02, or allow more travel and current"
         )
-        return EncoderCheck(refused("1", reason), direction)
-    return EncoderCheck(Estimate(float(nearest), float(nearest), float(nearest), "1"), direction)
+        return EncoderCheck(refused("1", reason), direction, ratio)
+    return EncoderCheck(Estimate(float(nearest), float(nearest), float(nearest), "1"), direction, ratio)
+
+
+def _tolerance(pole_pairs: int) -> float:
+    return max(TOLERANCE, 0.02 * pole_pairs)

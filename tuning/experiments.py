@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,8 @@ from tuning.encoder_check import EncoderCheck, check_encoders
 from tuning.frequency_response import measure
 from tuning.identification import NAMES, Estimate, Identification, Progress, refused
 from tuning.inertia import Mechanics, identify_mechanics
+from tuning.oscillation_watch import OscillationError, WatchedDrives, shaken
+from tuning.standstill import standstill_resistances
 from tuning.target import Target, timed
 from tuning.winding import Winding, identify_winding, pulse, to_torque_mode
 from tuning.working_state import (
@@ -43,7 +46,9 @@ UNITS = {
     "coulomb": "A", "viscous": "A*s/rad", "offset": "A", "anti_resonance": "Hz", "resonance": "Hz",
     "loop_delay": "s", "velocity_filter": "Hz",
 }  # fmt: skip
-RESPONSE = NAMES[NAMES.index("anti_resonance") :]
+MECHANICS, RESPONSE = NAMES[NAMES.index("inertia") :], NAMES[NAMES.index("anti_resonance") :]
+OSCILLATED = "the axis oscillated"  # how the reason begins where one did
+PULSED = 1.2  # of the current limit, RMS over 25 ms: beyond, the current loop does not pulse but oscillates
 
 
 class Experiments:
@@ -54,25 +59,54 @@ class Experiments:
         found: What is known so far of each axis, by the names of `NAMES`.
     """
 
+    thorough = True  # also what only tells better what is told
+
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
         self.target, self.where, self.progress = target, where, progress
+        self._at_rest: list[Estimate] = []  # resistances, where they are looked for
+        self._under_way: tuple[str, tuple[str, ...]] = ("", NAMES)
         self.found: list[dict[str, Estimate]] = [
             {name: refused(UNITS[name], "not asked for") for name in NAMES} for _ in range(target.num_axes)
         ]
 
     def run(self) -> list[Identification]:
         """Do them all."""
-        with timed(self.target) as (target, clock), working_state(target, self.where) as working:
-            good = self.check(working)
-            if good.any():
-                self.turn(replace(working, where=good))
+        with timed(self.target) as (target, clock):
+            noise = target.device.stage["adc_noise"].high
+            watched = WatchedDrives(target.drives, self.where, np.full(target.num_axes, target.current), noise)
+            with working_state(replace(target, drives=watched), self.where) as working:
+                watched.limit = working.current
+                with suppress(OscillationError):
+                    good = self.check(working)
+                    if good.any():
+                        self.turn(replace(working, where=good))
+                self.calm(working)
         self.progress("done", 1.0)
         return [Identification(found, clock.seconds if chosen else 0.0)
                 for found, chosen in zip(self.found, self.where, strict=True)]  # fmt: skip
 
+    def begin(self, what: str, share: float, names: tuple[str, ...]) -> None:
+        """Tell what is under way and the share done; what it and all after it are to say has these names."""
+        self.progress(what, share)
+        self._under_way = what, names
+
+    def calm(self, working: Working) -> Working:
+        """Return the axes that did not oscillate; what the others have no value of is refused with that reason."""
+        swung = working.where & working.target.drives.watch.swung
+        what, names = self._under_way
+        for k in np.flatnonzero(swung):
+            for name in names:
+                before = self.found[k][name]
+                if not before.is_known and not before.reason.startswith(OSCILLATED):
+                    self.found[k][name] = refused(UNITS[name], (
+                        f"{OSCILLATED} ({what}) and was switched off within 50 ms: is it another motor, or are current "
+                        "and inertia far from what its data sheet says?"
+                    ))  # fmt: skip
+        return replace(working, where=working.where & ~swung)
+
     def check(self, working: Working) -> Mask:
         """Check the encoders and return the axes whose torque may be commanded."""
-        self.progress("pole pairs and encoder", 0.0)
+        self.begin("pole pairs and encoder", 0.0, NAMES)
         checks: list[EncoderCheck] = check_encoders(working)
         good = working.where.copy()
         for k in np.flatnonzero(working.where):
@@ -82,49 +116,57 @@ class Experiments:
             if reason:
                 good[k] = False
                 self.refuse(int(k), NAMES, reason)
+        if good.any() and (self.thorough or _in_real_time(working)):
+            self._at_rest = standstill_resistances(replace(working, where=good))
         return good
 
     def _wrong(self, working: Working, k: int, check: EncoderCheck) -> str:
         """Return why no torque may be commanded, if so."""
+        target = working.target
         if not check.is_good:
             return (
                 "the encoder counts against the field, and torque would make the motor run away: turn 2080h:01 (or "
                 "swap two motor phases), then identify again"
             )
-        configured = int(working.target.drives.read(POLE_PAIRS)[k])
+        configured = int(target.drives.read(POLE_PAIRS)[k])
         if check.pole_pairs.is_known and round(check.pole_pairs.value) != configured:
             return (
                 f"the motor has {check.pole_pairs.value:.0f} pole pairs and 2056h says {configured}: torque would turn "
-                "with the angle; write the right number, then identify again"
+                "with the angle; write the right number (or the right encoder steps, 2080h:02), then identify again"
             )
+        if not check.is_whole(configured):
+            return f"{check.pole_pairs.reason}; torque would turn with the angle: correct it, then identify again"
         if "did not follow" in check.direction.reason or "switched off" in check.direction.reason:
             return check.direction.reason
-        if working.target.motor.kind != "dc" and not check.direction.is_known:
+        if target.motor.kind != "dc" and not check.direction.is_known:
             return f"{check.direction.reason}; torque with wiring that is not checked could make the motor run away"
         return ""
 
     def turn(self, working: Working) -> None:
         """Do what needs torque."""
         target, drives = working.target, working.target.drives
-        self.progress("winding", 0.15)
+        self.begin("current pulses", 0.15, NAMES)
         enable(working, "csp")
         go_back(working, "csp")
         holding = self.hold(working)
         electrical = drives.read(ELECTRICAL_ANGLE) * (2.0 * np.pi / 65536.0)
         to_torque_mode(working, holding)
-        with swinging_allowed(target.drives):
+        with swinging_allowed(drives), shaken(drives, PULSED * working.current):
             pulses = pulse(working, holding)
+        working = self.calm(working)
         gains = cautious_gains(target, GUESS * target.motor.inertia)
         write_gains(drives, gains, working.where)
         go_back(working, "csv")
         sign = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
         windings = identify_winding(working, pulses, electrical, float(target.motor.n_p) * float(sign[0]))
         self.take_windings(working, windings)
-        self.progress("inertia and friction", 0.3)
+        self.begin("inertia and friction", 0.3, MECHANICS)
         mechanics, inertia = identify_mechanics(working, holding)
         self._take_mechanics(working, mechanics)
-        self.progress("resonance, delay, filter", 0.7)
+        working = self.calm(working)
+        self.begin("resonance, delay, filter", 0.7, RESPONSE)
         self.respond(working, inertia)
+        working = self.calm(working)
         on = working.where & still_enabled(working, drives.read(STATUS))
         if on.any():
             go_back(replace(working, where=on), "csv", to=0.0)
@@ -141,7 +183,13 @@ class Experiments:
     def take_windings(self, working: Working, windings: list[Winding]) -> None:
         """Take resistance and inductance."""
         for k in np.flatnonzero(working.where):
-            self.found[k] |= {"resistance": windings[k].resistance, "inductance": windings[k].inductance}
+            both = [windings[k].resistance, *self._at_rest[k : k + 1]]
+            # In real time pulses say nothing, and why not is not what helps.
+            resistance = min(
+                (one for one in both if one.is_known), key=lambda one: one.high - one.low,
+                default=both[-1] if _in_real_time(working) else both[0],
+            )  # fmt: skip
+            self.found[k] |= {"resistance": resistance, "inductance": windings[k].inductance}
             if working.target.motor.kind == "dc" and windings[k].follows:
                 # Speed followed torque: with a reversed encoder the loops would have run away by now.
                 self.found[k]["encoder_direction"] = Estimate(1.0, 1.0, 1.0, "1")
@@ -172,7 +220,7 @@ class Experiments:
         here = replace(target, low=np.minimum(down, 0.0), high=np.maximum(up, 1e-3))
         with swinging_allowed(drives):
             response = measure(
-                here, "velocity", where=able, high=HIGHEST,
+                here, "velocity", where=able, high=HIGHEST, confirmed=True, softened=True,
                 progress=lambda share: self.progress("resonance, delay, filter", 0.7 + 0.29 * share),
             )  # fmt: skip
         for k in np.flatnonzero(able):
@@ -214,3 +262,7 @@ class Experiments:
         for name in names:
             if not self.found[k][name].is_known and self.found[k][name].reason in ("", "not asked for"):
                 self.found[k][name] = refused(UNITS[name], reason)
+
+
+def _in_real_time(working: Working) -> bool:
+    return not getattr(working.target.drives, "time_waits", True)

@@ -8,22 +8,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal, stats
 
 from drive_env.gains import GAIN_OBJECTS
 from tuning import margins as margins_
+from tuning.dead_time import dead_time_resistance
 from tuning.excitation import CREST, Lines, dimension, peak, plan_lines
 from tuning.held_samples import split, unhold
 from tuning.lags import velocity_noise
 from tuning.linear_model import Plant, controllers
-from tuning.plant_fit import FEWEST, PlantFit, fit_plant
-from tuning.shaking import CYCLE, RAMP, SETTLING, Pass, Shaker
+from tuning.oscillation_watch import OscillationError, shaken
+from tuning.plant_fit import PlantFit, Seen, fit_plant
+from tuning.shaking import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
 from tuning.target import timed
+from tuning.transfer import directions, transfer
 from tuning.working_state import swinging_allowed
 
 if TYPE_CHECKING:
@@ -40,7 +43,9 @@ LOOPS = ("velocity", "position")
 RANGE = {"velocity": (5.0, 400.0), "position": (5.0, 50.0)}  # Hz
 RESOLUTION = 5.0  # Hz
 COHERENT = 0.95  # from which on a line is trusted
-FITTED = 0.5  # from which on it is fitted, with the weight that its noise leaves it, once enough can be trusted
+# From which on a line is fitted, with the weight that its noise leaves it, once all together say as much as `WORTH`
+# lines that are trusted.
+FITTED, WORTH = 0.5, 4.0
 BUS_LIMIT = 400.0  # Hz; above, a bus's samples hold more of the images than of the line
 TRACED_TOP = 495.0  # Hz, of the set-points in a traced measurement
 TRACE_LIMIT = 1000.0  # Hz
@@ -48,13 +53,14 @@ FINE = 10  # points between two lines, where margins are looked for
 GOOD_MISFIT = 2.0  # of a fit that is good enough to read margins between lines by
 SMOOTHING = 1.5  # lines, standard deviation
 PASSES, PERIODS = 2, 3  # of a measurement; the trial before it has one of each
+SOFTER = 2  # how often the gains of an axis that oscillates are lowered
+CONFIRMING, LESS = 6, 0.5  # passes of one that is confirmed, and the share of its strength in the second half of them
 
-STANDS = 1e-9  # of the set-point: an axis that answers less was not shaken
-DISTORTION_HIGH, TRIMMED = 200.0, 0.1  # Hz up to which passes are compared, and the share of lines left out at each end
 
 # How an axis is loaded, over its limits.
 TRIAL_SPEED, TRIAL_CURRENT = 0.1, 0.4
 SPEED, CURRENT = 0.45, 0.9
+TRIAL_SWING, SWING = 0.42, 0.65  # RMS over 25 ms, beyond which it is not the shaking but an oscillation
 IN_RAMP = 0.5  # of what the shaking takes, for changing the speed
 TRAVEL = 0.85
 OVER_NOISE = 5.0  # least RMS of the shaken velocity over the encoder's noise, also where the motion then reverses
@@ -151,11 +157,14 @@ def measure(
     high: float | None = None,
     resolution: float = RESOLUTION,
     traced: bool = False,
+    confirmed: bool = False,
+    softened: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> FrequencyResponse:
     """Measure a loop's frequency response on its axes; they end where they began, as they were found.
 
-    Axes of one machine are shaken one after the other, machines side by side.
+    Axes of one machine are shaken one after the other, machines side by side. The others hold their places; where all
+    pull at one thing, they are off and run along.
 
     Args:
         target: The axes.
@@ -168,6 +177,9 @@ def measure(
             resonances do, is still found.
         resolution: Between two frequencies [Hz]; a period lasts its inverse.
         traced: Look above 400 Hz too, through the emulator's trace at the velocity loop's rate.
+        confirmed: Look longer, and again with half the strength: a resonance that is then another is refused.
+        softened: Quarter the velocity gains, twice at most, of an axis that oscillates in the trial, and leave them so;
+            its drives are watched (`tuning.oscillation_watch`).
         progress: Called with the share done.
 
     Raises:
@@ -194,16 +206,20 @@ def measure(
         raise ValueError("a P gain is 0 on every axis and the loop is open: give the drives gains first")
     position = np.arange(target.num_axes) % target.axes_per_machine
     results = []
-    for k in range(target.axes_per_machine):
-        chosen = axes & closed & (position == k)
-        if chosen.any():
-            measurement = _Measurement(target, loop, chosen, lines, top, kind, traced)
+    holds = target.axes_per_machine > 1 and not target.linked
+    with at_rest(target, loop, axes & closed) if holds else nullcontext():
+        for k in range(target.axes_per_machine):
+            chosen = axes & closed & (position == k)
+            if not chosen.any():
+                continue
+            measurement = _Measurement(target, loop, chosen, lines, top, kind, traced, confirmed, softened)
 
             def show(share: float, k: int = k) -> None:
                 if progress is not None:
                     progress((k + share) / target.axes_per_machine)
 
-            with swinging_allowed(target.drives):
+            free = let_go(target, axes & ~chosen, chosen) if target.linked else nullcontext()
+            with free, swinging_allowed(target.drives):
                 results.append(measurement.run(show))
     merged = _merge(results)
     open_loop = "a gain is 0 and the loop is open: give the drive gains first"
@@ -223,9 +239,11 @@ class _Measurement:
     """One measurement of axes side by side: a trial, the run proper, and what they say."""
 
     def __init__(
-        self, target: Target, loop: str, where: Mask, lines: Lines, top: float, kind: str, traced: bool
-    ) -> None:
-        self._top = top
+        self, target: Target, loop: str, where: Mask, lines: Lines, top: float, kind: str, traced: bool,
+        confirmed: bool, softened: bool,
+    ) -> None:  # fmt: skip
+        self._top, self._softened = top, softened
+        self._passes, self._confirmed = (CONFIRMING if confirmed else PASSES), confirmed
         self._target, self._loop, self._lines, self._kind, self._traced = target, loop, lines, kind, traced
         self._device: Device = target.device
         self._notes: list[list[str]] = [[] for _ in range(target.num_axes)]
@@ -242,18 +260,22 @@ class _Measurement:
                 sign = np.sign(room)
                 limit = self._current_limit()
                 speed = self._trial_speed(np.abs(room))
-                trial = shaker.run(self._trial_amplitude(speed, limit), sign * speed, 1, 1)
+                trial = self._trial(shaker, limit, speed, sign)
                 progress(0.2)
-                rough = _transfer(trial.set_point, trial.answer, self._lines)[0]
+                rough = transfer(trial.set_point, trial.answer, self._lines)[0]
                 room = np.abs(room) - speed * _duration(1, self._lines)
                 amplitude, speed = self._amplitude(rough, trial, room, limit)
-                seen = shaker.run(amplitude, sign * speed, PASSES, PERIODS, traced=self._traced)
-                progress(0.9)
+                less = None
+                with shaken(counted.drives, SWING * limit):
+                    seen = shaker.run(amplitude, sign * speed, self._passes, PERIODS, traced=self._traced)
+                    progress(0.5 if self._confirmed else 0.9)
+                    if self._confirmed:
+                        less = shaker.run(LESS * amplitude, sign * speed, self._passes, PERIODS)
         self._drive_time = clock.seconds + shaker.traced_time
         for axis in np.flatnonzero(where & ~seen.enabled):
             self._notes[axis].append("the drive stopped while it was shaken; see its emergencies")
         self._note_limits(seen.peak_current, where)
-        result = self._evaluate(seen, where & seen.enabled)
+        result = self._evaluate(seen, less, where & seen.enabled)
         progress(1.0)
         return result
 
@@ -262,6 +284,23 @@ class _Measurement:
         """Return what may flow [A]: the user's limit, or the drive's own."""
         own = self._target.drives.read(self._device.master.current_limit) * 1e-3
         return np.asarray(np.minimum(self._target.current, own))
+
+    def _trial(self, shaker: Shaker, limit: Floats, speed: Floats, sign: Floats) -> Pass:
+        """Return what a weak shaking shows; an axis that oscillates gets softer gains first, if it may."""
+        drives = self._target.drives
+        watch = getattr(drives, "watch", None)
+        for left in reversed(range(SOFTER + 1)):
+            amplitude = self._trial_amplitude(speed, limit)
+            try:
+                with shaken(drives, TRIAL_SWING * limit):
+                    trial = shaker.run(amplitude, sign * speed, 1, 1)
+            except OscillationError:
+                if not (self._softened and left):
+                    raise
+            if watch is None or not self._softened or not (self._where & watch.swung).any() or not left:
+                break
+            self._gains = watch.soften(self._where & watch.swung, self._gains, MODE[self._loop])
+        return trial
 
     def _trial_speed(self, room: Floats) -> Floats:
         return np.minimum(TRIAL_SPEED * self._target.speed, 0.4 * room / _duration(1, self._lines))
@@ -331,19 +370,21 @@ class _Measurement:
             )
 
     # --- what it says ---------------------------------------------------------------------------------------------
-    def _evaluate(self, seen: Pass, where: Mask) -> FrequencyResponse:
+    def _evaluate(self, seen: Pass, less: Pass | None, where: Mask) -> FrequencyResponse:
         lines = self._lines._replace(f=self._lines.f[self._lines.f <= self._top])
         f = lines.f
-        closed, coherence, spread = _transfer(seen.set_point, seen.answer, lines)
-        parts, distortion = _passes(seen.set_point, seen.answer, lines)
+        closed, coherence, spread = transfer(seen.set_point, seen.answer, lines)
+        parts, distortion = directions(seen.set_point, seen.answer, lines, self._passes)
+        weaker = None if less is None else transfer(less.set_point, less.answer, lines)
         open_loop = np.full(closed.shape, np.nan, complex)
         fits: list[PlantFit | None] = [None] * closed.shape[1]
         for axis in map(int, np.flatnonzero(where)):
             images = np.zeros(len(f), complex)
             if self._loop == "velocity":
                 fit = self._fit(
-                    self._gains[axis], f, closed[:, axis], coherence[:, axis], spread[:, axis],
-                    [part[:, axis] for part in parts], float(distortion[axis]), axis,
+                    axis, f, (closed[:, axis], coherence[:, axis], spread[:, axis]), [part[:, axis] for part in parts],
+                    float(distortion[axis]), seen.current[:, axis],
+                    None if weaker is None else (weaker[0][:, axis], weaker[1][:, axis], weaker[2][:, axis]),
                 )  # fmt: skip
                 fits[axis] = fit
                 images = split(self._device, f, _closed_by(self._device, fit, self._gains[axis]))[1]
@@ -364,17 +405,18 @@ class _Measurement:
         )  # fmt: skip
 
     def _fit(
-        self, gains: Integers, f: Floats, seen: Complex, coherence: Floats, spread: Floats, parts: Sequence[Complex],
-        distortion: float, axis: int,
+        self, axis: int, f: Floats, measured: _Transfer, parts: Sequence[Complex], distortion: float, current: Floats,
+        weaker: _Transfer | None,
     ) -> PlantFit:  # fmt: skip
-        target = self._target
-        start = Plant.from_data_sheet(
-            self._device, target.motor, float(target.supply[axis]), 3.0 * target.motor.inertia
-        )
-        good = coherence >= (FITTED if np.sum(coherence >= COHERENT) >= FEWEST else COHERENT)
+        target, device = self._target, self._device
+        supply = float(target.supply[axis])
+        start = Plant.from_data_sheet(device, target.motor, supply, 3.0 * target.motor.inertia)
+        lines, good = _fitted(f, measured)
         fit = fit_plant(
-            self._device, gains, f[good], seen[good], spread[good], start, [part[good] for part in parts], distortion
-        )
+            device, self._gains[axis], *lines, start, [part[good] for part in parts], distortion,
+            dead_time_resistance(device, target.motor, supply, current),
+            None if weaker is None else _fitted(f, weaker)[0],
+        )  # fmt: skip
         if not fit.reason and fit.misfit > GOOD_MISFIT:
             self._notes[axis].append(
                 f"the linear model is off by {fit.misfit:.1f} times the noise; margins are read from the lines alone"
@@ -382,6 +424,19 @@ class _Measurement:
         if fit.reason:
             self._notes[axis].append(f"excitation too weak: {fit.reason}")
         return fit
+
+
+_Transfer = tuple[Complex, Floats, Floats]  # of one axis, as `transfer` returns it
+
+
+def _fitted(f: Floats, measured: _Transfer) -> tuple[Seen, Mask]:
+    """Return the lines that are fitted, and which they are: those that are trusted, or all that are not mere noise."""
+    closed, coherence, spread = measured
+    good = coherence >= FITTED
+    clear = np.minimum(coherence[good], COHERENT)
+    if np.sum(clear / (1.0 - clear)) < WORTH * COHERENT / (1.0 - COHERENT):
+        good = coherence >= COHERENT
+    return Seen(f[good], closed[good], spread[good]), good
 
 
 def _closed_by(device: Device, fit: PlantFit, gains: Integers) -> Callable[[Floats], Complex]:
@@ -403,46 +458,6 @@ def _duration(periods: int, lines: Lines) -> float:
     return (2 * RAMP + SETTLING + periods * lines.samples) * CYCLE
 
 
-def _transfer(set_point: Floats, answer: Floats, lines: Lines) -> tuple[Complex, Floats, Floats]:
-    """Return set-point to answer at the lines, its coherence, and its standard deviation over its size, (n, axes)."""
-    periods = len(set_point) // lines.samples
-
-    def cross(x: Floats, y: Floats) -> Complex:
-        # Whole periods need no window.
-        spectrum = signal.csd(x, y, lines.rate, "boxcar", lines.samples, 0, detrend="constant", axis=0)[1]
-        return np.asarray(spectrum)[lines.bins]
-
-    error = set_point - answer
-    power, answers, errors = (np.abs(cross(x, x)) for x in (set_point, answer, error))
-    to_answer, to_error = cross(set_point, answer), cross(set_point, error)
-    tiny = 1e-30  # of what was not shaken
-    with_answer = np.abs(to_answer) ** 2 / np.maximum(power * answers, tiny)
-    with_error = np.abs(to_error) ** 2 / np.maximum(power * errors, tiny)
-    freedom = max(periods - 1, 1)
-    spread = np.sqrt(np.maximum(1.0 - with_answer, 0.0) / np.maximum(with_answer, tiny) / freedom)
-    return to_answer / np.maximum(power, tiny), np.minimum(with_answer, with_error), spread
-
-
-def _passes(set_point: Floats, answer: Floats, lines: Lines) -> tuple[list[Complex], Floats]:
-    """Return set-point to answer of each pass, (n, axes), and the share by which the passes differ beyond noise.
-
-    Within a pass periods repeat but for noise; from pass to pass the excitation runs backwards, and what is not linear
-    answers otherwise (Pintelon and Schoukens, System Identification, 2nd ed., chapter 4).
-    """
-    periods = len(set_point) // lines.samples
-    if periods < 2 * PASSES:
-        return [], np.zeros(set_point.shape[1])
-    shape = (PASSES, periods // PASSES, lines.samples, -1)
-    into, out = (np.fft.rfft(x.reshape(shape), axis=2)[:, :, lines.bins] for x in (set_point, answer))
-    each = out / np.where(into == 0.0, np.inf, into)
-    passes = each.mean(axis=1)
-    noise = np.sum(np.abs(each - passes[:, None]) ** 2, axis=(0, 1)) / (PASSES * (shape[1] - 1)) / shape[1]
-    between = np.sum(np.abs(passes - passes.mean(axis=0)) ** 2, axis=0) / (PASSES - 1)
-    size = np.abs(passes.mean(axis=0))
-    excess = ((between - noise) / np.where(size > STANDS, size, np.inf) ** 2)[lines.f <= DISTORTION_HIGH]
-    return list(passes), np.sqrt(np.maximum(stats.trim_mean(excess, TRIMMED, axis=0), 0.0))
-
-
 def _fast(device: Device, seen: Pass, lines: Lines) -> tuple[Floats, Complex, Floats]:
     """Return frequencies above the bus's, open loop and coherence there, from the trace.
 
@@ -453,7 +468,7 @@ def _fast(device: Device, seen: Pass, lines: Lines) -> tuple[Floats, Complex, Fl
     last = int(TRACE_LIMIT / lines.rate * lines.samples)
     bins = np.arange(first, last + 1)
     all_lines = Lines(bins * lines.rate / lines.samples, lines.samples * windows, lines.rate * windows)
-    closed, coherence, _ = _transfer(seen.fast_set_point, seen.fast_answer, all_lines)
+    closed, coherence, _ = transfer(seen.fast_set_point, seen.fast_answer, all_lines)
     # What is excited are the lines and their images; multiples of the bus's rate the holding takes out.
     folded = np.minimum(bins % lines.samples, -bins % lines.samples)
     lit = np.isin(folded, lines.bins)

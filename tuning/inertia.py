@@ -23,6 +23,7 @@ from drive_env.gains import write_gains
 from drive_env.parameters import velocity_filter
 from tuning.confidence import gain_error, interval, t_quantile
 from tuning.identification import Estimate, refused
+from tuning.oscillation_watch import SOFTER, VELOCITY_I, VELOCITY_P, OscillationError
 from tuning.target import Target
 from tuning.working_state import (
     CURRENT,
@@ -57,6 +58,7 @@ FEWEST_MOVES = 5  # with which more than the four is looked for
 CLEAR = 4.0  # times its deviation: from here on an effect that most loads do not have is one
 # Of what is over K_t, 95 %: commutation, temperature, the ripple that samples hide, a transmission's losses.
 TORQUE_MODEL = 0.018
+VISCOUS_MODEL = 0.02  # the same, of viscous friction besides: a transmission loses some of what lies behind it
 
 
 class Mechanics(NamedTuple):
@@ -244,21 +246,47 @@ def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked:
     """Move the axes there are and return what each says; `inertia` is brought up to date."""
     target = working.target
     results: list[Mechanics] = []
+    softness = np.ones(target.num_axes, np.int64)
     for times, shares in (COARSE, FINE):
-        gains = cautious_gains(target, inertia)
-        write_gains(target.drives, gains, working.where)
-        go_back(working, "csv")
-        plan = plan_moves(working, inertia, holding, times, shares, linked)
-        angle, current, alive = move(working, plan)
+
+        def plan() -> Plan:
+            return plan_moves(working, inertia, holding, times, shares, linked)  # noqa: B023
+
+        moves, angle, current, alive, gains = _moved(working, plan, cautious_gains(target, inertia), softness)
         results = []
         for k in range(target.num_axes):
             if not alive[k]:
                 results.append(_none("the drive switched off during the moves; see its emergencies"))
                 continue
-            found, rough = _balance(working, k, angle[:, k], current[:, k], plan, gains[k])
+            found, rough = _balance(working, k, angle[:, k], current[:, k], moves, gains[k])
             results.append(found)
             inertia[k] = np.clip(rough, 0.7 * target.motor.inertia, 2.0 * MOST_RATIO * target.motor.inertia)
     return results
+
+
+def _moved(
+    working: Working, plan: Callable[[], Plan], gains: Integers, softness: Integers
+) -> tuple[Plan, Floats, Floats, Mask, Integers]:
+    """Move, once more with softer gains if an axis oscillates; return plan, what `move` returns, and the gains."""
+    drives = working.target.drives
+    watch = getattr(drives, "watch", None)
+    for column in (VELOCITY_P, VELOCITY_I):
+        gains[:, column] = np.maximum(gains[:, column] // softness, 1)
+    write_gains(drives, gains, working.where)
+    for again in (True, False):
+        go_back(working, "csv")
+        moves = plan()
+        try:
+            angle, current, alive = move(working, moves)
+        except OscillationError:
+            if not again:
+                raise
+        if watch is None or not (again and (working.where & watch.swung).any()):
+            break
+        swung = working.where & watch.swung
+        gains = watch.soften(swung, gains, "csv")
+        softness[swung] *= SOFTER
+    return moves, angle, current, alive, gains
 
 
 def _none(reason: str) -> Mechanics:
@@ -340,7 +368,7 @@ def _balance(
     else:
         inertia = interval(J, float(half[0] * K), float(np.hypot(scale, _periodic(working, k, J, plan))), "kg*m^2")
     coulomb = _friction(float(fit.mean[1]), float(half[1]), scale, "A", why)
-    viscous = _friction(float(fit.mean[2]), float(half[2]), scale, "A*s/rad", why)
+    viscous = _friction(float(fit.mean[2]), float(half[2]), float(np.hypot(scale, VISCOUS_MODEL)), "A*s/rad", why)
     # Offsets of the sensors turn with the field and average out; those of a brushed motor's one channel do not.
     sensor = 0.95 * abs(target.device.stage["adc_offset_a"].high) if motor.kind == "dc" else 0.0
     offset = interval(float(fit.mean[3]), float(half[3]), scale, "A", sensor)

@@ -1,4 +1,4 @@
-"""Which gains are tried next on an axis: down until some pass, then beside what passed, as long as it gets better."""
+"""Which gains are tried next on an axis: down until some pass, then others, then beside the first."""
 
 from __future__ import annotations
 
@@ -6,19 +6,28 @@ from typing import NamedTuple
 
 # Factors of the gains that were found on a twin: how far down to go when they fail, and what is tried beside a pass.
 SLOWER, DOWN, UP = 0.6, 0.8, 1.15
+# Beside the gains that serve on all twins: the best if everything is as it was identified, and if friction is less.
+BOLD, SLIPPERY = range(2)
+OTHERS = ("bold gains", "gains for less friction")
 MOST_TRIALS = 3  # of an axis on which gains pass
 
 
 class Rung(NamedTuple):
-    """What is tried: the gains found, times a factor; or a fallback, by its number."""
+    """What is tried.
+
+    factor: Of the gains found. other: Others that were found, by their number, instead. fallback: One, by its number.
+    """
 
     factor: float = 1.0
     fallback: int | None = None
+    other: int | None = None
 
     @property
     def words(self) -> str:
         """Say which gains these are."""
-        return f"gains found, at {100.0 * self.factor:.0f} %" if self.fallback is None else "gains of a rule"
+        if self.fallback is not None:
+            return "gains of a rule"
+        return f"gains found, at {100.0 * self.factor:.0f} %" if self.other is None else OTHERS[self.other]
 
 
 class Ladder:
@@ -49,14 +58,15 @@ class Ladder:
         Args:
             passed: Whether it passed.
             better: Whether it is the best so far.
-            loud: Whether its current was noisy.
+            loud: Whether its current was noisy at rest: it hunts, since little friction holds it.
         """
         rung = self.rung
         assert rung is not None, "nothing was to be tried"
         self._trials += 1
-        self._tried.append(rung.factor)
-        if not passed:
-            self._ceiling = min(self._ceiling, rung.factor)
+        if rung.other is None:
+            self._tried.append(rung.factor)
+            if not passed:
+                self._ceiling = min(self._ceiling, rung.factor)
         if self.passed:
             self.rung = self._beside(rung, better)
         elif not passed:
@@ -69,8 +79,7 @@ class Ladder:
                 self.rung = None
             else:
                 # Below gains that failed: half way up again.
-                up = DOWN if self.failures else UP
-                self.rung = self._open(DOWN * rung.factor if loud else up)
+                self.rung = self._open(DOWN) if self.failures else Rung(other=SLIPPERY if loud else BOLD)
 
     def _below(self, rung: Rung) -> Rung | None:
         """Return what is slower than what failed."""
@@ -82,6 +91,9 @@ class Ladder:
         """Return a neighbour of the best: farther the same way if that was better, the other way if not."""
         if self._trials >= MOST_TRIALS:
             return None
+        if rung.other is not None:
+            # Beyond the bold ones lies what not even the twin that is as identified takes for better.
+            return None if better else self._open(UP)
         before, self._best = self._best, rung.factor if better else self._best
         if better:
             return self._open(rung.factor * rung.factor / before)

@@ -116,7 +116,8 @@ class Plant:
         if not math.isfinite(inertia):
             reason = getattr(identification.estimates.get("inertia"), "reason", "") or "it was not measured"
             raise ValueError(f"the axis has no identified inertia: {reason}")
-        fields = {"R": "resistance", "L": "inductance", "delay": "loop_delay", "velocity_filter": "velocity_filter"}
+        fields = {"R": "resistance", "L": "inductance", "delay": "loop_delay", "velocity_filter": "velocity_filter",
+                  "damping": "damping"}  # fmt: skip
         known = {field: found[name] for field, name in fields.items() if math.isfinite(found.get(name, math.nan))}
         pair = [found.get(name, math.nan) for name in ("anti_resonance", "resonance")]
         if all(math.isfinite(frequency) for frequency in pair):

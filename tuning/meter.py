@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,11 @@ from drive_env import motion
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.positioning import CURRENT, CYCLE, POSITION, STATUS, VELOCITY, wrapped
+from tuning.moves import MoveCounter
 from tuning.target import POSITION_SCALER, Target
+
+if TYPE_CHECKING:
+    from drive_env.dictionary.entries import Entry
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -31,8 +35,6 @@ SLACK = 0.02  # rev beyond the travel that are none yet: a few counts of an over
 KINDS = ("left its travel", "too fast", "oscillated", "tripped")
 
 _WATCHED = (POSITION, VELOCITY, CURRENT, STATUS)
-_CONTROLWORD, _SET_POINT = (0x6040, 0), 0x10
-_EXCITES = ((0x6071, 0), (0x60FF, 0))  # targets of torque and velocity: setting one moves the axis
 
 
 @cache
@@ -48,9 +50,9 @@ class MeteredDrives:
         target: What is tuned.
 
     Attributes:
-        seconds: When each axis was last written to [s], (num_axes,): until then it was in use.
+        seconds: When each axis was last written to, or moved by what was played [s], (num_axes,): until then it was in
+            use.
         elapsed: Time that passed [s].
-        moves: Set-points started, targets of velocity or torque that leave 0, and profiles played, (num_axes,).
         violations: By kind of `KINDS`, (4, num_axes).
     """
 
@@ -61,17 +63,16 @@ class MeteredDrives:
         count = target.num_axes
         self.elapsed = 0.0
         self.seconds = np.zeros(count)
-        self.moves = np.zeros(count, np.int64)
         self.violations = np.zeros((len(KINDS), count), np.int64)
         self._drives = drives
         self._dictionary = _dictionary(target.device.name)
-        self._word = np.zeros(count, np.int64)
-        self._driven = np.zeros(count, bool)
         scaler = np.asarray(drives.read(POSITION_SCALER), float)
         self._origin = drives.read(POSITION)
         self._low, self._high = (ends * scaler / (2.0 * np.pi) for ends in (target.low, target.high))
         self._slack = SLACK * scaler
-        self._fastest = OVERSPEED * target.speed * scaler / (2.0 * np.pi)
+        limit = target.speed * scaler / (2.0 * np.pi)
+        self._fastest = OVERSPEED * limit
+        self._counter = MoveCounter(limit, target.current * 1e3)
         self._rated = target.motor.rated_current
         self._outside: Mask = np.zeros((len(KINDS), count), bool)
         self._last_current = np.zeros(count)
@@ -81,21 +82,18 @@ class MeteredDrives:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._drives, name)
 
+    @property
+    def moves(self) -> Integers:
+        """Commanded motions from standstill to standstill so far, as moves.py counts them, (num_axes,)."""
+        return self._counter.moves
+
     def write(self, name: Any, value: ArrayLike, where: Mask | None = None) -> None:
         """Write an object, and count what it starts."""
         self._drives.write(name, value, where=where)
         axes = np.ones(len(self.seconds), bool) if where is None else where
         self.seconds[axes] = self.elapsed
         entry = self._dictionary.find(name)
-        key = (entry.index, entry.sub)
-        if key == _CONTROLWORD:
-            word = np.broadcast_to(np.asarray(value, np.int64), self._word.shape)
-            self.moves += axes & (word & _SET_POINT != 0) & (self._word & _SET_POINT == 0)
-            self._word = np.where(axes, word, self._word)
-        elif key in _EXCITES:
-            driven = np.broadcast_to(np.asarray(value), self._word.shape) != 0
-            self.moves += axes & driven & ~self._driven
-            self._driven = np.where(axes, driven, self._driven)
+        self._counter.written((entry.index, entry.sub), value, axes)
 
     def advance(self, duration: float) -> None:
         """Let time pass, watched."""
@@ -113,9 +111,9 @@ class MeteredDrives:
         watched = [name for name in _WATCHED if name not in objects]
         trace = self._drives.record([*objects, *watched], duration, play, period)
         self.elapsed += duration
-        if play:
-            self.moves += 1
-            self.seconds[:] = self.elapsed
+        rows = {(entry.index, entry.sub): values for entry, values in self._entries(play)}
+        moved = self._counter.passed(round(duration / CYCLE), rows)
+        self.seconds[moved] = self.elapsed
         self._watch(trace)
         current = np.asarray(trace[CURRENT], float) * 1e-3
         if play:  # what is played is to shake the axis
@@ -124,6 +122,9 @@ class MeteredDrives:
         else:
             self._watch_current(current)
         return trace
+
+    def _entries(self, play: Mapping[Any, ArrayLike] | None) -> list[tuple[Entry, ArrayLike]]:
+        return [(self._dictionary.find(name), values) for name, values in (play or {}).items()]
 
     def _watch(self, trace: Any) -> None:
         position = wrapped(trace[POSITION] - self._origin)

@@ -1,8 +1,8 @@
 """An axis's plant from a measured velocity loop: inertia, resonance, delay and velocity filter, with their intervals.
 
 The linear model is fitted to what was measured, images of held set-points included, so nothing need be known above
-half the bus's rate. Weights are what coherence says of the noise. A rigid axis has three unknowns, one whose load
-swings has six, one with two springs in a row nine; which it is, the data decide, by Bayes's information criterion.
+half the bus's rate. Weights are what coherence says of the noise. A rigid axis has four unknowns, one whose load
+swings has seven, one with two springs in a row ten; which it is, the data decide, by Bayes's information criterion.
 """
 
 from __future__ import annotations
@@ -47,6 +47,10 @@ WIDEST = {
 # s, standard deviation of what is expected of the delay before it is measured: without any, a few low frequencies
 # cannot tell it from the velocity filter, and both get lost.
 EXPECTED_DELAY = 50e-6
+# Share of what dead time may add to the winding's resistance that is expected, and its deviation: currents that swing
+# through zero seldom see all of it, and it is told from the lag of the velocity filter by this alone.
+EXPECTED_LOSS, LOSS_SPREAD = 0.5, 0.4
+LEVEL = 0.03  # by which a resonance may move with the strength of the shaking, unless noise explains more
 DISTORTED = 0.13  # share by which passes may differ beyond noise
 PAIR = ("anti_resonance", "resonance", "damping")
 DAMPED = {"anti_resonance": 0.03, "resonance": 0.03, "damping": 0.0}  # share of the damping that may move a pair
@@ -82,15 +86,17 @@ class PlantFit(NamedTuple):
     misfit: float  # RMS of the residuals over what noise and LINEAR explain; about 1 if the model fits
     reason: str = ""
     second: Pair | None = None
+    lost: float = 0.0  # what dead time adds to the resistance of a winding that is shaken [ohm]
 
     def open_loop(self, device: Device, gains: NDArray[np.int64], f: Floats) -> Complex:
         """Return the velocity loop's open loop at frequencies [Hz], shape (n,)."""
-        return _open_loop(device, _Model(self.plant, self.second), gains, f)
+        return _open_loop(device, _Model(self.plant, self.second), gains, f, self.lost)
 
 
 class _Model(NamedTuple):
     plant: Plant
     second: Pair | None = None
+    loss: float = EXPECTED_LOSS  # of what dead time may add to the resistance, the share that it does
 
 
 class _Solution(NamedTuple):
@@ -99,14 +105,15 @@ class _Solution(NamedTuple):
     jacobian: Floats  # their derivatives by the parameters, as `_unpack` takes them
 
 
-def _open_loop(device: Device, model: _Model, gains: NDArray[np.int64], f: Floats) -> Complex:
-    L = velocity_open_loop(device, model.plant, gains, f)
+def _open_loop(device: Device, model: _Model, gains: NDArray[np.int64], f: Floats, lost: float) -> Complex:
+    # The winding of a model is the data sheet's: what dead time adds to it comes here.
+    L = velocity_open_loop(device, replace(model.plant, R=model.plant.R + lost), gains, f)
     return L if model.second is None else L * model.second.response(f)
 
 
 def fit_plant(
     device: Device, gains: NDArray[np.int64], f: Floats, seen: Complex, spread: Floats, start: Plant,
-    parts: Sequence[Complex] = (), distortion: float = 0.0,
+    parts: Sequence[Complex] = (), distortion: float = 0.0, lost: float = 0.0, less: Seen | None = None,
 ) -> PlantFit:  # fmt: skip
     """Fit the plant of one axis to its closed velocity loop as a bus sees it.
 
@@ -117,27 +124,87 @@ def fit_plant(
         seen: Set-point to velocity, both as on the bus, shape (n,).
         spread: Standard deviation of each line over its size, shape (n,).
         start: What the data sheet says.
-        parts: What single passes saw, which differ in direction and level, shape (n,) each. By what their resonances
-            differ, intervals are wider.
+        parts: What single passes saw, which differ in direction, shape (n,) each. By what they differ, intervals are
+            wider.
         distortion: Share by which passes differ beyond noise; above `DISTORTED` resonances are refused.
+        lost: What dead time may add to the resistance [ohm]: see `dead_time_resistance`.
+        less: The same axis shaken less. Where that says another resonance it is refused, and where it says none.
     """
     if len(f) < FEWEST:
         return _refusal(start, f"only {len(f)} frequencies are coherent, of {FEWEST} that are needed")
-    size = np.abs(seen)
-    # In the valley of an anti-resonance what is not linear, small elsewhere, is all that is left.
-    around = maximum_filter1d(size, NEIGHBOURS)
-    weight = 1.0 / np.sqrt(size**2 * (spread**2 / 2.0 + LINEAR**2) + (VALLEY * around) ** 2)
     rough = _rough_loop(device, gains, f, seen)
     begin = _with_inertia(start, device, gains, f, rough)
-    loop = _Loop(device, gains, f, seen, weight)
+    loop = _Loop(device, gains, f, seen, _weight(seen, spread), lost)
     best = rigid = _solve(loop, _Model(begin))
-    if _misfit(rigid) > RIGID_ENOUGH:
+    # What will be confirmed may be looked for where a rigid axis would explain it, too.
+    if _misfit(rigid) > RIGID_ENOUGH or less is not None:
         ones = [_solve(loop, _Model(pair)) for pair in _candidate_pairs(loop, rough, begin)]
         best = _better(rigid, ones)
         if _misfit(best) > RIGID_ENOUGH and len(f) > 2 * FEWEST:
             best = _better(best, [_solve(loop, model) for model in _candidate_seconds(loop, ones)])
-    fit = _with_intervals(best, f, _scatter(loop, best, spread, parts))
-    return fit if distortion <= DISTORTED else _distorted(fit, distortion)
+    scatter, doubt = _scatter(loop, best, spread, parts), ""
+    if less is not None and best.model.plant.is_elastic:
+        change, doubt = _by_level(loop, best, less)
+        scatter = np.hypot(scatter, change)
+    fit = _with_intervals(best, f, scatter, lost)
+    # What is confirmed may differ from pass to pass for other reasons.
+    if (doubt or less is None) and distortion > DISTORTED:
+        why = (
+            f"the response is another when it is shaken the other way round, by {100.0 * distortion:.0f} % beyond "
+            "noise: with backlash, or friction that sticks, a resonance depends on how strongly it is shaken"
+        )
+        doubt = f"{doubt}; {why}" if doubt else why
+    return _doubted(fit, doubt) if doubt else fit
+
+
+def _weight(seen: Complex, spread: Floats) -> Floats:
+    size = np.abs(seen)
+    # In the valley of an anti-resonance what is not linear, small elsewhere, is all that is left.
+    around = maximum_filter1d(size, NEIGHBOURS)
+    return np.asarray(1.0 / np.sqrt(size**2 * (spread**2 / 2.0 + LINEAR**2) + (VALLEY * around) ** 2))
+
+
+def _by_level(loop: _Loop, found: _Solution, less: Seen) -> tuple[Floats, str]:
+    """Return by how much parameters differ beyond noise where an axis is shaken less, and why its pair is refused."""
+    p = _with_resonance(_pack(found.model))
+    if len(less.f) < FEWEST:
+        return np.zeros(len(p)), (
+            f"shaken less, only {len(less.f)} frequencies are coherent, of {FEWEST} that are needed to confirm it"
+        )
+    weight = _weight(less.seen, less.spread)
+    again = _solve(loop._replace(f=less.f, seen=less.seen, weight=weight), found.model)
+    q = _with_resonance(_pack(again.model))
+    deviation = _deviations(again)
+    change = np.abs(q - p)
+    doubt = 2.0 * deviation[-1]
+    if doubt > WIDEST["resonance"]:
+        return np.zeros(len(p)), f"shaken less, it can only be told to {100.0 * doubt:.0f} %, which does not confirm it"
+    if change[-1] > max(LEVEL, doubt):
+        return np.zeros(len(p)), (
+            f"it lies at {math.exp(p[-1]):.4g} Hz, and at {math.exp(q[-1]):.4g} Hz where the axis is shaken less: with "
+            "backlash, or friction that sticks, there is no such thing as one resonance"
+        )
+    return np.sqrt(np.maximum(change**2 - deviation**2, 0.0)), ""
+
+
+def _with_resonance(p: Floats) -> Floats:
+    """Return parameters and, of an elastic axis, the logarithm of its resonance, which is the sum of two."""
+    return np.append(p, p[FIRST] + p[FIRST + 1]) if len(p) > FIRST else np.append(p, 0.0)
+
+
+def _deviations(solution: _Solution) -> Floats:
+    """Return the standard deviations of the parameters, and of the resonance's logarithm."""
+    covariance = _covariance(solution)
+    own = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if len(own) <= FIRST:
+        return np.append(own, 0.0)
+    both = covariance[FIRST : FIRST + 2, FIRST : FIRST + 2]
+    return np.append(own, math.sqrt(max(float(both.sum()), 0.0)))
+
+
+def _covariance(solution: _Solution) -> Floats:
+    jacobian = solution.jacobian
+    return np.asarray(np.linalg.pinv(jacobian.T @ jacobian) * max(_misfit(solution), 1.0) ** 2)
 
 
 def _better(simple: _Solution, found: list[_Solution]) -> _Solution:
@@ -152,28 +219,32 @@ def _scatter(loop: _Loop, found: _Solution, spread: Floats, parts: Sequence[Comp
 
     Those of the model, and of the resonance in the end, shape (parameters + 1,).
     """
-    p = _pack(found.model)
-    if not found.model.plant.is_elastic or not parts:
-        return np.zeros(len(p) + 1)
+    p = _with_resonance(_pack(found.model))
+    if not parts:
+        return np.zeros(len(p))
 
     def parameters(part: _Loop) -> Floats:
-        q = _pack(_solve(part, found.model).model)
-        return np.append(q, q[3] + q[4])  # the resonance is the sum of two
+        return _with_resonance(_pack(_solve(part, found.model).model))
 
     passes = [parameters(loop._replace(seen=part, weight=loop.weight / math.sqrt(len(parts)))) for part in parts]
     quiet = spread <= np.median(spread)
     fewer = parameters(loop._replace(f=loop.f[quiet], seen=loop.seen[quiet], weight=loop.weight[quiet]))
-    return np.asarray(0.5 * np.hypot(np.ptp(passes, axis=0), fewer - np.append(p, p[3] + p[4])))
+    return np.asarray(0.5 * np.hypot(np.ptp(passes, axis=0), fewer - p))
 
 
-def _distorted(fit: PlantFit, distortion: float) -> PlantFit:
+def _doubted(fit: PlantFit, reason: str) -> PlantFit:
+    """Return a fit without its pair."""
     from tuning.identification import refused
 
-    reason = (
-        f"the response is another when it is shaken the other way round or less, by {100.0 * distortion:.0f} % beyond "
-        "noise: with backlash, or friction that sticks, a resonance depends on how strongly it is shaken"
-    )
-    return fit._replace(estimates=fit.estimates | {name: refused(_UNITS[name], reason) for name in NAMES[1:]})
+    return fit._replace(estimates=fit.estimates | {name: refused(_UNITS[name], reason) for name in PAIR})
+
+
+class Seen(NamedTuple):
+    """What was seen of a closed velocity loop at its trusted frequencies, as `fit_plant` takes it, shape (n,) each."""
+
+    f: Floats  # Hz
+    seen: Complex
+    spread: Floats
 
 
 class _Loop(NamedTuple):
@@ -184,36 +255,39 @@ class _Loop(NamedTuple):
     f: Floats
     seen: Complex
     weight: Floats
+    lost: float  # ohm, as `fit_plant` takes it
 
 
 def _solve(loop: _Loop, start: _Model) -> _Solution:
     def residuals(p: Floats) -> Floats:
         off = _residuals(loop, _unpack(p, start))
-        return np.append(off, (p[2] / _SCALE - 1.0 / loop.device.velocity_rate) / EXPECTED_DELAY)
+        delay = (p[2] / _SCALE - 1.0 / loop.device.velocity_rate) / EXPECTED_DELAY
+        return np.concatenate([off, [delay, (p[3] - EXPECTED_LOSS) / LOSS_SPREAD]])
 
     p, f = _pack(start), loop.f
     pair = (math.log(f[0] / 2), 0.005, math.log(1e-3)), (math.log(2 * f[-1]), 3.0, 0.0)
-    low = np.array([p[0] - 5.0, math.log(_LOWEST_FILTER), -_SCALE * 1e-3, *pair[0], *pair[0]])[: len(p)]
-    high = np.array([p[0] + 5.0, math.log(_HIGHEST_FILTER), _SCALE * _LONGEST_DELAY, *pair[1], *pair[1]])[: len(p)]
+    low = np.array([p[0] - 5.0, math.log(_LOWEST_FILTER), -_SCALE * 1e-3, 0.0, *pair[0], *pair[0]])[: len(p)]
+    high = np.array([p[0] + 5.0, math.log(_HIGHEST_FILTER), _SCALE * _LONGEST_DELAY, 2.0, *pair[1], *pair[1]])[: len(p)]
     result = least_squares(
         residuals,
         np.clip(p, low + 1e-6, high - 1e-6),
         bounds=(low, high),
         loss="soft_l1",
-        max_nfev=30 if len(p) < 9 else 60,
-        x_scale=np.array([0.1, 0.1, 0.1, 0.02, 0.05, 0.3, 0.02, 0.05, 0.3])[: len(p)],
+        max_nfev=30 if len(p) < FIRST + 6 else 60,
+        x_scale=np.array([0.1, 0.1, 0.1, 0.3, 0.02, 0.05, 0.3, 0.02, 0.05, 0.3])[: len(p)],
     )
     found, jacobian = _unpack(result.x, start), np.asarray(result.jac)
     if found.second is not None and found.second.anti_resonance < found.plant.anti_resonance:
         first = Pair(found.plant.anti_resonance, found.plant.resonance, found.plant.damping)
-        found = _Model(replace(found.plant, **found.second._asdict()), first)
-        jacobian = jacobian[:, [0, 1, 2, 6, 7, 8, 3, 4, 5]]
+        found = _Model(replace(found.plant, **found.second._asdict()), first, found.loss)
+        own = list(range(FIRST))
+        jacobian = jacobian[:, [*own, *range(FIRST + 3, FIRST + 6), *range(FIRST, FIRST + 3)]]
     return _Solution(found, np.asarray(result.fun), jacobian)
 
 
 def _residuals(loop: _Loop, model: _Model) -> Floats:
     def closed(at: Floats) -> Complex:
-        L = _open_loop(loop.device, model, loop.gains, at)
+        L = _open_loop(loop.device, model, loop.gains, at, model.loss * loop.lost)
         return np.asarray(L / (1.0 + L))
 
     off = (seen_by_bus(loop.device, loop.f, closed) - loop.seen) * loop.weight
@@ -222,11 +296,12 @@ def _residuals(loop: _Loop, model: _Model) -> Floats:
 
 _BEYOND = 20.0  # uncertainty of a logarithm that is as good as infinite
 _SCALE = 1e4  # of the delay's parameter, 1/s
+FIRST = 4  # parameter: of the first pair; before it those of a rigid axis
 
 
 def _pack(model: _Model) -> Floats:
     plant = model.plant
-    p = [math.log(plant.inertia), math.log(plant.velocity_filter), plant.delay * _SCALE]
+    p = [math.log(plant.inertia), math.log(plant.velocity_filter), plant.delay * _SCALE, model.loss]
     if plant.is_elastic:
         p += _packed_pair(plant.anti_resonance, plant.resonance, plant.damping)
     if model.second is not None:
@@ -240,10 +315,10 @@ def _packed_pair(anti_resonance: float, resonance: float, damping: float) -> lis
 
 def _unpack(p: Floats, like: _Model) -> _Model:
     known = {"inertia": math.exp(p[0]), "velocity_filter": math.exp(p[1]), "delay": p[2] / _SCALE}
-    pairs = [Pair(math.exp(p[k]), math.exp(p[k] + p[k + 1]), math.exp(p[k + 2])) for k in range(3, len(p), 3)]
+    pairs = [Pair(math.exp(p[k]), math.exp(p[k] + p[k + 1]), math.exp(p[k + 2])) for k in range(FIRST, len(p), 3)]
     if pairs:
         known |= pairs[0]._asdict()
-    return _Model(replace(like.plant, **known), pairs[1] if len(pairs) > 1 else None)
+    return _Model(replace(like.plant, **known), pairs[1] if len(pairs) > 1 else None, float(p[3]))
 
 
 def _misfit(solution: _Solution) -> float:
@@ -253,10 +328,9 @@ def _misfit(solution: _Solution) -> float:
 
 def _is_sure(solution: _Solution) -> bool:
     """Return whether every resonance is apart from its anti-resonance for certain."""
-    jacobian = solution.jacobian
-    covariance = np.linalg.pinv(jacobian.T @ jacobian) * max(_misfit(solution), 1.0) ** 2
+    covariance = _covariance(solution)
     p = _pack(solution.model)
-    return all(bool(p[k] > SURE * math.sqrt(max(covariance[k, k], 0.0))) for k in range(4, len(p), 3))
+    return all(bool(p[k] > SURE * math.sqrt(max(covariance[k, k], 0.0))) for k in range(FIRST + 1, len(p), 3))
 
 
 def _criterion(solution: _Solution) -> float:
@@ -332,23 +406,23 @@ def _cost(loop: _Loop, model: _Model) -> float:
 
 
 # --- intervals --------------------------------------------------------------------------------------------------------
-def _with_intervals(solution: _Solution, f: Floats, scatter: Floats) -> PlantFit:
+def _with_intervals(solution: _Solution, f: Floats, scatter: Floats, lost: float) -> PlantFit:
     from tuning.identification import Estimate, refused
 
-    (plant, second), residuals, jacobian = solution
+    (plant, second, loss), residuals, jacobian = solution
     freedom = max(len(residuals) - jacobian.shape[1], 1)
-    misfit = math.sqrt(float(np.sum(residuals**2)) / freedom)
-    covariance = np.linalg.pinv(jacobian.T @ jacobian) * max(misfit, 1.0) ** 2
+    misfit = _misfit(solution)
+    covariance = _covariance(solution)
     reach = float(student.ppf(0.975, freedom))
     p = _pack(solution.model)
 
     def positive(name: str, row: list[float], unit: str) -> Estimate:
         direction = np.array(row + [0.0] * (len(p) - len(row)))
         variance = max(float(direction @ covariance @ direction), 0.0) + SYSTEMATIC[name] ** 2
+        variance += float(scatter[-1] if name == "resonance" else scatter[int(np.flatnonzero(direction)[0])]) ** 2
         if name in PAIR:
             # Which bearing or spring takes the energy is not known: it moves a pair that is damped well.
-            passes = scatter[-1] if name == "resonance" else scatter[int(np.flatnonzero(direction)[0])]
-            variance += float(passes) ** 2 + (DAMPED[name] * plant.damping) ** 2
+            variance += (DAMPED[name] * plant.damping) ** 2
         spread = math.sqrt(variance)
         half = min(reach * spread, _BEYOND)
         middle = float(direction @ p)
@@ -361,9 +435,10 @@ def _with_intervals(solution: _Solution, f: Floats, scatter: Floats) -> PlantFit
     half = reach * math.hypot(math.sqrt(max(float(covariance[2, 2]), 0.0)) / _SCALE, SYSTEMATIC["loop_delay"])
     estimates["loop_delay"] = Estimate(plant.delay, plant.delay - half, plant.delay + half, "s")
     if plant.is_elastic:
-        estimates["anti_resonance"] = positive("anti_resonance", [0.0, 0.0, 0.0, 1.0, 0.0], "Hz")
-        estimates["resonance"] = positive("resonance", [0.0, 0.0, 0.0, 1.0, 1.0], "Hz")
-        estimates["damping"] = positive("damping", [0.0, 0.0, 0.0, 0.0, 0.0, 1.0], "1")
+        own = [0.0] * FIRST
+        estimates["anti_resonance"] = positive("anti_resonance", [*own, 1.0], "Hz")
+        estimates["resonance"] = positive("resonance", [*own, 1.0, 1.0], "Hz")
+        estimates["damping"] = positive("damping", [*own, 0.0, 0.0, 1.0], "1")
     else:
         reason = f"none shows between {f[0]:.0f} and {f[-1]:.0f} Hz"
         if misfit > RIGID_ENOUGH:
@@ -373,7 +448,7 @@ def _with_intervals(solution: _Solution, f: Floats, scatter: Floats) -> PlantFit
     if plant.is_elastic and plant.resonance > f[-1]:
         reason = f"it lies above {f[-1]:.0f} Hz, up to which the axis could be seen"
         estimates |= {name: refused(_UNITS[name], reason) for name in ("resonance", "damping")}
-    return PlantFit(plant, estimates, misfit, second=second)
+    return PlantFit(plant, estimates, misfit, second=second, lost=loss * lost)
 
 
 def _checked(name: str, estimate: Estimate) -> Estimate:

@@ -6,6 +6,7 @@ matters to no result where and in which order tasks ran.
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import re
@@ -22,6 +23,9 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
+WORKERS_PERIOD = 3.0  # s, between two looks at whether a cluster has workers
+
+logger = logging.getLogger(__name__)
 
 
 class PoolError(RuntimeError):
@@ -32,6 +36,7 @@ class Pool(Protocol):
     """Somewhere for work to run."""
 
     width: int  # tasks that run at a time, about
+    shares_disk: bool  # whether tasks can go on from files of this machine
 
     def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
         """Give the number of an item and its result as each is done."""
@@ -79,6 +84,7 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
 
 class _Here:
     width = 1
+    shares_disk = True
 
     def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
         for k, item in enumerate(items):
@@ -89,6 +95,8 @@ class _Here:
 
 
 class _Processes:
+    shares_disk = True
+
     def __init__(self, executor: ProcessPoolExecutor, width: int) -> None:
         self._executor = executor
         self.width = width
@@ -109,26 +117,68 @@ class _Processes:
 
 
 class _Dask:
-    def __init__(self, client: Any, width: int) -> None:
+    shares_disk = False
+
+    def __init__(self, client: Any, width: int, address: str = "") -> None:
         self._client = client
         self.width = width
+        self._address = address
 
     def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+        from concurrent.futures import CancelledError
+
         from distributed import as_completed as as_completed_there
         from distributed.scheduler import KilledWorker
 
         # Not pure: equal items of two runs on one cluster are computed twice rather than taken from its memory.
         futures = {self._client.submit(function, item, pure=False): k for k, item in enumerate(items)}
         try:
-            for future in as_completed_there(list(futures), loop=self._client.loop):
-                yield futures[future], future.result()
-                future.release()
+            with self._told_of_no_workers():
+                for future in as_completed_there(list(futures), loop=self._client.loop):
+                    yield futures[future], future.result()
+                    future.release()
         except KilledWorker as error:
             raise PoolError(f"workers of the cluster died over and over: {error}; go on with --resume") from None
+        except (CancelledError, OSError) as error:
+            raise PoolError(
+                f"the connection to the Dask scheduler at {self._address} was lost: start it again, with its workers, "
+                "and go on with --resume"
+            ) from error
+
+    @contextmanager
+    def _told_of_no_workers(self) -> Iterator[None]:
+        """Say it if the last worker goes: the work waits for another one, for ever if need be."""
+        ended = threading.Event()
+
+        def watch() -> None:
+            told = False
+            while not ended.wait(WORKERS_PERIOD):
+                try:
+                    there = self._client.nthreads()
+                except Exception:  # of a scheduler that is gone, which the futures tell
+                    return
+                if not there and not told:
+                    logger.warning(
+                        "the cluster at %s has no workers left; waiting for one: `dask worker %s`", self._address,
+                        self._address,
+                    )  # fmt: skip
+                told = not there
+
+        thread = threading.Thread(target=watch, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
 
     def differences(self) -> list[str]:
         here, lines = _versions(), set()
-        there: Mapping[str, dict[str, str]] = self._client.run(_versions)
+        try:
+            there: Mapping[str, dict[str, str]] = self._client.run(_versions)
+        except ImportError as error:
+            raise PoolError(
+                f"a worker of the cluster at {self._address} cannot run this: {error}; install drive-env where it runs"
+            ) from None
         for address, found in there.items():
             for name, version in found.items():
                 if here.get(name) != version:
@@ -157,7 +207,7 @@ def _cluster(address: str) -> Iterator[Pool]:
         threads = client.nthreads()
         if not threads:
             raise PoolError(f"the cluster at {address} has no workers; start some with `dask worker {address}`")
-        yield _Dask(client, sum(threads.values()))
+        yield _Dask(client, sum(threads.values()), address)
 
 
 def _versions() -> dict[str, str]:

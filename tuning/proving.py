@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import motion
-from drive_env.envs.gain_trial import OSCILLATION, PHASES, WATCH, Trial, Trials, measured_cost, softness
+from drive_env.envs.gain_trial import OSCILLATION, PHASES, Trial, Trials, measured_cost, softness
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.positioning import (
     CURRENT,
@@ -24,14 +24,16 @@ from drive_env.positioning import (
     POSITION,
     STATUS,
     TRIAL,
+    WATCH,
     Move,
+    move_terms,
     plan_move,
     start,
     wrapped,
     write_profile,
 )
 from drive_env.safety import SafetyError
-from drive_env.score import TRIP, Terms
+from drive_env.score import TRIP, Terms, cost
 
 if TYPE_CHECKING:
     from tuning.linear_model import Plant
@@ -45,10 +47,13 @@ ASTRAY = 0.2  # of the move: what is still farther away at a trial's end does no
 # Of the move, and of the encoder: an axis farther than both from where a trial starts is brought back first.
 NEAR, NEAR_COUNTS = 0.03, 5.0
 RETURN_MOVES, RETURN_SPEED = 3.0, 0.5  # moves that are as short a way as one; of the speed limit, on longer ones
-SETTLING = 0.03  # s at rest, once back
+SETTLING = 0.03  # s at rest before a trial, once the set-point is where the axis is
+STOPPING, STOPPING_LOOK = 400, 20  # cycles: the longest wait for axes to stand, and how often it is looked
+STEP_COUNTS = 1.5  # of the encoder: what is less is no motion, and no step
 RETURN_LOOKS, RETURN_LOOK = 8, 0.05  # looks whether it is back, and the time between them [s]
 OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
 ENABLING = 5.0  # s, the longest wait for an axis that is switched on: some align their encoder first
+TARGET_VELOCITY = 0x60FF
 SHORTEST = 16.0  # counts of the encoder: a move that is shorter proves nothing
 
 
@@ -78,7 +83,8 @@ class Proof(NamedTuple):
 class Shown(NamedTuple):
     """A recorded move: times [s], (n,); demand and actual angle from its start [rad] and current [A], (n, num_axes).
 
-    where: Axes that made it, (num_axes,). reason: Of each axis, why it does not pass, "" if it does.
+    where: Axes that made it, (num_axes,). reason: Of each axis, why it does not pass, "" if it does. cost: J by its
+    measured terms, (num_axes,).
     """
 
     t: Floats
@@ -87,16 +93,17 @@ class Shown(NamedTuple):
     current: Floats
     where: Mask
     reason: tuple[str, ...]
+    cost: Floats
 
     def replaced(self, later: Shown) -> Shown:
         """Return this with the axes of a later recording in their place."""
-        demand, actual, current = (
-            np.where(later.where, new, old)
-            for new, old in ((later.demand, self.demand), (later.actual, self.actual), (later.current, self.current))
+        demand, actual, current, cost = (
+            np.where(later.where, getattr(later, name), getattr(self, name))
+            for name in ("demand", "actual", "current", "cost")
         )
         both = zip(later.where, self.reason, later.reason, strict=True)
         reason = tuple(new if made else old for made, old, new in both)
-        return Shown(self.t, demand, actual, current, self.where | later.where, reason)
+        return Shown(self.t, demand, actual, current, self.where | later.where, reason, cost)
 
 
 @contextmanager
@@ -142,10 +149,11 @@ class ProvingGround:
         inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
         corner = [target.device.stage["velocity_filter"].default if p is None else p.velocity_filter for p in plants]
         self.move: Move = plan_move(motor, inertia, drives.read((0x2058, 0)), self.reach)
+        self._count: Floats = self.move.increments / self.move.counts  # increments
         top = RETURN_SPEED * target.speed * self.move.increments
         self._fastest: Floats = np.maximum(top / np.maximum(self.move.velocity, 1), 1.0)
-        t_0 = 4.0 * small_time_constants(target.device, np.array(corner))
-        self._trials = Trials(drives, motor, target.axes_per_machine, t_0)  # type: ignore[arg-type]
+        self._t_0 = 4.0 * small_time_constants(target.device, np.array(corner))
+        self._trials = Trials(drives, motor, target.axes_per_machine, self._t_0)  # type: ignore[arg-type]
         self._origin = drives.read(POSITION)
         self._direction = np.ones(target.num_axes, np.int64)
         self._shaken = np.zeros(target.num_axes, bool)
@@ -166,6 +174,12 @@ class ProvingGround:
         """Take where axes are as where the next move begins, of those that turn freely; the others are brought back."""
         free = where & np.isinf(self.target.low) & np.isinf(self.target.high)
         self._origin = np.where(free, self.target.drives.read(POSITION), self._origin)
+
+    def recover(self, where: Mask) -> None:
+        """Reset faults of axes, and have them hold with gains that are known to."""
+        write_gains(self.target.drives, self.safe, where)
+        self._trials.recover(where)
+        self._shaken |= where
 
     def run(self, gains: Integers, where: Mask) -> Proof:
         """Try gains, raw integers of shape (num_axes, 5), on some axes; the others' figures mean nothing."""
@@ -207,14 +221,22 @@ class ProvingGround:
                 stopped |= new
         position, demanded, current = (np.concatenate([part[name] for part in traces]) for name in objects[:3])
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
-        error = wrapped(position - away) * np.sign(self._direction * self.move.distance)
+        way = np.sign(self._direction * self.move.distance)
+        error = wrapped(position - away) * way
         size = np.maximum(np.abs(self.move.distance), 1)
         reason = self._reasons(stopped[None], np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size)
+        settling, noise, overshoot = move_terms(
+            position.astype(float), current * 1e-3, self.move, self._t_0, rated, away, way
+        )
+        # Of axes that take no part the gains may be none.
+        soft = softness(np.where(where[:, None], gains, self._reference)) / softness(self._reference)
+        costs = cost(Terms(settling, soft, noise, overshoot, stopped))
         self.aborts[stopped] += 1
         self._shaken |= stopped
         self._origin = np.where(where, away, self._origin)
         self._direction = np.where(where, -self._direction, self._direction)
-        return Shown(np.arange(len(demand), dtype=np.float64) * CYCLE, demand, actual, current * 1e-3, where, reason)
+        t = np.arange(len(demand), dtype=np.float64) * CYCLE
+        return Shown(t, demand, actual, current * 1e-3, where, reason, costs)
 
     def _run(self, gains: Integers, where: Mask) -> Trial:
         self._begin(where)
@@ -231,14 +253,29 @@ class ProvingGround:
         down = where & self._trials.down()
         if down.any():
             write_gains(drives, self.safe, down)
-            motion.enable(drives, mode="pp", where=down, timeout=ENABLING)
+            self._come_to_rest(down)
         motion.select_mode(drives, "pp", where)
         self._return(where)
+        self._begin_without_a_step(where)
+
+    def _come_to_rest(self, where: Mask) -> None:
+        """Enable axes and wait until they stand: what was switched off while it turned is taken over at its speed.
+
+        Slow gains stop it sooner by its velocity than by its position.
+        """
+        drives = self.target.drives
+        motion.enable(drives, mode="csv", where=where, timeout=ENABLING)
+        drives.write(TARGET_VELOCITY, 0, where=where)
+        for _ in range(STOPPING // STOPPING_LOOK):
+            seen = drives.record([POSITION], STOPPING_LOOK * CYCLE)[POSITION]
+            if not np.any(where & (np.abs(wrapped(seen - seen[-1])).max(axis=0) > STEP_COUNTS * self._count)):
+                break
+        self.begin_here(where)
 
     def _return(self, where: Mask) -> None:
         """Bring back what is not where it should be: what was stopped went on with slower gains, or fell, or ran."""
         drives = self.target.drives
-        near = np.maximum(NEAR * np.abs(self.move.distance), NEAR_COUNTS / self.move.counts * self.move.increments)
+        near = np.maximum(NEAR * np.abs(self.move.distance), NEAR_COUNTS * self._count)
         off = np.abs(wrapped(drives.read(POSITION) - self._origin))
         # A long way is not to take long.
         faster = np.clip(off / (RETURN_MOVES * np.maximum(np.abs(self.move.distance), 1)), 1.0, self._fastest)
@@ -259,9 +296,21 @@ class ProvingGround:
             if not np.any(astray & (np.abs(wrapped(seen - self._origin)).max(axis=0) > near)):
                 break
         self._shaken &= ~astray
-        # What is left of the way would be a step for gains that are faster: the set-point goes where the axis is.
-        self._origin = np.where(astray, drives.read(POSITION), self._origin)
-        start(drives, wrapped(self._origin).astype(np.int64), astray)
+
+    def _begin_without_a_step(self, where: Mask) -> None:
+        """Have the set-point go where axes are.
+
+        What slow gains have left of the way, or finding the poles has turned, would be a step for gains that are fast,
+        and its kick would pass for an oscillation.
+        """
+        drives = self.target.drives
+        here = drives.read(POSITION)
+        off = where & (np.abs(wrapped(here - self._origin)) > STEP_COUNTS * self._count)
+        if not off.any():
+            return
+        self._origin = np.where(off, here, self._origin)
+        write_profile(drives, self.move, off)
+        start(drives, wrapped(self._origin).astype(np.int64), off)
         drives.advance(SETTLING)
 
     def _refused(self, why: str, where: Mask) -> Proof:
@@ -276,7 +325,7 @@ class ProvingGround:
 
     def _proof(self, gains: Integers, tried: Trial, where: Mask) -> Proof:
         terms: Terms = tried.terms
-        cost = measured_cost(tried.costs(softness(gains) / softness(self._reference)))
+        costs = measured_cost(tried.costs(softness(gains) / softness(self._reference)))
         stopped: Mask = np.asarray(tried.aborted.any(axis=0))
         self.aborts[where & stopped] += 1
         self._shaken |= where & stopped
@@ -288,7 +337,7 @@ class ProvingGround:
         left = np.maximum(np.abs(tried.error[TRIAL - 1]), now)
         in_probe_only: Mask = np.asarray(stopped & ~tried.aborted[:2].any(axis=0))
         return Proof(
-            cost,
+            costs,
             stopped,
             in_probe_only,
             self._reasons(tried.aborted, overshoot, left),

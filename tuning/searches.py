@@ -1,13 +1,16 @@
 """Independent searches of the same emulated machine, each with its own seed: the shards into which optimising splits.
 
 A search is a sequence of generations, each from what the last one showed, so that it runs in one place. Several with
-other seeds guard against the luck of one, and run anywhere.
+other seeds guard against the luck of one, and run anywhere. One that is killed goes on from its last generation where
+its file can be reached, or else from its seed: to the same digits.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +21,7 @@ from tuning.pools import Pool
 from tuning.shard_log import Arrays, ShardLog
 from tuning.target import emulated
 from tuning.toml_tables import toml
+from tuning.unfinished import part_log, part_path
 
 
 class Search(NamedTuple):
@@ -25,6 +29,14 @@ class Search(NamedTuple):
 
     machine: Mapping[str, Any]
     settings: Settings
+
+
+class _Task(NamedTuple):
+    """A search to be run, and the file from which it goes on with its key; None if there is none."""
+
+    search: Search
+    path: Path | None
+    key: str
 
 
 def searches(machine: Mapping[str, Any], settings: Settings, count: int) -> list[Search]:
@@ -65,27 +77,33 @@ def run(
     """
     found = dict(log.done)
     left = [k for k in range(len(shards)) if k not in found]
-    for k, arrays in _done(shards, left, pool, progress):
+    # A journal remembers by itself; a cluster's workers do not see this machine's files.
+    here = shards[0].settings.journal is None and (pool is None or pool.shares_disk)
+    tasks = [
+        _Task(shard, part_path(log, k) if here else None, f"{log.key}search {k}") for k, shard in enumerate(shards)
+    ]
+    for k, arrays in _done(tasks, left, pool, progress):
         found[k] = arrays
         log.append(k, arrays)
+        part_path(log, k).unlink(missing_ok=True)
     return [_optimised(found[k], search=k) for k in range(len(shards))]
 
 
 def _done(
-    shards: list[Search], left: list[int], pool: Pool | None, progress: Callable[[float], None]
+    tasks: list[_Task], left: list[int], pool: Pool | None, progress: Callable[[float], None]
 ) -> Iterator[tuple[int, Arrays]]:
     """Give the number and the result of each search as it is done."""
-    before = len(shards) - len(left)
+    before = len(tasks) - len(left)
     if pool is None:
         for done, k in enumerate(left, before):
 
             def report(share: float, done: int = done) -> None:
-                progress((done + share) / len(shards))
+                progress((done + share) / len(tasks))
 
-            yield k, _run(shards[k], report)
+            yield k, _run(tasks[k], report)
         return
-    for done, (place, arrays) in enumerate(pool.unordered(_run, [shards[k] for k in left]), before + 1):
-        progress(done / len(shards))
+    for done, (place, arrays) in enumerate(pool.unordered(_run, [tasks[k] for k in left]), before + 1):
+        progress(done / len(tasks))
         yield left[place], arrays
 
 
@@ -103,10 +121,12 @@ def joined(found: list[Optimised]) -> Optimised:
     )
 
 
-def _run(search: Search, progress: Callable[[float], None] = lambda share: None) -> Arrays:
+def _run(task: _Task, progress: Callable[[float], None] = lambda share: None) -> Arrays:
     """Return what a search found, of the machine that its lanes are, as arrays."""
-    with emulated(**search.machine) as target:
-        found = optimise(target, search.settings, shared=True, anew=True, progress=progress)
+    search = task.search
+    kept = nullcontext() if task.path is None else part_log(task.path, task.key)
+    with emulated(**search.machine) as target, kept as log:
+        found = optimise(target, search.settings, shared=True, anew=True, log=log, progress=progress)
         axes = target.axes_per_machine
     rows = found.rows
     return {

@@ -8,6 +8,8 @@ when the reversal has died away.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +37,7 @@ FADE = 20  # cycles
 IN_RAMPS = 0.3  # share of the shaking while the speed changes
 REST, RETURN = 30, 50  # cycles in which an axis comes to rest, and goes back, or more where that would be too fast
 BACK = 0.8  # of the way back: an axis that overshoots must not leave its travel
+SETTLED = 200  # cycles until what was let go stands where the others have left it
 NEAR = 0.02  # rad from where it began at which an axis stays
 
 
@@ -215,3 +218,46 @@ class Shaker:
         name = SET_POINT[self._loop]
         raw = np.rint(path / self.radians - self._offset).astype(np.int64)
         drives.record([POSITION], len(raw) * CYCLE, {name: np.where(where, raw, drives.read(name))})
+
+
+@contextmanager
+def at_rest(target: Target, loop: str, where: Mask) -> Iterator[None]:
+    """Have axes enabled meanwhile, in the mode of a loop, so that each holds its place while another one is shaken."""
+    drives = target.drives
+    modes, off = drives.read(0x6060), where & ~_enabled(drives)
+    if loop == "velocity" and off.any():
+        drives.write(SET_POINT[loop], 0, where=off)
+    motion.enable(drives, mode=MODE[loop], where=where)
+    try:
+        yield
+    finally:
+        if (now := off & _enabled(drives)).any():
+            motion.disable(drives, where=now)
+        for mode in np.unique(modes[where]):
+            changed = where & (modes == mode) & (drives.read(0x6060) != mode)
+            if mode and changed.any():
+                drives.write(0x6060, mode, where=changed)
+
+
+@contextmanager
+def let_go(target: Target, where: Mask, shaken: Mask) -> Iterator[None]:
+    """Have axes off meanwhile: of a machine whose axes pull at one thing, those that are not shaken must run along."""
+    drives = target.drives
+    on = where & _enabled(drives)
+    if on.any():
+        motion.disable(drives, where=on)
+    try:
+        yield
+    finally:
+        if on.any():
+            # All come to rest and begin together: enabled under way they would stop askew and pull at each other, and
+            # gains that are fit for all of them need not be fit for one alone.
+            alone = shaken & _enabled(drives)
+            motion.disable(drives, where=alone)
+            drives.advance(SETTLED * CYCLE)
+            motion.enable(drives, where=on | alone)
+
+
+def _enabled(drives: motion.Drives) -> Mask:
+    mask, value = motion.OPERATION_ENABLED
+    return np.asarray(drives.read(STATUS) & mask == value)

@@ -40,7 +40,7 @@ class ShardLog:
     """
 
     def __init__(self, path: str | Path, key: str) -> None:
-        self.path = Path(path)
+        self.path, self.key = Path(path), key
         self._key = hashlib.sha256(f"{FORMAT} {key}".encode()).hexdigest()
         self.done: dict[int, Arrays] = {}
         self.holds_results = False  # from before the first frame is written: an interrupt may come at any moment

@@ -6,8 +6,11 @@ A `Transaction` writes the file before anything else happens, so that even a pro
 
 from __future__ import annotations
 
+import signal
+import threading
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -159,6 +162,22 @@ def restore(
     return changed
 
 
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Have Ctrl-C wait until the end of the block; who presses it twice shall not leave drives half brought back."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals reach the main thread alone
+        return
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
+
+
 class Transaction:
     """A change of drives that leaves a file and is undone unless committed.
 
@@ -185,7 +204,8 @@ class Transaction:
         if not left.any():
             return
         try:
-            self.roll_back(left)
+            with undisturbed():
+                self.roll_back(left)
         except (BusError, ObjectAccessError, RuntimeError, TimeoutError) as failure:
             raise BusError(
                 f"{failure}; the drives may hold what was tried: drive-tune restore {self.path} brings back what was"

@@ -24,8 +24,9 @@ from drive_env.misfit import MisfitWarning
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
+from tuning.linked_axes import are_linked
 from tuning.target import Target
-from tuning.toml_tables import ExperimentError, as_table, as_value, check_keys
+from tuning.toml_tables import ExperimentError, as_table, as_value, check_keys, kind_of
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -94,10 +95,10 @@ def load_suite(name_or_path: str | Path = "public", seed: int | None = None, cou
     machines: list[Machine] = []
     for row in table.get("group", []):
         machines += _group(where, device, as_table(f"{where}: group", row))
-    if seed is not None and "generated" in table:
-        machines += _generated(f"{where}: generated", device, as_table(where, table["generated"]), seed)
+    if seed is not None:
+        machines += _generated(f"{where}: generated", device, table.get("generated", []), seed)
     if not machines:
-        raise ExperimentError(f"{where}: there is no machine; add a [[group]], or [generated] and a seed")
+        raise ExperimentError(f"{where}: there is no machine; add a [[group]], or [[generated]] and a seed")
     _check_names(where, machines)
     return tuple(machines) if count is None else _spread(machines, count)
 
@@ -142,7 +143,8 @@ def open_group(machines: Sequence[Machine], num_threads: int | None = None) -> T
     drives.machine.seed_noise(np.array([1.0 + zlib.crc32(machine.name.encode()) % (2**32 - 2) for machine in machines]))
     drives.machine.supply = supply
     drives.machine.reset()  # charges the link from the supply
-    own, turns = way(one(drives.load)), np.repeat([machine.travel for machine in machines], axes)
+    alone = one(drives.load)
+    own, turns = way(alone), np.repeat([machine.travel for machine in machines], axes)
     return Target(
         drives,
         drives.device,
@@ -153,6 +155,7 @@ def open_group(machines: Sequence[Machine], num_threads: int | None = None) -> T
         speed=drives.motor.rated_speed,
         current=drives.motor.rated_current,
         axes_per_machine=axes,
+        linked=are_linked(alone),
         machine=load,
     )
 
@@ -255,19 +258,24 @@ def _spread(machines: Sequence[Machine], count: int) -> tuple[Machine, ...]:
 
 
 # --- drawing ----------------------------------------------------------------------------------------------------------
-def _generated(where: str, device: str, table: dict[str, Any], seed: int) -> list[Machine]:
+def _generated(where: str, device: str, tables: Any, seed: int) -> list[Machine]:
     """Return the machines that are drawn for a seed; one that its motor cannot move is drawn again."""
-    check_keys(where, table, ["count", "groups"])
-    count = as_value(f"{where}: count", table["count"], "int")
-    pairs = table["groups"]
-    if not isinstance(pairs, list) or not pairs or any(not isinstance(p, list) or len(p) != 2 for p in pairs):
-        raise ExperimentError(f"{where}: groups must be an array of [load, motor]")
     if seed < 0:
         raise ExperimentError(f"seed must be 0 or more, not {seed}")
-    machines = []
-    for k in range(count):
-        load, motor = pairs[k % len(pairs)]
-        machines.append(_draw(where, device, load, motor, seed, k))
+    if not isinstance(tables, list):
+        raise ExperimentError(f"{where} is {kind_of(tables)}; write one table [[generated]] for machines of a kind")
+    machines: list[Machine] = []
+    for table in tables:
+        check_keys(where, as_table(where, table), ["count", "groups"])
+        count = as_value(f"{where}: count", table["count"], "int")
+        pairs = table["groups"]
+        if not isinstance(pairs, list) or not pairs or any(not isinstance(p, list) or len(p) != 2 for p in pairs):
+            raise ExperimentError(f"{where}: groups must be an array of [load, motor]")
+        # Numbered on from table to table: one that is added changes no machine of those before it.
+        first = len(machines)
+        for k in range(count):
+            load, motor = pairs[k % len(pairs)]
+            machines.append(_draw(where, device, load, motor, seed, first + k))
     return machines
 
 

@@ -44,6 +44,7 @@ class Target:
         speed: Fastest that an excitation may turn a rotor [rad/s].
         current: Most that an excitation may ask for [A, peak i_q].
         axes_per_machine: Axes that one machine couples; axes are machine-major.
+        linked: Whether the axes of a machine pull at one thing, as those of a gantry: none goes far without the others.
         machine: What turns: an emulated load's name, or the channel.
         bus: How the drives of a bus are opened again: what `CanDrives` takes; empty for emulated ones.
     """
@@ -57,6 +58,7 @@ class Target:
     speed: float
     current: float
     axes_per_machine: int = 1
+    linked: bool = False
     machine: str = ""
     bus: Mapping[str, Any] = field(default_factory=dict)
 
@@ -64,9 +66,12 @@ class Target:
         for name in ("supply", "low", "high"):
             if getattr(self, name).shape != (self.num_axes,):
                 raise ValueError(f"{name} must have shape ({self.num_axes},), not {getattr(self, name).shape}")
-        if not np.all((self.supply > 0.0) & np.isfinite(self.supply)):
+        least, most = self.device.undervoltage, self.device.overvoltage
+        beyond = self.supply[~((self.supply > least) & (self.supply < most))]
+        if beyond.size:
             raise ValueError(
-                f"supply {self.supply.min():g} V must be above 0 V; give the voltage at the drive's terminals"
+                f"supply {beyond[0]:g} V lies outside {least:g}...{most:g} V, with which a {self.device.name} works; "
+                "give the voltage at the drive's terminals"
             )
         wrong = np.flatnonzero(~((self.low <= 0.0) & (self.high >= 0.0) & (self.low < self.high)))
         if wrong.size:
@@ -139,6 +144,7 @@ def emulated(
     """
     from drive_env import EmulatedDrives
     from mechanics.shaft import one, way
+    from tuning.linked_axes import are_linked
 
     if factory_fresh and motor != EmulatedDrives.DEFAULT_MOTOR:
         raise ValueError(
@@ -155,7 +161,8 @@ def emulated(
         supply=supply,
         **options,
     )
-    own = way(one(drives.load))
+    alone = one(drives.load)
+    own = way(alone)
     narrow_low, narrow_high = _ways(FREE if travel is None else travel, drives.load.num_axes)
     low = np.tile(np.maximum(own.low, narrow_low), num_machines)
     high = np.tile(np.minimum(own.high, narrow_high), num_machines)
@@ -168,6 +175,7 @@ def emulated(
         low=low,
         high=high,
         axes_per_machine=drives.load.num_axes,
+        linked=are_linked(alone),
         machine=drives.load.name,
         **limits,
     )

@@ -133,7 +133,7 @@ class TrialBench:
         axes = self._where if where is None else np.repeat(where, target.axes_per_machine)
         self._start_trial()
         self._return(axes)
-        self._drives.calmed[:] = False
+        self._drives.begin()
         try:
             tried = self._trials.run(gains, self.incumbent, self.move, self._origin, self._direction, axes)
         except SafetyError as error:  # the envelope has stopped all drives

@@ -71,6 +71,8 @@ def load_options(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"cannot read {path}: {error.strerror}; give settings.toml of drive-tune optimise") from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ValueError(f"{path} is no TOML: {error}; give settings.toml of drive-tune optimise") from None
+    if "machine" not in table:
+        raise ValueError(f"{path} is of no search; give settings.toml of drive-tune optimise")
     check_keys(str(path), table, [*_SEARCH, "machine", "versions"], optional=["versions", *_SEARCH])
     machine = dict(table["machine"]) if isinstance(table["machine"], dict) else {}
     check_keys(f"{path}: machine", machine, list(_MACHINE), optional=_MACHINE)

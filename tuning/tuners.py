@@ -57,8 +57,9 @@ class Row(NamedTuple):
 
     name: str
     meaning: str
-    make: Callable[[], Tuner]
+    make: Callable[..., Tuner]
     slow: bool = False
+    searches: bool = False  # then `make` takes the number of trials
 
 
 class MissingTunerError(ValueError):
@@ -81,8 +82,12 @@ def tuner_rows() -> dict[str, Row]:
     return rows
 
 
-def find_tuner(name: str) -> Tuner:
+def find_tuner(name: str, trials: int | None = None) -> Tuner:
     """Return a tuner by name.
+
+    Args:
+        name: Its name.
+        trials: How many a search makes; its own number by default. What does not search has none.
 
     Raises:
         MissingTunerError: For a name that is none, listing those there are, or a package that is missing.
@@ -90,7 +95,8 @@ def find_tuner(name: str) -> Tuner:
     rows = tuner_rows()
     if name not in rows:
         raise MissingTunerError(f"no tuner is named {name!r}; there are {', '.join(rows)}")
-    return rows[name].make()
+    row = rows[name]
+    return row.make(trials=trials) if row.searches and trials is not None else row.make()
 
 
 # --- tuners without a search ------------------------------------------------------------------------------------------
@@ -197,14 +203,15 @@ _OWN = (
 )
 _AFTER = (
     Row("auto", "one button: identify, compute, verify, refine", _auto),
-    Row("random", "20 trials drawn at random", partial(_search, "random", 20)),
-    Row("grid", "the fitted rule and a grid of 27 trials", partial(_search, "grid", 28)),
-    Row("tpe", "20 trials by tree-structured Parzen estimators", partial(_search, "tpe", 20)),
-    Row("tpe-safe", "20 trials by TPE from safe gains, in small steps", partial(_search, "tpe", 20, True)),
-    Row("cmaes", "20 trials by CMA-ES", partial(_search, "cmaes", 20)),
-    Row("gp", "12 trials by a Gaussian process", partial(_search, "gp", 12), slow=True),
-    Row("gp-safe", "12 trials by a Gaussian process from safe gains, in small steps", partial(_search, "gp", 12, True),
-        slow=True),
+    Row("random", "20 trials drawn at random", partial(_search, "random", trials=20), searches=True),
+    Row("grid", "the fitted rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
+    Row("tpe", "20 trials by tree-structured Parzen estimators", partial(_search, "tpe", trials=20), searches=True),
+    Row("tpe-safe", "20 trials by TPE from safe gains, in small steps", partial(_search, "tpe", trials=20, safe=True),
+        searches=True),
+    Row("cmaes", "20 trials by CMA-ES", partial(_search, "cmaes", trials=20), searches=True),
+    Row("gp", "12 trials by a Gaussian process", partial(_search, "gp", trials=12), slow=True, searches=True),
+    Row("gp-safe", "12 trials by a Gaussian process from safe gains, in small steps",
+        partial(_search, "gp", trials=12, safe=True), slow=True, searches=True),
 )  # fmt: skip
 
 

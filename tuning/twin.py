@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.envs.gain_trial import OSCILLATION
 from drive_env.gains import RAW_MAX, Gains, rule_gains
 from drive_env.positioning import Move, plan_move
 from drive_env.score import HiddenScore
@@ -118,6 +119,8 @@ WORLDS = (
     World("rough", 0.05, -0.04, -0.03, -0.1, 0.7, friction=0.4, adc_noise=0.05, cogging=1.7, supply_resistance=0.15),
     World("smooth", -0.05, 0.03, 0.04, 0.1, damping=1.5, adc_noise=0.01, cogging=0.5),
 )
+# What the current may swing in a move, likewise of the rated one, and the power by which more than that counts.
+MOST_SWING, SWINGING = 0.8 * OSCILLATION, 2.0
 FARTHEST = 0.6  # relative: an interval that says less than this says nothing
 
 
@@ -220,7 +223,10 @@ class Twins:
                 self._parts.append(part)
 
     def score(self, gains: Integers) -> Floats:
-        """Return the worth of gains, raw integers of shape (n, lanes, 5): mean hidden J over the worlds, (n, lanes)."""
+        """Return what gains, raw integers of shape (n, lanes, 5), are worth over the worlds, (n, lanes).
+
+        The mean of hidden J, in which gains count for worse that a trial would stop as oscillating.
+        """
         hidden = np.empty(gains.shape[:2])
         for part in self._parts:
             hidden[part.axes] = part.score(gains[part.axes])
@@ -259,7 +265,7 @@ class _Part:
         self._hidden = HiddenScore(device.name, load, motor.name, machines, num_threads=num_threads)
         rows = [[twin_parameters(device, motor, one, world) for world in worlds] for one in known]
         parameters = {
-            name: self._spread(np.array([[row[name] for row in axis] for axis in rows])) for name in rows[0][0]
+            name: self._spread_worlds(np.array([[row[name] for row in axis] for axis in rows])) for name in rows[0][0]
         }
         supply = np.array([one.plant.supply for one in known])
         self._hidden.set_machines(parameters, self._spread(supply))
@@ -273,16 +279,21 @@ class _Part:
         self._hidden.set_reference(self._spread(rule_gains(device, motor, inertia)))
 
     def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values per axis, or per axis and world, for all machines."""
-        rows = values.reshape(len(values), 1, -1) if values.shape[1:] == self._shape[2:] else values[:, None, None]
-        trailing = rows.shape[3:]
-        return np.broadcast_to(rows, (*self._shape, *trailing)).reshape(-1, *trailing)
+        """Return values per axis, (axes, ...), for all machines, (machines, ...)."""
+        trailing = values.shape[1:]
+        return np.broadcast_to(values[:, None, None], (*self._shape, *trailing)).reshape(-1, *trailing)
+
+    def _spread_worlds(self, values: Floats) -> Floats:
+        """Return values per axis and world, (axes, worlds), for all machines, (machines,)."""
+        return np.broadcast_to(values[:, None], self._shape).reshape(-1)
 
     def score(self, gains: Integers) -> Floats:
-        """Return the mean of hidden J over the worlds, geometric, of gains (axes, lanes, 5)."""
+        """Return the mean worth over the worlds, geometric, of gains (axes, lanes, 5)."""
         every = np.repeat(gains.reshape(-1, len(Gains._fields)), self._shape[2], axis=0)
-        logs = np.log(self._hidden.score(every).hidden).reshape(self._shape)
-        return np.asarray(np.exp(logs.mean(axis=2)))
+        found = self._hidden.score(every)
+        # A drive on which that swings would be stopped: a trial sees the move and the probe.
+        beyond = np.maximum(found.swing.max(axis=1) / MOST_SWING, 1.0)
+        return np.asarray(np.exp(np.log(found.hidden * beyond**SWINGING).reshape(self._shape).mean(axis=2)))
 
     def close(self) -> None:
         self._hidden.close()

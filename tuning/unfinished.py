@@ -1,7 +1,8 @@
 """A run that is under way: a folder beside the one that its results will have, from which it goes on if it is killed.
 
 The folder of the results is complete or absent. Beside it, named `<folder>.unfinished`, lie the settings of the run and
-the results of the shards that are done; it vanishes with the last step of the run.
+the results of the shards that are done, and for shards that can go on from where they were, what they have so far; it
+vanishes with the last step of the run.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 
 from tuning.shard_log import ShardLog, ShardLogError
 
-SUFFIX, SETTINGS, SHARDS = ".unfinished", "settings.toml", "shards"
+SUFFIX, SETTINGS, SHARDS, PART = ".unfinished", "settings.toml", "shards", "part-"
 
 
 def unfinished_folder(folder: str | Path) -> Path:
@@ -51,8 +52,29 @@ def shard_log(folder: str | Path, settings: str, *, resume: bool) -> Iterator[Sh
         try:
             yield log
         finally:
-            if not log.holds_results:
+            if not log.holds_results and not has_parts(log):
                 discard(folder)
+
+
+def has_parts(log: ShardLog) -> bool:
+    """Return whether shards of a run have begun, and kept what they have."""
+    return any(log.path.parent.glob(f"{PART}*"))
+
+
+def part_path(log: ShardLog, shard: int) -> Path:
+    """Return the file in which a shard of a run keeps what it has so far."""
+    return log.path.with_name(f"{PART}{shard}")
+
+
+@contextmanager
+def part_log(path: Path, key: str) -> Iterator[ShardLog]:
+    """Give what a shard has done so far, and keep what is to come; leave no file behind if there is nothing."""
+    with ShardLog(path, key) as log:
+        try:
+            yield log
+        finally:
+            if not log.holds_results:
+                path.unlink(missing_ok=True)
 
 
 def discard(folder: str | Path) -> None:

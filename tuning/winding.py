@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from drive_env import motion
 from tuning.confidence import gain_error, interval, t_quantile
+from tuning.dead_time import dead_time
 from tuning.identification import Estimate, refused
 from tuning.working_state import (
     CURRENT,
@@ -39,10 +40,11 @@ from tuning.working_state import (
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-SQRT3 = 3.0**0.5
-SHARES = (0.95, 0.7, 0.45, 0.25)  # amplitudes of the pulses, over what may be asked for
-DWELL = 3  # cycles a level lasts; a pulse is +, -, -, +, so that speed and way end at 0
-REPEATS = 8
+# Amplitude of a pulse over what may be asked for, and the cycles that a level lasts; a pulse is +, -, -, +, so that
+# speed and way end at 0. Short ones hold as many changes of the current in a third of the time: they say the
+# inductance, long ones the resistance, and those of little current what dead time loses.
+PULSES = ((0.95, 3), (0.95, 1), (0.95, 1), (0.7, 3), (0.7, 1), (0.45, 3), (0.25, 3))
+REPEATS, BRIEFLY = 8, 6
 LOOP_GAIN, LOOP_HZ = 4.0, 600.0  # P of the loop: so many winding resistances, or this bandwidth if that is less
 INTEGRAL_SHARE = 0.1  # of the integral gain that cancels the winding's lag: an instrument, not a controller
 HOLD_HZ, HOLD_DAMPING = 7.0, 0.7  # our own slow position loop around the pulses
@@ -50,6 +52,8 @@ HOLD_HZ, HOLD_DAMPING = 7.0, 0.7  # our own slow position loop around the pulses
 RESISTANCE_PRIOR, EMF_PRIOR = (1.1, 0.25), (0.965, 0.06)
 # Of R and L, 95 %: what the balance leaves out, as sag of the supply, lag of the encoder, what a tick hides.
 RESISTANCE_MODEL, INDUCTANCE_MODEL = 0.01, 0.02
+# The same, over the share that dead time loses of what drives the current: how it fades at small currents is unknown.
+RESISTANCE_LOSS, INDUCTANCE_LOSS = 0.12, 0.07
 LEAST_NOISE = 0.005  # of the flux: a better fit than that is not taken for knowledge
 SATURATIONS = 8  # currents at which dead time may saturate that are tried
 MOST_ROUNDS, SETTLED = 12, 2e-3  # of the fit, and the share by which values still change in the end
@@ -92,7 +96,7 @@ def loop_gains(working: Working) -> tuple[Floats, float]:
     return np.clip(P, 1, 32767), float(np.clip(np.rint(INTEGRAL_SHARE * cancels), 8, 32767))
 
 
-def pulse(working: Working, holding: Floats) -> Pulses:
+def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
     """Give current pulses in cst around the holding currents [A]; the axes are enabled in cst, at rest."""
     target, drives = working.target, working.target.drives
     motor, count = target.motor, target.num_axes
@@ -102,7 +106,7 @@ def pulse(working: Working, holding: Floats) -> Pulses:
     J = 3.0 * motor.inertia / motor.torque_constant
     stiffness, damping = J * (2.0 * np.pi * HOLD_HZ) ** 2, 2.0 * HOLD_DAMPING * J * 2.0 * np.pi * HOLD_HZ
     room = np.maximum(working.current - np.abs(holding), 0.0)
-    levels, blocks = _levels()
+    levels, blocks = _levels(repeats)
     in_real_time = not getattr(drives, "time_waits", True)
     # Where time does not wait for the reads, first only: how long do they take?
     for played in (np.zeros(PROBE), levels) if in_real_time else (levels,):
@@ -145,8 +149,8 @@ def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats,
     if pulses.step > CYCLE:
         return [_none(
             f"the integrator of 2041h can only be read by SDO, and a cycle with its reads took {1e3 * pulses.step:.1f} "
-            f"ms instead of {1e3 * CYCLE:g}: in real time they are not in step with the current; resistance and "
-            "inductance need an emulator in lockstep (--lockstep) or a faster bus, or take the data sheet's"
+            f"ms instead of {1e3 * CYCLE:g}: in real time they are not in step with the current; the inductance "
+            "needs an emulator in lockstep (--lockstep) or a faster bus, or take the data sheet's"
         )] * working.target.num_axes  # fmt: skip
     return [
         _winding(working, _of_axis(pulses, k), k, float(electrical_angle[k]), pole_pairs)
@@ -179,14 +183,14 @@ def _of_axis(pulses: Pulses, k: int) -> _Axis:
     return _Axis(pulses.demand[:, k], pulses.current[:, k], pulses.angle[:, k], pulses.duty_sum[:, k], pulses.block)
 
 
-def _levels() -> tuple[Floats, NDArray[np.int64]]:
+def _levels(repeats: int) -> tuple[Floats, NDArray[np.int64]]:
     levels: list[float] = []
     blocks: list[int] = []
-    for repeat in range(REPEATS):
-        for share in SHARES:
-            sign = 1.0 if repeat % 2 == 0 else -1.0
-            levels += [sign * share] * DWELL + [-sign * share] * 2 * DWELL + [sign * share] * DWELL
-            blocks += [blocks[-1] + 1 if blocks else 0] * 4 * DWELL
+    for repeat in range(repeats):
+        for share, cycles in PULSES:
+            level = share if repeat % 2 == 0 else -share
+            levels += [level] * cycles + [-level] * 2 * cycles + [level] * cycles
+            blocks += [blocks[-1] + 1 if blocks else 0] * 4 * cycles
     return np.array(levels), np.array(blocks)
 
 
@@ -279,25 +283,6 @@ def _simulate(
     return path
 
 
-def dead_time(angle: Floats, i_q: Floats, saturation: float, brushed: bool) -> Floats:
-    """Return the voltage along q that dead time takes, over what one phase loses at most.
-
-    Args:
-        angle: Electrical angle [rad].
-        i_q: Current [A]; i_d is 0.
-        saturation: Current from which a phase loses all of it [A].
-        brushed: Whether the motor lies between two legs.
-    """
-    if brushed:
-        return np.asarray(2.0 * np.clip(i_q / saturation, -1.0, 1.0))
-    s, c = np.sin(angle), np.cos(angle)
-    alpha, beta = -s * i_q / saturation, c * i_q / saturation
-    a = np.clip(alpha, -1.0, 1.0)
-    b = np.clip(0.5 * (SQRT3 * beta - alpha), -1.0, 1.0)
-    third = np.clip(-0.5 * (SQRT3 * beta + alpha), -1.0, 1.0)
-    return np.asarray(c * (b - third) / SQRT3 - s * (2.0 * a - b - third) / 3.0)
-
-
 class _Fit(NamedTuple):
     mean: Floats  # R, L, K_e, volts lost to dead time, constant
     spread: Floats
@@ -387,7 +372,12 @@ def _judge(working: Working, axis: _Axis, found: _Fit, window: _Window) -> Windi
     t = t_quantile(found.freedom)
     gain = gain_error(target.device, target.motor)
     estimates = []
-    for k, (unit, model) in enumerate((("ohm", RESISTANCE_MODEL), ("H", INDUCTANCE_MODEL))):
+    largest = float(dead_time(np.zeros(1), np.array([1.0]), 1e-9, target.motor.kind == "dc")[0])
+    driving = max(float(found.mean[0]), 0.2 * target.motor.R_s) * float(np.abs(axis.current).max())
+    lost = largest * abs(float(found.mean[3])) / max(driving, 1e-9)
+    for k, (unit, model, loss) in enumerate((
+        ("ohm", RESISTANCE_MODEL, RESISTANCE_LOSS), ("H", INDUCTANCE_MODEL, INDUCTANCE_LOSS),
+    )):  # fmt: skip
         value, half = float(found.mean[k]), t * float(found.spread[k])
         if not value > 0.0 or float(np.hypot(half / value, model)) > WIDEST:
             swing = float(np.ptp(axis.current))
@@ -396,7 +386,7 @@ def _judge(working: Working, axis: _Axis, found: _Fit, window: _Window) -> Windi
                 f"{half:.2g} {unit} around {value:.2g} {unit}; allow a greater current"
             )))  # fmt: skip
         else:
-            estimates.append(interval(value, half, float(np.hypot(gain, model)), unit))
+            estimates.append(interval(value, half, float(np.linalg.norm([gain, model, loss * lost])), unit))
     return Winding(estimates[0], estimates[1], _follows(window))
 
 

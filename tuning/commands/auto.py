@@ -9,28 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tuning.commands.options import (
+    INTERRUPTED,
     REFUSED,
-    Bitrate,
-    Bus,
-    Channel,
-    DeviceName,
-    Interface,
     Json,
-    LoadName,
-    Lockstep,
-    Machines,
-    MotorName,
-    Nodes,
-    Randomise,
-    Seed,
-    Supply,
-    TravelRange,
-    Yes,
-    ask_to_turn,
+    TargetOptions,
     errors_as_exit_codes,
-    open_target,
+    fail,
     print_json,
     progress_bar,
+    takes,
 )
 
 if TYPE_CHECKING:
@@ -38,33 +25,20 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 
+@takes(TargetOptions)
 def auto(
-    bus: Bus = False,
-    device: DeviceName = "tmcm1636",
-    motor: MotorName = "qbl4208",
-    load: LoadName = "two_mass",
-    seed: Seed = 0,
-    machines: Machines = 1,
-    randomise: Randomise = False,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Nodes = None,
-    bitrate: Bitrate = None,
-    lockstep: Lockstep = False,
-    supply: Supply = None,
-    travel: TravelRange = None,
+    drive: TargetOptions,
     store: Annotated[
         bool, typer.Option("--store/--no-store", help="Have drives on a bus keep the gains over a power cycle.")
     ] = True,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-auto")
     ] = None,
-    yes: Yes = False,
     json: Json = False,
 ) -> None:
     """Tune a drive: check, identify, compute, try, verify, write and keep; what fails a check is rolled back.
 
-    The motor turns, for less than 10 s in all. Writes before.toml, from which `drive-tune restore` brings back what
+    A motor turns, for less than 10 s in all. Writes before.toml, from which `drive-tune restore` brings back what
     was, certificate.json and report.html. Exit code 1 if an axis was rolled back; why is said.
     """
     with errors_as_exit_codes():
@@ -72,15 +46,9 @@ def auto(
 
         folder = provenance.run_folder("auto") if out is None else out
         provenance.check_folder(folder)
-        if bus and travel is not None:
-            ask_to_turn(node, yes)
-        with open_target(
-            bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
-            interface=interface, channel=channel, nodes=node, bitrate=bitrate, lockstep=lockstep, supply=supply,
-            travel=travel,
-        ) as target:  # fmt: skip
-            result = _run(target, folder, seed, store)
-            _report(target, result, folder, seed, json)
+        with drive.open() as target:
+            result = _run(target, folder, drive.seed, store)
+            _report(target, result, folder, drive.seed, json)
         if not result.accepted.all():
             raise typer.Exit(REFUSED)
 
@@ -88,8 +56,27 @@ def auto(
 def _run(target: Target, folder: Path, seed: int, store: bool) -> Result:
     from tuning.auto import auto as tune
 
-    with progress_bar("tuning") as show:
-        return tune(target, folder / "before.toml", seed=seed, keep=store, progress=lambda what, share: show(share))
+    file = folder / "before.toml"
+    try:
+        with progress_bar("tuning") as show:
+            return tune(target, file, seed=seed, keep=store, progress=lambda what, share: show(share))
+    except KeyboardInterrupt:
+        fail(f"interrupted; {_left_behind(target, file)}", INTERRUPTED)
+
+
+def _left_behind(target: Target, file: Path) -> str:
+    """Say what drives have after Ctrl-C: it may come before anything was changed, or after everything was."""
+    import numpy as np
+
+    from drive_env.gains import GAIN_OBJECTS
+    from tuning.snapshot import load_snapshot
+
+    if not file.exists():
+        return "nothing was changed"
+    before = load_snapshot(file)
+    if all(np.array_equal(target.drives.read(key), [axis[key] for axis in before.axes]) for key in GAIN_OBJECTS):
+        return "the drives are disabled and have the gains from before"
+    return f"the drives are disabled and have the new gains: drive-tune restore {file} brings back what was"
 
 
 def _report(target: Target, result: Result, folder: Path, seed: int, json: bool) -> None:

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from tuning.commands.options import Json, errors_as_exit_codes, print_json, progress_bar
+from tuning.commands.options import (
+    INTERRUPTED,
+    Json,
+    Resume,
+    check_seed,
+    errors_as_exit_codes,
+    fail,
+    print_json,
+    progress_bar,
+    what_an_interrupt_leaves,
+)
 
 
 def compare(
@@ -26,20 +37,34 @@ def compare(
     out: Annotated[
         Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-compare")
     ] = None,
+    trials: Annotated[
+        int | None, typer.Option(help="Trials of every search by trials.", show_default="each tuner's own: 12 or 20")
+    ] = None,
     slow: Annotated[bool, typer.Option("--slow", help="Compare the slow tuners, too.")] = False,
     show: Annotated[bool, typer.Option("--list", help="List tuners and suites, and stop.")] = False,
+    resume: Resume = False,
     json: Json = False,
 ) -> None:
     """Have every tuner tune the same emulated machines, and score what it finds by hidden J.
 
     Hidden J counts speed, stiffness, noise, overshoot and robustness; it is given relative to that of the fitted rule
-    with the true inertia. Writes tuners.csv, machines.csv, comparison.png and settings.toml.
+    with the true inertia, and machine by machine to that of the best other tuner. Writes tuners.csv, rivals.csv,
+    machines.csv, comparison.png and settings.toml. Stopped at any point, it goes on with --out and --resume, to the
+    same digits.
     """
     with errors_as_exit_codes():
         if show:
             _list()
             return
-        _compare(suite, tuners, seed, drawn, count, out, slow, json)
+        if resume and out is None:
+            raise ValueError("--resume needs --out: the folder into which the comparison was to write")
+        from tuning import provenance
+
+        folder = provenance.run_folder("compare") if out is None else out
+        try:
+            _compare(suite, tuners, seed, drawn, count, trials, folder, slow, resume, json)
+        except KeyboardInterrupt:
+            fail(what_an_interrupt_leaves(folder), INTERRUPTED)
 
 
 def _compare(
@@ -48,38 +73,52 @@ def _compare(
     seed: int,
     drawn: bool,
     count: int | None,
-    out: Path | None,
+    trials: int | None,
+    folder: Path,
     slow: bool,
+    resume: bool,
     json: bool,
 ) -> None:
+    import hashlib
     from dataclasses import asdict
 
-    from tuning import provenance
+    from tuning import provenance, unfinished
     from tuning.compare import compare as run
-    from tuning.compare import save
-    from tuning.suite import load_suite
+    from tuning.compare import save, settings_text
+    from tuning.rivals import all_rivals
+    from tuning.suite import groups, load_suite
     from tuning.tuners import MissingTunerError, find_tuner, tuner_rows
 
-    if seed < 0:
-        raise ValueError(f"--seed must be 0 or more, not {seed}")
-    folder = provenance.run_folder("compare") if out is None else out
+    check_seed(seed)
+    if trials is not None and trials < 1:
+        raise ValueError(f"--trials must be 1 or more, not {trials}")
     provenance.check_folder(folder)
     machines = load_suite(suite, seed if drawn else None, count)
     tuners, left_out = {}, []
     for name in names or [row.name for row in tuner_rows().values() if slow or not row.slow]:
         try:
-            tuners[name] = find_tuner(name)
+            tuners[name] = find_tuner(name, trials)
         except MissingTunerError as error:
             if names:  # asked for by name
                 raise
             left_out.append(str(error))
-    with progress_bar(f"{len(tuners)} tuners on {len(machines)} machines") as show:
-        comparison = run(machines, tuners, seed=seed, progress=lambda what, share: show(share))
-    settings = {"suite": suite, "tuners": list(tuners), "seed": seed, "drawn": str(drawn).lower(), "count": count}
+    settings = {"suite": suite, "tuners": list(tuners), "seed": seed, "drawn": drawn, "count": count}
+    settings |= {"trials": trials}
+    settings |= provenance.versions()
+    # The machines themselves, not the suite's name alone: its file may have been edited since.
+    run_text = settings_text(settings | {"machines": hashlib.sha256(repr(machines).encode()).hexdigest()})
+    with unfinished.shard_log(folder, run_text, resume=resume) as log:
+        if log.done:
+            print(f"note: goes on from {len(log.done)} of {len(tuners) * len(groups(machines))} steps that are done",
+                  file=sys.stderr)  # fmt: skip
+        with progress_bar(f"{len(tuners)} tuners on {len(machines)} machines") as show:
+            comparison = run(machines, tuners, seed=seed, log=log, progress=lambda what, share: show(share))
     with provenance.new_folder(folder) as partial:
-        save(comparison, partial, settings | provenance.versions())
+        save(comparison, partial, settings)
+    unfinished.discard(folder)
     if json:
-        print_json({"tuners": [asdict(row) for row in comparison.tuners], "folder": str(folder)})
+        rivals = [asdict(row) for row in all_rivals(comparison)]
+        print_json({"tuners": [asdict(row) for row in comparison.tuners], "rivals": rivals, "folder": str(folder)})
         return
     _print(comparison, folder, left_out)
 
@@ -88,6 +127,8 @@ def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
+
+    from tuning.rivals import all_rivals
 
     console = Console()
     machines = comparison.tuners[0].machines
@@ -107,10 +148,15 @@ def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
         )  # fmt: skip
     console.print(table)
     lines = ["Drive time and moves: median of a machine; stops, violations, gave up: all machines."]
+    for row in all_rivals(comparison):
+        lines.append(
+            f"{row.tuner}: machine by machine {row.median:.3f} of the best other's hidden J (median, 95 % of "
+            f"{row.low:.3f} to {row.high:.3f}), better than all on {row.better} of {row.machines}"
+        )
     lines += [f"left out: {text}" for text in left_out]
     failures = {(row.tuner, row.note) for row in comparison.rows if row.failed}
     lines += [f"{tuner} failed: {note}" for tuner, note in sorted(failures)]
-    lines.append(f"written to {folder}: tuners.csv, machines.csv, comparison.png, settings.toml")
+    lines.append(f"written to {folder}: tuners.csv, rivals.csv, machines.csv, comparison.png, settings.toml")
     console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
 
 

@@ -11,27 +11,12 @@ import typer
 
 from tuning.commands.options import (
     REFUSED,
-    Bitrate,
-    Bus,
-    Channel,
-    DeviceName,
-    Interface,
     Json,
-    LoadName,
-    Lockstep,
-    Machines,
-    MotorName,
-    Nodes,
-    Randomise,
-    Seed,
-    Supply,
-    TravelRange,
-    Yes,
-    ask_to_turn,
+    TargetOptions,
     errors_as_exit_codes,
-    open_target,
     print_json,
     progress_bar,
+    takes,
 )
 
 if TYPE_CHECKING:
@@ -53,23 +38,10 @@ TITLES = {
 }
 
 
+@takes(TargetOptions)
 def identify(
-    bus: Bus = False,
-    device: DeviceName = "tmcm1636",
-    motor: MotorName = "qbl4208",
-    load: LoadName = "two_mass",
-    seed: Seed = 0,
-    machines: Machines = 1,
-    randomise: Randomise = False,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Nodes = None,
-    bitrate: Bitrate = None,
-    lockstep: Lockstep = False,
-    supply: Supply = None,
-    travel: TravelRange = None,
+    drive: TargetOptions,
     out: Annotated[Path | None, typer.Option("--out", help="File for the results (JSON).")] = None,
-    yes: Yes = False,
     json: Json = False,
 ) -> None:
     """Identify axes: winding, encoder, inertia, friction, gravity, resonance, delay and filter.
@@ -85,13 +57,7 @@ def identify(
             raise ValueError(f"{out} is a folder; give a file for --out, e.g. {out / 'identified.json'}")
         from tuning.identification import identify as run
 
-        if bus and travel is not None:
-            ask_to_turn(node, yes)
-        with open_target(
-            bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
-            interface=interface, channel=channel, nodes=node, bitrate=bitrate, lockstep=lockstep, supply=supply,
-            travel=travel,
-        ) as target, progress_bar("identifying") as show:  # fmt: skip
+        with drive.open() as target, progress_bar("identifying") as show:
             found = run(target, progress=lambda what, share: show(share))
         rows = [row(one) for one in found]
         if out is not None:

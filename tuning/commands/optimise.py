@@ -10,31 +10,18 @@ import typer
 
 from tuning.commands.options import (
     INTERRUPTED,
-    Bitrate,
-    Bus,
-    Channel,
     Cluster,
-    DeviceName,
-    Interface,
+    DriveOptions,
     Json,
-    LoadName,
-    Lockstep,
-    MotorName,
-    Nodes,
     Resume,
-    Seed,
-    Supply,
-    TravelRange,
     Workers,
-    Yes,
-    ask_to_turn,
     check_seed,
     errors_as_exit_codes,
     fail,
-    open_target,
-    parse_travels,
     print_json,
     progress_bar,
+    takes,
+    what_an_interrupt_leaves,
 )
 
 STALL = 60.0  # s: so long a sampler may think while an axis stands still, enabled
@@ -50,7 +37,9 @@ def _from_file(context: typer.Context, path: Path | None) -> Path | None:
     return path
 
 
+@takes(DriveOptions)
 def optimise(
+    drive: DriveOptions,
     config: Annotated[
         Path | None,
         typer.Option(
@@ -105,19 +94,6 @@ def optimise(
         Path | None,
         typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-optimise"),
     ] = None,
-    device: DeviceName = "tmcm1636",
-    motor: MotorName = "qbl4208",
-    load: LoadName = "two_mass",
-    seed: Seed = 0,
-    bus: Bus = False,
-    interface: Interface = None,
-    channel: Channel = None,
-    nodes: Nodes = None,
-    bitrate: Bitrate = None,
-    lockstep: Lockstep = False,
-    supply: Supply = None,
-    travel: TravelRange = None,
-    yes: Yes = False,
     json: Json = False,
 ) -> None:
     """Search gains by trials: a move, its reversal, and the move with more gain, costed from what the drive shows.
@@ -127,7 +103,7 @@ def optimise(
     repeats the search; on a bus also <out>-before.toml, from which drive-tune restore brings back what was.
     """
     with errors_as_exit_codes():
-        check_seed(seed)
+        check_seed(drive.seed)
         if lanes < 1:
             raise ValueError(f"--lanes must be 1 or more, not {lanes}")
         if resume and out is None:
@@ -144,32 +120,20 @@ def optimise(
             sampler=sampler,
             trials=trials,
             objectives=tuple(objectives) if objectives else ("cost",),
-            safe=bus if safe is None else safe,
-            seed=seed,
+            safe=drive.bus if safe is None else safe,
+            seed=drive.seed,
             journal=journal,
             **chosen,
         )
-        where = "the bus" if bus else f"an emulated {load}"
-        common = {"device": device, "motor": motor, "supply": supply, "travel": travel}
-        if not bus:
-            if nodes or bitrate is not None or lockstep:
-                raise ValueError(
-                    "--node, --bitrate and --lockstep are of drives on a bus; add --bus, or leave them out"
-                )
-            ends = None if travel is None else parse_travels(travel)
-            machine = {
-                "device": device, "load": load, "motor": motor, "num_machines": lanes, "seed": seed, "supply": supply,
-                "travel": ends,
-            }  # fmt: skip
+        where = "the bus" if drive.bus else f"an emulated {drive.load}"
+        common = {name: getattr(drive, name) for name in ("device", "motor", "supply", "travel")}
+        if not drive.bus:
+            machine = drive.machine() | {"num_machines": lanes}
             try:
                 found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
             except KeyboardInterrupt:
-                if unfinished.unfinished_folder(folder).exists():
-                    going_on = f"; the searches that are done are kept; go on with --out {folder} --resume"
-                else:
-                    going_on = "; nothing was written"
-                fail(f"interrupted{going_on}", INTERRUPTED)
-            emulated = common | {"load": load, "lanes": lanes, "searches": searches}
+                fail(what_an_interrupt_leaves(folder), INTERRUPTED)
+            emulated = common | {"load": drive.load, "lanes": lanes, "searches": searches}
             _report(found, settings, folder, None, where, emulated, json)
             unfinished.discard(folder)
             return
@@ -178,24 +142,9 @@ def optimise(
                 "--searches, --workers, --cluster and --resume are of emulated machines; a search on a bus goes on "
                 "from its --journal"
             )
-        if travel is not None:
-            ask_to_turn(nodes, yes)
-        target = open_target(
-            bus=bus,
-            device=device,
-            motor=motor,
-            seed=seed,
-            interface=interface,
-            channel=channel,
-            nodes=nodes,
-            bitrate=bitrate,
-            lockstep=lockstep,
-            supply=supply,
-            travel=travel,
-        )
-        with target:
+        with drive.open() as target:
             found, before = _search_bus(target, settings, folder)
-        on_bus = common | {"nodes": nodes or [1], "bitrate": bitrate, "lockstep": lockstep}
+        on_bus = common | {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
         _report(found, settings, folder, before, where, on_bus | dict(target.bus), json)
 
 
@@ -219,6 +168,8 @@ def _search_machine(
         unfinished.shard_log(folder, searches.description(shards) + versions, resume=resume) as log,
         open_pool(workers, cluster) as pool,
     ):
+        if log.done or unfinished.has_parts(log):
+            print(f"note: goes on from what was done, {len(log.done)} of {count} searches whole", file=sys.stderr)
         for line in pool.differences():
             print(f"note: {line}", file=sys.stderr)
         elsewhere = workers is not None or cluster is not None

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 
 import typer
 
@@ -58,6 +61,70 @@ Resume = Annotated[
 ]
 
 
+@dataclass(frozen=True, kw_only=True)
+class DriveOptions:
+    """The options that name a drive, emulated or on a bus; `takes` gives them to a command."""
+
+    bus: Bus = False
+    device: DeviceName = "tmcm1636"
+    motor: MotorName = "qbl4208"
+    load: LoadName = "two_mass"
+    seed: Seed = 0
+    interface: Interface = None
+    channel: Channel = None
+    nodes: Nodes = None
+    bitrate: Bitrate = None
+    lockstep: Lockstep = False
+    supply: Supply = None
+    travel: TravelRange = None
+    yes: Yes = False
+
+    def machine(self) -> dict[str, Any]:
+        """Return what `tuning.target.emulated` takes of these options; raises as `open_target` does."""
+        check_seed(self.seed)
+        check_no_bus(self.nodes, self.bitrate, self.lockstep)
+        named = {name: getattr(self, name) for name in ("device", "load", "motor", "seed", "supply")}
+        return named | {"travel": None if self.travel is None else parse_travels(self.travel)}
+
+    def open(self) -> Target:
+        """Return the drives, once the user lets a motor of a bus turn; raises as `open_target` does."""
+        if self.bus and self.travel is not None:
+            ask_to_turn(self.nodes, self.yes)
+        return open_target(**{name: value for name, value in vars(self).items() if name != "yes"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetOptions(DriveOptions):
+    """The same, and how many emulated machines."""
+
+    machines: Machines = 1
+    randomise: Randomise = False
+
+
+def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command these options beside its own; it gets them together, as its argument `drive`."""
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        hints = get_type_hints(options, include_extras=True)
+        shared = [
+            inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
+            for f in fields(options)
+        ]
+        own = inspect.signature(command, eval_str=True).parameters
+        mine = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for name, p in own.items() if name != "drive"]
+
+        @wraps(command)
+        def run(**given: Any) -> None:
+            chosen = options(**{p.name: given.pop(p.name) for p in shared})
+            command(drive=chosen, **given)
+
+        run.__signature__ = inspect.Signature([*mine, *shared])  # type: ignore[attr-defined]  # what typer reads
+        run.__annotations__ = {p.name: p.annotation for p in (*mine, *shared)}
+        return run
+
+    return decorate
+
+
 def parse_travel(text: str) -> tuple[float, float]:
     """Return how far a rotor may turn [rad] from LOW:HIGH in turns, or `free`.
 
@@ -92,6 +159,15 @@ def check_seed(seed: int) -> None:
     """Raise ValueError for a seed below 0."""
     if seed < 0:
         raise ValueError(f"--seed must be 0 or more, not {seed}")
+
+
+def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool) -> None:
+    """Raise ValueError for options of a bus where --bus was not said.
+
+    Interface and channel may stand in the environment: alone they say nothing, and a motor must not turn by surprise.
+    """
+    if nodes or bitrate is not None or lockstep:
+        raise ValueError("--node, --bitrate and --lockstep are of drives on a bus; add --bus, or leave them out")
 
 
 def ask_to_turn(nodes: list[int] | None, yes: bool) -> None:
@@ -134,10 +210,10 @@ def open_target(
     from tuning.target import emulated, on_bus
 
     check_seed(seed)
-    # Interface and channel may stand in the environment: alone they say nothing, and a motor must not turn by surprise.
+    if machines < 1:
+        raise ValueError(f"--machines must be 1 or more, not {machines}")
     if not bus:
-        if nodes or bitrate is not None or lockstep:
-            raise ValueError("--node, --bitrate and --lockstep are of drives on a bus; add --bus, or leave them out")
+        check_no_bus(nodes, bitrate, lockstep)
         ends = None if travel is None else parse_travels(travel)
         return emulated(
             device, load, motor, num_machines=machines, seed=seed, randomise=randomise, supply=supply, travel=ends
@@ -207,6 +283,15 @@ def fail(error: object, code: int = USER_ERROR) -> NoReturn:
     """End the command with a line on stderr."""
     print(f"drive-tune: {error}", file=sys.stderr)
     raise typer.Exit(code)
+
+
+def what_an_interrupt_leaves(folder: Path) -> str:
+    """Return what an interrupted run that can be resumed says."""
+    from tuning import unfinished
+
+    if unfinished.unfinished_folder(folder).exists():
+        return f"interrupted; what is done is kept; go on with --out {folder} --resume"
+    return "interrupted; nothing was written"
 
 
 def interrupted() -> NoReturn:

@@ -11,29 +11,14 @@ import typer
 
 from tuning.commands.options import (
     REFUSED,
-    Bitrate,
-    Bus,
-    Channel,
-    DeviceName,
-    Interface,
     Json,
-    LoadName,
-    Lockstep,
-    Machines,
-    MotorName,
-    Nodes,
     Out,
-    Randomise,
-    Seed,
-    Supply,
-    TravelRange,
-    Yes,
-    ask_to_turn,
+    TargetOptions,
     errors_as_exit_codes,
     fail,
-    open_target,
     print_json,
     progress_bar,
+    takes,
 )
 
 if TYPE_CHECKING:
@@ -45,22 +30,10 @@ COLUMNS = (
 )  # fmt: skip
 
 
+@takes(TargetOptions)
 def response(
+    drive: TargetOptions,
     loop: Annotated[str, typer.Argument(help="velocity or position.")] = "velocity",
-    bus: Bus = False,
-    device: DeviceName = "tmcm1636",
-    motor: MotorName = "qbl4208",
-    load: LoadName = "two_mass",
-    seed: Seed = 0,
-    machines: Machines = 1,
-    randomise: Randomise = False,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Nodes = None,
-    bitrate: Bitrate = None,
-    lockstep: Lockstep = False,
-    supply: Supply = None,
-    travel: TravelRange = None,
     signal: Annotated[str, typer.Option("--signal", help="What shakes the axis: multisine or chirp.")] = "multisine",
     low: Annotated[float | None, typer.Option("--low", help="Lowest frequency [Hz].", show_default="5")] = None,
     high: Annotated[
@@ -72,7 +45,6 @@ def response(
         bool, typer.Option("--trace", help="Look above 400 Hz, through the emulator's trace; not on a bus.")
     ] = False,
     out: Out = None,
-    yes: Yes = False,
     json: Json = False,
 ) -> None:
     """Shake the axes with the gains they have and show open loop, coherence and margins.
@@ -86,17 +58,11 @@ def response(
 
         if out is not None:
             provenance.check_folder(out)
-        if trace and (bus or high is not None):
+        if trace and (drive.bus or high is not None):
             raise ValueError(
                 "--trace looks at emulated drives, up to 1000 Hz; leave --high and --bus out, or take no --trace"
             )
-        if bus and travel is not None:
-            ask_to_turn(node, yes)
-        with open_target(
-            bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
-            interface=interface, channel=channel, nodes=node, bitrate=bitrate, lockstep=lockstep, supply=supply,
-            travel=travel,
-        ) as target, progress_bar("shaking") as show:  # fmt: skip
+        with drive.open() as target, progress_bar("shaking") as show:
             measured = measure(
                 target, loop, kind=signal, low=low, high=high, resolution=resolution, traced=trace, progress=show
             )
@@ -108,7 +74,7 @@ def response(
             _print(measured, out)
         if measured.trusted.mean(axis=0).min() < FEWEST:
             late = "; or this computer or the drives' emulator is late: serve it with --lockstep" * (
-                bus and not lockstep
+                drive.bus and not drive.lockstep
             )
             fail(f"less than a tenth of an axis's frequencies is coherent: it was shaken too little{late}", REFUSED)
 

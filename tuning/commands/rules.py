@@ -2,35 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tuning.commands.options import (
-    Bitrate,
-    Bus,
-    Channel,
-    DeviceName,
-    Interface,
+    REFUSED,
     Json,
-    LoadName,
-    Lockstep,
-    Machines,
-    MotorName,
-    Nodes,
-    Randomise,
-    Seed,
-    Supply,
-    TravelRange,
-    Yes,
+    TargetOptions,
     ask,
-    ask_to_turn,
     errors_as_exit_codes,
-    open_target,
+    fail,
     print_json,
     progress_bar,
+    takes,
 )
 
 if TYPE_CHECKING:
@@ -42,22 +30,10 @@ MEASURED = "relay, measured"
 POINTS = 1500  # frequencies at which margins are looked for
 
 
+@takes(TargetOptions)
 def rules(
+    drive: TargetOptions,
     rule: Annotated[list[str] | None, typer.Argument(help="Rules by name; all by default.")] = None,
-    bus: Bus = False,
-    device: DeviceName = "tmcm1636",
-    motor: MotorName = "qbl4208",
-    load: LoadName = "two_mass",
-    seed: Seed = 0,
-    machines: Machines = 1,
-    randomise: Randomise = False,
-    interface: Interface = None,
-    channel: Channel = None,
-    node: Nodes = None,
-    bitrate: Bitrate = None,
-    lockstep: Lockstep = False,
-    supply: Supply = None,
-    travel: TravelRange = None,
     relay: Annotated[bool, typer.Option("--relay", help="Swing the axis by a relay, too, and show what that says.")] = (
         False
     ),
@@ -69,7 +45,6 @@ def rules(
             help="File for the state before, with --apply.", show_default="runs/<timestamp>-rules/before.toml"
         ),
     ] = None,
-    yes: Yes = False,
     json: Json = False,
 ) -> None:
     """Identify an axis and show the gains that each rule proposes, with the margins they would have.
@@ -87,46 +62,55 @@ def rules(
             raise ValueError("--store keeps what --apply writes; add --apply RULE, or leave it out")
         if snapshot is not None and not apply:
             raise ValueError("--snapshot is where --apply keeps the state before; add --apply RULE, or leave it out")
-        if bus and travel is not None:
-            ask_to_turn(node, yes)
-        with open_target(
-            bus=bus, device=device, motor=motor, load=load, seed=seed, machines=machines, randomise=randomise,
-            interface=interface, channel=channel, nodes=node, bitrate=bitrate, lockstep=lockstep, supply=supply,
-            travel=travel,
-        ) as target:  # fmt: skip
+        with drive.open() as target:
             plants = _identified(target)
-            proposals = [_propose(target, plant, chosen) for plant in plants]
-            swung = _swing(target, plants) if relay else [""] * len(plants)
-            for rows, measured in zip(proposals, swung, strict=True):
-                if not isinstance(measured, str):
-                    rows[MEASURED] = measured
-            unswung = [measured if isinstance(measured, str) else "" for measured in swung]
-            axes = list(zip(plants, proposals, unswung, strict=True))
+            known = [plant for plant in plants if not isinstance(plant, str)]
+            swung = _swing(target, known) if relay and len(known) == len(plants) else [""] * len(plants)
+            axes = [_Axis(plant) for plant in plants]
+            for axis, measured in zip(axes, swung, strict=True):
+                if not isinstance(axis.plant, str):
+                    axis.rows |= _propose(target, axis.plant, chosen)
+                if isinstance(measured, str):
+                    axis.unswung = measured
+                else:
+                    axis.rows[MEASURED] = measured
             if json:
-                print_json([_as_json(target, *axis) for axis in axes])
+                print_json([_as_json(target, axis) for axis in axes])
             else:
-                for k, (plant, rows, reason) in enumerate(axes):
-                    _print(target, plant, rows, reason, k if len(plants) > 1 else None)
+                for k, axis in enumerate(axes):
+                    _print(target, axis, k if len(plants) > 1 else None)
+            if not known or (apply and len(known) < len(plants)):
+                fail("nothing was written: a rule needs the inertia of every axis" if known else
+                     "no axis has an identified inertia, and no rule works without", REFUSED)  # fmt: skip
             if apply:
-                _apply(target, plants, apply, snapshot, store=store, yes=yes)
+                _apply(target, known, apply, snapshot, store=store, yes=drive.yes)
 
 
-def _identified(target: Target) -> list[Plant]:
-    """Return what the axes are.
+@dataclass
+class _Axis:
+    """What there is to show of an axis: its plant, or why it is not known, and what the rules say of it."""
 
-    Raises:
-        ValueError: If no inertia was found: no rule works without.
-    """
+    plant: Plant | str
+    rows: dict[str, Proposal] = field(default_factory=dict)
+    unswung: str = ""  # why the relay says nothing
+
+
+def _identified(target: Target) -> list[Plant | str]:
+    """Return what the axes are, or why no rule can say anything of one: its inertia was not found."""
     from tuning.identification import identify
     from tuning.linear_model import Plant
     from tuning.proving import shaken_on_purpose
 
     with progress_bar("identifying") as show, shaken_on_purpose(target.drives):
         found = identify(target, progress=lambda what, share: show(share))
-    return [
-        Plant.from_identification(target.device, target.motor, float(target.supply[axis]), one)
-        for axis, one in enumerate(found)
-    ]
+    plants: list[Plant | str] = []
+    for axis, one in enumerate(found):
+        try:
+            supply = float(target.supply[axis])
+            plants.append(Plant.from_identification(target.device, target.motor, supply, one))
+        except ValueError as error:
+            plants.append(str(error))
+    return plants
 
 
 def _propose(target: Target, plant: Plant, names: Sequence[str]) -> dict[str, Proposal]:
@@ -171,9 +155,12 @@ def _margins(target: Target, plant: Plant, proposal: Proposal) -> Any:
     return margins(f, velocity_open_loop(target.device, plant, proposal.gains, f))
 
 
-def _as_json(target: Target, plant: Plant, rows: Mapping[str, Proposal], unswung: str) -> dict[str, Any]:
+def _as_json(target: Target, axis: _Axis) -> dict[str, Any]:
     from dataclasses import asdict
 
+    plant, rows = axis.plant, axis.rows
+    if isinstance(plant, str):
+        return {"no_plant": plant}
     return {
         "plant": asdict(plant),
         "proposals": {
@@ -185,15 +172,19 @@ def _as_json(target: Target, plant: Plant, rows: Mapping[str, Proposal], unswung
             }
             for name, proposal in rows.items()
         },
-    } | ({"no_relay": unswung} if unswung else {})
+    } | ({"no_relay": axis.unswung} if axis.unswung else {})
 
 
-def _print(target: Target, plant: Plant, rows: Mapping[str, Proposal], unswung: str, axis: int | None) -> None:
+def _print(target: Target, shown: _Axis, axis: int | None) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
-    head = "" if axis is None else f"axis {axis}: "
+    head, plant, rows = "" if axis is None else f"axis {axis}: ", shown.plant, shown.rows
+    console = Console()
+    if isinstance(plant, str):
+        console.print(f"{head}{plant}", highlight=False, markup=False, soft_wrap=True)
+        return
     pair = f", resonances at {plant.anti_resonance:.0f} and {plant.resonance:.0f} Hz" if plant.is_elastic else ", rigid"
     title = f"{head}inertia {plant.inertia:.3g} kg m^2{pair}"
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
@@ -203,13 +194,12 @@ def _print(target: Target, plant: Plant, rows: Mapping[str, Proposal], unswung: 
         found = _margins(target, plant, proposal)
         figures = (found.crossover_hz, found.phase_deg, found.gain_db)
         table.add_row(name, *map(str, proposal.gains), *(f"{figure:.0f}" for figure in figures))
-    console = Console()
     console.print(table)
     for name, proposal in rows.items():
         for note in proposal.notes:
             console.print(f"{name}: {note}", highlight=False, markup=False, soft_wrap=True)
-    if unswung:
-        console.print(f"{MEASURED}: nothing: {unswung}", highlight=False, markup=False, soft_wrap=True)
+    if shown.unswung:
+        console.print(f"{MEASURED}: nothing: {shown.unswung}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _apply(

@@ -11,7 +11,15 @@ from typing import Annotated, Any
 
 import typer
 
-from tuning.commands.options import INTERRUPTED, Cluster, Resume, Workers, errors_as_exit_codes, fail
+from tuning.commands.options import (
+    INTERRUPTED,
+    Cluster,
+    Resume,
+    Workers,
+    errors_as_exit_codes,
+    fail,
+    what_an_interrupt_leaves,
+)
 
 BEST_ROWS = 10
 TABLE_FIGURES = ("settling [s]", "overshoot [%]", "dip [rpm]", "ripple [A]")
@@ -55,16 +63,7 @@ def sweep(
             try:
                 _sweep(config, overrides, folder, workers, cluster, resume)
             except KeyboardInterrupt:
-                fail(_interrupted(folder), INTERRUPTED)
-
-
-def _interrupted(folder: Path) -> str:
-    """Return what an interrupt leaves."""
-    from tuning import unfinished
-
-    if unfinished.unfinished_folder(folder).exists():
-        return f"interrupted; what is done is kept; go on with --out {folder} --resume"
-    return "interrupted; nothing was written"
+                fail(what_an_interrupt_leaves(folder), INTERRUPTED)
 
 
 def _sweep(
@@ -113,7 +112,7 @@ def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folde
     from tuning.sweep import run
 
     texts = {
-        "compiling": "loading the kernels (the first time: 40 seconds)",
+        "compiling": "loading the kernels (the first time: 30 seconds)",
         "simulating": f"simulating {experiment.size()} machines",
     }
     columns = (
@@ -137,7 +136,7 @@ def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folde
         console.show_cursor(True)
         if not log.holds_results:
             unfinished.discard(folder)
-        print(f"\ndrive-tune: {_interrupted(folder)}", file=sys.stderr, flush=True)
+        print(f"\ndrive-tune: {what_an_interrupt_leaves(folder)}", file=sys.stderr, flush=True)
         os._exit(INTERRUPTED)
 
     before = signal.signal(signal.SIGINT, stop)

@@ -1,0 +1,157 @@
+"""Ctrl-C while a drive is tuned: it gets its gains back, is off, and the command says so."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from test_auto import gains, quick, standing_in  # noqa: F401
+from test_auto_command import drive_tune
+from test_parity import served
+from test_serve import environment
+from test_serve import served as served_process
+
+from drive_env import CanDrives, motion
+from drive_env.devices import find_device
+from drive_env.motors import find_motor
+from tuning import auto as auto_module
+from tuning import auto_trials
+from tuning.auto import auto
+from tuning.snapshot import Transaction
+from tuning.target import Target, emulated
+
+DISABLED = 0x4F, 0x40  # mask and value of 6041h: switch on disabled
+PATIENCE = 300.0  # s until another process has come so far; it is never this long
+
+
+def is_off(drives):
+    mask, value = DISABLED
+    return bool(np.all(drives.read(0x6041) & mask == value))
+
+
+def while_it_moves(monkeypatch):
+    """Press Ctrl-C in the middle of the first trial."""
+    run = auto_trials.ProvingGround.run
+
+    def interrupted(self, tried, where):
+        self._begin(where)
+        motion.select_mode(self.target.drives, "pp", where)
+        signal.raise_signal(signal.SIGINT)
+        return run(self, tried, where)
+
+    monkeypatch.setattr(auto_trials.ProvingGround, "run", interrupted)
+
+
+def on_bus(drives):
+    motor, device, way = find_motor("qbl4208"), find_device("tmcm1636"), np.array([30.0])
+    return Target(
+        drives, device, motor, np.array([24.0]), -way, way, motor.rated_speed, motor.rated_current,
+        bus={"channel": "here", "nodes": [1]},
+    )  # fmt: skip
+
+
+def known(target, where):
+    """Return the identification of the default inertia."""
+    with emulated(load="inertia", num_threads=1) as same:
+        return standing_in(same)
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("how", ["in process", "calls", "hub"])
+def test_the_gains_before_are_back_and_the_drive_is_off(monkeypatch, tmp_path, how):
+    while_it_moves(monkeypatch)
+    if how == "in process":
+        with emulated(load="inertia", num_threads=1) as target:
+            before = gains(target.drives)
+            with pytest.raises(KeyboardInterrupt):
+                auto(target, tmp_path / "before.toml", experiments=standing_in)
+            np.testing.assert_array_equal(gains(target.drives), before)
+            assert is_off(target.drives)
+        return
+    with served(how, load="inertia") as drives:
+        before = gains(drives)
+        with pytest.raises(KeyboardInterrupt):
+            auto(on_bus(drives), tmp_path / "before.toml", experiments=known)
+        np.testing.assert_array_equal(gains(drives), before)
+        assert is_off(drives)
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_second_ctrl_c_waits_until_everything_is_back(monkeypatch, tmp_path):
+    roll_back = Transaction.roll_back
+
+    def pressed_again(self, where=None):
+        signal.raise_signal(signal.SIGINT)
+        roll_back(self, where)
+
+    while_it_moves(monkeypatch)
+    monkeypatch.setattr(Transaction, "roll_back", pressed_again)
+    handler = signal.getsignal(signal.SIGINT)
+    with emulated(load="inertia", num_threads=1) as target:
+        before = gains(target.drives)
+        with pytest.raises(KeyboardInterrupt):
+            auto(target, tmp_path / "before.toml", experiments=standing_in)
+        np.testing.assert_array_equal(gains(target.drives), before)
+        assert is_off(target.drives)
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+@pytest.mark.parametrize(
+    ("stage", "words"),
+    [
+        ("Transaction", "interrupted; nothing was changed"),
+        ("prove", "interrupted; the drives are disabled and have the gains from before"),
+        ("Run.result", "interrupted; the drives are disabled and have the new gains: drive-tune restore"),
+    ],
+)
+def test_the_command_ends_with_130_and_says_what_the_drives_have(monkeypatch, tmp_path, stage, words):
+    def pressed(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(auto_module, "identify", lambda run, experiments: None)
+    monkeypatch.setattr(auto_module, "compute", lambda run: None)
+    for name in ("prove", "show", "measure", "look_back"):
+        monkeypatch.setattr(auto_module, name, lambda run: None)
+    owner, _, name = stage.rpartition(".")
+    monkeypatch.setattr(getattr(auto_module, owner) if owner else auto_module, name, pressed)
+    done = drive_tune("auto", "--load", "inertia", "--out", tmp_path / "run")
+    assert done.exit_code == 130
+    assert words in done.stderr
+    assert done.stderr.strip().count("\n") == 0
+
+
+@pytest.mark.slow
+def test_a_real_signal_over_a_served_bus(tmp_path):
+    """As a user has it: a drive served by one process, tuned by another, and Ctrl-C in its terminal."""
+    out = tmp_path / "run"
+    with served_process("--load", "inertia", "--lockstep", cwd=tmp_path) as (_, channel):
+        bus = {"interface": "slcan", "channel": channel, "nodes": (1,), "pace": "lockstep"}
+        with CanDrives("tmcm1636", **bus) as drives:
+            before = gains(drives)
+        command = [
+            sys.executable, "-c", "from drive_env.commands import drive_tune; drive_tune()", "auto", "--bus",
+            "--interface", "slcan", "--channel", channel, "--travel", "-5:5", "--lockstep", "--yes", "--out", str(out),
+        ]  # fmt: skip
+        process = subprocess.Popen(
+            command, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            end = time.monotonic() + PATIENCE
+            # The file is there before anything is changed; from then on something is.
+            while not (out / "before.toml").exists() and process.poll() is None and time.monotonic() < end:
+                time.sleep(0.05)
+            time.sleep(1.0)
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=PATIENCE)
+        finally:
+            if process.poll() is None:
+                process.kill()
+        assert process.returncode == 130, said
+        assert "interrupted; the drives are disabled and have the gains from before" in said
+        with CanDrives("tmcm1636", **bus) as drives:
+            np.testing.assert_array_equal(gains(drives), before)
+            assert is_off(drives)

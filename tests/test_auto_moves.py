@@ -1,0 +1,178 @@
+"""Moves for the record: new gains that are no better than those before are not kept; machines of several axes."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_auto import gains, standing_in
+
+from drive_env import motion
+from drive_env.gains import Gains, write_gains
+from tuning import auto_search
+from tuning.auto import auto
+from tuning.auto_certificate import certificate
+from tuning.auto_moves import _keep_what_is_better
+from tuning.auto_result import AxisRun
+from tuning.auto_search import calm_gains
+from tuning.auto_trials import faster
+from tuning.identification import Estimate, Identification, refused
+from tuning.linear_model import Plant
+from tuning.moved_inertia import moved_inertia
+from tuning.proving import ProvingGround, Shown
+from tuning.rules import propose
+from tuning.target import emulated
+from tuning.twin import Optimum
+
+
+def finds(monkeypatch, wanted):
+    """Have the search on twins find these gains, (num_axes, 5)."""
+
+    def search(twins, starts, rng, **options):
+        ones = np.ones((len(starts), 1))
+        return Optimum(np.resize(wanted, (len(starts), 1, 5)), ones, ones[:, 0])
+
+    monkeypatch.setattr(auto_search, "search", search)
+
+
+@pytest.fixture
+def axes():
+    """Two like axes, and good gains for them."""
+    with emulated(load="inertia", num_machines=2, num_threads=1) as target:
+        plant = Plant.from_machine(target.drives)
+        yield target, np.array(propose("margin_55", target.device, target.motor, plant).gains)
+
+
+def test_the_gains_before_are_kept_where_a_move_is_better_with_them(axes, monkeypatch, tmp_path):
+    target, good = axes
+    slow = faster(good, 0.6)
+    write_gains(target.drives, np.stack([good, slow]))
+    finds(monkeypatch, np.stack([slow, good]))
+    result = auto(target, tmp_path / "before.toml", experiments=standing_in)
+    kept, tuned = result.axes
+    assert result.accepted.all()
+    assert (kept.is_kept, tuned.is_kept) == (True, False)
+    np.testing.assert_array_equal(gains(target.drives)[0], good)
+    assert kept.after == kept.before == Gains(*good)
+    assert any(note.startswith("the gains before are kept: J by the measured terms") for note in kept.notes)
+    assert "they are those before" in kept.verified
+    assert tuned.after.velocity_p >= good[2] > tuned.before.velocity_p
+    assert not any("are kept" in note for note in tuned.notes)
+    paper = certificate(target, result, seed=0)
+    # One move is shown, that with the gains which are there; what was measured with others is not.
+    assert [[step.tuned for step in axis.steps if step.name == "move"] for axis in paper.axes] == [
+        [True],
+        [False, True],
+    ]
+    assert paper.axes[0].frequency_responses == ()
+    assert paper.axes[1].frequency_responses
+
+
+def test_where_one_more_move_fails_the_second_best_of_the_trials_is_taken(axes, monkeypatch, tmp_path):
+    target, good = axes
+    finds(monkeypatch, np.stack([faster(good, 0.8), good]))
+    run, show, tried, shown = ProvingGround.run, ProvingGround.show, [], []
+
+    def seen(self, gains, where):
+        proof = run(self, gains, where)
+        tried.append((proof.cost[0], gains[0].copy(), proof.passed[0] and where[0]))
+        return proof
+
+    def fails_once(self, gains, where):
+        shown.append(gains[0].copy())
+        found = show(self, gains, where)
+        return found._replace(reason=("it shook", "")) if len(shown) == 1 else found
+
+    monkeypatch.setattr(ProvingGround, "run", seen)
+    monkeypatch.setattr(ProvingGround, "show", fails_once)
+    result = auto(target, tmp_path / "before.toml", experiments=standing_in)
+    passed = sorted((cost, gains.tolist()) for cost, gains, ok in tried if ok)
+    assert len(passed) >= 2
+    assert [gains.tolist() for gains in shown[:2]] == [gains for _, gains in passed[:2]]
+    assert list(result.axes[0].after) == passed[1][1]
+    assert any(
+        "the second best of the trial: with the best, in one more move it shook" in n for n in result.axes[0].notes
+    )
+
+
+def test_a_machine_of_several_axes_is_as_good_as_its_worst():
+    """Machine 0 has one axis that is better with the new gains and one that is far worse; machine 1 the reverse."""
+    now, before = np.array([1.0, 9.0, 9.0, 2.0]), np.array([3.0, 4.0, 3.0, 9.5])
+
+    def moved(cost):
+        row = np.array([cost])
+        return Shown(np.zeros(1), row, row, row, np.ones(4, bool), ("",) * 4, cost)
+
+    gains_now, gains_before = np.full((4, 5), 7), np.full((4, 5), 3)
+    axes = [AxisRun(Gains(*gains_before[k]), Gains(*gains_before[k])) for k in range(4)]
+    run = SimpleNamespace(
+        target=SimpleNamespace(axes_per_machine=2), axes=axes, gains=gains_now, before=gains_before,
+        shown=moved(now), earlier=moved(before),
+    )  # fmt: skip
+    _keep_what_is_better(run, np.ones(4, bool))
+    assert [axis.is_kept for axis in axes] == [True, True, False, False]
+    assert run.gains[:, 0].tolist() == [3, 3, 7, 7]
+    assert run.shown.actual[0].tolist() == [3.0, 4.0, 9.0, 2.0]
+    assert run.earlier.where.tolist() == [False, False, True, True]
+
+
+# --- several axes -----------------------------------------------------------------------------------------------------
+def gantry_known(target, where):
+    """Return the identification of two axes whose truth is known: what each pushes while both accelerate alike."""
+    motor, found = target.motor, []
+    for inertia in np.concatenate([moved_inertia(group.load) for group in target.drives._groups]).reshape(-1):
+        values = {
+            "resistance": motor.R_s, "inductance": motor.L_q, "inertia": inertia, "coulomb": 0.3, "viscous": 1e-3,
+            "offset": 0.0, "velocity_filter": 400.0, "pole_pairs": float(motor.n_p), "encoder_direction": 1.0,
+            "loop_delay": 200e-6,
+        }  # fmt: skip
+        estimates = {name: Estimate(value, 0.95 * value, 1.05 * value, "") for name, value in values.items()}
+        blank = {name: refused("Hz", "rigid") for name in ("anti_resonance", "resonance")}
+        found.append(Identification(estimates | blank, 0.0))
+    return found
+
+
+@pytest.mark.parametrize("unsafe", [False, True])
+def test_the_axes_of_a_machine_are_tuned_together_and_each_says_why_it_did_not_move(monkeypatch, tmp_path, unsafe):
+    monkeypatch.setattr(auto_search, "GENERATIONS", 3)
+    with emulated(load="gantry", num_machines=1, num_threads=1) as target:
+        before = gains(target.drives)
+        if unsafe:
+            before[1, Gains._fields.index("position_p")] = 0
+            write_gains(target.drives, before)
+        result = auto(target, tmp_path / "before.toml", experiments=gantry_known, budget=3.0)
+        np.testing.assert_array_equal(gains(target.drives), [axis.after for axis in result.axes])
+    assert result.accepted.all(), [axis.reason for axis in result.axes]
+    assert all(axis.after != axis.before for axis in result.axes)
+    said = [[note for note in axis.notes if "no move with the gains before" in note] for axis in result.axes]
+    if not unsafe:
+        assert said == [[], []]
+        assert result.earlier.where.all()
+        return
+    assert result.earlier is None
+    assert [len(notes) for notes in said] == [1, 1]
+    assert "another axis of its machine could not make it" in said[0][0]
+    assert "a P gain is 0" in said[1][0]
+
+
+# --- where a trial begins ---------------------------------------------------------------------------------------------
+def test_an_axis_that_still_turns_is_stopped_before_gains_are_judged_on_it():
+    """Switched off at 1,500 rpm, as after a frequency response; what follows must be what it is from rest."""
+    with emulated(load="inertia", num_machines=2, num_threads=1) as target:
+        drives = target.drives
+        plants = [Plant.from_machine(drives, axis) for axis in range(2)]
+        good = np.array([propose("margin_45", target.device, target.motor, plants[0]).gains] * 2)
+        turning = np.array([True, False])
+        drives.write(0x6083, 10_000_000)
+        motion.enable(drives, mode="pv", where=turning)
+        drives.write(0x60FF, 1500 * 65536 // 60, where=turning)
+        drives.advance(0.5)
+        motion.disable(drives, where=turning)
+        assert drives.read(0x606C)[0] > 1400 * 65536 // 60
+        slow = np.array([calm_gains(target, plant) for plant in plants])
+        ground = ProvingGround(target, plants, (target.low, target.high), slow, good)
+        proof = ground.run(good, np.ones(2, bool))
+    assert proof.reason == ("", "")
+    assert proof.ripple[0] == pytest.approx(proof.ripple[1], abs=0.02)
+    assert proof.overshoot[0] == pytest.approx(proof.overshoot[1], abs=0.05)
