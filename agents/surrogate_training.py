@@ -4,8 +4,8 @@
 
 Round by round: trials of random gains on machines of every row of `TRAINING`, then of gains that the surrogate of the
 round before proposes, so that it learns where it is sent. With --trials FOLDER the trials are kept there, and those
-that are there are not made again: a training that was stopped goes on. With OMP_NUM_THREADS=1 it takes 9 minutes of a core;
-NumPy's threads do nothing for matrices this small but wait for each other, three times as long.
+that are there are not made again: a training that was stopped goes on. With OMP_NUM_THREADS=1 it takes 9 minutes of a
+core; NumPy's threads do nothing for matrices this small but wait for each other, three times as long.
 """
 
 from __future__ import annotations
