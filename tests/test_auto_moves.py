@@ -69,6 +69,30 @@ def test_the_gains_before_are_kept_where_a_move_is_better_with_them(axes, monkey
     assert paper.axes[1].frequency_responses
 
 
+def test_a_fault_with_the_gains_before_is_theirs_and_is_reset(axes, monkeypatch, tmp_path):
+    target, good = axes
+    write_gains(target.drives, np.stack([faster(good, 0.6)] * 2))
+    finds(monkeypatch, np.stack([good, good]))
+    show, machine = ProvingGround.show, target.drives.machine
+
+    def trips_the_second(self, gains, where):
+        found = show(self, gains, where)
+        if gains[1, 2] == target_before[1, 2]:
+            machine.supply = np.array([24.0, 1.1 * target.device.overvoltage])
+            target.drives.advance(0.2)
+            machine.supply = np.full(2, 24.0)
+            target.drives.advance(1.0)
+        return found
+
+    target_before = gains(target.drives)
+    monkeypatch.setattr(ProvingGround, "show", trips_the_second)
+    result = auto(target, tmp_path / "before.toml", experiments=standing_in)
+    assert result.accepted.all(), [axis.reason for axis in result.axes]
+    assert [any("went into fault as it moved with" in n for n in axis.notes) for axis in result.axes] == [False, True]
+    assert np.all(target.drives.read(0x6041) & 0x4F == 0x40)
+    assert not any(axis.is_kept for axis in result.axes)
+
+
 def test_where_one_more_move_fails_the_second_best_of_the_trials_is_taken(axes, monkeypatch, tmp_path):
     target, good = axes
     finds(monkeypatch, np.stack([faster(good, 0.8), good]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,7 @@ LEAST_LINES = 10  # of a frequency response, that are worth a judgement
 SENSITIVITY = 4.0  # greatest |1/(1+L)| that a measured velocity loop may have: 14 degrees, 2.5 dB from instability
 SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5)  # factors of velocity P and position P by which a lively loop is calmed
 CALMED = [Gains._fields.index(name) for name in ("velocity_p", "position_p")]
+LEAST_WAY = 1e-3  # rad; an axis without any way is shaken as little as can be, and its response says so
 FREE_WINDOW = 100  # turns of following error that trip a frequency response: it means nothing there
 
 
@@ -42,11 +44,14 @@ def measure(run: Run) -> None:
     from tuning import frequency_response
 
     drives = run.target.drives
+    # Trials have left the axes somewhere in their travel: what is left of it is counted from there.
+    low, high = run.room()
+    here = replace(run.target, low=low, high=np.maximum(high, LEAST_WAY))
     write_gains(drives, run.gains, going)
     drives.write(FOLLOWING_WINDOW, FREE_WINDOW * drives.read((0x2058, 0)), where=going)
     try:
         with run.spending(going), shaken_on_purpose(drives):
-            run.response = response = frequency_response.measure(run.target, "velocity", where=going)
+            run.response = response = frequency_response.measure(here, "velocity", where=going)
     except SafetyError as error:
         run.stop(going, f"the envelope stopped the frequency response: {error}")
         return
@@ -125,7 +130,8 @@ def _go_on_after_faults(run: Run, faults: Mapping[int, str]) -> None:
         only = np.arange(run.target.num_axes) == axis
         _without_response(run, only, f"the drive went into fault while it was shaken for it ({causes})")
     assert run.ground is not None, "proving makes it"
-    run.ground.recover(where)
+    with run.spending(where):
+        run.ground.recover(where)
     run.drop_faults("its frequency response was measured, and stays in it")
     show(run, where & run.going)
 

@@ -72,9 +72,19 @@ def look_back(run: Run) -> None:
         run.note(able, f"the envelope stopped the move with the gains before: {error}")
         return
     failed = np.array([bool(reason) for reason in earlier.reason])
+    for k, causes in run.faults().items():
+        if able[k]:
+            # That is those gains' doing, and speaks for the new ones.
+            failed[k] = True
+            run.axes[k].notes.append(f"the drive went into fault as it moved with the gains before: {causes}")
+        else:
+            run.axes[k].reason = f"the drive went into fault while it held its place: {causes}"
     for k in map(int, np.flatnonzero(able & failed)):
-        run.axes[k].notes.append(f"the move with the gains before: {earlier.reason[k]}")
-    run.drop_faults("it moved with the gains before")
+        if earlier.reason[k]:
+            run.axes[k].notes.append(f"the move with the gains before: {earlier.reason[k]}")
+    if (able & failed).any():
+        with run.spending(able & failed):
+            run.ground.recover(able & failed)
     _keep_what_is_better(run, run.whole_machines(able & ~failed) & run.going)
 
 

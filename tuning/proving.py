@@ -47,6 +47,7 @@ ASTRAY = 0.2  # of the move: what is still farther away at a trial's end does no
 # Of the move, and of the encoder: an axis farther than both from where a trial starts is brought back first.
 NEAR, NEAR_COUNTS = 0.03, 5.0
 RETURN_MOVES, RETURN_SPEED = 3.0, 0.5  # moves that are as short a way as one; of the speed limit, on longer ones
+RECOVERIES = 6  # attempts to reset a fault, with such a time between them
 SETTLING = 0.03  # s at rest before a trial, once the set-point is where the axis is
 STOPPING, STOPPING_LOOK = 400, 20  # cycles: the longest wait for axes to stand, and how often it is looked
 STEP_COUNTS = 1.5  # of the encoder: what is less is no motion, and no step
@@ -176,9 +177,14 @@ class ProvingGround:
         self._origin = np.where(free, self.target.drives.read(POSITION), self._origin)
 
     def recover(self, where: Mask) -> None:
-        """Reset faults of axes, and have them hold with gains that are known to."""
+        """Reset faults of axes, and have them hold with gains that are known to; one that cannot stays as it is."""
         write_gains(self.target.drives, self.safe, where)
-        self._trials.recover(where)
+        for _ in range(RECOVERIES):
+            self._trials.recover(where)
+            if not (where & self._trials.down()).any():
+                break
+            # What a brake has put into the link must leave it first.
+            self.target.drives.advance(RETURN_LOOK)
         self._shaken |= where
 
     def run(self, gains: Integers, where: Mask) -> Proof:
