@@ -28,6 +28,7 @@ TOLD = 0.5  # s between two looks at a progress bar, which takes a millisecond
 STEP_SECONDS: dict[str, Callable[[Any], float]] = {"ServoDrive/Tracking-v0": lambda config: 1.0 / config.rate,
                 "ServoDrive/GainScheduling-v0": lambda config: config.step,
                 "ServoDrive/GainTuning-v0": lambda config: 0.75}  # fmt: skip
+TRIAL_OF = {"gains": "trial_gains", "measured": "trial_measured", "hidden": "trial_hidden"}  # of incumbent, of trial
 FIXED_STEPS = ("ServoDrive/Tracking-v0", "ServoDrive/GainScheduling-v0")  # a trial takes what clearing up takes besides
 
 
@@ -260,6 +261,7 @@ def _episodes(
     faults: list[str] = [""] * count
     last: list[dict[str, Any]] = [{} for _ in range(count)]
     open_ = np.ones(count, bool)
+    trials = [{name: begun[name] for name in TRIAL_OF if name in begun}]  # the first is of the gains at the begin
     start = last_told = time.perf_counter()
     while open_.any():
         action = policy.act(rows[-1])
@@ -269,6 +271,7 @@ def _episodes(
         rewards.append(reward)
         for name, value in info.get("reward_terms", {}).items():
             terms.setdefault(name, []).append(np.array(value, float))
+        trials.append({name: info[own] for name, own in TRIAL_OF.items() if own in info})
         lengths += open_
         ended = open_ & (terminated | truncated)
         for lane in map(int, np.flatnonzero(ended)):
@@ -284,6 +287,8 @@ def _episodes(
                 last[lane] = _of_lane(info, lane)
             break
     seconds = time.perf_counter() - start
+    if "trial_gains" in info and (answer := policy.answer(rows[-1])) is not None:
+        _stay_with(lanes.gains_of(answer), trials, last)
     episodes = [
         Episode(
             seeds[lane],
@@ -299,6 +304,23 @@ def _episodes(
         for lane in range(count)
     ]
     return episodes, seconds
+
+
+def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[dict[str, Any]]) -> None:
+    """Let the end of episodes tell of a tuner's own answers, which are gains that it tried, instead of incumbents.
+
+    Args:
+        gains: The answers, (lanes, axes, 5).
+        trials: What was told of every trial of all lanes, by the names of TRIAL_OF.
+        last: What the environment told in the last step of each lane; changed.
+    """
+    for lane, told in enumerate(last):
+        for trial in trials:
+            if np.array_equal(trial["gains"][lane], gains[lane]):
+                told.update({name: values[lane] for name, values in trial.items()})
+                break
+        else:
+            raise ValueError(f"the tuner answered gains that it had not tried: {gains[lane].tolist()}")
 
 
 def _seen(observation: Any) -> Any:

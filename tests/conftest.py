@@ -1,7 +1,15 @@
+import signal
+
 import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
+from drive_env.master.description import Description
+
+ANSWER_PATIENCE = 20.0  # a busy machine may keep a thread waiting for longer than any drive takes to answer [s]
+
+# A shell starts what runs in the background deaf to Ctrl-C; some tests press it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
@@ -25,3 +33,13 @@ def running(axis):
 def no_numpy_warnings():
     with np.errstate(all="raise", under="ignore"):
         yield
+
+
+@pytest.fixture(autouse=True)
+def patient_masters(monkeypatch):
+    """A master of this process whose test gives no time-out waits for an answer as long as a busy machine may take."""
+    monkeypatch.setattr(
+        Description,
+        "answer_timeout",
+        property(lambda self: self.timeout if self.timeout is not None else ANSWER_PATIENCE),
+    )

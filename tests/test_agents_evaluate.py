@@ -26,6 +26,7 @@ from drive_env import CanDrives, EmulatedDrives, Limits, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
+from drive_env.envs.gain_tuning import IDENTIFIED, GainTuning
 
 SHORT = {"load": "two_mass", "mode": "csp", "action": "offset", "duration": 0.05}
 SCORE = "RMS following error [rev]"
@@ -147,6 +148,54 @@ def test_every_environment_has_figures(environment, options, figure):
     assert found.score == figure and all(np.isfinite(found.values[figure]))
     if environment == "gain_tuning":  # the rule's gains again and again: nothing is won
         assert found.values[figure] == pytest.approx([1.0, 1.0], abs=0.1)
+
+
+class Bold(Gentle):
+    """A tuner that tries ever stiffer gains, and stays with those of one of its trials; trial 0 is the rule."""
+
+    def __init__(self, trial):
+        self.trial, self.seen = trial, []
+
+    def reset(self, mask=None):
+        self.seen = []
+
+    def act(self, observation):
+        self.seen.append(observation)
+        return np.full((len(observation), 3), 0.2, np.float32)
+
+    def answer(self, observation):
+        last, best = (slice(len(IDENTIFIED) + k * 3, len(IDENTIFIED) + (k + 1) * 3) for k in range(2))
+        return [*self.seen, observation][self.trial][:, last] - observation[:, best]
+
+
+@pytest.mark.parametrize("trial", [0, 1, 3])
+def test_a_tuner_is_judged_by_its_own_answer_not_by_the_incumbent(trial):
+    """What the environment told of that trial, on drawn machines and on given drives."""
+    told = []
+
+    class Listening(GainTuning):
+        def step(self, action):
+            found = super().step(action)
+            told.append(found[4])
+            return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("drive_env.envs.gain_tuning.GainTuning", Listening)
+        found = evaluate(Bold(trial), "gain_tuning", {"trials": 3}, episodes=2)
+    for lane, episode in enumerate(found.episodes):
+        names = {"hidden": "trial_hidden", "measured": "trial_measured", "gains": "trial_gains"}
+        for own, name in names.items():
+            expected = episode.first[own] if trial == 0 else told[trial - 1][name][lane]
+            assert np.array_equal(episode.last[own], expected), own
+
+
+def test_an_answer_that_was_never_tried_is_refused():
+    class Guessing(Bold):
+        def answer(self, observation):
+            return np.full((len(observation), 3), 0.123)
+
+    with pytest.raises(ValueError, match="answered gains that it had not tried"):
+        evaluate(Guessing(0), "gain_tuning", {"trials": 2}, episodes=2)
 
 
 def test_a_report_is_saved_and_loaded(tmp_path):

@@ -536,7 +536,8 @@ def test_rows_of_bytes_become_integers(size, signed):
     [({}, 0x6041, 0.5), ({}, (0x1010, 1), 10.0), ({"timeout": 2.0}, 0x6041, 2.0), ({"timeout": 2.0}, (0x1011, 1), 10.0),
      ({"timeouts": {(0x1010, 1): 20.0}}, (0x1010, 1), 20.0)],
 )  # fmt: skip
-def test_time_outs_are_the_devices_unless_given(bus, options, name, seconds):
+@pytest.mark.parametrize("patient_masters", [None], ids=["as they are"])
+def test_time_outs_are_the_devices_unless_given(bus, patient_masters, options, name, seconds):
     with CanDrives(bus=bus, pace="lockstep", **options) as drives:
         assert drives.description.patience(drives.description.dictionary.find(name)) == seconds
 

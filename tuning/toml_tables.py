@@ -32,7 +32,7 @@ def check_keys(where: str, table: Mapping[str, Any], known: list[str], optional:
             raise ExperimentError(f"{where}: key {key!r} is unknown; there are {', '.join(known)}")
     missing = [key for key in known if key not in table and key not in optional]
     if missing:
-        raise ExperimentError(f"{where}: key {missing[0]!r} is missing; there must be {', '.join(known)}")
+        raise ExperimentError(f"{where}: key {missing[0]!r} is missing; add it (there are {', '.join(known)})")
 
 
 def as_table(where: str, value: Any) -> dict[str, Any]:
