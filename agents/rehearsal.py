@@ -320,6 +320,8 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, st
 
 def _communication(target: Target) -> Iterator[tuple[tuple[int, int], str, str, bool]]:
     """Yield what is written so that samples come in PDOs and the drive watches over its master."""
+    from drive_env.master.pdo import OUT_OF_DRIVE, slots
+
     known = target.drives.description.dictionary
     for name, communication, mapping, pdos in (("RPDO", 0x1400, 0x1600, 1), ("TPDO", 0x1800, 0x1A00, 2)):
         for number in range(pdos):
@@ -327,6 +329,8 @@ def _communication(target: Target) -> Iterator[tuple[tuple[int, int], str, str, 
                 if entry.index == mapping + number or (entry.index == communication + number and entry.sub in (1, 2)):
                     why = f"{name} {number + 1} off, mapped as above, on again, with SYNC"
                     yield (entry.index, entry.sub), "", why, False
+    for number in slots(target.drives.description, OUT_OF_DRIVE, 0).numbers[2:]:
+        yield (0x1800 + number, 1), "", f"TPDO {number + 1} silent meanwhile, if it goes with SYNC", False
     in_real_time = (
         ((0x1016, 1), "7F01F4h", "whom the drive watches, in real time"),
         ((0x1029, 1), "0", "what it does when that one falls silent, where it was 1"),

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import can
+import numpy as np
 
 from drive_env import EmulatedDrives
 from drive_env.bus.world import World
@@ -134,6 +135,53 @@ def real_time() -> dict[str, float]:
     }
 
 
+def policy_loop() -> dict[str, float]:
+    """Return what a shipped policy at 1 kHz takes over the hub: all of a step, and processor time of the loop's thread.
+
+    A step is an action within a deadline, the envelope, an RPDO, SYNC, two TPDOs, observation and reward.
+    """
+    from agents.guard import PATIENT, GuardedPolicy
+    from agents.on_the_bus import drives_for
+    from agents.policy import load_policy
+    from agents.served import in_real_time
+    from agents.shipped import shipped
+    from drive_env import motion
+    from drive_env.bus.config import Machine
+    from drive_env.envs.tracking import Tracking
+    from drive_env.undisturbed import undisturbed
+
+    policy = load_policy(shipped("tracking_two_mass"))
+    options = {
+        key: value for key, value in policy.bundle.configuration.items() if key not in ("distributions", "stage")
+    }
+    options["duration"] = SECONDS
+    machine = Machine("tmcm1636", "two_mass", "qbl4208", (1,))
+    name = "ServoDrive/Tracking-v0"
+    with in_real_time(machine, 0) as there, drives_for(
+        name, options, PATIENT, device="tmcm1636", interface="slcan", channel=there.channel, nodes=(1,), lockstep=False
+    ) as drives:  # fmt: skip
+        env = Tracking(drives=drives, autoreset_mode="Disabled", config=options)
+        space = env.single_action_space
+        watched = GuardedPolicy(policy, space.low, space.high, 1e-3, PATIENT)
+        watched.warm_up(np.zeros(env.observation_space.shape, np.float32))
+        observation, _ = env.reset(seed=1)
+        times = []
+        with undisturbed():
+            for _ in range(round(SECONDS * 1000) - 1):
+                begin = time.perf_counter(), time.thread_time()
+                observation, *_ = env.step(watched.act(observation))
+                times.append((time.perf_counter() - begin[0], time.thread_time() - begin[1]))
+        watched.close()
+        motion.disable(drives)
+        env.close()
+    wall, own = np.array(times).T
+    return {
+        "policy at 1 kHz over the hub, ms per step": 1e3 * float(wall.mean()),
+        "policy at 1 kHz over the hub, steps beyond 1.1 ms [share]": float(np.mean(wall > 1.1e-3)),
+        "policy at 1 kHz over the hub, processor time of its thread [us per step]": 1e6 * float(own.mean()),
+    }
+
+
 def figures() -> dict[str, float]:
     """Return all figures of the bus."""
     return {
@@ -141,4 +189,5 @@ def figures() -> dict[str, float]:
         "SDO/s, hub, lockstep": sdo_through_hub("--lockstep"),
         "SDO/s, hub, real time (1 Mbit/s)": sdo_through_hub(),
         **real_time(),
+        **policy_loop(),
     }

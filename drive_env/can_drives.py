@@ -18,25 +18,20 @@ import can
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.dictionary.access import (
-    ObjectAccessError,
-    check_in_range,
-    check_readable,
-    check_writable,
-    checked_values,
-)
+from drive_env.dictionary.access import ObjectAccessError, check_readable, check_writable, checked_values
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.emergency import EmergencyMessage
 from drive_env.master.bounds import Limits
+from drive_env.master.cycle_runner import CycleRunner
 from drive_env.master.description import Description, check_timeout, describe
 from drive_env.master.dry_run import DryPort, DrySdoClient
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.network import PRE_OPERATIONAL, START, Network, check_nodes
 from drive_env.master.pace import LockstepPace, Pace, RealTimePace, Timing
-from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, PdoConfiguration, check_mappable
+from drive_env.master.pdo import PdoConfiguration
 from drive_env.master.port import Port, open_bus
 from drive_env.master.process_data import ProcessData
-from drive_env.master.sampling import Bytes, Samples, run_cycles
+from drive_env.master.sampling import run_cycles
 from drive_env.master.sdo import SdoClient
 from drive_env.safety import Envelope
 from drive_env.trace import Trace
@@ -114,6 +109,10 @@ class CanDrives:
         self._network = Network(self._port, self.nodes)
         self._pdos = [PdoConfiguration(n, s, self._description) for n, s in zip(self.nodes, self._sdo, strict=True)]
         self._process = ProcessData(self._description, self._pdos)
+        self._cycle_runner = CycleRunner(
+            self._description, self.num_axes, self._port, self._pace, self._process, self.start, self._catch_up,
+            self._dry,
+        )  # fmt: skip
         self._started = False
         self._closed = False
         self.safety: Envelope | None = None
@@ -179,9 +178,7 @@ class CanDrives:
         cycles = self._cycles(duration)
         if cycles == 0:
             return
-        samples = self._sample(()) if self.safety is not None else None
-        self._run(cycles, [], samples, skip_missed=True)
-        self._pace.end(self._port.receive)
+        self._cycle_runner.pass_time(cycles, self.safety)
 
     def record(
         self,
@@ -212,29 +209,17 @@ class CanDrives:
         cycles, every = self._cycles(duration), self._cycles(period)
         if every < 1:
             raise ValueError(f"period must be at least {self._description.cycle:g} s, not {period:g} s")
-        known = self._description.dictionary
-        entries = list(dict.fromkeys(known.find(name) for name in objects))
-        for entry in entries:
-            check_readable(entry)
-        check_mappable(self._description, entries, OUT_OF_DRIVE)
-        played = self._check_play(play or {}, cycles)
-        if self.safety is not None:
-            self.safety.before_play(played)
-        rpdos = self._play(played)
-        samples = self._sample(entries)
-        self._run(cycles, rpdos, samples)
-        if self.safety is not None and cycles:
-            self.safety.after_play(played)
+        given = play or {}
+        call = self._cycle_runner.call(objects, tuple(given))
+        played = self._cycle_runner.rows(call, tuple(given.values()), cycles)
+        found = self._cycle_runner.record(call, played, cycles, self.safety)
         rows = -(-cycles // every)
-        decoded = {} if samples is None or self._dry else self._process.decode(samples, 0, cycles)
         values = {}
-        for entry in entries:
+        for entry in call.sampled:
             key = (entry.index, entry.sub)
-            if self._dry:
-                values[key] = np.tile(self.read_entry(entry), (rows, 1))
-            else:
-                values[key] = decoded[key][::every]
-        return Trace(np.arange(rows, dtype=np.float64) * (every * self._description.cycle), values, known)
+            values[key] = np.tile(self.read_entry(entry), (rows, 1)) if self._dry else found[key][::every]
+        times = np.arange(rows, dtype=np.float64) * (every * self._description.cycle)
+        return Trace(times, values, self._description.dictionary)
 
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis.
@@ -418,75 +403,6 @@ class CanDrives:
     def _alive(self) -> None:
         if self.safety is not None:
             self.safety.alive()
-
-    def _check_play(self, play: Mapping[ObjectName, ArrayLike], cycles: int) -> dict[Entry, Integers]:
-        played = {}
-        for name, given in play.items():
-            entry = self._description.dictionary.find(name)
-            check_writable(entry)
-            raw = np.asarray(given)
-            if raw.shape not in ((cycles,), (cycles, self.num_axes)):
-                raise ValueError(
-                    f"{entry.label}: play takes shape ({cycles},) or ({cycles}, {self.num_axes}), one row per cycle, "
-                    f"not {raw.shape}"
-                )
-            check_in_range(entry, raw)
-            rows = raw.astype(np.int64)
-            played[entry] = np.broadcast_to(rows if rows.ndim == 2 else rows[:, None], (cycles, self.num_axes))
-        check_mappable(self._description, list(played), INTO_DRIVE)
-        return played
-
-    def _sample(self, entries: Sequence[Entry]) -> Samples | None:
-        """Have the entries, and what the envelope watches if it fits besides, sampled from now on."""
-        chosen = self._process.choose(entries, () if self.safety is None else self.safety.watched())
-        if not self._process.is_mapped(OUT_OF_DRIVE, chosen):
-            self.start()
-            self._process.map(OUT_OF_DRIVE, chosen)
-        pdos = self._process.sampled()
-        return Samples(self._port, pdos) if pdos and not self._dry else None
-
-    def _play(self, played: Mapping[Entry, Integers]) -> list[tuple[int, Bytes]]:
-        if not played:
-            return []
-        if not self._process.is_mapped(INTO_DRIVE, tuple(played)):
-            self.start()
-            self._process.map(INTO_DRIVE, tuple(played))
-        return self._process.encode(played)
-
-    def _run(
-        self, cycles: int, rpdos: list[tuple[int, Bytes]], samples: Samples | None, *, skip_missed: bool = False
-    ) -> None:
-        watch = None
-        envelope = self.safety
-        if envelope is not None and samples is not None:
-            # Bound here: the closure is called once a millisecond.
-            watcher, held = envelope, samples
-
-            def watch(first: int, last: int) -> None:
-                watcher.observe(self._process.decode(held, first, last))
-
-        try:
-            run_cycles(
-                self._port,
-                self._pace,
-                cycles,
-                rpdos,
-                samples,
-                self._description.answer_timeout,
-                observe=watch,
-                barrier=self._catch_up if self._pace.time_waits else None,
-                skip_missed=skip_missed,
-            )
-        finally:
-            if samples is not None:
-                samples.close()
-        if samples is None and self._pace.time_waits:
-            self._catch_up()
-        if self.timing.late:
-            logger.info("%d of %d SYNCs were late, the worst by %.1f ms", *self._late())
-
-    def _late(self) -> tuple[int, int, float]:
-        return self.timing.late, self.timing.cycles, 1e3 * self.timing.worst
 
     def _catch_up(self) -> None:
         """Return when an emulator in lockstep has simulated every SYNC: it answers in order."""

@@ -76,6 +76,8 @@ class Envelope:
         self._known = drives.description.dictionary
         self._current_limit = drives.description.hints.current_limit
         self._bounds: Bounds | None = None
+        self._watched: tuple[Bounds, list[Entry]] | None = None
+        self._everywhere = np.ones(drives.num_axes, bool)
         self._enabled = np.zeros(drives.num_axes, bool)  # watched
         self._live = np.zeros(drives.num_axes, bool)  # to be switched off at the end
         self._mode = np.zeros(drives.num_axes, np.int64)
@@ -129,7 +131,6 @@ class Envelope:
 
     def before_play(self, played: Mapping[Entry, Integers]) -> None:
         """Raise SafetyError for rows that would pass a limit."""
-        everywhere = np.ones(self._drives.num_axes, bool)
         words = next((rows for entry, rows in played.items() if (entry.index, entry.sub) == CONTROLWORD), None)
         if words is not None and np.any(_enables(words)):
             self._arm()
@@ -139,16 +140,14 @@ class Envelope:
             if (entry.index, entry.sub) == TARGET_POSITION:
                 relative = words is not None and np.any(words & RELATIVE)
                 if not relative:
-                    for aim in (rows.min(axis=0), rows.max(axis=0)):
-                        self._check_position(entry, aim, everywhere, (PP, CSP))
+                    self._check_position(entry, rows, self._everywhere, (PP, CSP))
             else:
-                self._check_magnitude(entry, np.abs(rows).max(axis=0), everywhere)
+                self._check_magnitude(entry, rows, self._everywhere)
 
     def after_play(self, played: Mapping[Entry, Integers]) -> None:
         """Take note of what was played."""
-        everywhere = np.ones(self._drives.num_axes, bool)
         for entry, rows in played.items():
-            self.after_write(entry, rows[-1], everywhere)
+            self.after_write(entry, rows[-1], self._everywhere)
 
     def after_reset(self, nodes: Sequence[int]) -> None:
         """Take note that nodes, by position, were reset: their axes are off and their error control is their own."""
@@ -162,8 +161,10 @@ class Envelope:
         self._disarm()
 
     def watched(self) -> list[Entry]:
-        """Return what is to be sampled at every SYNC, the most important first."""
+        """Return what is to be sampled at every SYNC, the most important first: the same list while limits are."""
         bounds = self._limits_now()
+        if self._watched is not None and self._watched[0] is bounds:
+            return self._watched[1]
         keys = []
         if np.any(bounds.current < NO_LIMIT):
             keys.append(CURRENT)
@@ -174,7 +175,8 @@ class Envelope:
         if np.any(bounds.following < NO_LIMIT):
             keys.append(DEMAND)
         entries = [self._known.find(key) for key in keys if self._drives.description.has(key)]
-        return [entry for entry in entries if entry.pdo_mappable]
+        self._watched = (bounds, [entry for entry in entries if entry.pdo_mappable])
+        return self._watched[1]
 
     def observe(self, rows: Mapping[Key, Integers]) -> None:
         """Look at samples, each object of shape (rows, num_axes); quick-stop and raise SafetyError beyond a limit."""
@@ -234,14 +236,20 @@ class Envelope:
         self._check_position(target, aim, starts, (PP,))
 
     def _check_position(self, entry: Entry, aim: Integers, axes: Mask, modes: tuple[int, ...]) -> None:
-        """Raise SafetyError for an aim beyond the limits of an axis in one of the modes."""
+        """Raise SafetyError for an aim, or rows of aims, beyond the limits of an axis in one of the modes."""
         bounds = self._limits_now()
-        beyond = axes & ((aim < bounds.low) | (aim > bounds.high))
+        if not bounds.has_position:
+            return
+        outside = (aim < bounds.low) | (aim > bounds.high)
+        if not outside.any():
+            return
         # The mode is an SDO transfer away, half a millisecond of a policy's cycle: asked for only where it matters.
-        if beyond.any() and (wrong := np.flatnonzero(beyond & np.isin(self._modes(), modes))).size:
+        rows, outside = np.atleast_2d(aim), np.atleast_2d(outside)
+        if (wrong := np.flatnonzero(axes & outside.any(axis=0) & np.isin(self._modes(), modes))).size:
             axis = int(wrong[0])
+            farthest = rows[outside[:, axis], axis][0]
             raise SafetyError(
-                f"axis {axis}: {entry.label} would lead to {aim[axis]}, beyond the limits {_text(bounds.low[axis])} to "
+                f"axis {axis}: {entry.label} would lead to {farthest}, beyond the limits {_text(bounds.low[axis])} to "
                 f"{_text(bounds.high[axis])}; nothing was sent. Choose a target inside, or widen "
                 f"{self._origin(self.limits.position, 'position', '607Dh')}"
             )
@@ -259,11 +267,16 @@ class Envelope:
             name = _MAGNITUDES[key]
             own = f"{self._current_limit[0]:04X}h" if name == "current" else "607Fh"
         limit = getattr(bounds, name)
-        wrong = np.flatnonzero(where & (np.abs(raw) > limit))
+        above = np.abs(raw) > limit
+        if not above.any():
+            return
+        rows, above = np.atleast_2d(raw), np.atleast_2d(above)
+        wrong = np.flatnonzero(where & above.any(axis=0))
         if wrong.size:
             axis = int(wrong[0])
+            largest = rows[above[:, axis], axis][0]
             raise SafetyError(
-                f"axis {axis}: {entry.label} = {raw[axis]} is beyond the limit {limit[axis]}; nothing was sent. Choose "
+                f"axis {axis}: {entry.label} = {largest} is beyond the limit {limit[axis]}; nothing was sent. Choose "
                 f"less, or raise {self._origin(getattr(self.limits, name), name, own)}"
             )
 
@@ -272,6 +285,9 @@ class Envelope:
 
     # --- samples --------------------------------------------------------------------------------------------------
     def _observe_position(self, position: Integers, bounds: Bounds) -> None:
+        if ((position >= bounds.low) & (position <= bounds.high)).all():
+            self._outside[:] = 0
+            return
         below = np.where(bounds.low > -NO_LIMIT, bounds.low - position, 0)
         above = np.where(bounds.high < NO_LIMIT, position - bounds.high, 0)
         outside = np.maximum(np.maximum(below, above), 0)
@@ -306,9 +322,27 @@ class Envelope:
         )
 
     def _observe_current(self, current: Integers, bounds: Bounds) -> None:
-        for row in current:
-            above = np.abs(row) > CURRENT_MARGIN * bounds.current
-            self._over_current = np.where(above, self._over_current + 1, 0)
+        above = np.abs(current) > CURRENT_MARGIN * bounds.current
+        if above.any():
+            self._count_over_current(current, above, bounds)
+        else:
+            self._over_current[:] = 0
+        if not self.limits.oscillation:
+            return
+        for axis in map(int, np.flatnonzero(self._enabled & (bounds.current < NO_LIMIT))):
+            swings, threshold = self._swings[axis], SWING * float(bounds.current[axis])
+            for value in current[:, axis].tolist():
+                if swings.count(value, threshold) >= SWINGS:
+                    self._swings[axis] = Swings()
+                    self._stop_for(
+                        f"axis {axis} oscillates: its current swung {SWINGS} times past plus and minus "
+                        f"{threshold:.0f} within {SWING_WINDOW} cycles",
+                        "lower the velocity loop's gains, or set Limits(oscillation=False) for an excitation",
+                    )
+
+    def _count_over_current(self, current: Integers, above: Mask, bounds: Bounds) -> None:
+        for row, too_high in zip(current, above, strict=True):
+            self._over_current = np.where(too_high, self._over_current + 1, 0)
             late = np.flatnonzero(self._enabled & (self._over_current >= CURRENT_CYCLES))
             if late.size:
                 axis = int(late[0])
@@ -317,16 +351,6 @@ class Envelope:
                     f"{bounds.current[axis]}",
                     "check the current loop's gains 2041h and the motor's wiring",
                 )
-            if not self.limits.oscillation:
-                continue
-            for axis in map(int, np.flatnonzero(self._enabled & (bounds.current < NO_LIMIT))):
-                if self._swings[axis].count(int(row[axis]), SWING * float(bounds.current[axis])) >= SWINGS:
-                    self._swings[axis] = Swings()
-                    self._stop_for(
-                        f"axis {axis} oscillates: its current swung {SWINGS} times past plus and minus "
-                        f"{SWING * bounds.current[axis]:.0f} within {SWING_WINDOW} cycles",
-                        "lower the velocity loop's gains, or set Limits(oscillation=False) for an excitation",
-                    )
 
     def _trip(self, value: Integers, limit: Integers, key: Key, remedy: str, what: str | None = None) -> None:
         wrong = np.flatnonzero(self._enabled & (value > limit))

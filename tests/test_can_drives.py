@@ -207,8 +207,34 @@ def test_a_tpdo_is_remapped_off_empty_filled_counted_on(drives, bus):
         "601  23 00 1A 02 10 00 41 60",
         "601  2F 00 1A 00 02 00 00 00",
         "601  23 00 18 01 81 01 00 40",  # on
+        "601  40 01 18 01 00 00 00 00",
+        "601  40 01 18 02 00 00 00 00",  # event-driven: it may go on
+        "601  40 02 18 01 00 00 00 00",
+        "601  40 02 18 02 00 00 00 00",
+        "601  23 02 18 01 81 03 00 C0",  # goes with SYNC: off, since nobody asked for it
+        "601  40 03 18 01 00 00 00 00",
+        "601  40 03 18 02 00 00 00 00",
+        "601  23 03 18 01 81 04 00 C0",
         "080",
     ]
+
+
+def test_tpdos_that_nobody_asked_for_are_silent_until_the_drives_are_closed(bus, drive):
+    """TPDO 3 and 4 of the factory go with SYNC; the third is needed now and then, and silent again afterwards."""
+    before = {key: drive.values[key] for key in drive.values if 0x1800 <= key[0] < 0x1C00}
+    sent, sync = [], drive._sync
+
+    def listening():
+        frames = sync()
+        sent.append([can_id for can_id, _ in frames])
+        return frames
+
+    drive._sync = listening
+    with CanDrives(bus=bus, pace="lockstep", safety=False) as drives:
+        for objects in ([0x6041], [0x6064, 0x606C, 0x6062, 0x6041, 0x6077, 0x6061], [0x6041, 0x6040], [0x6041]):
+            drives.record(objects, 0.001)
+    assert sent == [[0x181], [0x181, 0x281, 0x381], [0x181], [0x181]]
+    assert {key: drive.values[key] for key in before} == before
 
 
 def test_set_points_go_out_before_their_sync(drives, bus, drive):

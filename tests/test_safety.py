@@ -115,7 +115,7 @@ def test_in_pp_the_target_counts_when_the_move_is_started(bus, drive):
 
 def test_rows_are_checked_before_the_first_is_sent(bus, drive):
     with enabled(bus, Limits(velocity=100), mode="csv") as drives:
-        with pytest.raises(SafetyError, match="60FFh:00 Target velocity = 101"):
+        with pytest.raises(SafetyError, match="60FFh:00 Target velocity = -101"):
             drives.record([0x6064], 0.003, play={0x60FF: [0, -101, 3]})
         assert drive.syncs == 0
         drives.record([0x6064], 0.003, play={0x60FF: [0, -100, 100]})

@@ -32,9 +32,12 @@ INTEGER_TYPES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Entry:
-    """One sub-index: everything the dictionary says of it. `bits`, `low`, `high` are None for a text."""
+    """One sub-index: everything the dictionary says of it. `bits`, `low`, `high` are None for a text.
+
+    A dictionary has one for each, which is equal to itself alone: tables by entry are looked up every millisecond.
+    """
 
     index: int
     sub: int

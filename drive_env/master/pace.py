@@ -47,7 +47,8 @@ class RealTimePace:
     """One SYNC per communication cycle by the clock.
 
     A SYNC that is more than a cycle late shifts those that follow: several at once would not make the motor faster,
-    only its set-points.
+    only its set-points. Between runs of cycles, which a policy makes one by one, half a cycle does: one action that
+    took 1.1 ms leaves the drives' rhythm as it was.
 
     Args:
         cycle: Communication cycle [s].
@@ -62,8 +63,10 @@ class RealTimePace:
         self.timing = self.total = Timing(0, 0, 0.0)
 
     def begin(self) -> None:
-        """Begin now, or a cycle after the last SYNC if that is later."""
-        self._due = max(self._due, time.perf_counter())
+        """Begin a cycle after the last SYNC; now, if that was more than half a cycle ago."""
+        now = time.perf_counter()
+        if now - self._due > 0.5 * self._cycle:
+            self._due = now
         self.timing = Timing(0, 0, 0.0)
 
     def wait(self, receive: Receive) -> int:

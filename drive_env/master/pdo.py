@@ -15,7 +15,8 @@ from drive_env.master.mapping import PDO_BITS, Slots, pack
 from drive_env.master.sdo import SdoClient
 from drive_env.master.tidying import Tidying
 
-SYNC_EVERY = 1  # transmission type of a TPDO: at each SYNC (CiA 301, table 74)
+# Transmission types of a TPDO (CiA 301, table 74): at each SYNC; with a SYNC at all.
+SYNC_EVERY, WITH_SYNC = 1, range(241)
 
 
 class Direction(NamedTuple):
@@ -137,11 +138,15 @@ class PdoConfiguration:
         self._sdo = sdo
         self._description = description
         self._before: dict[tuple[str, int], _Before] = {}
+        self._silenced: dict[int, int] = {}  # TPDO -> its COB-ID as it was found
+        self._quiet: set[int] = set()  # TPDOs that do not go with SYNC as they are
 
     def configure(self, groups: Sequence[Sequence[Entry]], direction: Direction) -> list[Pdo]:
         """Map entries of all axes, each group to a PDO that goes with SYNC, and return these PDOs.
 
-        PDOs of this direction that carried a mapping of ours and are not needed any more are put back.
+        PDOs of this direction that carried a mapping of ours and are not needed any more are put back. Other TPDOs that
+        go with SYNC, as the factory's may, are silent meanwhile: the SYNCs are ours, and a frame that nobody asked for
+        holds up the next one for 0.1 ms.
 
         Raises:
             ObjectAccessError: If the drive refuses; BusError if it gives the PDO no identifier.
@@ -155,6 +160,8 @@ class PdoConfiguration:
                 used.add((direction.name, number))
         for key in [key for key in self._before if key[0] == direction.name and key not in used]:
             self._put_back(direction, self._before.pop(key))
+        if direction is OUT_OF_DRIVE:
+            self._silence({pdo for _, pdo in used})
         return pdos
 
     def restore(self) -> None:
@@ -167,17 +174,39 @@ class PdoConfiguration:
         tidying = Tidying()
         for (name, _), before in found.items():
             tidying.step(partial(self._put_back, INTO_DRIVE if name == INTO_DRIVE.name else OUT_OF_DRIVE, before))
+        silenced, self._silenced = self._silenced, {}
+        for number, cob_id in silenced.items():
+            tidying.step(partial(self._put, OUT_OF_DRIVE.communication + number, 1, cob_id, 4, self._sdo.put_back))
         tidying.end()
 
     def forget(self) -> None:
         """Forget what was found: the node was reset and has its own configuration again."""
         self._before.clear()
+        self._silenced.clear()
+        self._quiet.clear()
+
+    def _silence(self, used: set[int]) -> None:
+        """Switch off the TPDOs besides those in use that go with SYNC."""
+        direction = OUT_OF_DRIVE
+        for axis in range(self._description.num_axes):
+            for number in slots(self._description, direction, axis).numbers:
+                if number in used or number in self._silenced or number in self._quiet:
+                    continue
+                cob_id = self._read(direction.communication + number, 1)
+                kind = self._read(direction.communication + number, 2)
+                if cob_id & INVALID or kind not in WITH_SYNC:
+                    self._quiet.add(number)
+                    continue
+                self._put(direction.communication + number, 1, cob_id | INVALID, 4, self._sdo.write)
+                self._silenced[number] = cob_id
 
     def _map(self, direction: Direction, number: int, axis: int, group: Sequence[Entry]) -> Pdo:
         label = f"{direction.name} {number + 1} of node {self._node}"
         before = self._before.get((direction.name, number)) or self._look(direction, number)
         before = self._look_further(direction, before, len(group))
         self._before[direction.name, number] = before
+        if direction is OUT_OF_DRIVE:
+            self._silenced.pop(number, None)
         can_id = before.cob_id & IDENTIFIER
         if can_id == 0 and number < len(direction.identifiers):
             can_id = direction.identifiers[number] + self._node
@@ -203,9 +232,10 @@ class PdoConfiguration:
     def _look(self, direction: Direction, number: int) -> _Before:
         communication, mapping = direction.communication + number, direction.mapping + number
         count = self._read(mapping, 0)
+        silenced = self._silenced.get(number) if direction is OUT_OF_DRIVE else None
         return _Before(
             number,
-            self._read(communication, 1),
+            self._read(communication, 1) if silenced is None else silenced,
             self._read(communication, 2),
             count,
             tuple(self._read(mapping, sub) for sub in range(1, count + 1)),
@@ -218,6 +248,8 @@ class PdoConfiguration:
         return before._replace(mapping=before.mapping + found)
 
     def _put_back(self, direction: Direction, before: _Before) -> None:
+        if direction is OUT_OF_DRIVE:
+            self._quiet.discard(before.number)
         # Entries that are not in use are parameters, too: a backup has them.
         self._write_all(
             direction, before.number, before.cob_id, before.kind, before.mapping, before.in_use, self._sdo.put_back
@@ -234,11 +266,7 @@ class PdoConfiguration:
         write: Callable[[int, int, bytes, str, float], None],
     ) -> None:
         """Remap in the order that CiA 301 demands: off, no entries, entries, their number, on."""
-
-        def put(index: int, sub: int, value: int, size: int) -> None:
-            label = f"{index:04X}h:{sub:02X} = {value:X}h"
-            write(index, sub, value.to_bytes(size, "little"), label, self._description.answer_timeout)
-
+        put = partial(self._put, write=write)
         communication = direction.communication + number
         put(communication, 1, cob_id | INVALID, 4)
         put(communication, 2, kind, 1)
@@ -247,6 +275,12 @@ class PdoConfiguration:
             put(direction.mapping + number, sub, value, 4)
         put(direction.mapping + number, 0, count, 1)
         put(communication, 1, cob_id, 4)
+
+    def _put(
+        self, index: int, sub: int, value: int, size: int, write: Callable[[int, int, bytes, str, float], None]
+    ) -> None:
+        label = f"{index:04X}h:{sub:02X} = {value:X}h"
+        write(index, sub, value.to_bytes(size, "little"), label, self._description.answer_timeout)
 
     def _read(self, index: int, sub: int) -> int:
         label = f"{index:04X}h:{sub:02X}"

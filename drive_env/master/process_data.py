@@ -23,6 +23,9 @@ class ProcessData:
     Args:
         description: What device the nodes are.
         configurations: The PDOs of each node.
+
+    Attributes:
+        mapping: Its number: it grows with every change.
     """
 
     def __init__(self, description: Description, configurations: Sequence[PdoConfiguration]) -> None:
@@ -31,9 +34,11 @@ class ProcessData:
         self._num_axes = len(configurations) * description.num_axes
         self._mapped: dict[str, tuple[tuple[Entry, ...], list[list[Pdo]]]] = {}
         self._plans: dict[tuple[str, tuple[Entry, ...]], Groups | None] = {}
+        self.mapping = 0
 
     def forget(self) -> None:
         """Forget what is mapped: a node was reset."""
+        self.mapping += 1
         self._mapped.clear()
 
     def choose(self, wanted: Sequence[Entry], welcome: Sequence[Entry]) -> tuple[Entry, ...]:
@@ -65,6 +70,7 @@ class ProcessData:
         groups = self._plan(direction, entries)
         if groups is None:
             raise too_many(self._description, entries, direction)
+        self.mapping += 1
         self._mapped.pop(direction.name, None)
         pdos = [configuration.configure(groups, direction) for configuration in self._configurations]
         self._mapped[direction.name] = (entries, pdos)

@@ -108,14 +108,22 @@ def run_cycles(
                 first, seen = seen, complete
                 observe(first, complete)
 
+    def send_row(number: int) -> None:
+        for can_id, rows in frames:
+            port.send(can_id, rows[number])
+
     pace.begin()
+    # The first row has no SYNC to wait for, and its frames take 0.1 ms each on the bus: a policy that computes it in
+    # what is left of a cycle meets the next SYNC. Later rows go out just before theirs, and overtake none.
+    if cycles:
+        send_row(0)
     sent = passed = 0
     while passed < cycles:
         missed = pace.wait(port.receive)
         passed += missed + 1 if skip_missed else 1
         look()
-        for can_id, rows in frames:
-            port.send(can_id, rows[sent])
+        if sent:
+            send_row(sent)
         port.send(SYNC)
         sent += 1
         if samples is not None:

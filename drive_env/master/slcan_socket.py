@@ -10,6 +10,7 @@ import select
 import socket
 import time
 from collections import deque
+from contextlib import suppress
 
 import can
 
@@ -35,6 +36,7 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
             raise OpenError(f"bit rate {bitrate} bit/s is none of slcan's: {', '.join(map(str, _BIT_RATES))}")
         self._socket = _connect(channel)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setblocking(False)
         self._frames: deque[can.Message] = deque()
         self._rest = b""
         self._closed = False
@@ -69,11 +71,14 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
 
     def _read(self, timeout: float | None) -> None:
         """Take in what is there, after waiting for something."""
-        if not select.select([self._socket], [], [], timeout)[0]:
-            return
         try:
-            data = self._socket.recv(_CHUNK)
-        except OSError as error:
+            if timeout == 0.0 or select.select([self._socket], [], [], timeout)[0]:
+                data = self._socket.recv(_CHUNK)
+            else:
+                return
+        except BlockingIOError:
+            return
+        except (OSError, ValueError) as error:
             raise can.CanOperationError(f"the adapter at {self.channel_info} is gone: {error}") from error
         if not data:
             raise can.CanOperationError(f"{self.channel_info}: the other end closed the connection")
@@ -86,10 +91,14 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
 
     def _write(self, data: bytes, timeout: float | None = None) -> None:
         try:
-            if not select.select([], [self._socket], [], timeout)[1]:
-                raise can.CanOperationError(f"{self.channel_info}: the other end takes nothing")
-            self._socket.sendall(data)
-        except OSError as error:
+            while True:
+                with suppress(BlockingIOError):
+                    data = data[self._socket.send(data) :]
+                if not data:
+                    return
+                if not select.select([], [self._socket], [], timeout)[1]:
+                    raise can.CanOperationError(f"{self.channel_info}: the other end takes nothing")
+        except (OSError, ValueError) as error:  # ValueError: another thread has closed it
             raise can.CanOperationError(f"{self.channel_info} is gone: {error}") from error
 
 

@@ -1,0 +1,214 @@
+"""Communication cycles of `advance` and `record`: objects into PDOs, rows out and in, under the envelope's eyes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env.dictionary.access import check_in_range, check_readable, check_writable
+from drive_env.dictionary.entries import Entry, ObjectName
+from drive_env.master.description import Description, Key
+from drive_env.master.pace import Pace
+from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, check_mappable
+from drive_env.master.port import Port
+from drive_env.master.process_data import ProcessData
+from drive_env.master.sampling import Bytes, Samples, run_cycles
+
+if TYPE_CHECKING:
+    from drive_env.safety import Envelope
+
+logger = logging.getLogger(__name__)
+
+Integers = NDArray[np.int64]
+MOST_CALLS = 64  # that are remembered
+NOTHING: Sequence[Entry] = ()
+
+
+@dataclass(eq=False)
+class Call:
+    """What `record` must know of its objects: found out once, for a policy makes the same call every millisecond.
+
+    sampled: Entries to return.
+    played: Entries to write, in the order given.
+    watched: What the envelope wanted sampled when `chosen` was made.
+    chosen: What is sampled: `sampled` and as much of `watched` as fits.
+    mapping: The number of the mapping that has all of it.
+    """
+
+    sampled: tuple[Entry, ...]
+    played: tuple[Entry, ...]
+    watched: Sequence[Entry] | None = None
+    chosen: tuple[Entry, ...] = ()
+    mapping: int = -1
+
+
+class CycleRunner:
+    """Runs communication cycles of the drives of a bus.
+
+    Args:
+        description: What device the nodes are.
+        num_axes: Axes of all nodes.
+        port: The bus.
+        pace: When SYNCs are due.
+        process: The nodes' process data.
+        start: Takes the nodes to NMT operational, once.
+        catch_up: Returns when nodes in lockstep have seen every SYNC.
+        dry: Nobody is there: nothing is sampled.
+    """
+
+    def __init__(
+        self,
+        description: Description,
+        num_axes: int,
+        port: Port,
+        pace: Pace,
+        process: ProcessData,
+        start: Callable[[], None],
+        catch_up: Callable[[], None],
+        dry: bool,
+    ) -> None:
+        self._description, self._num_axes = description, num_axes
+        self._port, self._pace, self._process = port, pace, process
+        self._start, self._catch_up, self._dry = start, catch_up, dry
+        self._calls: dict[object, Call] = {}
+        self._nothing = Call((), ())
+
+    def pass_time(self, cycles: int, envelope: Envelope | None) -> None:
+        """Let cycles pass by the clock: where this computer was late, SYNCs are left out."""
+        samples = None
+        if envelope is not None:
+            self._map(self._nothing, envelope)
+            samples = self._samples()
+        self._run(cycles, [], samples, envelope, skip_missed=True)
+        self._pace.end(self._port.receive)
+
+    def call(self, objects: Sequence[ObjectName], play: Sequence[ObjectName]) -> Call:
+        """Return what is known of a call.
+
+        Raises:
+            ObjectAccessError: For an object that cannot be recorded or played.
+        """
+        names = (tuple(objects), tuple(play))
+        try:
+            if (known := self._calls.get(names)) is not None:
+                return known
+        except TypeError:  # a name that is none, as `find` says
+            pass
+        entries = self._description.dictionary
+        sampled = tuple(dict.fromkeys(entries.find(name) for name in objects))
+        for entry in sampled:
+            check_readable(entry)
+        check_mappable(self._description, sampled, OUT_OF_DRIVE)
+        played = tuple(entries.find(name) for name in play)
+        for entry in played:
+            check_writable(entry)
+        check_mappable(self._description, played, INTO_DRIVE)
+        if len(self._calls) >= MOST_CALLS:
+            self._calls.clear()
+        made = self._calls[names] = Call(sampled, played)
+        return made
+
+    def rows(self, call: Call, given: Sequence[ArrayLike], cycles: int) -> dict[Entry, Integers]:
+        """Return what is played, each of shape (cycles, num_axes).
+
+        Raises:
+            ValueError: For another shape; ObjectAccessError for a value out of range.
+        """
+        played = {}
+        for entry, one in zip(call.played, given, strict=True):
+            raw = np.asarray(one)
+            if raw.shape not in ((cycles, self._num_axes), (cycles,)):
+                raise ValueError(
+                    f"{entry.label}: play takes shape ({cycles},) or ({cycles}, {self._num_axes}), one row per cycle, "
+                    f"not {raw.shape}"
+                )
+            check_in_range(entry, raw)
+            rows = raw.astype(np.int64)
+            played[entry] = rows if rows.ndim == 2 else np.broadcast_to(rows[:, None], (cycles, self._num_axes))
+        return played
+
+    def record(
+        self, call: Call, played: Mapping[Entry, Integers], cycles: int, envelope: Envelope | None
+    ) -> dict[Key, Integers]:
+        """Let cycles pass and return what was sampled, each object of shape (cycles, num_axes)."""
+        if envelope is not None:
+            envelope.before_play(played)
+        self._map(call, envelope)
+        rpdos = self._process.encode(played) if played else []
+        samples = self._samples()
+        found = self._run(cycles, rpdos, samples, envelope)
+        if envelope is not None and cycles:
+            envelope.after_play(played)
+        return found
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _map(self, call: Call, envelope: Envelope | None) -> None:
+        """Have a call's objects mapped, and what the envelope watches if it fits besides, from now on."""
+        watched = NOTHING if envelope is None else envelope.watched()
+        if call.watched is not watched:
+            call.watched, call.chosen, call.mapping = watched, self._process.choose(call.sampled, watched), -1
+        if call.mapping == self._process.mapping:
+            return
+        for direction, entries in ((INTO_DRIVE, tuple(dict.fromkeys(call.played))), (OUT_OF_DRIVE, call.chosen)):
+            wanted = bool(entries) or direction is OUT_OF_DRIVE
+            if wanted and not self._process.is_mapped(direction, entries):
+                self._start()
+                self._process.map(direction, entries)
+        call.mapping = self._process.mapping
+
+    def _samples(self) -> Samples | None:
+        pdos = self._process.sampled()
+        return Samples(self._port, pdos) if pdos and not self._dry else None
+
+    def _run(
+        self,
+        cycles: int,
+        rpdos: list[tuple[int, Bytes]],
+        samples: Samples | None,
+        envelope: Envelope | None,
+        *,
+        skip_missed: bool = False,
+    ) -> dict[Key, Integers]:
+        last: tuple[int, int, dict[Key, Integers]] | None = None
+        watch = None
+        if envelope is not None and samples is not None:
+            # Bound here: the closure is called once a millisecond.
+            watcher, held = envelope, samples
+
+            def watch(first: int, end: int) -> None:
+                nonlocal last
+                last = (first, end, self._process.decode(held, first, end))
+                watcher.observe(last[2])
+
+        try:
+            run_cycles(
+                self._port,
+                self._pace,
+                cycles,
+                rpdos,
+                samples,
+                self._description.answer_timeout,
+                observe=watch,
+                barrier=self._catch_up if self._pace.time_waits else None,
+                skip_missed=skip_missed,
+            )
+        finally:
+            if samples is not None:
+                samples.close()
+        if samples is None and self._pace.time_waits:
+            self._catch_up()
+        timing = self._pace.timing
+        if timing.late:
+            logger.info(
+                "%d of %d SYNCs were late, the worst by %.1f ms", timing.late, timing.cycles, 1e3 * timing.worst
+            )
+        if samples is None or skip_missed:
+            return {}
+        if last is not None and last[:2] == (0, cycles):
+            return last[2]
+        return self._process.decode(samples, 0, cycles)

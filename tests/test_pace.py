@@ -1,0 +1,69 @@
+"""When SYNCs go out by the clock: in the drives' rhythm, which one late action does not shift."""
+
+from __future__ import annotations
+
+import pytest
+
+from drive_env.master import pace as module
+from drive_env.master.pace import RealTimePace, Timing
+
+CYCLE = 0.001
+
+
+class Clock:
+    """A clock that goes on only while somebody waits, or as a test says."""
+
+    def __init__(self):
+        self.now = 5.0
+
+    def perf_counter(self):
+        return self.now
+
+    def receive(self, timeout):
+        self.now += timeout
+        return False
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    made = Clock()
+    monkeypatch.setattr(module, "time", made)
+    return made
+
+
+def run_of_one_cycle_each(clock, thinking):
+    """Return when the SYNCs of runs of one cycle go out, with so much time [ms] before each, in ms since the first."""
+    pace, times = RealTimePace(CYCLE), []
+    for milliseconds in thinking:
+        clock.now += 1e-3 * milliseconds
+        pace.begin()
+        pace.wait(clock.receive)
+        times.append(clock.now)
+    return pytest.approx([1e3 * (time - times[0]) for time in times], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("thinking", "times"),
+    [
+        ([0, 0.2, 0.9, 0.5], [0, 1, 2, 3]),  # a SYNC each millisecond, however long one thinks meanwhile
+        ([0, 1.1, 0.3, 0.3], [0, 1.1, 2, 3]),  # a tenth late, and the next ones are in time again
+        ([0, 1.4, 1.05, 0.2], [0, 1.4, 2.45, 3]),
+        ([0, 1.6, 0.2, 0.2], [0, 1.6, 2.6, 3.6]),  # more than half a cycle: two SYNCs would come too close
+        ([0, 7.3, 0.2], [0, 7.3, 8.3]),  # a pause
+    ],
+)
+def test_a_policy_that_is_a_little_late_keeps_the_rhythm(clock, thinking, times):
+    assert run_of_one_cycle_each(clock, thinking) == times
+
+
+def test_within_a_run_a_sync_more_than_a_cycle_late_shifts_the_others(clock):
+    pace = RealTimePace(CYCLE)
+    pace.begin()
+    found = []
+    for late in (0, 0.9, 0, 2.5, 0):
+        clock.now += 1e-3 * late
+        found.append((pace.wait(clock.receive), round(1e3 * (clock.now - 5.0), 6)))
+    assert found == [(0, 0), (0, 1), (0, 2), (1, 4.5), (0, 5.5)]
+    assert pace.timing == Timing(5, 1, pytest.approx(0.0015))
+    pace.begin()
+    assert pace.timing.cycles == 0 and pace.total.cycles == 5
