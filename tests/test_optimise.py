@@ -13,6 +13,7 @@ from drive_env import motion
 from drive_env.envs.gain_trial import Trials, measured_cost, softness
 from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
 from drive_env.motors import find_motor
+from tuning import trial_bench
 from tuning.meter import KINDS, MeteredDrives
 from tuning.optimise import SAFE_STEP, Settings, objective_values, optimise, pareto
 from tuning.suite import load_suite, open_group
@@ -77,6 +78,39 @@ def test_whatever_gains_the_drives_had_they_are_identified_and_tried(rigid, gain
         bench.identified.inertia, (true["load.inertia"] + true["motor.inertia"]) / share, rtol=0.1
     )
     assert not bench.run(bench.safe).aborted.any()
+
+
+def test_an_axis_that_oscillates_while_it_is_identified_is_off_within_50_ms_and_moves_again_more_softly(
+    rigid, monkeypatch
+):
+    """Three axes have the commissioning gains, which suit them; the last has far too high ones."""
+    gains = first_gains(rigid)
+    gains[3, 2:4] *= 60
+    monkeypatch.setattr(trial_bench, "first_gains", lambda target: gains.copy())
+    currents = []
+    record = type(rigid.drives).record
+
+    def listening(drives, objects, *rest, **more):
+        trace = record(drives, objects, *rest, **more)
+        if 0x6077 in objects or (0x6077, 0) in objects:
+            currents.append(trace[0x6077][:, 3])
+        return trace
+
+    monkeypatch.setattr(type(rigid.drives), "record", listening)
+    bench = TrialBench(rigid)
+    bench.identify()
+    shaking = np.abs(np.diff(np.concatenate(currents))) > 0.5 * rigid.current * 1e3
+    assert 5 <= shaking.sum() <= 50
+    truth = rigid.drives.machine.parameters["load.inertia"] + rigid.drives.machine.parameters["motor.inertia"]
+    np.testing.assert_allclose(bench.identified.inertia, truth, rtol=0.2)
+    assert bench.moves.min() > 2
+
+
+def test_an_axis_that_oscillates_with_any_gains_is_told(rigid, monkeypatch):
+    monkeypatch.setattr(trial_bench, "SOFTER", 1)
+    monkeypatch.setattr(trial_bench, "first_gains", lambda target: np.tile(np.array(WILD), (4, 1)))
+    with pytest.raises(RuntimeError, match="axis 0 oscillates in the moves of identification, even with 1/"):
+        TrialBench(rigid).identify()
 
 
 def test_what_oscillates_is_stopped_and_has_the_last_good_gains_again(rigid):

@@ -7,12 +7,13 @@ what oscillates stopped within 50 ms, and counts what the drives had to do.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.envs.gain_trial import Trial, Trials, measured_cost, softness
+from drive_env.envs.gain_trial import Identified, Trial, Trials, measured_cost, softness
 from drive_env.gains import (
     FITTED_RULE,
     GAIN_OBJECTS,
@@ -36,6 +37,7 @@ from drive_env.positioning import (
 from drive_env.safety import SafetyError
 from drive_env.score import TRIP, cost
 from tuning.calming import CalmedDrives
+from tuning.oscillation_watch import SOFTER, VELOCITY_P, OscillationError, WatchedDrives
 from tuning.target import Target
 
 Floats = NDArray[np.float64]
@@ -52,6 +54,7 @@ SAFE_RULE = FITTED_RULE._replace(
 
 CALM = 0.1  # s until what an axis did before has died away
 ASTRAY = 0.2  # of the move: an axis farther than that from where a trial starts is brought back first
+SOFTENINGS = 3  # of gains from the data sheet, with which an axis may oscillate
 MOST_STOPS = 3  # by the safety envelope, one trial after the other, before the search ends
 BEYOND = 0.1  # how fast the cost grows where J has come to its end
 E_D_EXPONENT = 0.4  # of E_d/E_0 in J (drive_env/score.py)
@@ -109,11 +112,11 @@ class TrialBench:
         target, drives = self.target, self.target.drives
         if self._anew:
             drives.machine.reset()
-        write_gains(drives, first_gains(target))  # before anything is enabled: the drives may have any
+        gains = first_gains(target)
+        write_gains(drives, gains)  # before anything is enabled: the drives may have any
         self._trials.recover(self._where)
         drives.advance(CALM)
-        self.identified, self._origin = self._trials.identify(self._reach, self._where)
-        self.moves += MOVES_OF_IDENTIFICATION
+        self.identified, self._origin = self._moved(gains)
         self._trials.recover(self._where)
         self.move = plan_move(target.motor, self.identified.inertia, drives.read((0x2058, 0)), self._reach)
         self.rule, self.safe = (_rule_gains(target, self.identified.inertia, rule) for rule in (FITTED_RULE, SAFE_RULE))
@@ -121,6 +124,35 @@ class TrialBench:
         write_gains(drives, self.safe)
         drives.advance(TRIAL * CYCLE)  # the first gains may leave an axis swinging
         self._drives.calm = self.safe
+
+    def _moved(self, gains: Integers) -> tuple[Identified, Integers]:
+        """Move there and back for identification; an axis that oscillates is switched off, and moves with softer gains.
+
+        Raises:
+            RuntimeError: If one oscillates with any.
+        """
+        target, drives = self.target, self.target.drives
+        noise = target.device.stage["adc_noise"].high
+        scaler = drives.read((0x2058, 0))
+        for _ in range(SOFTENINGS):
+            began = drives.read(POSITION)
+            watched = WatchedDrives(self._drives, self._where, np.full(target.num_axes, target.current), noise)
+            trials = Trials(watched, target.motor, target.axes_per_machine, self._t_0)
+            self.moves += MOVES_OF_IDENTIFICATION
+            with suppress(OscillationError):
+                found = trials.identify(self._reach, self._where)
+            if not watched.swung.any():
+                return found
+            gains[watched.swung, VELOCITY_P:] = np.maximum(gains[watched.swung, VELOCITY_P:] // SOFTER, 1)
+            write_gains(drives, gains, watched.swung)
+            self._trials.recover(self._where)
+            drives.advance(CALM)
+            self._reach = self._reach - wrapped(drives.read(POSITION) - began) / scaler * 2.0 * np.pi
+        axis = int(np.flatnonzero(watched.swung)[0])
+        raise RuntimeError(
+            f"axis {axis} oscillates in the moves of identification, even with 1/{SOFTER ** (SOFTENINGS - 1)} of the "
+            "gains that its motor's data sheet gives; check motor and wiring"
+        )
 
     def run(self, gains: Integers, where: Mask | None = None) -> Tried:
         """Try gains in a move, its reversal and the gain probe; what is stopped gets the incumbent back.
