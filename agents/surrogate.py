@@ -29,6 +29,7 @@ Mask = NDArray[np.bool_]
 
 # Of an axis's observation (the class docstring of GainTuning): what was identified, then gains, then two trials.
 IDENTIFIED, SHOWN = 4, 16
+STOPPED = (4, 9, 14)  # of what a trial showed: whether its move, its reversal, its probe was stopped
 CONTEXT = IDENTIFIED + SHOWN
 CLIP = 6.0  # of normalised inputs
 LEAST, MOST = -3.5, 1.0  # of ln of the scale
@@ -180,12 +181,13 @@ class SurrogatePolicy:
     def answer(self, observation: ArrayLike) -> Array:
         """Return the change of the log gains to stay with: it leads to a trial's gains, or to the rule's.
 
-        All axes of a lane stay with the same trial: that whose worst axis is best. It is asked instead of `act`, with
-        the observation after the last trial, and raises what that does.
+        All axes of a lane stay with the same trial: that whose worst axis is best, of those that were not stopped. It
+        is asked instead of `act`, with the observation after the last trial, and raises what that does.
         """
         _, incumbent = self._take(observation)
         median, scale = self._ask(self._read(), self._tried)
-        value = np.where(self._known, median + self._caution * scale, np.inf)
+        good = self._known & ~(self._showed[:, :, STOPPED] > 0.0).any(axis=-1)
+        value = np.where(good, median + self._caution * scale, np.inf)
         lanes = len(np.atleast_2d(observation))
         of_lanes = value.reshape(lanes, -1, value.shape[1]).max(axis=1)
         chosen = _pick(self._tried, np.repeat(of_lanes, len(value) // lanes, axis=0))

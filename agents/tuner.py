@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -43,13 +43,22 @@ class TrialShown(NamedTuple):
 
 
 class Tuned(NamedTuple):
-    """What came of it: the answer's gains, raw (num_axes, 5), and all trials.
+    """What came of it: the answer's gains, raw (num_axes, 5), all trials, and which of them each machine's answer was.
 
-    The answer is the policy's own choice (`answer`) where it makes one, else the best trial by measured terms.
+    The answer is the policy's own choice (`answer`) where it makes one that was not stopped, else the best trial by
+    measured terms that was not; of a machine all of whose trials were stopped it is the first one, the fitted rule's.
+    overruled: Machines whose policy would have stayed with gains that were stopped.
     """
 
     gains: Integers
     trials: tuple[TrialShown, ...]
+    answers: Integers
+    overruled: Mask
+
+    @property
+    def moves(self) -> int:
+        """How often each axis was moved."""
+        return MOVES_OF_IDENTIFICATION + MOVES_OF_TRIAL * len(self.trials)
 
 
 def tune_target(
@@ -94,8 +103,10 @@ def tune_target(
         with stopping(drives):
             observation, info = env.reset(seed=0)
             watched.reset()
-            none = np.zeros(env.num_envs, bool)
-            shown.append(TrialShown(0, _flat(info["gains"]), info["measured"], none, ~none, ((),) * env.num_envs))
+            better = ~info["aborted"]
+            shown.append(
+                TrialShown(0, _flat(info["gains"]), info["measured"], info["aborted"], better, ((),) * env.num_envs)
+            )
             show(shown[-1])
             for number in range(1, env.config.trials + 1):
                 action = watched.act(observation)
@@ -116,13 +127,34 @@ def tune_target(
                     names = ", ".join(shown[-1].faults[0]) or "it stays disabled"
                     raise RuntimeError(f"the drive cannot be cleared after trial {number}: {names}")
             answer = watched.answer(observation)
-            gains = _flat(info["gains"] if answer is None else env.gains_of(answer))
+            wanted = None if answer is None else _flat(env.gains_of(answer))
+            answers = np.array([_answer(shown, machine, axes, wanted) for machine in range(env.num_envs)])
+            gains = np.stack([shown[answers[axis // axes]].gains[axis] for axis in range(target.num_axes)])
             motion.disable(drives)
             write_gains(drives, gains)
     finally:
         watched.close()
         env.close()
-    return Tuned(gains, tuple(shown))
+    same = np.ones(target.num_axes, bool) if wanted is None else np.all(wanted == gains, axis=1)
+    overruled = ~same.reshape(-1, axes).all(axis=1)
+    return Tuned(gains, tuple(shown), answers, overruled)
+
+
+def best_unstopped(trials: Sequence[TrialShown], machine: int) -> TrialShown | None:
+    """Return the trial of a machine that was best by measured terms, None if all were stopped."""
+    good = [trial for trial in trials if not trial.aborted[machine]]
+    return min(good, key=lambda trial: float(trial.measured[machine]), default=None)
+
+
+def _answer(trials: Sequence[TrialShown], machine: int, axes: int, wanted: Integers | None) -> int:
+    """Return the number of the trial that a machine stays with."""
+    own = slice(machine * axes, (machine + 1) * axes)
+    if wanted is not None:
+        for trial in trials:
+            if np.array_equal(trial.gains[own], wanted[own]) and not trial.aborted[machine]:
+                return trial.number
+    best = best_unstopped(trials, machine)
+    return 0 if best is None else best.number
 
 
 # Options of the environment that are of random machines, or that the target says.
@@ -138,12 +170,11 @@ def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
         found = tune_target(watched, load_policy(shipped(TUNER)))
     lanes = target.axes_per_machine
     aborts = np.sum([trial.aborted for trial in found.trials], axis=0)
-    moves = MOVES_OF_IDENTIFICATION + MOVES_OF_TRIAL * len(found.trials)
     zero = np.zeros(target.num_axes, np.int64)
     return Outcome(
         found.gains,
         np.full(target.num_axes, clock.seconds),
-        zero + moves,
+        zero + found.moves,
         np.repeat(aborts, lanes),
         zero,
         ("",) * target.num_axes,

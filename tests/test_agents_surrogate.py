@@ -328,3 +328,15 @@ def test_the_shipped_tuner_is_of_this_trainings_kind():
     ships, made = Bundle.load(shipped("gain_tuning")), training.bundle_of({}, {})
     assert (ships.kind, ships.configuration) == (made.kind, made.configuration)
     assert ships.settings == json.loads(json.dumps(dict(made.settings)))
+
+
+@pytest.mark.parametrize("phase", range(3))
+def test_what_was_stopped_in_any_phase_is_no_answer(phase, monkeypatch):
+    """Though the network thinks most of it."""
+    policy = load_policy(shipped("gain_tuning"))
+    first, second = np.zeros((2, 2, 43), np.float32)  # two machines
+    second[:, 4:7] = 1.0  # the trial's gains, ln over the rule's
+    second[0, 10 + 5 * phase + 4] = 1.0  # of the first machine it was stopped
+    policy.act(first)
+    monkeypatch.setattr(policy, "_ask", lambda memory, gains: (-gains.sum(axis=-1), np.zeros(gains.shape[:2])))
+    assert policy.answer(second).tolist() == [[0.0] * 3, [1.0] * 3]

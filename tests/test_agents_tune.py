@@ -15,9 +15,7 @@ from agents.guard import PolicyStoppedError
 from agents.policy import PolicyError, load_policy
 from agents.shipped import shipped
 from agents.tuner import surrogate, tune_target
-from agents.tuning_run import from_here
 from agents.tuning_run import run as run_agent
-from drive_env import motion
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.motion import OPERATION_ENABLED
 from tuning.certificate import load_certificate
@@ -138,16 +136,6 @@ def test_a_tuner_that_never_returns_ends_the_run_and_leaves_the_drive_of_a_bus_a
         assert np.array_equal(gains(target), before) and not is_enabled(target).any()
 
 
-def test_the_travel_is_counted_from_where_trials_have_left_the_axis():
-    turn = 2.0 * np.pi
-    with emulated("tmcm1636", "inertia", "qbl4208", travel=(-turn, 2.0 * turn)) as target:
-        origin = target.drives.read(0x6064)
-        motion.enable(target.drives, mode="pp")
-        motion.move_to(target.drives, origin + 65536 // 2)
-        here = from_here(target, origin)
-    assert (here.low[0], here.high[0]) == pytest.approx((-1.5 * turn, 1.5 * turn), rel=1e-2)
-
-
 class Contrary:
     """A tuner that lowers all gains, and answers those of its first look."""
 
@@ -170,6 +158,69 @@ def test_the_answer_is_the_tuners_own_where_it_makes_one():
         assert np.array_equal(gains(target), found.gains)
     assert np.array_equal(found.gains, found.trials[0].gains)
     assert not np.array_equal(found.gains, found.trials[1].gains)
+
+
+class Reckless(Contrary):
+    """A tuner that raises all gains tenfold, which no axis bears, and would stay with that."""
+
+    def act(self, observation):
+        return np.full((len(observation), 3), 2.3, np.float32)
+
+    def answer(self, observation):
+        return self.act(observation)
+
+
+def settings(target):
+    """Return what tuning has no business to change."""
+    names = [0x6065, 0x6081, 0x6083, 0x6084, 0x6085, 0x2003, 0x2050, 0x2055, 0x2056, (0x60C2, 1)]
+    return np.stack([target.drives.read(name) for name in names], axis=1)
+
+
+def test_gains_that_were_stopped_are_no_answer(tmp_path):
+    """However sure a tuner is of them: the best trial that was not stopped is kept, and that is said."""
+    with emulated("tmcm1636", "inertia", "qbl4208") as target:
+        done = run_agent(target, Reckless(), tmp_path / "before.toml", name="reckless")
+        assert all(trial.aborted.all() for trial in done.trials[1:]) and not done.trials[0].aborted.any()
+        (axis,) = done.result.axes
+        assert axis.accepted and any("own answer was stopped" in note for note in axis.notes)
+        assert tuple(axis.after) == tuple(done.trials[0].gains[0]) == tuple(gains(target)[0])
+        assert done.result.aborts[0] == len(done.trials) - 1
+
+
+def test_where_every_trial_was_stopped_the_drive_has_what_it_had(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "drive_env.envs.gain_tuning.rule_gains", lambda *_, **__: np.array([[4021, 1573, 32767, 9, 32767]])
+    )
+    with emulated("tmcm1636", "inertia", "qbl4208") as target:
+        before, set_before = gains(target), settings(target)
+        done = run_agent(target, Reckless(), tmp_path / "before.toml", name="reckless")
+        assert done.result.axes[0].reason == "every trial was stopped, the fitted rule's too"
+        assert not done.result.kept and not done.certificate.axes[0].accepted
+        assert np.array_equal(gains(target), before) and np.array_equal(settings(target), set_before)
+        assert not is_enabled(target).any()
+
+
+def test_a_wrong_wiring_ends_the_run_before_any_trial_with_code_1_and_the_reason(tmp_path, monkeypatch):
+    reversed_ = (0x2080, 1)
+    with emulated("tmcm1636", "inertia", "qbl4208") as target:
+        target.drives.write(reversed_, 1 - target.drives.read(reversed_))
+        before = gains(target)
+        done = run_agent(target, Contrary(), tmp_path / "before.toml", name="contrary")
+        assert done.trials == () and "encoder counts against the motor" in done.result.axes[0].reason
+        assert np.array_equal(gains(target), before) and not is_enabled(target).any()
+    monkeypatch.setattr("agents.tuning_run.run", lambda *_, **__: done)
+    code, out, _ = command("--load", "inertia", "--out", tmp_path / "run")
+    assert code == 1 and "axis 0 was rolled back: the encoder counts against the motor" in out
+    assert "keeps the new gains" not in out
+
+
+def test_gains_are_all_that_a_run_changes(tmp_path):
+    with emulated("tmcm1636", "two_mass", "qbl4208", num_machines=2) as target:
+        before = settings(target)
+        done = run_agent(target, load_policy(shipped("gain_tuning")), tmp_path / "before.toml", name="gain_tuning")
+        assert done.result.accepted.all()
+        assert np.array_equal(settings(target), before) and not is_enabled(target).any()
+        assert [tuple(row) for row in gains(target)] == [axis.after for axis in done.certificate.axes]
 
 
 def test_it_starts_from_any_gains():

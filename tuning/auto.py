@@ -17,7 +17,7 @@ import numpy as np
 from tuning.auto_margins import measure
 from tuning.auto_moves import look_back, show
 from tuning.auto_run import Run
-from tuning.auto_search import compute, identify
+from tuning.auto_search import compute, identify, prepare
 from tuning.auto_settings import begin, commission, write
 from tuning.auto_trials import prove
 from tuning.brief import identify_briefly
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from tuning.tuners import Outcome
 
 Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
+Find = Callable[[Run, Progress], None]  # finds gains for the axes that go on, and has tried them on the drives
 
 BUDGET = 10.0  # s of drive time
 
@@ -60,6 +61,43 @@ def auto(
     Raises:
         BusError: If the drives cannot be reached any more: what then holds is said, and how to bring back what was.
     """
+    return prove_found(
+        target, file, on_twins, seed=seed, keep=keep, progress=progress, experiments=experiments, budget=budget
+    )
+
+
+def on_twins(run: Run, say: Progress) -> None:
+    """Search gains on digital twins, and try the best few on the drives."""
+    say("searching gains on digital twins", 0.3)
+    compute(run)
+    say("trying gains on the drives", 0.7)
+    prove(run)
+
+
+def prove_found(
+    target: Target,
+    file: str | Path,
+    find: Find,
+    *,
+    seed: int = 0,
+    keep: bool = True,
+    progress: Progress | None = None,
+    experiments: Identify = identify_briefly,
+    budget: float = BUDGET,
+) -> Result:
+    """Check and identify axes, have gains found, and prove, write and keep them; what fails is rolled back.
+
+    Args:
+        target: The drives, as `auto` takes them.
+        file: Where the state before is left.
+        find: What finds gains: it sets the run's gains and proving ground. What it raises ends the run, and everything
+            is as it was before.
+        seed: Of the run.
+        keep: Whether drives on a bus are told to keep the new gains over a power cycle.
+        progress: Called with what is under way, and the share done.
+        experiments: What identifies.
+        budget: Most time that may pass on the drives for each axis of a machine [s].
+    """
     say = progress or (lambda what, share: None)
     with Transaction(target, file) as transaction, timed(target) as (watched, clock):
         run = Run(watched, seed, clock, budget)
@@ -68,10 +106,10 @@ def auto(
         say("identifying", 0.05)
         identify(run, experiments)
         commission(run)
-        say("searching gains on digital twins", 0.3)
-        compute(run)
-        say("trying gains on the drives", 0.7)
-        prove(run)
+        prepare(run)
+        if run.going.any():
+            find(run, say)
+        say("a move for the record", 0.8)
         show(run)
         say("measuring the frequency response", 0.85)
         measure(run)

@@ -30,13 +30,14 @@ if TYPE_CHECKING:
 SETTLED = 0.01  # of the move: what counts as there
 
 
-def certificate(target: Target, result: Result, seed: int) -> Certificate:
+def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") -> Certificate:
     """Return the certificate of a run of auto; emulated axes feel a load step for it.
 
     Args:
         target: What was tuned.
         result: What came of it.
         seed: That of the run.
+        tuner: What found the gains.
     """
     loaded = {}
     if target.drives.machine is not None:
@@ -45,7 +46,7 @@ def certificate(target: Target, result: Result, seed: int) -> Certificate:
         loaded = load_step(target, result.accepted & np.all(now == [run.after for run in result.axes], axis=1))
     axes = tuple(_axis(target, result, axis, run, loaded.get(axis)) for axis, run in enumerate(result.axes))
     return Certificate(
-        tuner="auto",
+        tuner=tuner,
         device=target.device.name,
         motor=target.motor.name,
         machine=target.machine or "unnamed",

@@ -67,6 +67,20 @@ def identify(run: Run, experiments: Identify) -> None:
         ]
 
 
+def prepare(run: Run) -> None:
+    """Find what gains are measured against, what stands by when they fail, and whether those before are safe."""
+    target = run.target
+    for axis in map(int, np.flatnonzero(run.going)):
+        plant, before = run.axes[axis].plant, run.axes[axis].before
+        assert plant is not None, "an axis that goes on has one"
+        fitted = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)[0]
+        run.unsafe[axis] = unsafe_gains(target.device, plant, before)
+        # What the drive had may be better than what is only soft.
+        soft = propose(SOFT, target.device, target.motor, plant).gains if run.unsafe[axis] else before
+        run.fallbacks[:, axis] = fitted, soft, calm_gains(target, plant)
+        run.reference[axis] = fitted
+
+
 def compute(run: Run) -> None:
     """Search gains on twins, from what the rules propose."""
     target = run.target
@@ -80,16 +94,8 @@ def compute(run: Run) -> None:
         plant, identified = run.axes[axis].plant, run.axes[axis].identified
         assert plant is not None and identified is not None, "an axis that goes on has both"
         known.append(known_of(plant, identified, float(reach[axis])))
-        fitted = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)[0]
-        proposals = {name: propose(name, target.device, target.motor, plant) for name in RULES}
-        run.fallbacks[0, axis] = fitted
-        before = run.axes[axis].before
-        run.unsafe[axis] = unsafe_gains(target.device, plant, before)
-        # What the drive had may be better than what is only soft.
-        run.fallbacks[1, axis] = proposals[SOFT].gains if run.unsafe[axis] else before
-        run.fallbacks[2, axis] = calm_gains(target, plant)
-        run.reference[axis] = fitted
-        starts.append(np.array([fitted, *(proposal.gains for proposal in proposals.values())], np.int64))
+        proposals = (propose(name, target.device, target.motor, plant) for name in RULES)
+        starts.append(np.array([run.reference[axis], *(proposal.gains for proposal in proposals)], np.int64))
     scaler = np.asarray(target.drives.read((0x2058, 0)), float)[chosen]
     found = _search_apart(run, known, np.array(starts), scaler)
     run.gains[chosen] = found.gains[:, 0]

@@ -206,7 +206,10 @@ def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:
         print(f"  {check.verdict:<4}  {check.what}: {check.found}")
     print(f"a run would identify (about 4 s), make 1 + {trials} trials of 3 moves of 250 ms, what oscillates stopped "
           "within 50 ms,")  # fmt: skip
-    print("show a move and measure the frequency response; then the drive keeps the best gains. It would write:")
+    print(
+        "show a move, measure the frequency response, move with the gains before; then the drive keeps what passed, or"
+    )
+    print("has again what it had. It would write:")
     for _, group in groupby(found.writes, key=lambda write: write.why):
         _tell_writes(list(group))
     print("What does not stay is put back at the end, and all of it if something goes wrong.")
@@ -256,27 +259,42 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
     return run(target, policy, folder / "before.toml", name=agent, keep=store, show=show, say=say)
 
 
-def _report(result: Run, folder: Path, json: bool) -> None:
-    certificate, report = result.certificate.save(folder)
-    axis = result.certificate.axes[0]
-    first = result.trials[0].measured[0]
-    best = next(float(one.measured[0]) for one in reversed(result.trials) if (one.gains[0] == axis.after).all())
+def _report(done: Run, folder: Path, json: bool) -> None:
+    certificate, report = done.certificate.save(folder)
+    result, rule = done.result, float(done.trials[0].measured[0]) if done.trials else None
+    axis, seconds = result.axes[0], float(result.drive_seconds[0])
+    refused = [f"axis {k} was rolled back: {one.reason}" for k, one in enumerate(result.axes) if not one.accepted]
     if json:
         print_json(
             {
-                "before": axis.before, "after": axis.after, "J of the rule": float(first), "J": best,
-                "drive seconds": axis.hardware_seconds, "stored": result.kept, "certificate": str(certificate),
-                "report": str(report),
+                "accepted": not refused, "reason": axis.reason, "notes": axis.notes, "before": list(axis.before),
+                "after": list(axis.after), "J of the rule": rule, "J": axis.proof, "drive seconds": seconds,
+                "stored": result.kept, "certificate": str(certificate), "report": str(report),
             }
         )  # fmt: skip
-        return
+    else:
+        _print(done, refused, rule)
+        print(f"written to {folder}: report.html to read, certificate.json, before.toml for `drive-tune restore`")
+    if refused:
+        raise typer.Exit(REFUSED)
+
+
+def _print(done: Run, refused: list[str], rule: float | None) -> None:
+    result = done.result
+    axis, certified = result.axes[0], done.certificate.axes[0]
     print(f"{'':<7}{''.join(f'{name:>12}' for name in GAIN_NAMES)}")
     for name, gains in (("before", axis.before), ("after", axis.after)):
         print(f"{name:<7}{''.join(f'{value:>12}' for value in gains)}")
-    print(f"J {best:.3f}, {100.0 * best / first:.0f} % of the fitted rule's {first:.3f}; "
-          f"{axis.hardware_seconds:.1f} s of drive time, {axis.aborts} trials stopped")  # fmt: skip
-    for loop in axis.frequency_responses:
-        print(f"{loop.name}: " + ", ".join(f"{name} {value:.3g}" for name, value in loop.margins.items()))
-    print("the drive keeps the new gains over a power cycle" if result.kept else "the drive has the new gains until it "
-          "is switched off")  # fmt: skip
-    print(f"written to {folder}: report.html to read, certificate.json, before.toml for `drive-tune restore`")
+    if axis.accepted and rule is not None:
+        print(f"J {axis.proof:.3f}, {100.0 * axis.proof / rule:.0f} % of the fitted rule's {rule:.3f}; "
+              f"{certified.hardware_seconds:.1f} s of drive time, {certified.aborts} trials stopped")  # fmt: skip
+    for loop in certified.frequency_responses:
+        if loop.tuned:
+            print(f"{loop.name}: " + ", ".join(f"{name} {value:.3g}" for name, value in loop.margins.items()))
+    for note in axis.notes:
+        print(note)
+    for line in refused:
+        print(line)
+    if not refused:
+        print("the drive keeps the new gains over a power cycle" if result.kept else "the drive has the new gains "
+              "until it is switched off")  # fmt: skip

@@ -174,8 +174,9 @@ class GainTuning(Lanes):
 
     `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (lanes, axes, 5) raw integers in the order of
     `Gains`; "measured", its J by measured terms, and "hidden", hidden J; "trial_hidden", that of this step's trial;
-    "trial_gains", "trial_measured" and "aborted" too; "faults", names of the trial's emergencies, tuples; "parameters",
-    the true machine. Of given drives there is nothing hidden.
+    "trial_gains" and "trial_measured" too; "aborted", whether it was stopped, of the rule's trial at the begin as well;
+    "faults", names of the trial's emergencies, tuples; "parameters", the true machine. Of given drives there is nothing
+    hidden.
 
     Args:
         num_envs: Lanes.
@@ -324,7 +325,9 @@ class GainTuning(Lanes):
             hidden = self._hidden.set_reference(self._rule, mask).hidden
             self._hidden_now = np.where(mask, hidden, self._hidden_now)
         drives.emergencies()
-        return self._observe(), self._told()
+        info = self._told()
+        info["aborted"] = mask & self._stopped(tried)
+        return self._observe(), info
 
     def _step_lanes(self, action: Any) -> Stepped:
         n = self.num_envs
@@ -342,7 +345,7 @@ class GainTuning(Lanes):
         if trial_hidden is not None:
             self._hidden_now = np.where(better, trial_hidden, self._hidden_now)
         after = self._measured if self._hidden is None else self._hidden_now
-        aborted = active & tried.aborted.any(axis=0).reshape(n, -1).any(axis=1)
+        aborted = active & self._stopped(tried)
         terms = {"tuning": np.log(before / after), "abort": -self.config.abort_cost * aborted}
         self._left[active] -= 1
         info = self._told()
@@ -406,6 +409,10 @@ class GainTuning(Lanes):
         """Return J by measured terms of the lanes: that of the worst axis."""
         costs = measured_cost(tried.costs(softness(gains) / softness(self._rule)))
         return np.asarray(costs.reshape(self.num_envs, -1).max(axis=1))
+
+    def _stopped(self, tried: Trial) -> Mask:
+        """Return in which lanes a trial was stopped, on any axis."""
+        return np.asarray(tried.aborted.any(axis=0).reshape(self.num_envs, -1).any(axis=1))
 
     def _take(self, mask: Mask, gains: Integers, tried: Trial, measured: Floats, better: Mask | None = None) -> None:
         """Keep a trial as the last one where the mask is true, and as the incumbent where it is better."""
