@@ -113,8 +113,7 @@ def test_the_command_ends_with_130_and_says_what_the_drives_have(monkeypatch, tm
         raise KeyboardInterrupt
 
     monkeypatch.setattr(auto_module, "identify", lambda run, experiments: None)
-    monkeypatch.setattr(auto_module, "compute", lambda run: None)
-    for name in ("prove", "show", "measure", "look_back"):
+    for name in ("prepare", "compute", "prove", "show", "measure", "look_back"):
         monkeypatch.setattr(auto_module, name, lambda run: None)
     owner, _, name = stage.rpartition(".")
     monkeypatch.setattr(getattr(auto_module, owner) if owner else auto_module, name, pressed)
