@@ -27,12 +27,14 @@ from tuning.certificate import (
     Parameter,
     StepResponse,
     frequency_response,
+    identified,
     is_unchanged,
     load_certificate,
     si_gains,
 )
 from tuning.certificate_pictures import AFTER, BEFORE, DOUBTFUL, bode_picture, step_picture
 from tuning.cli import app
+from tuning.identification import Estimate, Identification, refused
 from tuning.margins import margins
 from tuning.report import to_html
 
@@ -239,6 +241,27 @@ def test_the_report_says_everything_that_the_certificate_holds(certificate):
                  certificate.hash()):  # fmt: skip
         assert any(said in word for word in words), said
     assert "gains as before" in to_html(replace(certificate, axes=(replace(certificate.axes[0], accepted=False),)))
+
+
+def test_what_a_tuner_guessed_is_in_neither_file(certificate):
+    guess, reason = Estimate(0.4567, 0.32, 0.59, "A"), "two moves do not tell it from viscous friction"
+    known = Estimate(1.48e-5, 1.4e-5, 1.56e-5, "kg*m^2")
+    found = identified(Identification(
+        {"coulomb": guess, "inertia": known, "damping": guess}, 4.0,
+        {"coulomb": refused("A", reason), "inertia": known},
+    ))  # fmt: skip
+    assert set(found) == {"coulomb", "inertia"}
+    assert (found["inertia"].value, found["inertia"].low, found["inertia"].high) == known[:3]
+    paper = replace(certificate, axes=(replace(certificate.axes[0], identified=found),))
+    words = Page(to_html(paper)).words
+    assert reason in words and "not identified" in words
+    assert json.loads(paper.to_json())["axes"][0]["identified"]["coulomb"]["value"] is None
+    assert "0.4567" not in paper.to_json() and not any("0.4567" in word for word in words)
+
+
+def test_what_has_no_guesses_is_identified_as_it_is():
+    known = Estimate(0.36, 0.35, 0.37, "ohm")
+    assert identified(Identification({"resistance": known}, 4.0)) == {"resistance": Parameter(*known)}
 
 
 def test_an_axis_of_which_nothing_is_known_has_a_report_too(certificate):

@@ -10,6 +10,7 @@ import math
 import re
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from drive_env.gains import GAIN_OBJECTS, write_gains
 from drive_env.misfit import MisfitWarning
 from mechanics.shaft import way
 from tuning import identification
+from tuning.brief import identify_briefly
 from tuning.identification import NAMES, identify
 from tuning.suite import load_suite, open_group, open_machines
 from tuning.target import Target, emulated
@@ -125,6 +127,110 @@ def test_the_suite_is_identified_and_the_intervals_hold(seed):
     assert not missed, "axes, told, near, inside"
 
 
+# --- values, briefly --------------------------------------------------------------------------------------------------
+# What the brief identification must tell of the suite's axes, as shares; all else it refuses, of every axis.
+TOLD_BRIEFLY = {
+    "resistance": 0.95, "inductance": 0.95, "inertia": 0.9, "velocity_filter": 0.45, "resonance": 0.45,
+    "anti_resonance": 0.45,
+}  # fmt: skip
+NEVER_BRIEFLY = ("coulomb", "viscous", "offset", "loop_delay")
+
+
+def told_briefly(machines):
+    """Identify machines briefly; return by name the true value and what is told of every axis that has such a thing."""
+    found = {name: [] for name in TOLD_BRIEFLY}
+    for target, _ in open_machines(machines, num_threads=1):
+        if target.axes_per_machine > 1:  # `truth` knows one axis
+            continue
+        corners = target.drives.machine.parameters["stage.velocity_filter"]
+        for axis, one in enumerate(identify_briefly(target)):
+            assert tuple(one.told) == NAMES
+            for name, estimate in one.told.items():
+                assert estimate.is_known != bool(estimate.reason), (name, estimate)
+                assert not estimate.is_known or name not in NEVER_BRIEFLY
+            true = truth(target.drives, axis, 0.0) | {"velocity_filter": corners[axis]}
+            for name in TOLD_BRIEFLY:
+                if np.isfinite(true[name]):
+                    found[name].append((true[name], one.told[name]))
+                else:
+                    assert not one.told[name].is_known, "a rigid axis has no resonance"
+    return found
+
+
+def outside(found, share=None):
+    """Return the quantities that lie inside less than 90 % of their intervals: axes, told, inside.
+
+    Args:
+        found: As `told_briefly` returns it.
+        share: Half of the intervals over the value, in place of those that are told.
+    """
+    wrong = {}
+    for name, axes in found.items():
+        told = [(true, one) for true, one in axes if one.is_known]
+        inside = sum(
+            one.low <= true <= one.high if share is None else abs(one.value - true) <= share * one.value
+            for true, one in told
+        )
+        if inside < 0.9 * len(told):
+            wrong[name] = len(axes), len(told), inside
+    return wrong
+
+
+def few_told(found, shares):
+    """Return the quantities that are told of fewer axes than they must be: axes, told."""
+    counts = {name: (len(axes), sum(one.is_known for _, one in axes)) for name, axes in found.items()}
+    return {name: (axes, told) for name, (axes, told) in counts.items() if told < shares[name] * axes}
+
+
+def test_what_is_told_briefly_is_inside_its_interval_and_the_rest_has_its_reason():
+    """Eleven machines: rigid, on a spring, a belt, gears with backlash, a vertical axis, an arm, a fan."""
+    chosen = (
+        "inertia-qbl4208-0", "inertia-qbl4208-3", "two_mass-qbl4208-0", "two_mass-qbl4208-1", "two_mass-qbl4208-5",
+        "belt-qbl4208-0", "belt-qbl4208-3", "vertical_screw-qbl4208-0", "geared_joint-ec_45_flat-3", "arm-re_40-0",
+        "fan-re_35-2",
+    )  # fmt: skip
+    machines = [m for m in load_suite("public") if m.name in chosen]
+    assert len(machines) == len(chosen)
+    found = told_briefly(machines)
+    assert not outside(found), "axes, told, inside"
+    assert not few_told(found, dict.fromkeys(TOLD_BRIEFLY, 0.4) | {"resistance": 0.9, "inductance": 0.9})
+    # Intervals that are too narrow do not pass, of any quantity.
+    assert set(outside(found, share=1e-3)) == set(TOLD_BRIEFLY)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [None, 301])
+def test_the_suite_is_identified_briefly_and_what_is_told_holds(seed):
+    machines = load_suite("public", seed=seed)
+    found = told_briefly([m for m in machines if seed is None or m.name.startswith("seed")])
+    assert not outside(found), "axes, told, inside"
+    assert not few_told(found, TOLD_BRIEFLY), "axes, told"
+    assert "inertia" in outside(found, share=1e-3)
+
+
+def test_what_a_tuner_works_with_is_not_what_is_told():
+    target = emulated(load="inertia", num_threads=1)
+    one = identify_briefly(target)[0]
+    for name in ("coulomb", "viscous", "offset"):
+        assert one.estimates[name].is_known, name
+        assert "two moves" in one.told[name].reason, name
+    assert one.told["inertia"] == one.estimates["inertia"]
+    assert identify(target)[0].told is None
+
+
+def test_without_a_response_the_inertia_of_two_moves_is_a_guess(monkeypatch):
+    def nothing(target, *_, **__):
+        n = target.num_axes
+        return SimpleNamespace(fits=[None] * n, notes=[["the shaking was stopped"]] * n)
+
+    monkeypatch.setattr("tuning.brief.measure", nothing)
+    one = identify_briefly(emulated(load="inertia", num_threads=1))[0]
+    assert one.estimates["inertia"].is_known
+    for name in ("inertia", "resonance", "velocity_filter"):
+        assert "the shaking was stopped" in one.told[name].reason, name
+
+
+# --- values, further --------------------------------------------------------------------------------------------------
 def test_of_two_springs_in_a_row_the_first_resonance_is_told():
     target = emulated(load="three_mass", num_threads=1)
     found, true = identify(target)[0], truth(target.drives, 0, 0.0)

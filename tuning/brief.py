@@ -2,6 +2,9 @@
 
 Where `identify` moves an axis for five seconds to know inertia and friction within a few percent, two moves of a
 quarter of a second must do here; the frequency response then says the inertia again, and better.
+
+A tuner's twins are better off with a guess than with nothing, and their worlds are as far apart as guesses may be off:
+`Identification.estimates` has those. What is identified is in `Identification.told`: nothing that is guessed.
 """
 
 from __future__ import annotations
@@ -16,9 +19,9 @@ from numpy.typing import NDArray
 from drive_env import motion
 from drive_env.envs.gain_trial import Trials
 from drive_env.gains import write_gains
-from tuning.experiments import MECHANICS, PULSED, RESPONSE, Experiments
+from tuning.experiments import MECHANICS, PULSED, RESPONSE, UNITS, WORST_MISFIT, Experiments
 from tuning.frequency_response import measure
-from tuning.identification import NAMES, Estimate, Identification, Progress
+from tuning.identification import NAMES, Estimate, Identification, Progress, refused
 from tuning.oscillation_watch import shaken
 from tuning.target import Target
 from tuning.winding import BRIEFLY, identify_winding, pulse, to_torque_mode
@@ -27,17 +30,32 @@ from tuning.working_state import GUESS, STATUS, Working, cautious_gains, enable,
 if TYPE_CHECKING:
     from tuning.plant_fit import PlantFit
 
-INERTIA_ERROR, FRICTION_ERROR = 0.15, 0.3  # relative: what two moves tell it to
-# Half of an interval over its value, of what a fit gives and would refuse to state.
+# Half of an interval over its value, for twins alone: of what two moves tell, and of what a fit refuses to state.
+INERTIA_ERROR, FRICTION_ERROR = 0.15, 0.3
 DOUBT = {"inertia": 0.2, "velocity_filter": 0.4, "anti_resonance": 0.1, "resonance": 0.1, "damping": 0.5}
 ANOTHER = 2.5  # times the inertia that two moves tell: a response that says more is that of another axis
 ELECTRICAL_ANGLE, SHAFT_DIRECTION = 0x2103, 0x2057
+# Of 46 axes of the suite one had its viscous friction and 13 their dry friction within FRICTION_ERROR.
+SHORT, LONGER = "two moves of a quarter of a second do not tell it from", "`drive-tune identify` moves for longer"
+NOT_TOLD = {
+    "inertia": "two moves of a quarter of a second tell it too roughly, and no response was measured",
+    "coulomb": f"{SHORT} viscous friction and drag; {LONGER}",
+    "viscous": f"{SHORT} dry friction; {LONGER}",
+    "offset": f"{SHORT} friction; {LONGER}",
+}
+# Dead time and friction make it up to 0.09 ms shorter here, to one side, which no scatter shows.
+NO_DELAY = "so short a response tells it to 0.1 ms, which is no better than the period of the drive's velocity loop"
 
 
 def identify_briefly(
     target: Target, where: NDArray[np.bool_] | None = None, progress: Progress | None = None
 ) -> list[Identification]:
-    """Identify axes, all by default, in about four seconds; otherwise as `tuning.identification.identify`."""
+    """Identify axes, all by default, in about four seconds; otherwise as `tuning.identification.identify`.
+
+    Returns:
+        One per axis. Its `told` is what is identified; in place of most of what is refused there its `estimates` have
+        guesses, for twins.
+    """
     axes = np.ones(target.num_axes, bool) if where is None else where
     return _Brief(target, axes, progress or (lambda what, share: None)).run()
 
@@ -46,6 +64,15 @@ class _Brief(Experiments):
     """Those experiments, with another middle."""
 
     thorough = False
+
+    def __init__(self, target: Target, where: NDArray[np.bool_], progress: Progress) -> None:
+        super().__init__(target, where, progress)
+        # What is told of each axis where `found` has a guess.
+        self._told: list[dict[str, Estimate]] = [{} for _ in range(target.num_axes)]
+
+    def run(self) -> list[Identification]:
+        every = zip(super().run(), self._told, strict=True)
+        return [replace(one, told={name: told.get(name, one.estimates[name]) for name in NAMES}) for one, told in every]
 
     def turn(self, working: Working) -> None:
         target, drives = working.target, working.target.drives
@@ -73,6 +100,7 @@ class _Brief(Experiments):
                 "viscous": _about(found.viscous[k], FRICTION_ERROR, "A*s/rad"),
                 "offset": _about(found.offset[k], FRICTION_ERROR, "A"),
             }
+            self._told[k] = {name: refused(UNITS[name], reason) for name, reason in NOT_TOLD.items()}
         working = self.calm(working)
         self.begin("resonance, delay, filter", 0.55, RESPONSE)
         switch_off(drives, working.where)
@@ -83,7 +111,7 @@ class _Brief(Experiments):
         fault = drives.read(STATUS) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1]
         able = working.where & ~fault
         for k in map(int, np.flatnonzero(working.where & fault)):
-            self.refuse(k, RESPONSE, "the drive is in fault; see its emergencies")
+            self._no_response(k, "the drive is in fault; see its emergencies")
         if not able.any():
             return
         write_gains(drives, self.response_gains(working, inertia), able)
@@ -94,14 +122,37 @@ class _Brief(Experiments):
             fit = response.fits[k]
             if fit is None or fit.reason:
                 why = "; ".join(response.notes[k]) or "the response was not measured"
-                self.refuse(k, RESPONSE, why if fit is None else fit.reason)
+                self._no_response(k, why if fit is None else fit.reason)
                 continue
             ratio = fit.plant.inertia / self.found[k]["inertia"].value
             if not 1.0 / ANOTHER < ratio < ANOTHER:
                 # A fit of few lines may come to rest anywhere, and the two moves went well enough.
-                self.refuse(k, RESPONSE, f"the response would be that of {ratio:.2g} times the inertia that was moved")
+                self._no_response(k, f"the response would be that of {ratio:.2g} times the inertia that was moved")
                 continue
             self.found[k] |= _guessed(fit)
+            self._told[k] |= _told(fit, float(response.f[-1]))
+
+    def _no_response(self, k: int, reason: str) -> None:
+        self.refuse(k, RESPONSE, reason)
+        self._told[k]["inertia"] = refused(UNITS["inertia"], (
+            f"two moves of a quarter of a second tell it too roughly, and the response does not: {reason}"
+        ))  # fmt: skip
+
+
+def _told(fit: PlantFit, highest: float) -> dict[str, Estimate]:
+    """Return what a fit says by itself, up to the highest frequency [Hz]; its refusals are what is told."""
+    told = {name: fit.estimates[name] for name in ("inertia", *RESPONSE)}
+    told["loop_delay"] = refused(UNITS["loop_delay"], NO_DELAY)
+    if fit.plant.is_elastic and fit.plant.resonance > highest:
+        # What lies there may as well be the filter's own lag.
+        reason = f"a resonance above {highest:.0f} Hz, up to which the axis could be seen, is not told from it"
+        told["velocity_filter"] = refused(UNITS["velocity_filter"], reason)
+    if fit.misfit > WORST_MISFIT:
+        reason = (
+            f"the response is not that of one spring: the model is off by {fit.misfit:.1f} times what noise explains"
+        )
+        told |= {name: refused(UNITS[name], reason) for name in RESPONSE}
+    return told
 
 
 def _guessed(fit: PlantFit) -> dict[str, Estimate]:

@@ -191,8 +191,9 @@ MARGIN_NAMES = {
 
 
 def identified(identification: Identification) -> dict[str, Parameter]:
-    """Return what was identified as a certificate has it."""
-    return {name: Parameter(*estimate) for name, estimate in identification.estimates.items()}
+    """Return what was identified as a certificate has it: nothing that a tuner only guessed."""
+    told = identification.estimates if identification.told is None else identification.told
+    return {name: Parameter(*estimate) for name, estimate in told.items()}
 
 
 def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, float]:

@@ -57,10 +57,13 @@ class Identification:
             K_t, all that turns, at the rotor [kg*m^2]), "coulomb" [A], "viscous" [A*s/rad], "offset" [A, gravity or a
             constant load], "anti_resonance", "resonance" [Hz], "loop_delay" [s], "velocity_filter" [Hz].
         drive_time: Time that passed on the drive [s].
+        told: What is identified, by the same names, where `estimates` have guesses that only a tuner should work with;
+            None where they have none.
     """
 
     estimates: Mapping[str, Estimate]
     drive_time: float
+    told: Mapping[str, Estimate] | None = None
 
     def value(self, name: str) -> float:
         """Return a value, nan where it was refused."""
