@@ -124,8 +124,9 @@ def test_the_command_ends_with_130_and_says_what_the_drives_have(monkeypatch, tm
 
 
 @pytest.mark.slow
-def test_a_real_signal_over_a_served_bus(tmp_path):
-    """As a user has it: a drive served by one process, tuned by another, and Ctrl-C in its terminal."""
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda how: how.name)
+def test_a_real_signal_over_a_served_bus(tmp_path, how):
+    """A drive served by one process, tuned by another; Ctrl-C, a service that is stopped, a terminal that is closed."""
     out = tmp_path / "run"
     with served_process("--load", "inertia", "--lockstep", cwd=tmp_path) as (_, channel):
         bus = {"interface": "slcan", "channel": channel, "nodes": (1,), "pace": "lockstep"}
@@ -144,7 +145,7 @@ def test_a_real_signal_over_a_served_bus(tmp_path):
             while not (out / "before.toml").exists() and process.poll() is None and time.monotonic() < end:
                 time.sleep(0.05)
             time.sleep(1.0)
-            process.send_signal(signal.SIGINT)
+            process.send_signal(how)
             _, said = process.communicate(timeout=PATIENCE)
         finally:
             if process.poll() is None:
