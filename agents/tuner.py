@@ -136,7 +136,7 @@ def tune_target(
         watched.close()
         env.close()
     same = np.ones(target.num_axes, bool) if wanted is None else np.all(wanted == gains, axis=1)
-    overruled = ~same.reshape(-1, axes).all(axis=1)
+    overruled = np.logical_not(same.reshape(-1, axes).all(axis=1))
     return Tuned(gains, tuple(shown), answers, overruled)
 
 
