@@ -85,6 +85,12 @@ def test_it_tunes_an_emulated_drive_over_its_bus_and_certifies_it(tmp_path):
     assert (tmp_path / "run" / "report.html").is_file()
 
 
+def test_a_channel_of_the_environment_alone_moves_no_motor(tmp_path, monkeypatch):
+    monkeypatch.setenv("DRIVE_ENV_CHANNEL", "socket://127.0.0.1:1")
+    result = CliRunner().invoke(app, ["tune", "--trials", "1", "--load", "inertia", "--out", str(tmp_path / "run")])
+    assert result.exit_code == 0 and "inertia, emulated, node 1 of socket://127.0.0.1:" in result.stdout
+
+
 def test_json_for_programs(tmp_path):
     code, out, _ = command("--trials", 1, "--load", "inertia", "--json", "--out", tmp_path / "run")
     found = json.loads(out)
@@ -97,7 +103,8 @@ def test_json_for_programs(tmp_path):
     (["nobody"], "no agent named 'nobody' ships; there are gain_tuning"),
     (["nothing.npz"], "there is no file nothing.npz"),
     (["tracking_gantry"], "acts in ServoDrive/Tracking-v0; a tuner acts in ServoDrive/GainTuning-v0"),
-    (["--channel", "can0"], "give its --interface, too"),
+    (["--channel", "can0", "--travel", "-1:1"], "channel 'can0' needs an interface"),
+    (["--node", "1", "--travel", "-1:1"], "no CAN channel is given"),
     (["--interface", "virtual", "--channel", "none", "--seed", "1"], "--seed draws an emulated machine"),
     (["--interface", "virtual", "--channel", "none"], "--travel is missing: how far may the motor turn?"),
     (["--trials", "0"], "--trials 0 must be 1 or more"),

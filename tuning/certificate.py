@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 HASH = "sha256"
+MAXIMUM_CURRENT = 0x2003
 
 Floats = NDArray[np.float64]
 
@@ -203,14 +204,18 @@ def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, f
     return dict(zip(SI_NAMES, gains_in_si(device, supply, Gains(*map(int, gains))), strict=True))
 
 
-def envelope(target: Target, axis: int = 0) -> dict[str, float]:
-    """Return what a target allows of one of its axes."""
-    return {
-        "travel low [rad]": float(target.low[axis]),
-        "travel high [rad]": float(target.high[axis]),
-        "speed [rad/s]": float(target.speed),
-        "current [A]": float(target.current),
+def envelope(target: Target) -> dict[str, float]:
+    """Return what a target allows; where it has several axes, each of them."""
+    allowed = target.drives.read(MAXIMUM_CURRENT) * 1e-3
+    rows = {
+        "travel low [rad]": target.low,
+        "travel high [rad]": target.high,
+        "speed while identified [rad/s]": np.full(target.num_axes, target.speed),
+        "current while identified [A]": np.full(target.num_axes, target.current),
+        "current in moves, 2003h [A]": allowed,
     }
+    names = [""] if target.num_axes == 1 else [f"axis {axis}: " for axis in range(target.num_axes)]
+    return {f"{name}{what}": float(row[axis]) for axis, name in enumerate(names) for what, row in rows.items()}
 
 
 def frequency_response(

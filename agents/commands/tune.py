@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import groupby
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 
 def tune(
+    context: typer.Context,
     agent: Annotated[str, typer.Argument(help="Agent: one that ships, by name, or a file (.npz).")] = "gain_tuning",
     interface: Interface = None,
     channel: Channel = None,
@@ -49,7 +51,7 @@ def tune(
     load: Annotated[str, typer.Option(help="Load of the emulated drive, where no --interface is given.")] = "two_mass",
     seed: Annotated[
         int | None,
-        typer.Option(help="Draw the emulated machine from the load's distributions.", show_default="default"),
+        typer.Option(min=0, help="Draw the emulated machine from the load's distributions.", show_default="default"),
     ] = None,
     supply: Supply = None,
     travel: TravelRange = None,
@@ -66,7 +68,7 @@ def tune(
 ) -> None:
     """Let a trained agent tune a drive, trial by trial, inside the safety envelope; PyTorch is not needed.
 
-    Without --interface an emulated drive is served as a CANopen node and reached over its bus as a real one would be.
+    Without an option of a bus an emulated drive is served as a CANopen node and reached as a real one would be.
     Writes before.toml, from which `drive-tune restore` brings back what was, certificate.json and report.html.
     """
     with errors_as_exit_codes():
@@ -74,10 +76,9 @@ def tune(
         from agents.shipped import find_agent
         from drive_env.tools.options import ask
 
-        if interface is None and (channel is not None or node or bitrate is not None or lockstep):
-            raise ValueError("--channel, --node, --bitrate and --lockstep are of a bus; give its --interface, too")
-        if interface is not None and seed is not None:
-            raise ValueError("--seed draws an emulated machine; leave it out with --interface")
+        bus = _is_of_a_bus(context)
+        if bus and seed is not None:
+            raise ValueError("--seed draws an emulated machine; leave it out on a bus")
         if trials is not None and trials < 1:
             raise ValueError(f"--trials {trials} must be 1 or more")
         policy = load_policy(find_agent(agent))
@@ -89,7 +90,7 @@ def tune(
             policy.bundle.configuration["trials"] = trials
         folder = new_folder(out, "agent-tune")
         with ExitStack() as stack:
-            if interface is None:
+            if not bus:
                 target = stack.enter_context(_emulated_node(device, motor, load, seed, supply, travel))
             else:
                 if dry_run:
@@ -100,10 +101,16 @@ def tune(
                 if not _tell_plan(target, policy, store, json):
                     fail("a run would not begin: see the lines with 'no'", REFUSED)
                 return
-            if interface is not None:
+            if bus:
                 ask(f"The motor of node {', '.join(map(str, node or [1]))} will turn. Is its way clear?", yes)
             result = _run(target, policy, folder, agent, store, json)
-        _report(result, folder, json)
+        _report(result, folder, json, bus)
+
+
+def _is_of_a_bus(context: typer.Context) -> bool:
+    """Return whether the command line says anything of a bus; variables of the environment alone do not."""
+    given = (context.get_parameter_source(name) for name in ("interface", "channel", "node", "bitrate", "lockstep"))
+    return any(source is not None and source.name == "COMMANDLINE" for source in given)
 
 
 @contextmanager
@@ -150,7 +157,7 @@ def _emulated_node(
 
 @contextmanager
 def _on_bus(
-    interface: str,
+    interface: str | None,
     channel: str | None,
     nodes: list[int] | None,
     bitrate: int | None,
@@ -169,7 +176,7 @@ def _on_bus(
         yield target
 
 
-def _look_first(interface: str, channel: str | None, nodes: list[int], bitrate: int | None, device: str) -> None:
+def _look_first(interface: str | None, channel: str | None, nodes: list[int], bitrate: int | None, device: str) -> None:
     """Raise NoAnswerError for a node that is silent: to open it as drives would send it an NMT command."""
     from drive_env.master.description import describe
     from drive_env.master.errors import NoAnswerError
@@ -236,8 +243,8 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
         mark = "better" if trial.better[0] else ""
         if trial.number == 0:
             mark = "the fitted rule's gains, from which the agent sets out"
-        elif trial.aborted[0]:
-            mark = "stopped: it oscillated or tripped"
+        if trial.aborted[0]:
+            mark = f"stopped: it oscillated or tripped{f'; {mark}' if trial.number == 0 else ''}"
         velocity_p, velocity_i, position_p = trial.gains[0, 2:]
         print(
             f"{trial.number or 'rule':>5} {velocity_p:>11} {velocity_i:>11} {position_p:>11} "
@@ -259,7 +266,7 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
     return run(target, policy, folder / "before.toml", name=agent, keep=store, show=show, say=say)
 
 
-def _report(done: Run, folder: Path, json: bool) -> None:
+def _report(done: Run, folder: Path, json: bool, bus: bool) -> None:
     certificate, report = done.certificate.save(folder)
     result, rule = done.result, float(done.trials[0].measured[0]) if done.trials else None
     axis, seconds = result.axes[0], float(result.drive_seconds[0])
@@ -274,7 +281,8 @@ def _report(done: Run, folder: Path, json: bool) -> None:
         )  # fmt: skip
     else:
         _print(done, refused, rule)
-        print(f"written to {folder}: report.html to read, certificate.json, before.toml for `drive-tune restore`")
+        way_back = ", before.toml for `drive-tune restore`" if bus else ""  # an emulated drive ended with this program
+        print(f"written to {folder}: report.html to read, certificate.json{way_back}")
     if refused:
         raise typer.Exit(REFUSED)
 
@@ -285,12 +293,15 @@ def _print(done: Run, refused: list[str], rule: float | None) -> None:
     print(f"{'':<7}{''.join(f'{name:>12}' for name in GAIN_NAMES)}")
     for name, gains in (("before", axis.before), ("after", axis.after)):
         print(f"{name:<7}{''.join(f'{value:>12}' for value in gains)}")
+    if axis.accepted and (said := _answer(done)):
+        print(said)
     if axis.accepted and rule is not None:
         print(f"J {axis.proof:.3f}, {100.0 * axis.proof / rule:.0f} % of the fitted rule's {rule:.3f}; "
               f"{certified.hardware_seconds:.1f} s of drive time, {certified.aborts} trials stopped")  # fmt: skip
     for loop in certified.frequency_responses:
         if loop.tuned:
-            print(f"{loop.name}: " + ", ".join(f"{name} {value:.3g}" for name, value in loop.margins.items()))
+            margins = {n: f"{value:.3g}" if math.isfinite(value) else "not seen" for n, value in loop.margins.items()}
+            print(f"{loop.name}: {', '.join(f'{name} {text}' for name, text in margins.items())}")
     for note in axis.notes:
         print(note)
     for line in refused:
@@ -298,3 +309,21 @@ def _print(done: Run, refused: list[str], rule: float | None) -> None:
     if not refused:
         print("the drive keeps the new gains over a power cycle" if result.kept else "the drive has the new gains "
               "until it is switched off")  # fmt: skip
+
+
+def _answer(done: Run) -> str:
+    """Return which trial the agent stays with, and why where another one measured better; "" if it is none of them."""
+    from agents.tuner import best_unstopped
+
+    after = tuple(done.result.axes[0].after)
+    own = next((trial for trial in done.trials if tuple(trial.gains[0]) == after), None)
+    if own is None:
+        return ""
+    which = f"trial {own.number}" if own.number else "the fitted rule's gains"
+    best = best_unstopped(done.trials, 0)
+    if best is None or best.measured[0] >= own.measured[0]:
+        return f"the agent stays with {which}, the best"
+    return (
+        f"the agent stays with {which}: it judges each by all of them, and doubts that J {best.measured[0]:.3f} of "
+        f"trial {best.number} would hold"
+    )

@@ -39,7 +39,7 @@ def open_bus(interface: str | None = None, channel: str | None = None, **options
     """
     channel = channel or os.environ.get(CHANNEL_VARIABLE)
     interface = interface or os.environ.get(INTERFACE_VARIABLE)
-    if channel is None:
+    if not channel:
         raise OpenError(
             "no CAN channel is given; give interface and channel (--interface socketcan --channel can0, or --channel "
             f"socket://127.0.0.1:PORT of `drive-env serve`), or set {INTERFACE_VARIABLE} and {CHANNEL_VARIABLE}"
