@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,11 +11,13 @@ from test_auto import gains, standing_in
 
 from drive_env import motion
 from drive_env.gains import Gains, write_gains
+from drive_env.master.pace import Timing
 from tuning import auto_search
-from tuning.auto import auto
+from tuning.auto import auto, tell_of_lateness
 from tuning.auto_certificate import certificate
 from tuning.auto_moves import _keep_what_is_better
 from tuning.auto_result import AxisRun
+from tuning.auto_run import Run as AutoRun
 from tuning.auto_search import calm_gains
 from tuning.auto_trials import faster
 from tuning.identification import Estimate, Identification, refused
@@ -200,3 +203,44 @@ def test_an_axis_that_still_turns_is_stopped_before_gains_are_judged_on_it():
     assert proof.reason == ("", "")
     assert proof.ripple[0] == pytest.approx(proof.ripple[1], abs=0.02)
     assert proof.overshoot[0] == pytest.approx(proof.overshoot[1], abs=0.05)
+
+
+RINGING = (11883, 382, 1437, 1007, 1370)  # of a belt: good while it moves, and a limit cycle within an encoder count
+
+
+def test_an_axis_that_shakes_at_rest_does_not_pass_and_one_that_is_still_does():
+    with emulated(load="belt", num_machines=2, num_threads=1) as target:
+        plant = Plant.from_machine(target.drives)
+        calm = np.array(propose("margin_60", target.device, target.motor, plant).gains)
+        room = (target.low, target.high)
+        ground = ProvingGround(target, [plant] * 2, room, np.stack([calm] * 2), np.stack([calm] * 2))
+        shown = ground.show(np.stack([np.array(RINGING), calm]), np.ones(2, bool))
+    assert re.match(
+        r"it shook at rest: its current swung by \d+ % of the rated one \(RMS\), and 5 % are", shown.reason[0]
+    )
+    assert shown.reason[1] == ""
+
+
+def test_gains_that_shake_at_rest_are_slowed_until_they_do_not(monkeypatch, tmp_path):
+    finds(monkeypatch, np.array(RINGING))
+    with emulated(load="belt", num_threads=1) as target:
+        result = auto(target, tmp_path / "before.toml", experiments=standing_in)
+        (axis,) = result.axes
+        assert axis.accepted and any("it shook at rest" in note for note in axis.notes), axis
+        drives = target.drives
+        motion.enable(drives, mode="pp")
+        drives.advance(0.2)
+        swing = drives.record([0x6077], 0.1)[0x6077].std() * 1e-3
+    assert swing < 0.05 * target.motor.rated_current
+
+
+@pytest.mark.parametrize(("late", "told"), [(0, False), (7, True)])
+def test_syncs_that_were_late_are_told(late, told):
+    """A busy computer tears holes into set-points and samples: whoever reads a certificate of such a run must know."""
+    axis = AxisRun(Gains(1, 1, 1, 1, 1), Gains(1, 1, 1, 1, 1))
+    drives = SimpleNamespace(time_waits=False, total_timing=Timing(9000, late, 0.0031))
+    run = SimpleNamespace(target=SimpleNamespace(drives=drives, num_axes=1), axes=[axis], note=None)
+    run.note = lambda where, text: AutoRun.note(run, where, text)
+    tell_of_lateness(run)
+    wanted = "7 of 9000 SYNCs were more than a cycle late, the worst by 3.1 ms: this computer is busy"
+    assert [note.startswith(wanted) for note in axis.notes] == [True] * told

@@ -115,12 +115,28 @@ def prove_found(
         measure(run)
         say("comparing with the gains before", 0.95)
         look_back(run)
+        tell_of_lateness(run)
         say("writing", 0.96)
         accepted = write(run, transaction)
         kept = keep and bool(accepted.any()) and transaction.store(accepted)
         transaction.commit(accepted)
     say("done", 1.0)
     return run.result(transaction.path, kept)
+
+
+def tell_of_lateness(run: Run) -> None:
+    """Say of a bus in real time whether its SYNCs were late: moves and responses are distorted by that."""
+    drives = run.target.drives
+    if getattr(drives, "time_waits", True):
+        return
+    timing = drives.total_timing
+    if timing.late:
+        run.note(
+            np.ones(run.target.num_axes, bool),
+            f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {1e3 * timing.worst:.1f} "
+            "ms: this computer is busy, and moves and responses are distorted by that; end other programs, or put "
+            "`chrt -f 10` before the command (Linux)",
+        )
 
 
 def tune(target: Target, rng: np.random.Generator) -> Outcome:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 Mask = NDArray[np.bool_]
 
-SHOWINGS, AT_THE_EDGE = 3, 0.6  # moves for the record until one passes, and the factor of the gains between them
+SHOWINGS, AT_THE_EDGE = 4, 0.8  # moves for the record until one passes, and the factor of the gains between them
 
 
 def show(run: Run, where: Mask | None = None) -> None:

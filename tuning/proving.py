@@ -56,6 +56,9 @@ OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
 ENABLING = 5.0  # s, the longest wait for an axis that is switched on: some align their encoder first
 TARGET_VELOCITY = 0x60FF
 SHORTEST = 16.0  # counts of the encoder: a move that is shorter proves nothing
+# After a move for the record: the time at rest, of which the second half is looked at, and what its current may swing
+# (RMS about its mean, over the rated one). Loops at their edge shake on, or begin to, once the move is over.
+REST, RESTLESS = 0.2, 0.05
 
 
 class Proof(NamedTuple):
@@ -225,12 +228,18 @@ class ProvingGround:
             if new.any():
                 write_gains(drives, self.safe, new)
                 stopped |= new
+        swing = drives.record([CURRENT], REST)[CURRENT][round(REST / CYCLE) // 2 :].std(axis=0) * 1e-3 / rated
         position, demanded, current = (np.concatenate([part[name] for part in traces]) for name in objects[:3])
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
         way = np.sign(self._direction * self.move.distance)
         error = wrapped(position - away) * way
         size = np.maximum(np.abs(self.move.distance), 1)
-        reason = self._reasons(stopped[None], np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size)
+        reason = tuple(
+            why or _restless(float(swing[axis])) if where[axis] else why
+            for axis, why in enumerate(
+                self._reasons(stopped[None], np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size)
+            )
+        )
         settling, noise, overshoot = move_terms(
             position.astype(float), current * 1e-3, self.move, self._t_0, rated, away, way
         )
@@ -378,6 +387,16 @@ class ProvingGround:
                 reason = ""
             reasons.append(reason)
         return tuple(reasons)
+
+
+def _restless(swing: float) -> str:
+    """Return why an axis does not pass that is to stand still, "" if it does."""
+    if swing <= RESTLESS:
+        return ""
+    return (
+        f"it shook at rest: its current swung by {100.0 * swing:.0f} % of the rated one (RMS), and "
+        f"{100.0 * RESTLESS:.0f} % are allowed"
+    )
 
 
 def _merged(proofs: Sequence[tuple[Mask, Proof]]) -> Proof:
