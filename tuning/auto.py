@@ -130,11 +130,12 @@ def tell_of_lateness(run: Run) -> None:
     if getattr(drives, "time_waits", True):
         return
     timing = drives.total_timing
+    worst = 1e3 * timing.worst
     if timing.late:
         run.note(
             np.ones(run.target.num_axes, bool),
-            f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {1e3 * timing.worst:.1f} "
-            "ms: this computer is busy, and moves and responses are distorted by that; end other programs, or put "
+            f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {worst:.1f} ms: "
+            "this computer is busy, and moves and responses are distorted by that; end other programs, or put "
             "`chrt -f 10` before the command (Linux)",
         )
 
