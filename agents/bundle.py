@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
@@ -22,6 +23,9 @@ from numpy.typing import NDArray
 FORMAT, FORMAT_VERSION = "drive-agent", 1
 MAX_BYTES = 1_000_000  # of a file: what ships in the package and is read by a small computer
 ABOUT = "about"  # the array with the JSON, as bytes
+AN_AGENT = "the .npz that drive-agent train writes, or the name of an agent that ships"
+# What NumPy, zip and JSON raise at a file that is another one: what they advise (allow_pickle) helps nobody here.
+NOT_OURS = (OSError, EOFError, KeyError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
 
 
 class BundleError(ValueError):
@@ -103,16 +107,20 @@ class Bundle:
             about = json.loads(bytes(arrays.pop(ABOUT)).decode())
         except FileNotFoundError:
             raise BundleError(f"there is no file {path}") from None
-        except (OSError, EOFError, KeyError, ValueError, AttributeError, zipfile.BadZipFile) as error:
-            raise BundleError(f"{path} is no agent of drive-agent: {error}") from None
+        except (IsADirectoryError, PermissionError) as error:
+            raise BundleError(f"cannot read {path}: {error.strerror}; give {AN_AGENT}") from None
+        except NOT_OURS:
+            raise BundleError(f"{path} is no agent; give {AN_AGENT}") from None
         if not isinstance(about, dict) or about.get("format") != FORMAT:
-            raise BundleError(f"{path} is no agent of drive-agent")
-        if about["format_version"] != FORMAT_VERSION:
+            raise BundleError(f"{path} is no agent; give {AN_AGENT}")
+        if about.get("format_version") != FORMAT_VERSION:
             raise BundleError(
-                f"{path} has format {about['format_version']} and this drive-env reads {FORMAT_VERSION}; "
+                f"{path} has format {about.get('format_version')} and this drive-env reads {FORMAT_VERSION}; "
                 "use the drive-env that wrote it, or train again"
             )
         names = ("kind", "settings", "environment", "configuration", "card", "versions")
+        if not all(name in about for name in names):
+            raise BundleError(f"{path} is no agent; give {AN_AGENT}")
         bundle = cls(arrays=arrays, **{name: about[name] for name in names})
         if bundle.hash != about.get("hash"):
             raise BundleError(f"{path} was changed after it was written: its hash is {bundle.hash[:12]}…; get it anew")

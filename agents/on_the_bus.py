@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from agents.guard import GuardLimits
 from agents.tasks import environment_name, make_lanes
+
+if TYPE_CHECKING:
+    from tuning.target import Target
 
 POSITION_SCALER = 0x2058  # increments of a revolution
 # Of the task's amplitude and speed: what a policy may do beyond them before the envelope stops it.
@@ -17,7 +20,14 @@ POSITION_SLACK, SPEED_SLACK = 1.5, 2.0
 
 
 @contextmanager
-def drives_for(
+def drives_for(environment: str, configuration: Mapping[str, Any], guard: GuardLimits, **options: Any) -> Iterator[Any]:
+    """Open drives on a bus for a policy, as `target_for` does, and give them alone."""
+    with target_for(environment, configuration, guard, **options) as target:
+        yield target.drives
+
+
+@contextmanager
+def target_for(
     environment: str,
     configuration: Mapping[str, Any],
     guard: GuardLimits,
@@ -28,8 +38,10 @@ def drives_for(
     nodes: Sequence[int] = (1,),
     lockstep: bool = False,
     **options: Any,
-) -> Iterator[Any]:
+) -> Iterator[Target]:
     """Open drives on a bus for a policy; they are at rest and disabled afterwards.
+
+    Of the target nothing counts but the drives and how they are opened again: not motor, supply and travel.
 
     The envelope's limits are the task's: about the place where the axes stand now, half as far again as the amplitude,
     and twice the speed; the drive's own limits hold besides. Its watch for stalls is the guard's.
@@ -39,9 +51,11 @@ def drives_for(
     """
     from drive_env.can_drives import CanDrives
     from drive_env.master.bounds import Limits
+    from tuning.target import FREE, LOCKSTEP_PATIENCE, on_bus
 
-    pace: Any = "lockstep" if lockstep else "real-time"
-    more = {"device": device, "interface": interface, "channel": channel, "nodes": nodes, "pace": pace, **options}
+    more: dict[str, Any] = {"device": device, "interface": interface, "channel": channel, "nodes": nodes}
+    more |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE} if lockstep else {"pace": "real-time"}
+    more |= options
     warm_up(environment, configuration)
     position, velocity = None, None
     if environment_name(environment) == "ServoDrive/Tracking-v0":
@@ -56,8 +70,8 @@ def drives_for(
     # A trial of gains may oscillate: it sees that and stops the lane by itself.
     oscillation = environment_name(environment) != "ServoDrive/GainTuning-v0"
     limits = Limits(position=position, velocity=velocity, oscillation=oscillation, stall=guard.stall)
-    with CanDrives(safety=limits, **more) as drives:
-        yield drives
+    with on_bus(travel=FREE, safety=limits, **more) as target:
+        yield target
 
 
 def warm_up(environment: str, configuration: Mapping[str, Any]) -> None:

@@ -97,6 +97,46 @@ def test_a_file_that_is_none_is_told(tmp_path, content, message):
         Bundle.load(path)
 
 
+def another_npz(path):
+    np.savez(path, weights=np.zeros(3))
+
+
+def another_about(path):
+    np.savez(path, about=np.frombuffer(b'{"format": "drive-agent", "format_version": 1}', np.uint8))
+
+
+def array(path):
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+def picture(path):
+    path.write_bytes(b"\x89PNG\r\n\x1a\n")
+
+
+@pytest.mark.parametrize("write", [another_npz, array, picture])
+def test_a_file_of_another_program_is_told_without_numpys_advice(tmp_path, write):
+    path = tmp_path / "other.npz"
+    write(path)
+    with pytest.raises(BundleError) as error:
+        Bundle.load(path)
+    assert str(error.value) == (
+        f"{path} is no agent; give the .npz that drive-agent train writes, or the name of an agent that ships"
+    )
+
+
+def test_what_cannot_be_read_is_told(tmp_path):
+    path = tmp_path / "folder.npz"
+    path.mkdir()
+    with pytest.raises(
+        BundleError, match=r"cannot read .*folder\.npz: .*; give the \.npz that drive-agent train writes"
+    ):
+        Bundle.load(path)
+    with pytest.raises(BundleError, match=r"half\.npz is no agent; give"):
+        another_about(tmp_path / "half.npz")
+        Bundle.load(tmp_path / "half.npz")
+
+
 def test_pickles_are_not_opened(tmp_path):
     path = tmp_path / "agent.npz"
     np.savez(path, **{ABOUT: np.array([{"format": "drive-agent"}], object)})

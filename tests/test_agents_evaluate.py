@@ -64,8 +64,9 @@ def run(*arguments):
 
 
 @pytest.fixture
-def served():
-    """A node on a hub, in lockstep."""
+def served(tmp_path, monkeypatch):
+    """A node on a hub, in lockstep, and a folder of its own for what a command leaves."""
+    monkeypatch.chdir(tmp_path)
     world = World(lockstep=True)
     emulated = EmulatedDrives(load="two_mass", num_threads=1)
     world.add(emulated, [1])

@@ -84,11 +84,11 @@ def test_auto_leaves_the_way_back_a_certificate_and_a_report(tmp_path, monkeypat
     assert load_snapshot(out / "before.toml").axes[0][0x2042, 1] == axis["before"]["velocity_p"]
 
 
-def test_auto_ends_with_1_and_says_why_where_it_rolled_back(tmp_path, monkeypatch):
+def test_auto_ends_with_1_and_says_why_where_it_changed_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(auto_settings, "LEAST_WAY", 1e9)
     done = drive_tune("auto", "--load", "belt", "--out", tmp_path / "run")
     assert done.exit_code == 1
-    assert "axis 0 was rolled back: the travel is too short" in " ".join(done.stdout.split())
+    assert "axis 0 was left as it was: the travel is too short" in " ".join(done.stdout.split())
 
 
 def test_rules_write_one_of_them_and_leave_the_way_back(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import socket
 import subprocess
 import sys
 import threading
@@ -14,13 +15,14 @@ import can
 import pytest
 from typer.testing import CliRunner
 
-from drive_env import EmulatedDrives
+from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.cli import PANELS, app
+from drive_env.master.errors import BusError
 
-DONE, REFUSED, USER_ERROR = 0, 1, 2
+DONE, REFUSED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +95,7 @@ def test_get_raw_several_nodes_texts_and_json(run):
         (["get", "Statuswort"], USER_ERROR, "did you mean 'Statusword'"),
         (["get", "1234"], USER_ERROR, "object 1234h does not exist"),
         (["get", "6041", "-n", "9", "--timeout", "0.05"], REFUSED, "node 9 did not answer"),
+        (["get", "6041", "-n", "9", "--timeout", "0.05"], REFUSED, "a slow object takes a longer --timeout"),
         (["get", "6041", "-n", "200"], USER_ERROR, "nodes are different numbers of 1 to 127"),
         (["get", "6041", "--device", "nonsense"], USER_ERROR, "no device is named 'nonsense'"),
         (["get", "6041", "--eds", "missing.eds"], USER_ERROR, "there is no EDS at missing.eds"),
@@ -109,6 +112,7 @@ def test_get_raw_several_nodes_texts_and_json(run):
         (["get", "6041", "--timeout", "0"], USER_ERROR, "a time-out of 0 s cannot be"),
         (["get", "6041", "-i", "slcan", "-c", "socket://127.0.0.1:1", "--bitrate", "3"], USER_ERROR, "none of slcan's"),
         (["scan", "--timeout", "nan"], USER_ERROR, "--timeout nan s must be above 0 s"),
+        (["jog", "10 rpm", "--max-current", "-5"], USER_ERROR, "--max-current -5 must be above 0 A; leave it out for"),
         (["jog", "10 rpm", "--for", "-1"], USER_ERROR, "must be at least 0.001 s"),
         (["jog", "1e9 rpm"], USER_ERROR, "60FFh:00 Target velocity cannot be"),
         (["jog", "10 rpm", "--by", "1e9 rev"], USER_ERROR, "607Ah:00 Target position cannot be"),
@@ -154,6 +158,37 @@ def test_a_dry_run_shows_the_frames_and_changes_nothing(run, shared):
     assert code == DONE
     assert "601   [8]  23 81 60 00 34 12 00 00" in out
     assert shared[1][0].read(0x6081) == [2_184_533]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name", "remedy"),
+    [
+        (["backup", "was.toml"], "was.toml", "choose another file"),
+        (["log", "was.asc", "--duration", "0.1"], "was.asc", "choose another file"),
+        (["scope", "--duration", "0.01", "--out", "was"], "was.csv", "choose another --out"),
+        (["scope", "--duration", "0.01", "--out", "was"], "was.png", "choose another --out"),
+        (["render", "--load", "inertia", "--out", "was.gif"], "was.gif", "choose another --out"),
+        (["compare", "log.csv", "--fit", "load.inertia", "--out", "was.toml"], "was.toml", "choose another --out"),
+    ],
+)
+def test_no_command_replaces_a_file(run, tmp_path, monkeypatch, arguments, name, remedy):
+    """A second backup after a change would replace the only copy of what the drive had."""
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / name
+    file.write_text("the only copy", encoding="utf-8")
+    code, _, error = run(*arguments)
+    assert (code, error) == (USER_ERROR, f"drive-env: {name} is there already, and would be replaced; {remedy}\n")
+    assert file.read_text(encoding="utf-8") == "the only copy"
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_picture_is_no_log_to_compare_with(run, tmp_path):
+    path = tmp_path / "scope.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n")
+    code, _, error = run("compare", path)
+    assert (code, error) == (
+        USER_ERROR, f"drive-env: {path} is no text; give the CSV that drive-env scope writes\n",
+    )  # fmt: skip
 
 
 # --- parameters ---------------------------------------------------------------------------------------------------
@@ -316,6 +351,64 @@ def test_scope_waits_for_its_trigger(run, shared, tmp_path):
     assert len(rows) == 30
     assert [row[1] for row in rows if float(row[0]) < 0.0] == [rows[0][1]] * 10
     assert {row[1] for row in rows if float(row[0]) >= 0.0} == {"77"}
+
+
+def breaks_off(monkeypatch, error, after):
+    """Have the recording of a scope break off after so many pieces."""
+    record = CanDrives.record
+    calls = iter(range(after))
+
+    def broken(self, *arguments):
+        if next(calls, None) is None:
+            raise error
+        return record(self, *arguments)
+
+    monkeypatch.setattr(CanDrives, "record", broken)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "says"),
+    [(KeyboardInterrupt(), INTERRUPTED, "interrupted"), (BusError("the bus is gone"), REFUSED, "the bus is gone")],
+)
+def test_scope_keeps_what_came_before_it_was_broken_off(run, tmp_path, monkeypatch, error, code, says):
+    breaks_off(monkeypatch, error, 2)
+    out = tmp_path / "trace"
+    got, text, told = run("scope", "6064", "--duration", 10, "--out", out, "--json")
+    files = f"{out}.csv and {out}.png"
+    assert (got, told) == (code, f"drive-env: {says}; the 500 samples that came until then are in {files}\n")
+    assert [json.loads(text)[key] for key in ("samples", "complete")] == [500, False]
+    rows = list(csv.reader(out.with_suffix(".csv").open()))
+    assert len(rows) == 1 + 500 and rows[-1][0] == "0.499"
+    assert out.with_suffix(".png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_scope_writes_nothing_where_nothing_came(run, tmp_path, monkeypatch):
+    breaks_off(monkeypatch, KeyboardInterrupt(), 0)
+    assert run("scope", "--out", tmp_path / "trace") == (INTERRUPTED, "", "drive-env: interrupted\n")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("ending", ["asc", "log"])
+def test_a_log_of_a_bus_that_is_lost_keeps_what_came(run, tmp_path, ending):
+    """The emulator, or the adapter, ends while its frames are logged."""
+    listening = socket.create_server(("127.0.0.1", 0))
+    file = tmp_path / f"dead.{ending}"
+
+    def serve_three_frames():
+        connection, _ = listening.accept()
+        with connection:
+            connection.sendall(b"t701105\r" * 3)
+
+    server = threading.Thread(target=serve_three_frames)
+    server.start()
+    code, out, error = run("log", file, "-i", "slcan", "-c", f"socket://127.0.0.1:{listening.getsockname()[1]}")
+    server.join()
+    listening.close()
+    assert (code, out, error.count("\n")) == (REFUSED, "", 1)
+    assert error.startswith("drive-env: the bus was lost: ")
+    assert error.endswith(f"; the 3 frames that came until then are in {file}\n")
+    with can.LogReader(str(file)) as frames:
+        assert [frame.arbitration_id for frame in frames] == [0x701] * 3
 
 
 @pytest.mark.parametrize("ending", ["log", "blf"])

@@ -8,12 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_parity import served
+from typer.testing import CliRunner
 
-from drive_env import motion
+from drive_env import EmulatedDrives, motion
+from drive_env.bus.hub import Hub
+from drive_env.bus.server import Server
+from drive_env.bus.world import World
 from drive_env.envs.gain_trial import Trials, measured_cost, softness
 from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
 from drive_env.motors import find_motor
+from tuning import optimise as optimise_module
 from tuning import trial_bench
+from tuning.cli import app
 from tuning.meter import KINDS, MeteredDrives
 from tuning.optimise import SAFE_STEP, Settings, objective_values, optimise, pareto
 from tuning.suite import load_suite, open_group
@@ -435,6 +441,98 @@ def test_a_stop_by_the_envelope_is_an_abort():
         assert tried.aborted.tolist() == [True] and tried.cost[0] == math.log(30.0)
         np.testing.assert_array_equal(read_gains(target), bench.rule)
         assert not bench.run(bench.rule).aborted.any()
+
+
+# --- the command --------------------------------------------------------------------------------------------------
+def drive_tune(*arguments):
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done.exit_code, done.stderr.strip()  # of the progress bar an empty line is left
+
+
+@pytest.fixture
+def node(tmp_path, monkeypatch):
+    """An emulated drive on a hub, and the arguments that search on it."""
+    monkeypatch.chdir(tmp_path)
+    world = World(lockstep=True)
+    machine = EmulatedDrives(load="inertia", num_threads=1)
+    machine.advance(0.001)  # compiles: a node that does would not answer in time
+    world.add(machine, [1])
+    hub = Hub()
+    bus = ("--bus", "--interface", "slcan", "--channel", hub.channel, "--lockstep")
+    with Server(world, hub):
+        yield machine, ("optimise", *bus, "--travel", "-5:5", "--yes", "--trials", 4, "--out", "obus")
+    world.close()
+
+
+def is_interrupted(monkeypatch):
+    """Press Ctrl-C while the drives have gains that are tried."""
+
+    def pressed(target, settings, progress):
+        write_gains(target.drives, WILD[None])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(optimise_module, "optimise", pressed)
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ((), "the trials made are lost: on a bus they are kept only with --journal FILE"),
+        (("--journal", "kept.log"), "the trials made are in kept.log: the same command goes on from there"),
+    ],
+)
+def test_ctrl_c_on_a_bus_says_what_the_drives_have_and_what_is_kept(node, monkeypatch, more, says):
+    machine, arguments = node
+    before = [int(machine.read(key)[0]) for key in GAIN_OBJECTS]
+    is_interrupted(monkeypatch)
+    code, error = drive_tune(*arguments, *more)
+    assert code == 130
+    assert error.splitlines() == [
+        "drive-tune: the drives have what they had before; if ever not, drive-tune restore obus-before.toml brings it "
+        "back",
+        f"drive-tune: interrupted; {says}",
+    ]
+    assert [int(machine.read(key)[0]) for key in GAIN_OBJECTS] == before
+
+
+def test_the_way_back_of_an_earlier_search_is_not_replaced(node, monkeypatch, tmp_path):
+    """It is the only one, if that search was killed."""
+    _, arguments = node
+    is_interrupted(monkeypatch)
+    (tmp_path / "obus-before.toml").write_text("the only copy", encoding="utf-8")
+    _, error = drive_tune(*arguments)
+    assert "drive-tune restore obus-before-2.toml brings it back" in error
+    assert (tmp_path / "obus-before.toml").read_text(encoding="utf-8") == "the only copy"
+
+
+def test_what_there_is_not_is_not_resumed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    search = ("optimise", "--load", "inertia", "--trials", 2, "--lanes", 1, "--sampler", "random", "--out", "run")
+    assert drive_tune(*search, "--resume") == (
+        2, "drive-tune: there is no search to resume: run.unfinished does not exist; correct --out, or leave --resume "
+        "out to begin a new one",
+    )  # fmt: skip
+    assert not list(tmp_path.iterdir())
+    code, error = drive_tune(*search)
+    assert code == 0, error
+    assert drive_tune(*search, "--resume") == (
+        2, "drive-tune: the search of run is finished: nothing is left to resume, its results are there",
+    )  # fmt: skip
+
+
+def test_what_an_emulated_search_keeps_in_its_journal_is_told(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def pressed(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tuning.searches.run", pressed)
+    search = ("optimise", "--load", "inertia", "--out", "run")
+    assert drive_tune(*search) == (130, "drive-tune: interrupted; nothing was written")
+    assert drive_tune(*search, "--journal", "kept.log") == (
+        130, "drive-tune: interrupted; the trials made are in kept.log: the same command goes on from there",
+    )  # fmt: skip
 
 
 # --- mistakes -----------------------------------------------------------------------------------------------------

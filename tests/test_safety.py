@@ -18,6 +18,8 @@ from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
+from drive_env.master.errors import BusError
+from drive_env.master.lifeline import Lifeline
 
 QUICK_STOP = bytes.fromhex("2B 40 60 00 02 00 00 00")
 DISABLE = bytes.fromhex("2B 40 60 00 00 00 00 00")
@@ -347,6 +349,46 @@ def test_waiting_and_recording_is_no_stall(bus):
         drives.advance(0.8)
         drives.record([0x6041], 0.8)
         assert 2 not in sent_controlwords(bus)
+
+
+class LostBus:
+    """A port that takes what it is told to; `tried` counts what was sent."""
+
+    def __init__(self):
+        self.error, self.tried = "the bus did not take frame 77Fh", 0
+
+    def send(self, *frame, **how):
+        self.tried += 1
+        if self.error:
+            raise BusError(self.error)
+
+
+class Watched:
+    kind = "heartbeat"
+
+
+def test_a_bus_that_is_lost_is_told_once_until_a_heartbeat_gets_out_again(caplog):
+    bus = LostBus()
+    lifeline = Lifeline(bus, [Watched()], [1], timeout=0.03, stall=None, stop=lambda: None)
+
+    def told_after_more_beats():
+        tried = bus.tried
+        until(lambda: bus.tried > tried + 3)
+        return [record.message for record in caplog.records]
+
+    error, bus.error = bus.error, ""
+    lifeline.start()
+    bus.error = error
+    try:
+        assert told_after_more_beats() == [error]
+        bus.error = "the adapter is gone"
+        assert told_after_more_beats() == [error, "the adapter is gone"]
+        bus.error = ""
+        told_after_more_beats()
+        bus.error = "the adapter is gone"
+        assert told_after_more_beats() == [error, "the adapter is gone", "the adapter is gone"]
+    finally:
+        lifeline.close()
 
 
 def until(condition, patience=30.0):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import re
 import uuid
 from contextlib import contextmanager
+from pathlib import Path
 
 import can
 import numpy as np
@@ -16,8 +19,18 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.gains import GAIN_OBJECTS, write_gains
 from drive_env.master.errors import BusError
+from drive_env.safety import SafetyError
 from tuning.cli import app
-from tuning.snapshot import SnapshotError, Transaction, load_snapshot, restore, take
+from tuning.snapshot import (
+    SnapshotError,
+    Transaction,
+    check_place,
+    file_before,
+    load_snapshot,
+    put_back,
+    restore,
+    take,
+)
 from tuning.target import FREE, emulated, on_bus
 
 CURRENT_LIMIT, PROFILE_VELOCITY = (0x2003, 0), (0x6081, 0)
@@ -107,6 +120,36 @@ def test_emulated_drives_have_nothing_that_outlives_them(target, tmp_path):
     assert not load_snapshot(transaction.path).stored
 
 
+def test_an_axis_that_somebody_else_runs_and_nothing_has_changed_is_left_running(target, tmp_path):
+    motion.enable(target.drives, mode="pv", where=np.array([True, True, False]))
+    with pytest.raises(RuntimeError, match="axis 0 is enabled"), Transaction(target, tmp_path / "before.toml"):
+        target.drives.write(CURRENT_LIMIT, 1234, where=np.array([False, True, False]))
+        raise RuntimeError("axis 0 is enabled: disable it")
+    mask, enabled = motion.OPERATION_ENABLED
+    assert (target.drives.read(0x6041) & mask == enabled).tolist() == [True, False, False]
+    assert target.drives.read(CURRENT_LIMIT).tolist() == [7000, 7000, 7000]
+
+
+def test_what_ends_with_an_error_is_put_back_and_says_where_the_file_is(target, tmp_path, capsys):
+    before = take(target)
+    file = tmp_path / "before.toml"
+    with pytest.raises(ValueError, match="no"), put_back(target, file, "drive-tune"):
+        change(target.drives)
+        raise ValueError("no")
+    assert take(target) == before == load_snapshot(file)
+    said = f"the drives have what they had before; if ever not, drive-tune restore {file} brings it back"
+    assert capsys.readouterr().err == f"drive-tune: {said}\n"
+
+
+def test_an_error_after_a_commit_says_that_the_drives_are_others(target, tmp_path, capsys):
+    file = tmp_path / "before.toml"
+    with pytest.raises(ValueError, match="no"), put_back(target, file, "drive-tune") as transaction:
+        change(target.drives)
+        transaction.commit()
+        raise ValueError("no")
+    assert capsys.readouterr().err == f"drive-tune: drive-tune restore {file} brings back what was\n"
+
+
 # --- the file -----------------------------------------------------------------------------------------------------
 def test_a_snapshot_reads_back_equal_and_says_what_its_numbers_are(target, tmp_path):
     before = take(target)
@@ -139,6 +182,37 @@ def test_a_file_that_is_no_snapshot_is_refused(tmp_path, text, message):
     (tmp_path / "x.toml").write_text(text, encoding="utf-8")
     with pytest.raises(SnapshotError, match=message):
         load_snapshot(tmp_path / "x.toml")
+
+
+def test_a_file_that_cannot_be_written_is_one_line_and_nothing_is_left(target, tmp_path, monkeypatch):
+    monkeypatch.setattr(Path, "replace", lambda self, other: (_ for _ in ()).throw(OSError(28, "No space left")))
+    before = take(target)
+    with (
+        pytest.raises(OSError, match=r"the state before cannot be written to .*: No space left; choose another place"),
+        Transaction(target, tmp_path / "before.toml"),
+    ):
+        change(target.drives)
+    assert take(target) == before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_of_others_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    with pytest.raises(OSError, match=r"cannot be written to .*found-before\.toml: .* is not yours to write"):
+        file_before("identify", tmp_path / "found")
+
+
+def test_a_file_that_is_there_is_never_replaced(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first = file_before("identify", tmp_path / "found")
+    first.write_text("left by a run that was killed", encoding="utf-8")
+    assert [first.name, file_before("identify", tmp_path / "found").name] == [
+        "found-before.toml", "found-before-2.toml",
+    ]  # fmt: skip
+    with pytest.raises(OSError, match="is there already, and may hold the state before an earlier run"):
+        check_place(first)
+    assert re.fullmatch(r"runs/\d{8}-\d{6}-identify-before\.toml", file_before("identify").as_posix())
+    assert list(tmp_path.iterdir()) == [first]
 
 
 # --- over the bus -------------------------------------------------------------------------------------------------
@@ -188,6 +262,34 @@ def test_one_command_brings_back_what_a_program_left_behind_that_was_killed(tmp_
         assert [int(machine.read(CURRENT_LIMIT)[0]) for machine in machines] == [7000, 7000]
         again = drive_tune("restore", transaction.path, "--yes", "--json")
         assert again.stdout == '{"changed": [], "stored": false}\n'
+
+
+def test_what_turns_is_braked_before_it_is_put_back_also_after_a_stall(tmp_path, monkeypatch):
+    """An envelope refuses one call after a stall, to tell of it: that must not cost the way back."""
+    monkeypatch.setenv("DRIVE_ENV_TIMEOUT", "20")
+    with served() as (channel, machines), opened(channel) as target:
+        before = take(target)
+        with pytest.raises(ValueError, match="no"), Transaction(target, tmp_path / "before.toml") as transaction:
+            motion.enable(target.drives, mode="pv")
+            target.drives.write(0x60FF, 65536 * 10)
+            target.drives.advance(0.3)
+            speeds = []
+            truly = transaction.roll_back
+
+            def look(where=None):
+                speeds.append(np.abs([machine.read(0x606C)[0] for machine in machines]).max())
+                if len(speeds) == 1:
+                    raise SafetyError("the program made no call for 0.6 s")
+                truly(where)
+
+            monkeypatch.setattr(transaction, "roll_back", look)
+            assert all(machine.read(0x606C)[0] > 65536 for machine in machines)
+            raise ValueError("no")
+        assert len(speeds) == 2
+        assert max(speeds) < 16384  # what an encoder shows of rest: some counts a millisecond
+        after = take(target)
+    own = [{key: v for key, v in axis.items() if key[0] >= 0x2000} for axis in before.axes]
+    assert [{key: v for key, v in axis.items() if key[0] >= 0x2000} for axis in after.axes] == own
 
 
 def test_a_change_that_the_drives_keep_is_undone_for_good(tmp_path, monkeypatch):

@@ -12,8 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from tuning.compare import Comparison, MachineRow, TunerRow
+from tuning.comparison_picture import WORSE, draw
 from tuning.experiment import DEFAULT
 
 ROOT = Path(__file__).parent.parent
@@ -207,6 +211,35 @@ def test_an_interrupt_ends_with_code_130_and_writes_nothing(tmp_path):
     assert process.returncode == 130
     assert errors.strip() == "drive-tune: interrupted; nothing was written"
     assert [path.name for path in tmp_path.iterdir()] == ["long.toml"]
+
+
+def test_a_travel_that_is_too_short_is_told_in_turns_with_its_remedy(tmp_path):
+    done = drive_tune("auto", "--load", "inertia", "--travel=-0.01:0.01", "--out", "run", cwd=tmp_path)
+    assert done.returncode == 1
+    assert (
+        "axis 0 was left as it was: the travel is too short: 0.13 rad, and 0.2 are needed (0.02 and 0.032 turns); "
+        "allow more with --travel"
+    ) in done.stdout
+    assert "rolled back" not in done.stdout
+
+
+def test_the_picture_of_a_comparison_names_its_colour_and_has_every_median_at_its_tuner(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: figures.append(figure))
+    rows = [
+        MachineRow(tuner, f"machine {k}", J, J, 1.0, 2.0, 3, 0, 0, "", False, 1, 1, 1, 1, 1, "")
+        for tuner, relative in (("auto", (0.6, 0.68, 0.8)), ("modulus", (0.9, 1.0, 1.4)))
+        for k, J in enumerate(relative)
+    ]
+    medians = {"auto": 0.68, "modulus": 1.0}
+    tuners = [TunerRow(name, 3, median, 1.2, 0.0, 2.0, 3, 0, 0, 0) for name, median in medians.items()]
+    draw(Comparison(tuple(rows), tuple(tuners)), tmp_path / "comparison.png")
+    score, *_ = figures[0].axes
+    assert [label.get_text() for label in score.get_yticklabels()] == ["modulus, median 1.00", "auto, median 0.68"]
+    assert not score.texts  # which would stand beside the next panel
+    assert "orange: more than 5 % worse" in score.get_title()
+    red, green, blue = to_rgb(WORSE)
+    assert red > green > blue  # orange
 
 
 def test_a_foreign_package_in_the_way_is_named(tmp_path):

@@ -29,7 +29,11 @@ def begin(run: Run) -> None:
     """Refuse what has no way to go, and disable what is enabled: identification begins at rest."""
     drives, way = run.target.drives, run.target.high - run.target.low
     for axis in np.flatnonzero(way < LEAST_WAY):
-        run.axes[axis].reason = f"the travel is too short: {way[axis]:.2g} rad, and {LEAST_WAY:g} are needed"
+        turns, least = (0.5 * x / np.pi for x in (way[axis], LEAST_WAY))
+        run.axes[axis].reason = (
+            f"the travel is too short: {way[axis]:.2g} rad, and {LEAST_WAY:g} are needed ({turns:.2g} and {least:.2g} "
+            "turns); allow more with --travel"
+        )
     mask, value = motion.OPERATION_ENABLED
     on = drives.read(0x6041) & mask == value
     if on.any():

@@ -287,6 +287,8 @@ def is_unchanged(path: str | Path) -> bool:
 def _read(path: Path) -> dict[str, Any]:
     try:
         data = json.loads(_text(path), parse_constant=_no_constant)
+    except CertificateError:
+        raise
     except ValueError as error:
         raise CertificateError(f"{path} is no certificate: {error}; give a certificate.json of drive-tune") from None
     if not isinstance(data, dict) or HASH not in data or data.get("format") != FORMAT:

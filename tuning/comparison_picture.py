@@ -38,18 +38,15 @@ def draw(comparison: Comparison, path: Path) -> None:
         score.plot([tuner.median, tuner.p95], [place, place], color=MARK, linewidth=1.2)
         score.plot([tuner.median], [place], marker="|", color=MARK, markersize=15, markeredgewidth=2.2)
         score.plot([tuner.p95], [place], marker="|", color=MARK, markersize=8)
-        _figure(score, f"{tuner.median:.2f}", 1.01, place)
     score.set_xscale("log")
     ticks = FixedLocator([a * b for a in (0.001, 0.01, 0.1, 1.0, 10.0) for b in (1.0, 2.0, 5.0)])
     score.xaxis.set(major_locator=ticks, major_formatter=FuncFormatter(lambda value, _: f"{value:g}"))
     score.xaxis.set_minor_locator(NullLocator())
     score.axvline(1.0, color="0.5", linewidth=0.8, zorder=0)
-    score.set_yticks(range(len(tuners)), [tuner.tuner for tuner in tuners])
-    score.set_xlabel(
-        "hidden J over the fitted rule's, less is better\nlong mark: median (figure at the right), short: 95 %"
-    )
+    score.set_yticks(range(len(tuners)), [f"{tuner.tuner}, median {tuner.median:.2f}" for tuner in tuners])
+    score.set_xlabel("hidden J over the fitted rule's, less is better\nlong mark: median, short: 95 %")
     machines = tuners[0].machines if tuners else 0
-    score.set_title(f"{machines} machines; red: more than 5 % worse than the rule", fontsize=10)
+    score.set_title(f"{machines} machines; orange: more than 5 % worse than the rule", fontsize=10)
     _bars(time, [tuner.drive_seconds for tuner in tuners], "drive time of a machine [s]\nmedian")
     _bars(trouble, [float(tuner.violations) for tuner in tuners], "violations\nall machines", whole=True)
     for axes in (score, time, trouble):
@@ -67,7 +64,3 @@ def _bars(axes: Axes, values: list[float], label: str, *, whole: bool = False) -
         axes.text(value + 0.02 * top, place, f"{value:.0f}" if whole else f"{value:.3g}", va="center", fontsize=8)
     axes.set_xlim(0.0, 1.25 * top)
     axes.set_xlabel(label)
-
-
-def _figure(axes: Axes, text: str, x: float, y: float) -> None:
-    axes.text(x, y, text, transform=axes.get_yaxis_transform(), va="center", fontsize=8)

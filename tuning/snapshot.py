@@ -6,11 +6,13 @@ A `Transaction` writes the file before anything else happens, so that even a pro
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 import threading
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,6 +27,8 @@ from drive_env.gains import GAIN_OBJECTS
 from drive_env.master.description import Description, Key, describe
 from drive_env.master.errors import BusError
 from drive_env.master.parameters import Difference, read_parameters, write_all_or_none
+from drive_env.safety import SafetyError
+from tuning.provenance import run_folder
 from tuning.toml_tables import toml
 
 if TYPE_CHECKING:
@@ -60,12 +64,31 @@ class Snapshot:
     stored: bool = False
 
     def save(self, path: str | Path) -> Path:
-        """Write the snapshot as TOML and return its path; the file is complete or absent."""
+        """Write the snapshot as TOML and return its path; the file is complete or absent, also after a power cut.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
         where = Path(path)
-        where.parent.mkdir(parents=True, exist_ok=True)
         partial = where.with_name(f".{where.name}.partial")
-        partial.write_text(self._toml(where.name), encoding="utf-8", newline="\n")
-        partial.replace(where)
+        try:
+            where.parent.mkdir(parents=True, exist_ok=True)
+            with partial.open("w", encoding="utf-8", newline="\n") as file:
+                file.write(self._toml(where.name))
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(where)
+            if os.name == "posix":  # the new name, too
+                folder = os.open(where.parent, os.O_RDONLY)
+                with suppress(OSError):  # some file systems know no such thing
+                    os.fsync(folder)
+                os.close(folder)
+        except OSError as error:
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise OSError(
+                f"the state before cannot be written to {where}: {error.strerror}; choose another place"
+            ) from None
         return where
 
     def _toml(self, name: str) -> str:
@@ -157,25 +180,88 @@ def restore(
     single = _per_axis(drives)
     changed: list[list[Difference]] = [[] for _ in snapshot.axes]
     for axis in map(int, np.flatnonzero(axes)):
-        wanted = {key: v for key, v in snapshot.axes[axis].items() if whole or key[0] >= DEVICE_OBJECTS}
+        wanted = snapshot.axes[axis] if whole else _settings(snapshot.axes[axis])
         changed[axis] = write_all_or_none(single, wanted, axis)
     return changed
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Have Ctrl-C wait until the end of the block; who presses it twice shall not leave drives half brought back."""
+    """Have Ctrl-C, and what else ends a command, wait for the block's end: drives are not left half brought back."""
     if threading.current_thread() is not threading.main_thread():
         yield  # signals reach the main thread alone
         return
     pressed: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    ends = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in ends}
+    handled = {number: handler for number, handler in before.items() if callable(handler)}
+    for number in handled:
+        signal.signal(number, lambda number, frame: pressed.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in handled.items():
+            signal.signal(number, handler)
     if pressed:
         raise KeyboardInterrupt
+
+
+def file_before(kind: str, out: Path | None = None) -> Path:
+    """Return where the state before goes: beside the results in `out`, or in runs/; never a file that is there.
+
+    Args:
+        kind: What moves the drives, for the name.
+        out: Folder for its results, if any; or their file, less its ending.
+
+    Raises:
+        OSError: If nothing can be written there.
+    """
+    first = Path(f"{run_folder(kind)}-before.toml") if out is None else out.with_name(f"{out.name}-before.toml")
+    file, k = first, 2
+    while file.exists():  # the only way back, if it is from a run that was killed
+        file, k = first.with_name(f"{first.stem}-{k}.toml"), k + 1
+    check_place(file)
+    return file
+
+
+def check_place(file: Path) -> None:
+    """Raise OSError unless a new file can be written there: before a drive is asked for anything."""
+    if file.exists():
+        raise OSError(f"{file} is there already, and may hold the state before an earlier run; choose another file")
+    place = file.absolute().parent
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir():
+        raise OSError(f"the state before cannot be written to {file}: {place} is a file; choose another place")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise OSError(f"the state before cannot be written to {file}: {place} is not yours to write; choose another")
+
+
+@contextmanager
+def put_back(target: Target, file: Path, program: str) -> Iterator[Transaction]:
+    """Have the state of drives in a file while a block moves them, and bring it back at the end unless committed.
+
+    If the block fails, a line on stderr says where the file is.
+
+    Args:
+        target: The drives.
+        file: The file to leave.
+        program: Who speaks on stderr.
+    """
+    transaction = Transaction(target, file)
+    try:
+        with transaction:
+            yield transaction
+    except BaseException as error:
+        if file.exists() and str(file) not in str(error):  # no line for a file that could not be written
+            way = f"drive-tune restore {file} brings back what was" if transaction.changed else what_is_left(file)
+            print(f"{program}: {way}", file=sys.stderr)
+        raise
+
+
+def what_is_left(file: Path) -> str:
+    """Return what a run says that has put everything back."""
+    return f"the drives have what they had before; if ever not, drive-tune restore {file} brings it back"
 
 
 class Transaction:
@@ -195,6 +281,8 @@ class Transaction:
         self._committed = np.zeros(target.num_axes, bool)
 
     def __enter__(self) -> Transaction:
+        mask, enabled = motion.OPERATION_ENABLED
+        self._ran: Mask = self._target.drives.read(0x6041) & mask == enabled
         self.before = take(self._target)
         self.before.save(self.path)
         return self
@@ -205,11 +293,31 @@ class Transaction:
             return
         try:
             with undisturbed():
-                self.roll_back(left)
+                if error is not None and getattr(self._target.drives, "safety", None):
+                    # What still turns is braked as their own exit would: without voltage it would run on.
+                    self._target.drives.safety.stop(str(error) or type(error).__name__)
+                try:
+                    self.roll_back(left & ~self._untouched())
+                except SafetyError:  # after a stall the envelope refuses one call, to tell of it
+                    self.roll_back(left & ~self._untouched())
         except (BusError, ObjectAccessError, RuntimeError, TimeoutError) as failure:
             raise BusError(
                 f"{failure}; the drives may hold what was tried: drive-tune restore {self.path} brings back what was"
             ) from (error or failure)
+
+    def _untouched(self) -> Mask:
+        """Return the axes that somebody else runs and that were let alone, as they are in a run that refuses them."""
+        if not self._ran.any():
+            return self._ran
+        now = take(self._target)
+        same = [_settings(one) == _settings(other) for one, other in zip(now.axes, self.before.axes, strict=True)]
+        untouched: Mask = self._ran & same
+        return untouched
+
+    @property
+    def changed(self) -> bool:
+        """Whether any axis keeps what it has now."""
+        return bool(self._committed.any())
 
     def commit(self, where: Mask | None = None) -> None:
         """Keep what axes have now, all by default."""
@@ -252,6 +360,10 @@ def _switch_off(drives: Any, where: Mask) -> None:
 def store(drives: Any, where: Mask | None = None) -> None:
     """Have drives keep their parameters over a power cycle (1010h)."""
     drives.write(STORE, SAVE, where=where)
+
+
+def _settings(values: Mapping[Key, int]) -> dict[Key, int]:
+    return {key: value for key, value in values.items() if key[0] >= DEVICE_OBJECTS}
 
 
 def _per_axis(drives: Any) -> Any:

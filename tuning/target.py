@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 Travel = tuple[float, float]  # how far a rotor may turn from where it stands [rad], low <= 0 <= high
 
 POSITION_SCALER = (0x2058, 0)
+LOCKSTEP_PATIENCE = 5.0  # s, for an answer where time waits: a late one says that the computer is busy
 FREE: Travel = (-math.inf, math.inf)
 # Of the travel, how far the envelope lets an axis overshoot it, and the least and the most of that [rad].
 SLACK, SLACK_ENDS = 0.05, (0.02 * 2.0 * np.pi, 0.5 * 2.0 * np.pi)

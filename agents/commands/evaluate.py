@@ -103,8 +103,10 @@ def evaluate(
     """Run episodes of a policy: score with a 95 % interval, violations, pictures; on both sides the same command.
 
     On a bus it acts inside the safety envelope; a policy that gives no number, sticks at its limit, stalls or never
-    returns is stopped, and the drives are left at rest and disabled. `--out` keeps report.json, episodes.npz and
-    pictures. In real time other programs disturb: on Linux, `chrt -f 10 drive-agent evaluate ...` goes before them.
+    returns is stopped, and the drives are left at rest and disabled. Their parameters are in a file for
+    `drive-tune restore` meanwhile, beside --out or in runs/, and back at the end. `--out` keeps report.json,
+    episodes.npz and pictures. In real time other programs disturb: on Linux, `chrt -f 10 drive-agent evaluate ...` goes
+    before them.
     """
     with errors_as_exit_codes():
         for name, value in (("--episodes", episodes), ("--gap", gap), ("--seed", seed + 1)):
@@ -134,18 +136,26 @@ def evaluate(
             return
         count = episodes or (BUS_EPISODES if on_bus else EPISODES)
         options = {"episodes": count, "seed": seed, "guard": guard, "name": policy}
+        before = _way_back(out) if on_bus else None
         found = (
-            _on_bus(loaded, configuration, options, sensor, device=device, interface=interface, channel=channel,
-                    nodes=node or (1,), lockstep=lockstep, **({} if bitrate is None else {"bitrate": bitrate}))
-            if on_bus
+            _on_bus(loaded, configuration, options, sensor, before, device=device, interface=interface,
+                    channel=channel, nodes=node or (1,), lockstep=lockstep,
+                    **({} if bitrate is None else {"bitrate": bitrate}))
+            if before
             else _on_emulator(loaded, configuration, options)
         )  # fmt: skip
         gaps: list[str] = []
         if against is not None:
             gaps = _against(loaded, configuration, options, against, found)
-        _tell(found, gaps, json)
+        _tell(found, gaps, json, before=before)
         if folder is not None:
             _save(found, folder, gaps, json)
+
+
+def _way_back(out: Path | None) -> Path:
+    from tuning.snapshot import file_before
+
+    return file_before("evaluate", out)
 
 
 def _open(
@@ -271,20 +281,23 @@ def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, 
 
 
 def _on_bus(
-    loaded: Any, configuration: dict[str, Any], options: dict[str, Any], sensor: str | None, **where: Any
+    loaded: Any, configuration: dict[str, Any], options: dict[str, Any], sensor: str | None, before: Path, **where: Any
 ) -> Any:
     from agents.evaluation import evaluate as run
-    from agents.on_the_bus import drives_for
+    from agents.on_the_bus import target_for
     from agents.policies import find_object
+    from tuning.snapshot import put_back
 
     function = None if sensor is None else find_object(sensor)
     with (
-        drives_for(loaded.environment, configuration, options["guard"], **where) as drives,
+        target_for(loaded.environment, configuration, options["guard"], **where) as target,
+        put_back(target, before, "drive-agent"),
         progress_bar(f"{loaded.name} on the bus") as show,
     ):
         return run(
-            loaded.policy, loaded.environment, configuration, drives=drives, sensor=function, told=show, **options
-        )
+            loaded.policy, loaded.environment, configuration, drives=target.drives, sensor=function, told=show,
+            **options,
+        )  # fmt: skip
 
 
 def _recording(path: Path) -> Any:
@@ -350,7 +363,9 @@ def _was_typed(context: typer.Context, name: str) -> bool:
     return source is not None and source.name == "COMMANDLINE"
 
 
-def _tell(found: Any, gaps: list[str], json: bool, missing: Mapping[int, str] | None = None) -> None:
+def _tell(
+    found: Any, gaps: list[str], json: bool, missing: Mapping[int, str] | None = None, before: Path | None = None
+) -> None:
     if json:
         print_json(
             {
@@ -364,6 +379,7 @@ def _tell(found: Any, gaps: list[str], json: bool, missing: Mapping[int, str] | 
                 "gap": gaps,
                 "missing": dict(missing or {}),
             }
+            | ({} if before is None else {"before": str(before)})
         )
         return
     print(f"{found.policy} in {found.environment} on the {found.side}, {len(found.seeds)} episodes")
@@ -381,6 +397,10 @@ def _tell(found: Any, gaps: list[str], json: bool, missing: Mapping[int, str] | 
         )
     for line in gaps:
         print(line)
+    if before is not None:
+        from tuning.snapshot import what_is_left
+
+        print(what_is_left(before))
 
 
 def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:

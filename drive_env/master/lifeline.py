@@ -161,11 +161,13 @@ class Lifeline:
     def _run(self) -> None:
         step = min(self._period, self._stall / 4 if self._stall else self._period)
         next_beat = time.monotonic() + self._period
+        told = ""  # a bus that is gone is told once, not with every beat
         while not self._ended.wait(step):
             try:
                 if time.monotonic() >= next_beat:
                     next_beat = time.monotonic() + self._period
                     self._beat()
+                    told = ""
                 pause = time.monotonic() - self._alive
                 if self._watching and self._stall is not None and pause > self._stall:
                     self._watching = False
@@ -174,7 +176,9 @@ class Lifeline:
                     self._stop()
             except BusError as error:
                 # Heartbeats that do not get out are what the drive waits for to stop by itself.
-                logger.error("%s", error)
+                if str(error) != told:
+                    told = str(error)
+                    logger.error("%s", told)
 
     def _beat(self) -> None:
         if any(control.kind == "heartbeat" for control in self._controls):

@@ -99,7 +99,8 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
                 raise BusError(f"{where} answered {what} wrongly: {error}; is another master on the bus?") from None
             raise NoAnswerError(
                 f"{where} did not answer {what} within {timeout:g} s; check power, bit rate and node-ID "
-                "(`drive-env scan`), and that the node is not stopped; a slow object takes timeouts={...}"
+                "(`drive-env scan`), and that the node is not stopped; a slow object takes a longer --timeout "
+                "(in Python timeouts={index: seconds})"
             ) from None
 
     # --- what python-canopen's transfers call -----------------------------------------------------------------------

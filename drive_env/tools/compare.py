@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drive_env.tools.options import DeviceName, Json, errors_as_exit_codes, print_json
+from drive_env.tools.options import DeviceName, Json, check_free, errors_as_exit_codes, print_json
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectDictionary
@@ -38,7 +38,7 @@ def compare(
     machines: Annotated[int, typer.Option(help=f"Machines tried at a time in a fit, {LEAST} or more.")] = 64,
     rounds: Annotated[int, typer.Option(help="Rounds of a fit.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of a fit, and of the machines' noise.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="File for the fitted set of laws (TOML).")] = None,
+    out: Annotated[Path | None, typer.Option(help="New file for the fitted set of laws (TOML).")] = None,
     json: Json = False,
 ) -> None:
     """Repeat a recorded move on the emulated machine and tell how far its response lies from the log.
@@ -55,9 +55,14 @@ def compare(
             raise ValueError(f"--rounds {rounds} must be 1 or more")
         if out is not None and not out.absolute().parent.is_dir():
             raise ValueError(f"the folder {out.parent} does not exist; create it")
+        if out is not None:
+            check_free(out, "choose another --out")
         from drive_env.replay import read_log
 
-        recorded = read_log(log)
+        try:
+            recorded = read_log(log)
+        except UnicodeDecodeError:
+            raise ValueError(f"{log} is no text; give the CSV that drive-env scope writes") from None
         # The compiler is imported from here on: a mistake above is told at once.
         from drive_env.drives import EmulatedDrives
         from drive_env.envs.randomisation import Distributions

@@ -57,6 +57,8 @@ def jog(
 
         known = describe(device, eds).dictionary
         current = None if max_current is None else quantities.parse(max_current, known.find(0x6077), None)
+        if current is not None and current <= 0:
+            raise ValueError(f"--max-current {max_current} must be above 0 A; leave it out for the drive's own limit")
         if not 0.001 <= duration <= 3600.0:
             raise ValueError(f"--for {duration:g} s must be at least 0.001 s and at most an hour")
         options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "dry_run": dry_run}

@@ -9,13 +9,16 @@ from typing import Annotated, Any
 import typer
 
 from drive_env.tools.options import (
+    REFUSED,
     Bitrate,
     Channel,
     DryRun,
     Interface,
     Json,
+    check_free,
     check_time,
     errors_as_exit_codes,
+    fail,
     print_json,
 )
 
@@ -23,14 +26,16 @@ FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc")
 
 
 def log(
-    file: Annotated[Path, typer.Argument(help="File; .log is candump's format, .blf Vector's, also .asc .csv .trc.")],
+    file: Annotated[
+        Path, typer.Argument(help="New file; .log is candump's format, .blf Vector's, also .asc .csv .trc.")
+    ],
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
     duration: Annotated[float | None, typer.Option(help="End after this time [s]; else by Ctrl-C.")] = None,
     json: Json = False,
 ) -> None:
-    """Write every frame of the bus to a file; nothing is sent."""
+    """Write every frame of the bus to a file; nothing is sent. Where the bus is lost, what came until then is kept."""
     with errors_as_exit_codes():
         import can
 
@@ -40,14 +45,20 @@ def log(
         check_time("--duration", duration)
         if not file.parent.is_dir():
             raise ValueError(f"there is no folder {file.parent}; choose another file")
+        check_free(file)
         bus = open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {}))
         count = 0
+        lost: Exception | None = None
         end = time.monotonic() + (float("inf") if duration is None else duration)
         try:
             with can.Logger(str(file)) as writer:
                 try:
                     while (left := end - time.monotonic()) > 0.0:
-                        message = bus.recv(min(left, 0.1))
+                        try:
+                            message = bus.recv(min(left, 0.1))
+                        except (can.CanError, OSError, ValueError) as error:  # ValueError: of a closed socket
+                            lost = error
+                            break
                         if message is not None:
                             writer(message)
                             count += 1
@@ -55,6 +66,10 @@ def log(
                     pass  # the usual end: the file is complete
         finally:
             bus.shutdown()
+        if lost is not None:
+            if json:
+                print_json({"frames": count, "file": str(file), "lost": str(lost)})
+            fail(f"the bus was lost: {lost}; the {count} frames that came until then are in {file}", REFUSED)
         _say(f"{count} frames written to {file}", {"frames": count, "file": str(file)}, json)
 
 

@@ -119,6 +119,15 @@ def check_time(option: str, value: float | None) -> None:
         raise ValueError(f"{option} {value:g} s must be above 0 s")
 
 
+def check_free(file: Path, remedy: str = "choose another file") -> None:
+    """Raise ValueError for a file that is there already: no command replaces one. What is no file (/dev/null) is any.
+
+    Call it before anything takes long, or is asked of a drive.
+    """
+    if file.is_file():
+        raise ValueError(f"{file} is there already, and would be replaced; {remedy}")
+
+
 def ask(question: str, yes: bool) -> None:
     """Go on if the user agrees, or end the command."""
     if yes:

@@ -22,6 +22,7 @@ from drive_env.tools.options import (
     Timeout,
     Yes,
     ask,
+    check_free,
     connect,
     errors_as_exit_codes,
     increments_per_revolution,
@@ -36,7 +37,7 @@ SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 
 
 def backup(
-    file: Annotated[Path, typer.Argument(help="File to write (TOML); - prints it.")],
+    file: Annotated[Path, typer.Argument(help="New file (TOML); - prints it.")],
     interface: Interface = None,
     channel: Channel = None,
     node: Node = 1,
@@ -50,10 +51,13 @@ def backup(
     """Read all parameters of a drive into a file; commands and services are none."""
     from drive_env.master.parameters import read_parameters
 
-    with errors_as_exit_codes(), _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
-        _check_axis(drives, axis)
-        values = read_parameters(drives, axis)
-        text = _toml(drives, values)
+    with errors_as_exit_codes():
+        if str(file) != "-":
+            check_free(file)
+        with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
+            _check_axis(drives, axis)
+            values = read_parameters(drives, axis)
+            text = _toml(drives, values)
         if str(file) == "-":
             print(text, end="")
             return

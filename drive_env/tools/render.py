@@ -27,7 +27,7 @@ def render(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Film: a name that ends in .gif, .webp, .apng, .png or .mp4 (needs ffmpeg), or a new folder for PNGs.",
+            help="New film: a name that ends in .gif, .webp, .apng, .png or .mp4 (needs ffmpeg), or a folder for PNGs.",
             show_default="<load>.gif",
         ),
     ] = None,
@@ -50,6 +50,8 @@ def render(
             sys.stdout.write(_with_overrides(config or DEFAULT, device=device, motor=motor, load=load, seed=seed))
             return
         film = None if view and out is None else check_out(out or Path(f"{Path(row.load).stem}.gif"))
+        if film is not None and film.is_file():
+            raise PictureFileError(f"{film} is there already, and would be replaced; choose another --out")
         if view and not has_display():
             raise OpenGLError(
                 "--view needs a display and there is none (DISPLAY and WAYLAND_DISPLAY are unset); leave it out, and "

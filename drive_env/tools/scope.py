@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from drive_env.tools.options import (
+    INTERRUPTED,
     REFUSED,
     Bitrate,
     Channel,
@@ -20,6 +21,7 @@ from drive_env.tools.options import (
     Nodes,
     Timeout,
     axis_name,
+    check_free,
     connect,
     errors_as_exit_codes,
     fail,
@@ -30,6 +32,7 @@ from drive_env.tools.options import (
 
 DEFAULT = ("6064", "606C", "6077")
 CHUNK = 0.05  # recorded at a time while the trigger is waited for [s]
+PIECE = 0.25  # recorded at a time afterwards [s]: as much is lost at most where the recording is broken off
 _TRIGGER = re.compile(r"^\s*(.+?)\s*(<=|>=|<|>|==|!=)\s*(.+?)\s*$")
 
 
@@ -59,11 +62,12 @@ def scope(
     before: Annotated[float, typer.Option(help="How much to keep from before the trigger [s].")] = 0.05,
     wait: Annotated[float, typer.Option(help="How long to wait for the trigger [s].")] = 30.0,
     period: Annotated[float, typer.Option(help="Time between samples [s], whole milliseconds.")] = 0.001,
-    out: Annotated[Path, typer.Option(help="Files to write, without ending: OUT.csv and OUT.png.")] = Path("scope"),
+    out: Annotated[Path, typer.Option(help="New files, without ending: OUT.csv and OUT.png.")] = Path("scope"),
     json: Json = False,
 ) -> None:
     """Sample objects with SYNC, one sample per millisecond, and write CSV (raw integers) and PNG (in units).
 
+    After Ctrl-C, or where the bus is lost, what came until then is written, and told.
     It sends SYNC and maps TPDOs, which it puts back: no other master may send SYNC meanwhile.
     """
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
@@ -71,25 +75,33 @@ def scope(
         _check_times(duration=duration, before=before, wait=wait, period=period)
         if not out.parent.is_dir():
             raise ValueError(f"there is no folder {out.parent}; choose another --out")
+        table, picture = out.with_suffix(".csv"), out.with_suffix(".png")
+        for file in (table, picture):
+            check_free(file, "choose another --out")
         with connect(interface, channel, node, device, eds, **options) as drives:
             known = drives.description.dictionary
             entries = [known.find(object_name(name)) for name in objects or DEFAULT]
             condition = None if trigger is None else _parse(trigger, known)
             scales = increments_per_revolution(drives)
-            rows, start = _record(drives, entries, condition, scales, duration, before, wait)
-            late, worst = drives.timing.late, drives.timing.worst
             labels = [axis_name(drives, axis) for axis in range(drives.num_axes)]
+            rows, start, broken = _record(drives, entries, condition, scales, duration, before, wait)
+            _, late, worst = drives.total_timing
+        if broken is not None and not len(rows[entries[0]]):
+            raise broken
         every = round(period / 0.001)
         t, rows = _thin(rows, start, every)
-        _write_csv(out.with_suffix(".csv"), entries, labels, t, rows)
-        _draw(out.with_suffix(".png"), entries, labels, scales, t, rows)
-        summary = {"samples": len(t), "csv": str(out.with_suffix(".csv")), "png": str(out.with_suffix(".png"))}
+        _write_csv(table, entries, labels, t, rows)
+        _draw(picture, entries, labels, scales, t, rows)
+        summary = {"samples": len(t), "csv": str(table), "png": str(picture), "complete": broken is None}
         if json:
             print_json(summary | {"late": late, "worst lateness": worst})
-        else:
-            print(f"{len(t)} samples written to {summary['csv']} and {summary['png']}")
-            if late:
-                print(f"{late} SYNCs were late, the worst by {1e3 * worst:.1f} ms: times are those of the SYNCs' grid")
+        elif broken is None:
+            print(f"{len(t)} samples written to {table} and {picture}")
+        if late and not json:
+            print(f"{late} SYNCs were late, the worst by {1e3 * worst:.1f} ms: times are those of the SYNCs' grid")
+        if broken is not None:
+            why, code = (str(broken), REFUSED) if isinstance(broken, Exception) else ("interrupted", INTERRUPTED)
+            fail(f"{why}; the {len(t)} samples that came until then are in {table} and {picture}", code)
 
 
 def _check_times(**times: float) -> None:
@@ -130,9 +142,11 @@ def _record(
     duration: float,
     before: float,
     wait: float,
-) -> tuple[dict[Any, Any], int]:
-    """Return rows of each entry, and the number of the row at which the trigger fired."""
+) -> tuple[dict[Any, Any], int, BaseException | None]:
+    """Return rows of each entry, the number of the row at which the trigger fired, and what broke the rest off."""
     import numpy as np
+
+    from drive_env.master.errors import BusError
 
     wanted = list(dict.fromkeys([*entries, trigger.entry] if trigger else entries))
     names = [(entry.index, entry.sub) for entry in wanted]
@@ -141,11 +155,23 @@ def _record(
         trace = drives.record(names, round(seconds, 3))
         return {entry: trace[name] for entry, name in zip(wanted, names, strict=True)}
 
+    def rest(rows: dict[Any, Any], missing: int) -> tuple[dict[Any, Any], BaseException | None]:
+        """Return these rows and as many more, or those that came before Ctrl-C or the loss of the bus."""
+        pieces, broken, piece = [rows], None, round(PIECE / 0.001)
+        try:
+            for first in range(0, missing, piece):
+                pieces.append(record(min(piece, missing - first) * 0.001))
+        except (BusError, KeyboardInterrupt) as error:
+            broken = error
+        return {entry: np.concatenate([part[entry] for part in pieces]) for entry in wanted}, broken
+
+    nothing: dict[Any, Any] = {entry: np.empty((0, drives.num_axes), np.int64) for entry in wanted}
     if trigger is None:
-        return record(duration), 0
+        rows, broken = rest(nothing, round(duration / 0.001))
+        return rows, 0, broken
     _fires(trigger, np.zeros((1, drives.num_axes), np.int64), scales)  # a wrong level is told before the wait
     keep = round(before / 0.001)
-    rows: dict[Any, Any] = {entry: np.empty((0, drives.num_axes), np.int64) for entry in wanted}
+    rows = nothing
     held = True  # a condition that holds from the start must end first
     for _ in range(max(1, round(wait / CHUNK))):
         chunk = record(CHUNK)
@@ -156,13 +182,9 @@ def _record(
         rows = {entry: np.concatenate([rows[entry], chunk[entry]]) for entry in wanted}
         if first.size:
             fired = old + int(first[0])
-            missing = fired + round(duration / 0.001) - len(rows[trigger.entry])
-            if missing > 0:
-                rest = record(missing * 0.001)
-                rows = {entry: np.concatenate([rows[entry], rest[entry]]) for entry in wanted}
-            begin = max(0, fired - keep)
-            end = fired + round(duration / 0.001)
-            return {entry: rows[entry][begin:end] for entry in entries}, fired - begin
+            begin, end = max(0, fired - keep), fired + round(duration / 0.001)
+            rows, broken = rest(rows, end - len(rows[trigger.entry]))
+            return {entry: rows[entry][begin:end] for entry in entries}, fired - begin, broken
         if keep:
             rows = {entry: rows[entry][-keep:] for entry in wanted}
         else:

@@ -75,7 +75,10 @@ def _left_behind(target: Target, file: Path) -> str:
         return "nothing was changed"
     before = load_snapshot(file)
     if all(np.array_equal(target.drives.read(key), [axis[key] for axis in before.axes]) for key in GAIN_OBJECTS):
-        return "the drives are disabled and have the gains from before"
+        return (
+            "the drives are disabled and have the gains from before; if ever not, "
+            f"drive-tune restore {file} brings them back"
+        )
     return f"the drives are disabled and have the new gains: drive-tune restore {file} brings back what was"
 
 
@@ -117,7 +120,9 @@ def _report(target: Target, result: Result, folder: Path, seed: int, json: bool)
     console.print(table)
     lines = []
     for k, axis in enumerate(result.axes):
-        if not axis.accepted:
+        if not axis.accepted and axis.identified is None and result.drive_seconds[k] == 0.0:  # refused at the outset
+            lines.append(f"axis {k} was left as it was: {axis.reason}")
+        elif not axis.accepted:
             lines.append(f"axis {k} was rolled back: {axis.reason}")
         else:
             lines.append(f"axis {k} was verified {axis.verified}")

@@ -13,10 +13,14 @@ from tuning.commands.options import (
     REFUSED,
     Json,
     TargetOptions,
+    before_as_json,
     errors_as_exit_codes,
     print_json,
     progress_bar,
     takes,
+    tell_before,
+    unchanged,
+    way_back,
 )
 
 if TYPE_CHECKING:
@@ -48,26 +52,28 @@ def identify(
 
     The motor turns: there and back within --travel, up to its rated current and 0.7 of its rated speed. Every value
     has a 95 % interval; what cannot be told is refused with its reason. Afterwards the drive is off and has its own
-    parameters.
+    parameters; those of a bus are in a file for `drive-tune restore`, too, beside --out or in runs/.
     """
     with errors_as_exit_codes():
         if out is not None and not out.parent.is_dir():
             raise ValueError(f"there is no folder {out.parent} for --out; make it first")
         if out is not None and out.is_dir():
             raise ValueError(f"{out} is a folder; give a file for --out, e.g. {out / 'identified.json'}")
+        file = way_back(drive, "identify", None if out is None else out.with_suffix(""))
         from tuning.identification import identify as run
 
-        with drive.open() as target, progress_bar("identifying") as show:
+        with drive.open() as target, unchanged(target, file), progress_bar("identifying") as show:
             found = run(target, progress=lambda what, share: show(share))
         rows = [row(one) for one in found]
         if out is not None:
             out.write_text(json_.dumps(rows, indent=1) + "\n", encoding="utf-8")
         if json:
-            print_json(rows)
+            print_json([one | before_as_json(file) for one in rows])
         else:
             _print(found)
             if out is not None:
                 print(f"written to {out}")
+            tell_before(file)
         if not any(estimate.is_known for one in found for estimate in one.estimates.values()):
             raise typer.Exit(REFUSED)
 

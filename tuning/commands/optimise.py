@@ -108,10 +108,18 @@ def optimise(
             raise ValueError(f"--lanes must be 1 or more, not {lanes}")
         if resume and out is None:
             raise ValueError("--resume needs --out: the folder into which the search was to write")
+        if drive.bus and (searches != 1 or workers is not None or cluster is not None or resume):
+            raise ValueError(
+                "--searches, --workers, --cluster and --resume are of emulated machines; a search on a bus goes on "
+                "from its --journal"
+            )
         from tuning import provenance, unfinished
         from tuning.optimise import Settings
+        from tuning.snapshot import file_before
 
         folder = provenance.run_folder("optimise") if out is None else out
+        if resume:
+            _check_unfinished(folder, journal)
         provenance.check_folder(folder)
         chosen: dict[str, Any] = {"gains": tuple(gains)} if gains else {}
         if width is not None:
@@ -132,18 +140,18 @@ def optimise(
             try:
                 found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
             except KeyboardInterrupt:
-                fail(what_an_interrupt_leaves(folder), INTERRUPTED)
+                fail(what_an_interrupt_leaves(folder) if journal is None else _kept_in(journal), INTERRUPTED)
             emulated = common | {"load": drive.load, "lanes": lanes, "searches": searches}
             _report(found, settings, folder, None, where, emulated, json)
             unfinished.discard(folder)
             return
-        if searches != 1 or workers is not None or cluster is not None or resume:
-            raise ValueError(
-                "--searches, --workers, --cluster and --resume are of emulated machines; a search on a bus goes on "
-                "from its --journal"
-            )
+        before = file_before("optimise", folder)
         with drive.open() as target:
-            found, before = _search_bus(target, settings, folder)
+            try:
+                found = _search_bus(target, settings, before)
+            except KeyboardInterrupt:
+                lost = "interrupted; the trials made are lost: on a bus they are kept only with --journal FILE"
+                fail(lost if journal is None else _kept_in(journal), INTERRUPTED)
         on_bus = common | {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
         _report(found, settings, folder, before, where, on_bus | dict(target.bus), json)
 
@@ -177,20 +185,37 @@ def _search_machine(
             return searches.joined(searches.run(shards, pool if elsewhere else None, log, show))
 
 
-def _search_bus(target: Any, settings: Any, folder: Path) -> tuple[Any, Path]:
-    """Search on a bus inside a transaction; return what was found, and the file that leads back."""
+def _check_unfinished(folder: Path, journal: Path | None) -> None:
+    """Raise ValueError where there is no search to go on with: it would be a new one. A journal has its own."""
+    from tuning import unfinished
+
+    if (folder / "trials.csv").is_file():
+        raise ValueError(f"the search of {folder} is finished: nothing is left to resume, its results are there")
+    if journal is None and not unfinished.unfinished_folder(folder).is_dir():
+        raise ValueError(
+            f"there is no search to resume: {unfinished.unfinished_folder(folder)} does not exist; correct --out, or "
+            "leave --resume out to begin a new one"
+        )
+
+
+def _kept_in(journal: Path) -> str:
+    """Return what an interrupted search with a journal says."""
+    return f"interrupted; the trials made are in {journal}: the same command goes on from there"
+
+
+def _search_bus(target: Any, settings: Any, before: Path) -> Any:
+    """Search on a bus, the state before being in a file; what is no success is undone, and says where that file is."""
     from tuning.optimise import optimise as search
-    from tuning.snapshot import Transaction
+    from tuning.snapshot import put_back
 
     leave_oscillations_to_trials(target.drives)
-    before = folder.with_name(f"{folder.name}-before.toml")
     with (
-        Transaction(target, before) as transaction,
+        put_back(target, before, "drive-tune") as transaction,
         progress_bar(f"{settings.trials} trials by {settings.sampler}") as show,
     ):
         found = search(target, settings, progress=show)
         transaction.commit()
-    return found, before
+    return found
 
 
 def leave_oscillations_to_trials(drives: Any) -> None:

@@ -23,6 +23,7 @@ from drive_env.tools.options import Yes as Yes
 from drive_env.tools.options import print_json as print_json
 
 if TYPE_CHECKING:
+    from tuning.snapshot import Transaction
     from tuning.target import Target
 
 # Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
@@ -57,7 +58,7 @@ Cluster = Annotated[
     str | None, typer.Option("--cluster", help="Dask scheduler on whose workers to run: tcp://host:port.")
 ]
 Resume = Annotated[
-    bool, typer.Option("--resume", help="Go on with what a run into this --out left when it was stopped, if anything.")
+    bool, typer.Option("--resume", help="Go on with what a run into this --out left when it was stopped.")
 ]
 
 
@@ -207,7 +208,7 @@ def open_target(
     Raises:
         ValueError: For a name that does not exist, or a bus without a travel; BusError if a node does not answer.
     """
-    from tuning.target import emulated, on_bus
+    from tuning.target import LOCKSTEP_PATIENCE, emulated, on_bus
 
     check_seed(seed)
     if machines < 1:
@@ -222,7 +223,7 @@ def open_target(
         raise ValueError("--travel is missing: how far may the motor turn? Give LOW:HIGH in turns, or free")
     options: dict[str, Any] = {} if bitrate is None else {"bitrate": bitrate}
     if lockstep:
-        options["pace"] = "lockstep"
+        options |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE}
     return on_bus(
         device,
         motor,
@@ -233,6 +234,40 @@ def open_target(
         travel=parse_travels(travel),
         **options,
     )
+
+
+def way_back(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | None:
+    """Return the file for the state before of drives on a bus, None for emulated ones; raises as `file_before` does."""
+    if not drive.bus:
+        return None
+    from tuning.snapshot import file_before
+
+    return file_before(kind, out)
+
+
+@contextmanager
+def unchanged(target: Target, file: Path | None) -> Iterator[Transaction | None]:
+    """Leave the state before in a file, if there is one to leave, and put back at the end what is not committed."""
+    if file is None:
+        yield None
+        return
+    from tuning.snapshot import put_back
+
+    with put_back(target, file, "drive-tune") as transaction:
+        yield transaction
+
+
+def before_as_json(file: Path | None) -> dict[str, str]:
+    """Return what programs are told of the file with the state before."""
+    return {} if file is None else {"before": str(file)}
+
+
+def tell_before(file: Path | None) -> None:
+    """Say where the state before is, once everything is put back."""
+    if file is not None:
+        from tuning.snapshot import what_is_left
+
+        print(what_is_left(file))
 
 
 @contextmanager

@@ -14,11 +14,15 @@ from tuning.commands.options import (
     Json,
     Out,
     TargetOptions,
+    before_as_json,
     errors_as_exit_codes,
     fail,
     print_json,
     progress_bar,
     takes,
+    tell_before,
+    unchanged,
+    way_back,
 )
 
 if TYPE_CHECKING:
@@ -50,7 +54,8 @@ def response(
     """Shake the axes with the gains they have and show open loop, coherence and margins.
 
     The axes run there and back at a steady speed, for about two seconds, and end where they began. With --out, a
-    picture and a CSV of each axis are written. What is not coherent is grey, and no margin is read from it.
+    picture and a CSV of each axis are written. What is not coherent is grey, and no margin is read from it. The
+    parameters of drives on a bus are in a file for `drive-tune restore` meanwhile, beside --out or in runs/.
     """
     with errors_as_exit_codes():
         from tuning import provenance
@@ -62,16 +67,18 @@ def response(
             raise ValueError(
                 "--trace looks at emulated drives, up to 1000 Hz; leave --high and --bus out, or take no --trace"
             )
-        with drive.open() as target, progress_bar("shaking") as show:
+        file = way_back(drive, "response", out)
+        with drive.open() as target, unchanged(target, file), progress_bar("shaking") as show:
             measured = measure(
                 target, loop, kind=signal, low=low, high=high, resolution=resolution, traced=trace, progress=show
             )
         if out is not None:
             _write(out, measured)
         if json:
-            print_json(_as_json(measured))
+            print_json([one | before_as_json(file) for one in _as_json(measured)])
         else:
             _print(measured, out)
+            tell_before(file)
         if measured.trusted.mean(axis=0).min() < FEWEST:
             late = "; or this computer or the drives' emulator is late: serve it with --lockstep" * (
                 drive.bus and not drive.lockstep

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,16 +15,20 @@ from tuning.commands.options import (
     Json,
     TargetOptions,
     ask,
+    before_as_json,
     errors_as_exit_codes,
     fail,
     print_json,
     progress_bar,
     takes,
+    tell_before,
+    unchanged,
 )
 
 if TYPE_CHECKING:
     from tuning.linear_model import Plant
     from tuning.proposal import Proposal
+    from tuning.snapshot import Transaction
     from tuning.target import Target
 
 MEASURED = "relay, measured"
@@ -42,17 +47,21 @@ def rules(
     snapshot: Annotated[
         Path | None,
         typer.Option(
-            help="File for the state before, with --apply.", show_default="runs/<timestamp>-rules/before.toml"
+            help="File for the state before, with --apply or on a bus.",
+            show_default="runs/<timestamp>-rules/before.toml",
         ),
     ] = None,
     json: Json = False,
 ) -> None:
     """Identify an axis and show the gains that each rule proposes, with the margins they would have.
 
-    Margins are those of the velocity loop on the identified model. Notes say what no integer reaches.
+    Margins are those of the velocity loop on the identified model. Notes say what no integer reaches. On a bus the
+    parameters before are in --snapshot from the begin, and back at the end, but for what --apply writes.
     """
     with errors_as_exit_codes():
+        from tuning.provenance import run_folder
         from tuning.rules import RULES
+        from tuning.snapshot import check_place
 
         chosen = rule or list(RULES)
         for name in [*chosen, *([apply] if apply else [])]:
@@ -60,9 +69,13 @@ def rules(
                 raise ValueError(f"no rule is named {name!r}; there are {', '.join(RULES)}")
         if store and not apply:
             raise ValueError("--store keeps what --apply writes; add --apply RULE, or leave it out")
-        if snapshot is not None and not apply:
+        if snapshot is not None and not (apply or drive.bus):
             raise ValueError("--snapshot is where --apply keeps the state before; add --apply RULE, or leave it out")
-        with drive.open() as target:
+        file = run_folder("rules") / "before.toml" if snapshot is None else snapshot
+        if drive.bus:
+            check_place(file)  # written before the motor turns; of emulated drives, before their gains change
+        before = file if drive.bus else None
+        with drive.open() as target, unchanged(target, before) as transaction:
             plants = _identified(target)
             known = [plant for plant in plants if not isinstance(plant, str)]
             swung = _swing(target, known) if relay and len(known) == len(plants) else [""] * len(plants)
@@ -75,7 +88,7 @@ def rules(
                 else:
                     axis.rows[MEASURED] = measured
             if json:
-                print_json([_as_json(target, axis) for axis in axes])
+                print_json([_as_json(target, axis) | before_as_json(before) for axis in axes])
             else:
                 for k, axis in enumerate(axes):
                     _print(target, axis, k if len(plants) > 1 else None)
@@ -83,7 +96,9 @@ def rules(
                 fail("nothing was written: a rule needs the inertia of every axis" if known else
                      "no axis has an identified inertia, and no rule works without", REFUSED)  # fmt: skip
             if apply:
-                _apply(target, known, apply, snapshot, store=store, yes=drive.yes)
+                _apply(target, known, apply, file, transaction, store=store, yes=drive.yes)
+        if not (apply or json):
+            tell_before(before)
 
 
 @dataclass
@@ -203,19 +218,25 @@ def _print(target: Target, shown: _Axis, axis: int | None) -> None:
 
 
 def _apply(
-    target: Target, plants: Sequence[Plant], name: str, snapshot: Path | None, *, store: bool, yes: bool
+    target: Target,
+    plants: Sequence[Plant],
+    name: str,
+    file: Path,
+    under_way: Transaction | None,
+    *,
+    store: bool,
+    yes: bool,
 ) -> None:
+    """Write a rule's gains if the user agrees, inside the transaction that is under way, or one of its own."""
     import numpy as np
 
     from drive_env.gains import write_gains
-    from tuning.provenance import run_folder
     from tuning.rules import propose
     from tuning.snapshot import Transaction
 
     proposals = [propose(name, target.device, target.motor, plant) for plant in plants]
     ask(f"Write the gains of {name} to {'the axis' if target.num_axes == 1 else f'{target.num_axes} axes'}?", yes)
-    file = run_folder("rules") / "before.toml" if snapshot is None else snapshot
-    with Transaction(target, file) as transaction:
+    with Transaction(target, file) if under_way is None else nullcontext(under_way) as transaction:
         write_gains(target.drives, np.array([proposal.gains for proposal in proposals], np.int64))
         kept = store and transaction.store()
         transaction.commit()

@@ -1,0 +1,215 @@
+"""Whatever moves drives of a bus leaves a file first: a run that is killed is undone by one command."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import pytest
+from test_serve import environment
+from typer.testing import CliRunner
+
+from agents.cli import app as drive_agent
+from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env.bus.hub import Hub
+from drive_env.bus.server import Server
+from drive_env.bus.world import World
+from drive_env.gains import GAIN_OBJECTS
+from drive_env.master.description import Description
+from drive_env.master.parameters import read_parameters
+from tuning.cli import app as drive_tune
+from tuning.snapshot import load_snapshot
+
+PATIENCE = 120.0  # s until a run has come so far; it is never this long
+OFF = ((0x4F, 0x40), (0x4F, 0x08))  # masks and values of 6041h: as it comes up, and in fault
+COMMUTATION, RAMP, CURRENT_LIMIT = (0x2055, 0), (0x6083, 0), (0x2003, 0)
+
+TUNING = ("--travel", "-5:5", "--yes", "--bus")
+COMMANDS = {
+    "identify": (drive_tune, ("identify", *TUNING)),
+    "response": (drive_tune, ("response", "position", *TUNING)),
+    "rules": (drive_tune, ("rules", "chain", "--relay", *TUNING)),
+    "evaluate": (drive_agent, ("evaluate", "gain_tuning", "--episodes", "1", "--stall", "60")),
+}
+
+
+@contextmanager
+def node(lockstep=True):
+    """An emulated drive on a hub: its machine, and the options that name it."""
+    world = World(lockstep=lockstep)
+    machine = EmulatedDrives(load="inertia", num_threads=1)
+    machine.advance(0.001)  # compiles: a node that does would not answer in time
+    world.add(machine, [1])
+    hub = Hub()
+    try:
+        with Server(world, hub):
+            yield machine, ["--interface", "slcan", "--channel", hub.channel, *["--lockstep"] * lockstep]
+    finally:
+        world.close()
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def parameters(bus):
+    """Return what a master reads of the drive, its communication too."""
+    _, interface, _, channel, *lockstep = bus
+    pace = "lockstep" if lockstep else "real-time"
+    with CanDrives(interface=interface, channel=channel, pace=pace, safety=False) as drives:
+        return read_parameters(drives)
+
+
+def differences(machine, file):
+    """Return the parameters of a machine that are not what a file says."""
+    (before,) = load_snapshot(file).axes
+    return {key for key, was in before.items() if key[0] >= 0x2000 and int(machine.read(key)[0]) != was}
+
+
+def status_is(machine, *states):
+    return any(int(machine.read(0x6041)[0]) & mask == value for mask, value in states)
+
+
+def wait_until(condition, process=None):
+    end = time.monotonic() + PATIENCE
+    while not condition() and time.monotonic() < end and (process is None or process.poll() is None):
+        time.sleep(0.01)
+
+
+def files(folder):
+    return [path for path in folder.rglob("*before*.toml") if not path.name.startswith(".")]
+
+
+def killed(machine, command, bus, folder):
+    """Run a command, kill it once the axis is enabled and other than before; return the file that it left."""
+
+    def is_under_way():
+        # A response is measured with the gains and ramps that there are: it changes PDOs alone.
+        changed = command == "response" or any(differences(machine, file) for file in files(folder))
+        return changed and status_is(machine, motion.OPERATION_ENABLED)
+
+    app, arguments = COMMANDS[command]
+    program = "drive_agent" if app is drive_agent else "drive_tune"
+    process = subprocess.Popen(
+        [sys.executable, "-c", f"from drive_env.commands import {program} as run; run()", *arguments, *bus],
+        cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        wait_until(is_under_way, process)
+    finally:
+        process.kill()
+        _, said = process.communicate()
+    assert process.returncode == -signal.SIGKILL, said
+    (file,) = files(folder)
+    return file
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_run_that_is_killed_is_undone_by_one_command(tmp_path, command):
+    with node() as (machine, bus):
+        before = parameters(bus)
+        file = killed(machine, command, bus, tmp_path)
+        machine.write(0x6040, 0x00)  # without a SYNC this node's time stands still: it cannot miss its master
+        machine.advance(0.2)
+        left = parameters(bus)
+        assert left != before
+        assert bool(differences(machine, file)) == (command != "response")
+        if command in ("identify", "rules"):
+            assert {COMMUTATION, RAMP, CURRENT_LIMIT} <= differences(machine, file)
+            assert differences(machine, file) & set(GAIN_OBJECTS)
+        done = CliRunner().invoke(drive_tune, ["restore", str(file), "--yes"])
+        assert done.exit_code == 0, done.output
+        assert parameters(bus) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+def test_a_node_in_real_time_switches_itself_off_and_is_restored(tmp_path, monkeypatch):
+    # It is stopped then, and does not answer until it is woken.
+    monkeypatch.setattr(Description, "answer_timeout", property(lambda self: 2.0))
+    with node(lockstep=False) as (machine, bus):
+        before = parameters(bus)
+        file = killed(machine, "identify", bus, tmp_path)
+        assert {COMMUTATION, RAMP, CURRENT_LIMIT} <= differences(machine, file)
+        wait_until(lambda: status_is(machine, *OFF))
+        done = CliRunner().invoke(drive_tune, ["restore", str(file), "--yes"])
+        assert done.exit_code == 0, done.output
+        assert parameters(bus) == before
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_run_that_ends_well_leaves_the_drive_as_the_file_says_and_tells_it(tmp_path, command):
+    app, arguments = COMMANDS[command]
+    with node() as (machine, bus):
+        before = parameters(bus)
+        done = CliRunner().invoke(app, [*arguments, *bus, "--json"])
+        assert done.exit_code == 0, done.output
+        (file,) = files(tmp_path)
+        told = json.loads(done.stdout)
+        assert (told if command == "evaluate" else told[0])["before"] == str(file.relative_to(tmp_path))
+        assert parameters(bus) == before
+        assert parameters(bus) == dict(load_snapshot(file).axes[0])
+        assert status_is(machine, *OFF)
+
+
+def test_what_rules_apply_stays_and_is_undone_by_the_file(tmp_path):
+    with node() as (machine, bus):
+        done = CliRunner().invoke(
+            drive_tune, ["rules", "chain", *TUNING, *bus, "--apply", "chain", "--snapshot", "mine.toml"]
+        )
+        assert done.exit_code == 0, done.output
+        assert "written; drive-tune restore mine.toml brings back what was" in done.stdout
+        assert set() < differences(machine, "mine.toml") <= set(GAIN_OBJECTS)
+        again = CliRunner().invoke(drive_tune, ["rules", "chain", *TUNING, *bus, "--snapshot", "mine.toml"])
+        assert again.exit_code == 2
+        assert "mine.toml is there already, and may hold the state before an earlier run" in again.stderr
+        CliRunner().invoke(drive_tune, ["restore", "mine.toml", "--yes"])
+        assert differences(machine, "mine.toml") == set()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_place_that_cannot_be_written_is_told_before_the_bus_is_opened(tmp_path, command):
+    (tmp_path / "runs").write_text("a file", encoding="utf-8")
+    app, arguments = COMMANDS[command]
+    done = CliRunner().invoke(app, [*arguments, "--channel", "socket://127.0.0.1:9"])
+    assert done.exit_code == 2
+    assert "the state before cannot be written to runs/" in done.stderr
+    assert f"{tmp_path / 'runs'} is a file; choose another place" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(("command", "out", "file"), [
+    ("identify", "found.json", "found-before.toml"),
+    ("response", "shaken", "shaken-before.toml"),
+    ("evaluate", "judged", "judged-before.toml"),
+])  # fmt: skip
+def test_the_file_lies_beside_the_results_and_never_replaces_one(tmp_path, monkeypatch, command, out, file):
+    (tmp_path / file).write_text("what a killed run left", encoding="utf-8")
+    named = []
+
+    def taken(target):
+        named.append(sorted(path.name for path in tmp_path.iterdir()))
+        raise OSError("enough")
+
+    monkeypatch.setattr("tuning.snapshot.take", taken)
+    app, arguments = COMMANDS[command]
+    with node() as (_, bus):
+        done = CliRunner().invoke(app, [*arguments, *bus, "--out", out])
+    assert (done.exit_code, named) == (2, [[file]])
+    assert done.stderr.strip().endswith("enough")
+    assert (tmp_path / file).read_text(encoding="utf-8") == "what a killed run left"
+
+
+@pytest.mark.parametrize("command", ["identify", "response", "rules"])
+def test_emulated_drives_leave_none(tmp_path, command):
+    _, arguments = COMMANDS[command]
+    emulated = [one for one in arguments if one not in ("--bus", "--yes")]
+    done = CliRunner().invoke(drive_tune, [*emulated, "--load", "inertia", "--json"])
+    assert done.exit_code == 0, done.output
+    assert all("before" not in row for row in json.loads(done.stdout))
+    assert list(tmp_path.iterdir()) == []
