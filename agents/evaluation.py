@@ -20,6 +20,7 @@ from agents.bundle import plain
 from agents.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
 from agents.scores import Episode, Interval, figures, interval
 from agents.tasks import ENVIRONMENTS, configuration_of, environment_name, make_lanes
+from agents.tuner import TRIAL_SECONDS
 from drive_env.undisturbed import undisturbed
 
 LANES = 64
@@ -27,7 +28,7 @@ FIRST_SEED = 1_000_000  # far from those of a training
 TOLD = 0.5  # s between two looks at a progress bar, which takes a millisecond
 STEP_SECONDS: dict[str, Callable[[Any], float]] = {"ServoDrive/Tracking-v0": lambda config: 1.0 / config.rate,
                 "ServoDrive/GainScheduling-v0": lambda config: config.step,
-                "ServoDrive/GainTuning-v0": lambda config: 0.75}  # fmt: skip
+                "ServoDrive/GainTuning-v0": lambda config: TRIAL_SECONDS}  # fmt: skip
 TRIAL_OF = {"gains": "trial_gains", "measured": "trial_measured", "hidden": "trial_hidden"}  # of incumbent, of trial
 FIXED_STEPS = ("ServoDrive/Tracking-v0", "ServoDrive/GainScheduling-v0")  # a trial takes what clearing up takes besides
 

@@ -9,7 +9,7 @@ import importlib
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,16 +28,6 @@ KINDS: dict[str, str] = {
 
 class PolicyError(RuntimeError):
     """A policy got or gave what is no number; whoever acts with it stops the drives."""
-
-
-class Policy(Protocol):
-    """What acts: observations in, actions out."""
-
-    def act(self, observation: ArrayLike) -> Array:
-        """Return the action for one observation, or one for each lane."""
-
-    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
-        """Forget what was, in all lanes or where the mask is true: an episode begins."""
 
 
 def load_policy(path: str | Path) -> Any:

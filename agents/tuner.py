@@ -20,7 +20,6 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL = 2, 3
 TRIAL_SECONDS = 0.75
 
 
@@ -58,6 +57,8 @@ class Tuned(NamedTuple):
     @property
     def moves(self) -> int:
         """How often each axis was moved."""
+        from tuning.trial_bench import MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL
+
         return MOVES_OF_IDENTIFICATION + MOVES_OF_TRIAL * len(self.trials)
 
 

@@ -80,9 +80,9 @@ def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
     """Have the policy make its trials; leave its answer, what was second best, and where moves go on from."""
     from dataclasses import replace
 
-    from drive_env.safety import SafetyError
+    from drive_env.safety import SafetyError, swinging_allowed
     from tuning.auto_trials import BY_TRIAL, watch_following
-    from tuning.proving import ProvingGround, shaken_on_purpose
+    from tuning.proving import ProvingGround
 
     target, going = run.target, run.going
     if not going.all():
@@ -91,7 +91,7 @@ def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
     low, high = run.room()
     try:
         # The trials stop by themselves what oscillates, within 50 ms, and go on.
-        with run.spending(going), shaken_on_purpose(target.drives):
+        with run.spending(going), swinging_allowed(target.drives):
             tuned = tune_target(replace(target, low=low, high=high), policy, show=show)
     except SafetyError as error:
         run.stop(going, f"the envelope stopped the trials: {error}")

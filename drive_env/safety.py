@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -440,6 +441,21 @@ class Envelope:
         for axis in np.flatnonzero(axes):
             with _logged():
                 act(int(axis))
+
+
+@contextlib.contextmanager
+def swinging_allowed(drives: Any) -> Iterator[None]:
+    """Have the envelope of drives, if they have one, take current that swings for intended; its other limits stay."""
+    envelope = getattr(drives, "safety", None)
+    if envelope is None:
+        yield
+        return
+    limits = envelope.limits
+    envelope.limits = replace(limits, oscillation=False)
+    try:
+        yield
+    finally:
+        envelope.limits = limits
 
 
 # Objects whose magnitude is a command, and which limit holds it.

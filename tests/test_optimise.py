@@ -24,7 +24,7 @@ from tuning.meter import KINDS, MeteredDrives
 from tuning.optimise import SAFE_STEP, Settings, objective_values, optimise, pareto
 from tuning.suite import load_suite, open_group
 from tuning.target import Target, emulated
-from tuning.trial_bench import OBJECTIVES, TrialBench, first_gains, read_gains, trial_seconds
+from tuning.trial_bench import OBJECTIVES, TrialBench, first_gains, read_gains
 
 WILD = np.array([4021, 1573, 30_000, 3000, 30_000])
 FEW = Settings(sampler="tpe", trials=8)
@@ -35,6 +35,11 @@ def rigid():
     """Four rigid machines of one to eighteen rotors."""
     with open_group([m for m in load_suite() if m.load == "inertia" and m.motor == "qbl4208"]) as target:
         yield target
+
+
+def trial_seconds(trials: int) -> float:
+    """Return how long identification and so many trials take [s], without what recovery takes."""
+    return (2 + 3 * trials) * 0.25  # moves of identification and of a trial, each of a quarter of a second
 
 
 def searched(settings, load="inertia", lanes=4, **options):

@@ -16,7 +16,6 @@ from tuning.auto_moves import show
 from tuning.auto_run import MOVE_TIME, TRIAL_TIME
 from tuning.auto_trials import BY_TRIAL, FOLLOWING_WINDOW, watch_following
 from tuning.margins import margins
-from tuning.proving import shaken_on_purpose
 
 if TYPE_CHECKING:
     from tuning.auto_run import Run
@@ -50,7 +49,7 @@ def measure(run: Run) -> None:
     write_gains(drives, run.gains, going)
     drives.write(FOLLOWING_WINDOW, FREE_WINDOW * drives.read((0x2058, 0)), where=going)
     try:
-        with run.spending(going), shaken_on_purpose(drives):
+        with run.spending(going):
             run.response = response = frequency_response.measure(here, "velocity", where=going)
     except SafetyError as error:
         run.stop(going, f"the envelope stopped the frequency response: {error}")

@@ -8,15 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.safety import SafetyError
-from tuning.auto_run import MOVE_TIME
+from tuning.auto_run import MOVE_TIME, TRIAL_TIME
 from tuning.auto_trials import faster
+from tuning.proving import RESTLESS
 
 if TYPE_CHECKING:
     from tuning.auto_run import Run
 
 Mask = NDArray[np.bool_]
 
-SHOWINGS, AT_THE_EDGE = 4, 0.8  # moves for the record until one passes, and the factor of the gains between them
+SHOWINGS, AT_THE_EDGE = 3, 0.6  # moves for the record until one passes, and the factor of the gains between them
+EASED = 0.8  # the factor of gains with which an axis shook at rest
 
 
 def show(run: Run, where: Mask | None = None) -> None:
@@ -25,6 +27,7 @@ def show(run: Run, where: Mask | None = None) -> None:
     if not going.any():
         return
     assert run.ground is not None, "proving makes it"
+    eased = np.zeros(run.target.num_axes, bool)
     for attempt in range(SHOWINGS):
         try:
             with run.spending(going):
@@ -35,6 +38,12 @@ def show(run: Run, where: Mask | None = None) -> None:
         run.shown = shown if run.shown is None else run.shown.replaced(shown)
         failed = going & np.array([bool(reason) for reason in shown.reason])
         last = attempt == SHOWINGS - 1
+        # Time for a response, and for what may follow from it, is kept; what was calmed by one is not eased, too.
+        later = run.response_time + TRIAL_TIME + MOVE_TIME + run.look_back_time
+        again = going & ~failed & shown.restless & ~eased & run.affordable(MOVE_TIME + later) & (where is None)
+        for k in map(int, np.flatnonzero(going & ~failed & shown.restless)):
+            _ease(run, k, float(shown.swing[k]), bool(again[k]))
+        eased |= again
         for k in map(int, np.flatnonzero(failed)):
             axis, why = run.axes[k], shown.reason[k]
             if last or not run.affordable(MOVE_TIME)[k]:
@@ -47,10 +56,25 @@ def show(run: Run, where: Mask | None = None) -> None:
             else:
                 run.gains[k] = faster(run.gains[k], AT_THE_EDGE)
                 axis.notes.append(f"slowed to {100.0 * AT_THE_EDGE:.0f} % after the trial: in one more move {why}")
-        going = failed & run.going
+        # Axes of one machine pull at one load: one that is to move again has the others move with it.
+        lanes = run.target.axes_per_machine
+        going = np.repeat((failed | again).reshape(-1, lanes).any(axis=1), lanes) & run.going
         if not going.any():
             break
     run.drop_faults("it moved with the new gains")
+
+
+def _ease(run: Run, k: int, swing: float, again: bool) -> None:
+    """Say that an axis shook at rest; where there is another move for it, take calmer gains for that."""
+    shook = f"its current swung by {100.0 * swing:.0f} % of the rated one (RMS) at rest"
+    if not again:
+        run.axes[k].notes.append(f"it shakes at rest: {shook}; {100.0 * RESTLESS:.0f} % is still")
+    elif run.spare[k].any():
+        run.gains[k], run.spare[k] = run.spare[k], 0
+        run.axes[k].notes.append(f"the second best of the trial: with the best, {shook}")
+    else:
+        run.gains[k] = faster(run.gains[k], EASED)
+        run.axes[k].notes.append(f"slowed to {100.0 * EASED:.0f} % after the trial: {shook}")
 
 
 def look_back(run: Run) -> None:

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from drive_env.gains import Gains, gains_from_bandwidths, rule_gains
 from drive_env.master.errors import BusError
-from drive_env.safety import SafetyError
+from drive_env.safety import SafetyError, swinging_allowed
 from tuning.auto_checks import unsafe_gains, wrong_wiring
 from tuning.ladder import BOLD, SLIPPERY
 from tuning.linear_model import Plant
-from tuning.proving import shaken_on_purpose
 from tuning.rules import RULES, propose
 from tuning.target import Target
 from tuning.twin import WORLDS, Known, Optimum, Twins, known_of, search
@@ -44,7 +43,7 @@ def identify(run: Run, experiments: Identify) -> None:
     if not run.going.any():
         return
     try:
-        with run.spending(run.going), shaken_on_purpose(target.drives):
+        with run.spending(run.going), swinging_allowed(target.drives):
             found = experiments(target, run.going)
     except (SafetyError, RuntimeError, TimeoutError) as error:
         if isinstance(error, BusError):

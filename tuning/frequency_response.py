@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import GAIN_OBJECTS
+from drive_env.safety import swinging_allowed
 from tuning import margins as margins_
 from tuning.dead_time import dead_time_resistance
 from tuning.excitation import CREST, Lines, dimension, peak, plan_lines
@@ -27,7 +28,6 @@ from tuning.plant_fit import PlantFit, Seen, fit_plant
 from tuning.shaking import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
 from tuning.target import timed
 from tuning.transfer import directions, transfer
-from tuning.working_state import swinging_allowed
 
 if TYPE_CHECKING:
     from drive_env.devices import Device

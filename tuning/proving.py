@@ -6,9 +6,7 @@ envelope may be faster: it quick-stops all drives, so that the trial is repeated
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -56,9 +54,9 @@ OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
 ENABLING = 5.0  # s, the longest wait for an axis that is switched on: some align their encoder first
 TARGET_VELOCITY = 0x60FF
 SHORTEST = 16.0  # counts of the encoder: a move that is shorter proves nothing
-# After a move for the record: the time at rest, of which the second half is looked at, and what its current may swing
-# (RMS about its mean, over the rated one). Loops at their edge shake on, or begin to, once the move is over.
-REST, RESTLESS = 0.2, 0.05
+# After a move for the record: the time at rest [s], of which all but the first third is looked at, and what the current
+# may swing then (RMS about its mean, over the rated one). Loops at their edge begin to shake once the move is over.
+REST, RESTLESS = 0.15, 0.05
 
 
 class Proof(NamedTuple):
@@ -88,7 +86,7 @@ class Shown(NamedTuple):
     """A recorded move: times [s], (n,); demand and actual angle from its start [rad] and current [A], (n, num_axes).
 
     where: Axes that made it, (num_axes,). reason: Of each axis, why it does not pass, "" if it does. cost: J by its
-    measured terms, (num_axes,).
+    measured terms, (num_axes,). swing: Of the current at rest afterwards, over the rated one (RMS), (num_axes,).
     """
 
     t: Floats
@@ -98,31 +96,22 @@ class Shown(NamedTuple):
     where: Mask
     reason: tuple[str, ...]
     cost: Floats
+    swing: Floats
+
+    @property
+    def restless(self) -> Mask:
+        """Which axes shook at rest, (num_axes,)."""
+        return self.where & (self.swing > RESTLESS)
 
     def replaced(self, later: Shown) -> Shown:
         """Return this with the axes of a later recording in their place."""
-        demand, actual, current, cost = (
+        demand, actual, current, cost, swing = (
             np.where(later.where, getattr(later, name), getattr(self, name))
-            for name in ("demand", "actual", "current", "cost")
+            for name in ("demand", "actual", "current", "cost", "swing")
         )
         both = zip(later.where, self.reason, later.reason, strict=True)
         reason = tuple(new if made else old for made, old, new in both)
-        return Shown(self.t, demand, actual, current, self.where | later.where, reason, cost)
-
-
-@contextmanager
-def shaken_on_purpose(drives: Any) -> Iterator[None]:
-    """Keep the envelope of a bus from taking an excitation for an oscillation; its other limits stay in force."""
-    envelope = getattr(drives, "safety", None)
-    if envelope is None:
-        yield
-        return
-    limits = envelope.limits
-    envelope.limits = replace(limits, oscillation=False)
-    try:
-        yield
-    finally:
-        envelope.limits = limits
+        return Shown(self.t, demand, actual, current, self.where | later.where, reason, cost, swing)
 
 
 class ProvingGround:
@@ -228,18 +217,13 @@ class ProvingGround:
             if new.any():
                 write_gains(drives, self.safe, new)
                 stopped |= new
-        swing = drives.record([CURRENT], REST)[CURRENT][round(REST / CYCLE) // 2 :].std(axis=0) * 1e-3 / rated
+        swing = drives.record([CURRENT], REST)[CURRENT][round(REST / CYCLE) // 3 :].std(axis=0) * 1e-3 / rated
         position, demanded, current = (np.concatenate([part[name] for part in traces]) for name in objects[:3])
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
         way = np.sign(self._direction * self.move.distance)
         error = wrapped(position - away) * way
         size = np.maximum(np.abs(self.move.distance), 1)
-        reason = tuple(
-            why or _restless(float(swing[axis])) if where[axis] else why
-            for axis, why in enumerate(
-                self._reasons(stopped[None], np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size)
-            )
-        )
+        reason = self._reasons(stopped[None], np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size)
         settling, noise, overshoot = move_terms(
             position.astype(float), current * 1e-3, self.move, self._t_0, rated, away, way
         )
@@ -251,7 +235,7 @@ class ProvingGround:
         self._origin = np.where(where, away, self._origin)
         self._direction = np.where(where, -self._direction, self._direction)
         t = np.arange(len(demand), dtype=np.float64) * CYCLE
-        return Shown(t, demand, actual, current * 1e-3, where, reason, costs)
+        return Shown(t, demand, actual, current * 1e-3, where, reason, costs, swing)
 
     def _run(self, gains: Integers, where: Mask) -> Trial:
         self._begin(where)
@@ -387,16 +371,6 @@ class ProvingGround:
                 reason = ""
             reasons.append(reason)
         return tuple(reasons)
-
-
-def _restless(swing: float) -> str:
-    """Return why an axis does not pass that is to stand still, "" if it does."""
-    if swing <= RESTLESS:
-        return ""
-    return (
-        f"it shook at rest: its current swung by {100.0 * swing:.0f} % of the rated one (RMS), and "
-        f"{100.0 * RESTLESS:.0f} % are allowed"
-    )
 
 
 def _merged(proofs: Sequence[tuple[Mask, Proof]]) -> Proof:

@@ -277,11 +277,6 @@ def read_gains(target: Target) -> Integers:
     return np.stack([target.drives.read(name) for name in GAIN_OBJECTS], axis=-1)
 
 
-def trial_seconds(trials: int) -> float:
-    """Return how long identification and so many trials take [s], without what recovery takes."""
-    return (MOVES_OF_IDENTIFICATION + MOVES_OF_TRIAL * trials) * TRIAL * CYCLE
-
-
 def _rule_gains(target: Target, inertia: Floats, rule: Rule) -> Integers:
     return np.concatenate(
         [

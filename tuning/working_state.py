@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -211,21 +211,6 @@ def switch_off(drives: motion.Drives, where: Mask) -> None:
     """Switch axes off; one in fault is off already, and its fault stays, to be read and reset by who wants."""
     fault = drives.read(STATUS) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1]
     motion.disable(drives, where & ~fault)
-
-
-@contextmanager
-def swinging_allowed(drives: Any) -> Iterator[None]:
-    """Have a bus's envelope take current that swings for intended meanwhile; all its other limits stay."""
-    envelope = getattr(drives, "safety", None)
-    if envelope is None:
-        yield
-        return
-    limits = envelope.limits
-    envelope.limits = replace(limits, oscillation=False)
-    try:
-        yield
-    finally:
-        envelope.limits = limits
 
 
 def still_enabled(working: Working, status: Integers) -> Mask:

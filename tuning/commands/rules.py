@@ -112,11 +112,11 @@ class _Axis:
 
 def _identified(target: Target) -> list[Plant | str]:
     """Return what the axes are, or why no rule can say anything of one: its inertia was not found."""
+    from drive_env.safety import swinging_allowed
     from tuning.identification import identify
     from tuning.linear_model import Plant
-    from tuning.proving import shaken_on_purpose
 
-    with progress_bar("identifying") as show, shaken_on_purpose(target.drives):
+    with progress_bar("identifying") as show, swinging_allowed(target.drives):
         found = identify(target, progress=lambda what, share: show(share))
     plants: list[Plant | str] = []
     for axis, one in enumerate(found):
