@@ -199,6 +199,13 @@ def test_an_answer_that_was_never_tried_is_refused():
         evaluate(Guessing(0), "gain_tuning", {"trials": 2}, episodes=2)
 
 
+def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = run("evaluate", "tracking_two_mass", "--channel", "socket://127.0.0.1:1", "--node", 3)
+    assert found.exit_code == 2 and "The motor of node 3 will turn. Is its way clear?" in found.output
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_report_is_saved_and_loaded(tmp_path):
     found = evaluate(Gentle(), "tracking", SHORT, episodes=2)
     again = Evaluation.load(found.save(tmp_path / "report.json"))

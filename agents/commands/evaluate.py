@@ -24,6 +24,7 @@ from agents.commands.options import (
     print_json,
     progress_bar,
 )
+from drive_env.tools.options import Yes, ask
 
 EMULATOR = "emulator"
 BUS_EPISODES, EPISODES = 8, 64
@@ -98,6 +99,7 @@ def evaluate(
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for report, episodes and pictures, new or empty.")
     ] = None,
+    yes: Yes = False,
     json: Json = False,
 ) -> None:
     """Run episodes of a policy: score with a 95 % interval, violations, pictures; on both sides the same command.
@@ -136,6 +138,8 @@ def evaluate(
             return
         count = episodes or (BUS_EPISODES if on_bus else EPISODES)
         options = {"episodes": count, "seed": seed, "guard": guard, "name": policy}
+        if on_bus and not lockstep:  # what waits for SYNC is emulated
+            ask(f"The motor of node {', '.join(map(str, node or [1]))} will turn. Is its way clear?", yes)
         before = _way_back(out) if on_bus else None
         found = (
             _on_bus(loaded, configuration, options, sensor, before, device=device, interface=interface,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -208,8 +209,17 @@ def _print(target: Target, shown: _Axis, axis: int | None) -> None:
     for name, proposal in rows.items():
         found = _margins(target, plant, proposal)
         figures = (found.crossover_hz, found.phase_deg, found.gain_db)
-        table.add_row(name, *map(str, proposal.gains), *(f"{figure:.0f}" for figure in figures))
+        shown_figures = (f"{figure:.0f}" if math.isfinite(figure) else "-" for figure in figures)
+        table.add_row(name, *map(str, proposal.gains), *shown_figures)
     console.print(table)
+    if plant.is_elastic and plant.damping == type(plant).damping:
+        console.print(
+            "How much the resonance is damped is not identified: margins are computed with a ratio of "
+            f"{plant.damping:g}, hardly any; `drive-tune response` measures them.",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
     for name, proposal in rows.items():
         for note in proposal.notes:
             console.print(f"{name}: {note}", highlight=False, markup=False, soft_wrap=True)
