@@ -17,6 +17,7 @@ from agents.bundle import Bundle, BundleError
 from agents.cli import app
 from agents.evaluation import AsOnABus, Evaluation, evaluate
 from agents.guard import GuardLimits
+from agents.on_the_bus import target_for
 from agents.policies import PolicyNotFoundError, open_policy
 from agents.policy import PolicyError, policy_of
 from agents.scores import interval
@@ -197,6 +198,16 @@ def test_an_answer_that_was_never_tried_is_refused():
 
     with pytest.raises(ValueError, match="answered gains that it had not tried"):
         evaluate(Guessing(0), "gain_tuning", {"trials": 2}, episodes=2)
+
+
+def test_a_policy_on_a_bus_has_half_as_far_again_as_its_task_and_twice_its_speed(served):
+    channel, emulated = served
+    at = int(emulated.read(0x6064)[0])
+    task = SHORT | {"amplitude": 1.0, "speed": 10.0}
+    with target_for("tracking", task, PATIENT, channel=channel, lockstep=True) as target:
+        limits = target.drives.safety.limits
+    assert limits.position == (at - 3 * TURN // 2, at + 3 * TURN // 2) and limits.velocity == 20 * TURN
+    assert limits.oscillation and limits.stall == PATIENT.stall
 
 
 def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkeypatch):

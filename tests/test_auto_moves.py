@@ -217,6 +217,20 @@ def test_a_move_tells_whether_its_axis_shakes_at_rest():
     assert shown.reason == ("", "") and shown.restless.tolist() == [True, False]
 
 
+def test_gains_that_are_too_slow_to_arrive_do_not_pass():
+    with emulated(load="inertia", num_machines=2, num_threads=1) as target:
+        plant = Plant.from_machine(target.drives)
+        good = np.array(propose("margin_55", target.device, target.motor, plant).gains)
+        slow = good.copy()
+        slow[Gains._fields.index("position_p")] = max(good[-1] // 40, 1)
+        ground = ProvingGround(
+            target, [plant] * 2, (target.low, target.high), np.stack([good] * 2), np.stack([good] * 2)
+        )
+        proof = ground.run(np.stack([slow, good]), np.ones(2, bool))
+    assert "of the move away at the end; 20 % is allowed" in proof.reason[0]
+    assert proof.passed.tolist() == [False, True]
+
+
 def test_gains_that_shake_at_rest_are_eased_once_or_said_to(monkeypatch, tmp_path):
     finds(monkeypatch, np.array(RINGING))
     with emulated(load="belt", num_threads=1) as target:
