@@ -18,7 +18,7 @@ from drive_env.safety import SafetyError
 from drive_env.score import HiddenScore
 from tuning import auto as auto_module
 from tuning import auto_margins, auto_search, auto_trials
-from tuning.auto import BUDGET, auto, tune
+from tuning.auto import BUDGET, auto
 from tuning.auto_certificate import certificate
 from tuning.auto_checks import unsafe_gains
 from tuning.brief import identify_briefly
@@ -447,19 +447,23 @@ def hidden_ratio(target, machines, found):
 
 
 @pytest.mark.slow
-def test_on_machines_of_the_suite_it_is_far_better_than_the_fitted_rule(tmp_path):
-    machines = load_suite("public", count=12)
-    ratios, accepted, seconds = [], [], []
+def test_on_the_public_machines_it_is_far_better_than_the_fitted_rule_and_stays_inside_its_envelope(tmp_path):
+    """All 46 of one axis; side by side they wait for each other, which counts as their drive time."""
+    machines = [machine for machine in load_suite("public") if machine.load not in ("gantry", "robot")]
+    ratios, accepted, seconds, violations = [], [], [], 0
     for target, indices in open_machines(machines):
         chosen = [machines[k] for k in indices]
-        outcome = tune(target, np.random.default_rng(5))
-        np.testing.assert_array_equal(outcome.gains, gains(target.drives))
-        ratios += hidden_ratio(target, chosen, outcome.gains).tolist()
-        accepted += [not note.startswith("no gains") for note in outcome.notes]
-        seconds += outcome.drive_seconds.tolist()
-    assert max(seconds) < BUDGET + 0.5
-    assert np.median(ratios) < 0.7
-    assert sum(accepted) >= len(accepted) - 2
+        result = auto(target, tmp_path / f"{chosen[0].name}.toml", seed=5)
+        found = np.array([axis.after for axis in result.axes], np.int64)
+        np.testing.assert_array_equal(found, gains(target.drives))
+        ratios += hidden_ratio(target, chosen, found).tolist()
+        accepted += result.accepted.tolist()
+        seconds += result.drive_seconds.tolist()
+        violations += int(result.violations.sum())
+    assert len(ratios) == 46 and sum(accepted) >= 45
+    assert np.median(ratios) <= 0.6
+    assert violations == 0
+    assert np.median(seconds) < BUDGET and max(seconds) < 1.3 * BUDGET
 
 
 def test_brief_identification_is_right_and_quick():
