@@ -97,3 +97,18 @@ def test_without_a_crossing_there_is_none():
 def test_rows_that_are_none_are_refused(f, L, message):
     with pytest.raises(ValueError, match=message):
         margins(f, L)
+
+
+def test_margins_are_read_where_they_are_least_of_several_crossings():
+    """A resonance lifts the gain above 1 once more: the phase is read there, not at the first crossover."""
+    f = np.geomspace(1.0, 1000.0, 4000)
+    s = 2j * np.pi * f
+    w, z = 2.0 * np.pi * 100.0, 0.02
+    L = 2.0 * np.pi * 20.0 / s * np.exp(-5e-4 * s) * w**2 / (s**2 + 2.0 * z * w * s + w**2)
+    found = margins(f, L)
+    assert found.crossover_hz == pytest.approx(20.9, abs=0.5)
+    assert 80.0 < found.phase_hz < 115.0
+    at = lambda hz: np.interp(hz, f, np.degrees(np.unwrap(np.angle(L))))  # noqa: E731
+    off = (at(found.phase_hz) + 180.0 + 180.0) % 360.0 - 180.0
+    assert off == pytest.approx(found.phase_deg, abs=0.5)
+    assert -20.0 * np.log10(np.interp(found.gain_hz, f, np.abs(L))) == pytest.approx(found.gain_db, abs=0.05)

@@ -70,6 +70,8 @@ def _model(response: FrequencyResponse, axis: int, plant: Plant | None) -> tuple
 
 
 def _draw_bode(magnitude: Any, phase: Any, response: FrequencyResponse, axis: int, plant: Plant | None) -> None:
+    from tuning.certificate_pictures import PHASES, draw_margins
+
     f, L = response.f, response.open_loop[:, axis]
     good = response.trusted[:, axis]
     seen = np.isfinite(L)
@@ -97,14 +99,12 @@ def _draw_bode(magnitude: Any, phase: Any, response: FrequencyResponse, axis: in
     found = response.margins(axis)
     magnitude.axhline(0.0, color="k", linewidth=0.5)
     phase.axhline(-180.0, color="k", linewidth=0.5)
-    if np.isfinite(found.crossover_hz):
-        for plot in (magnitude, phase):
-            plot.axvline(found.crossover_hz, color="k", linewidth=0.5, linestyle=":")
+    draw_margins(magnitude, phase, found.phase_hz, found.phase_deg, found.gain_hz, found.gain_db, "k")
     if response.traced.any():
         for plot in (magnitude, phase):
             plot.axvspan(f[response.traced].min(), f.max(), color=TRACED, alpha=0.07, linewidth=0)
     magnitude.set(xscale="log", ylabel="open loop [dB]")
-    phase.set(ylabel="phase [deg]", ylim=(-360.0, 0.0), yticks=np.arange(-360, 1, 90))
+    phase.set(ylabel="phase [deg]", ylim=PHASES, yticks=np.arange(PHASES[0], PHASES[1] + 1.0, 90.0))
     if good.any():
         magnitude.set_ylim(*_around(level[good], 6.0))
     magnitude.legend(fontsize=8, loc="lower left")
@@ -165,8 +165,10 @@ def _text(value: float, form: str) -> str:
 
 
 def _turns(L: Complex) -> Floats:
-    """Return the phase in degrees, -360...0."""
-    return np.asarray(np.degrees(np.angle(L)) % 360.0 - 360.0)
+    """Return the phase in degrees, as it is shown."""
+    from tuning.certificate_pictures import within_a_turn
+
+    return within_a_turn(np.degrees(np.angle(L)))
 
 
 def _without_jumps(f: Floats, value: Floats) -> tuple[Floats, Floats]:

@@ -188,6 +188,8 @@ MARGIN_NAMES = {
     "crossover_hz": "crossover [Hz]",
     "bandwidth_hz": "bandwidth [Hz]",
     "ms": "Ms",
+    "phase_hz": "phase margin at [Hz]",
+    "gain_hz": "gain margin at [Hz]",
 }
 
 

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 TRUSTED = 0.95  # coherence; what lies below is shown as doubtful, not as truth
 BEFORE, AFTER, DOUBTFUL = "#d55e00", "#0072b2", "#b8b8b8"
 DPI = 110
+MARGINS = ("phase margin at [Hz]", "phase margin [deg]", "gain margin at [Hz]", "gain margin [dB]")
+PHASES = (-270.0, 90.0)  # degrees shown: about -180, and an anti-resonance, which leads, does not wrap
 
 
 def step_picture(steps: Sequence[StepResponse]) -> Figure:
@@ -48,16 +50,13 @@ def bode_picture(responses: Sequence[FrequencyResponse]) -> Figure:
             trusted = np.isnan(found.coherence) | (found.coherence >= TRUSTED)
         doubtful = doubtful or not trusted.all()
         _curve(magnitude, found.frequency, found.magnitude_db, trusted, color, label)
-        # Within a turn: -540 degrees is as near to instability as -180.
-        turn = found.phase_deg % 360.0 - 360.0
+        turn = within_a_turn(found.phase_deg)
         jumps = np.flatnonzero(np.abs(np.diff(turn)) > 180.0) + 1
         f, turn = np.insert(found.frequency, jumps, np.nan), np.insert(turn, jumps, np.nan)
         _curve(phase, f, turn, np.insert(trusted, jumps, False), color, label)
         coherence.plot(found.frequency, found.coherence, color=color, linewidth=1.0)
-        crossover = found.margins.get("crossover [Hz]", np.nan)
-        if np.isfinite(crossover):
-            for axes in (magnitude, phase):
-                axes.axvline(crossover, color=color, linewidth=0.8, linestyle=":")
+        read = [found.margins.get(name, np.nan) for name in MARGINS]
+        draw_margins(magnitude, phase, read[0], read[1], read[2], read[3], color)
     magnitude.axhline(0.0, color="black", linewidth=0.8)
     phase.axhline(-180.0, color="black", linewidth=0.8)
     coherence.axhline(TRUSTED, color="black", linewidth=0.8, linestyle="--")
@@ -69,14 +68,28 @@ def bode_picture(responses: Sequence[FrequencyResponse]) -> Figure:
     magnitude.set_ylabel("magnitude [dB]")
     magnitude.legend(loc="best")
     phase.set_ylabel("phase [°]")
-    phase.set_ylim(-360.0, 0.0)
-    phase.set_yticks(range(-360, 1, 90))
+    phase.set_ylim(*PHASES)
+    phase.set_yticks(range(int(PHASES[0]), int(PHASES[1]) + 1, 90))
     coherence.set_ylabel("coherence")
     coherence.set_ylim(0.0, 1.05)
     coherence.set_xlabel("frequency [Hz]")
     for axes in (magnitude, phase, coherence):
         axes.grid(True, which="both", alpha=0.25)
     return figure
+
+
+def within_a_turn(phase: np.ndarray) -> np.ndarray:
+    """Return phases [degrees] within PHASES: -540 degrees is as near to instability as -180."""
+    return np.asarray((phase - PHASES[0]) % 360.0 + PHASES[0])
+
+
+def draw_margins(
+    magnitude: Axes, phase: Axes, phase_hz: float, phase_deg: float, gain_hz: float, gain_db: float, color: str
+) -> None:
+    """Draw the phase margin from -180 degrees and the gain margin from 0 dB, each where it is read, if it was seen."""
+    for axes, at, line, size in ((phase, phase_hz, -180.0, phase_deg), (magnitude, gain_hz, 0.0, -gain_db)):
+        if np.isfinite(at) and np.isfinite(size):
+            axes.plot([at, at], [line, line + size], color=color, linewidth=2.2, marker="_", solid_capstyle="butt")
 
 
 def _curve(axes: Axes, f: np.ndarray, y: np.ndarray, trusted: np.ndarray, color: str, label: str) -> None:

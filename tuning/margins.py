@@ -22,6 +22,7 @@ class Margins(NamedTuple):
     crossover_hz: Lowest frequency from which on the gain is below 1 until the next crossing [Hz].
     bandwidth_hz: Frequency at which the closed loop's gain has fallen by 3 dB [Hz].
     ms: Greatest sensitivity |1 / (1 + L)|.
+    phase_hz, gain_hz: Where phase_deg and gain_db are read [Hz]: with a resonance there are several crossings.
     """
 
     phase_deg: float
@@ -29,6 +30,8 @@ class Margins(NamedTuple):
     crossover_hz: float
     bandwidth_hz: float
     ms: float
+    phase_hz: float = math.nan
+    gain_hz: float = math.nan
 
 
 def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None) -> Margins:
@@ -59,28 +62,29 @@ def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None
     turned = np.abs(np.diff(off)) < math.pi
     phases = _crossings(at, off, both & turned & (off[:-1] * off[1:] <= 0.0) & (off[:-1] != off[1:]))
     continuous = np.unwrap(off)
-    phase = crossover = math.nan
+    phase = crossover = phase_at = math.nan
     if gains.size:
         angles = (np.interp(np.log(gains), np.log(at), continuous) + math.pi) % (2.0 * math.pi) - math.pi
-        phase = math.degrees(float(angles[np.argmin(np.abs(angles))]))
+        least = int(np.argmin(np.abs(angles)))
+        phase, phase_at = math.degrees(float(angles[least])), float(gains[least])
         falling = gains[[log_gain[np.searchsorted(at, x, side="right") - 1] > 0.0 for x in gains]]
         crossover = float(falling[0]) if falling.size else float(gains[0])
     known = np.flatnonzero(good)
     unseen = known[:-1][(np.diff(known) > 1) & (np.diff(np.sign(log_gain[known])) != 0.0)]
     if unseen.size:
         # The gain passes 1 where nothing is trusted: the phase there is not known, and it may be the worst.
-        phase = math.nan
+        phase = phase_at = math.nan
         crossover = math.nan if not crossover < at[unseen[0]] else crossover
-    gain = _gain_margin(at, log_gain, off, phases)
+    gain, gain_at = _gain_margin(at, log_gain, off, phases)
     left, right = known[:-1], known[1:]
     hidden = (right - left > 1) & (off[left] * off[right] < 0.0) & (np.abs(off[left] - off[right]) < math.pi)
     if hidden.any():
         # The phase passes -180 degrees where nothing is trusted, and the gain there may be the greater of both ends'.
-        least = -20.0 / math.log(10.0) * float(np.maximum(log_gain[left], log_gain[right])[hidden].max())
-        gain = math.nan if least < gain else gain
+        worst = -20.0 / math.log(10.0) * float(np.maximum(log_gain[left], log_gain[right])[hidden].max())
+        gain, gain_at = (math.nan, math.nan) if worst < gain else (gain, gain_at)
     closed = np.where(good, np.abs(L / (1.0 + L)), math.nan)
     sensitivity = 1.0 / np.abs(1.0 + L[good]) if good.any() else np.array([math.nan])
-    return Margins(phase, gain, crossover, _bandwidth(at, closed), float(sensitivity.max()))
+    return Margins(phase, gain, crossover, _bandwidth(at, closed), float(sensitivity.max()), phase_at, gain_at)
 
 
 def _crossings(f: Floats, value: Floats, where: NDArray[np.bool_]) -> Floats:
@@ -90,17 +94,20 @@ def _crossings(f: Floats, value: Floats, where: NDArray[np.bool_]) -> Floats:
     return np.asarray(np.exp(np.log(f[k]) + share * np.log(f[k + 1] / f[k])))
 
 
-def _gain_margin(f: Floats, log_gain: Floats, off: Floats, phases: Floats) -> float:
+def _gain_margin(f: Floats, log_gain: Floats, off: Floats, phases: Floats) -> tuple[float, float]:
+    """Return the gain margin [dB] and where it is read [Hz], of crossings of -180 degrees at `phases` [Hz]."""
     if not phases.size:
-        return math.inf
+        return math.inf, math.nan
     margin = -20.0 / math.log(10.0) * np.interp(np.log(phases), np.log(f), log_gain)
     before = np.searchsorted(f, phases, side="right") - 1
     falling = off[np.clip(before, 0, len(off) - 1)] > 0.0
     # Nyquist: unstable if, with a gain above 1, the phase falls through -180 degrees more often than it rises.
     beyond = margin < 0.0
-    if np.count_nonzero(beyond & falling) > np.count_nonzero(beyond & ~falling):
-        return float(margin[beyond & falling].min())
-    return float(margin[~beyond].min()) if not beyond.all() else math.inf
+    count = beyond & falling if np.count_nonzero(beyond & falling) > np.count_nonzero(beyond & ~falling) else ~beyond
+    if not count.any():
+        return math.inf, math.nan
+    k = np.flatnonzero(count)[margin[count].argmin()]
+    return float(margin[k]), float(phases[k])
 
 
 def _bandwidth(f: Floats, closed: Floats) -> float:
