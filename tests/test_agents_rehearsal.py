@@ -146,7 +146,8 @@ def test_what_a_run_would_not_begin_for(prepare, line):
     assert found.stderr.startswith("drive-agent: a run would not begin")
 
 
-def test_a_node_that_is_stopped_stays_so():
+@pytest.mark.parametrize("patient_masters", [None], ids=["as patient as a user's"])
+def test_a_node_that_is_stopped_stays_so(patient_masters):
     with served() as (world, _, channel, frames):
         world.nodes[1].receive(Frame(NMT, bytes((STOP, 1))), world.time)
         state = world.nodes[1].state

@@ -21,6 +21,7 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.cli import PANELS, app
 from drive_env.master.errors import BusError
+from drive_env.tools import scan
 
 DONE, REFUSED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 
@@ -65,6 +66,30 @@ def test_scan_finds_and_names_the_nodes(run):
         (1, "tmcm1636", 0x286),
         (2, "tmcm1636", 0x286),
     ]
+
+
+def test_a_node_that_boots_while_it_is_scanned_is_found_and_said_to_be_in_no_state():
+    """A boot-up message is an event (CiA 301): a heartbeat tells a state."""
+    sent = []
+
+    class Port:
+        def __init__(self):
+            self.handlers = {}
+
+        def subscribe(self, can_id, handler):
+            self.handlers[can_id] = handler
+
+        def send(self, can_id, data):
+            if can_id == 0x600 + 2 and not sent:
+                sent.append(can_id)
+                self.handlers[0x701](b"\0")
+                self.handlers[0x702](b"\x05")
+                self.handlers[0x702](b"\0")
+
+        def wait(self, done, timeout):
+            pass
+
+    assert scan._find(Port(), 1, 3, 0.1) == {(1, ""), (2, "operational")}
 
 
 def test_scan_of_an_empty_range_is_told(run):

@@ -64,9 +64,12 @@ def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, st
 
     answered: set[int] = set()
     heard: dict[int, str] = {}
-    states = {0: "booting", 4: "stopped", 5: "operational", 127: "pre-operational"}
+    states = {4: "stopped", 5: "operational", 127: "pre-operational"}
 
     def hear(node: int, data: bytes) -> None:
+        if data == bytes(1):  # it has booted: where it is now it does not say
+            heard.setdefault(node, "")
+            return
         heard[node] = states.get(data[0] & 0x7F, "unknown") if data else "unknown"
 
     for node in range(first, last + 1):
