@@ -436,6 +436,26 @@ def test_a_log_of_a_bus_that_is_lost_keeps_what_came(run, tmp_path, ending):
         assert [frame.arbitration_id for frame in frames] == [0x701] * 3
 
 
+@pytest.mark.parametrize("ending", ["log", "blf", "asc"])
+def test_a_channel_whose_name_ends_in_a_large_number_is_logged(tmp_path, monkeypatch, ending):
+    class Bus:
+        def __init__(self):
+            self.left = [can.Message(arbitration_id=0x181, data=b"\1\2", channel="0cac0e67637", is_extended_id=False)]
+
+        def recv(self, timeout):
+            return self.left.pop() if self.left else None
+
+        def shutdown(self):
+            pass
+
+    monkeypatch.setattr("drive_env.master.port.open_bus", lambda *_, **__: Bus())
+    file = tmp_path / f"session.{ending}"
+    done = CliRunner().invoke(app, ["log", str(file), "--duration", "0.02"])
+    assert done.exit_code == 0, done.exception
+    with can.LogReader(str(file)) as reader:
+        assert [(one.arbitration_id, bytes(one.data)) for one in reader] == [(0x181, b"\1\2")]
+
+
 @pytest.mark.parametrize("ending", ["log", "blf"])
 def test_a_logged_session_replays_the_masters_frames(run, shared, tmp_path, ending):
     file = tmp_path / f"session.{ending}"

@@ -138,9 +138,9 @@ def evaluate(
             return
         count = episodes or (BUS_EPISODES if on_bus else EPISODES)
         options = {"episodes": count, "seed": seed, "guard": guard, "name": policy}
+        before = _way_back(out) if on_bus else None
         if on_bus and not lockstep:  # what waits for SYNC is emulated
             ask(f"The motor of node {', '.join(map(str, node or [1]))} will turn. Is its way clear?", yes)
-        before = _way_back(out) if on_bus else None
         found = (
             _on_bus(loaded, configuration, options, sensor, before, device=device, interface=interface,
                     channel=channel, nodes=node or (1,), lockstep=lockstep,

@@ -22,6 +22,7 @@ from drive_env.tools.options import (
     print_json,
 )
 
+MOST_CHANNELS = 0xFFFF
 FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc")
 
 
@@ -38,6 +39,7 @@ def log(
     """Write every frame of the bus to a file; nothing is sent. Where the bus is lost, what came until then is kept."""
     with errors_as_exit_codes():
         import can
+        from can.util import channel2int
 
         from drive_env.master.port import open_bus
 
@@ -60,6 +62,9 @@ def log(
                             lost = error
                             break
                         if message is not None:
+                            # BLF has two bytes for a channel, which python-can fills with the last digits of its name.
+                            if (channel2int(message.channel) or 0) >= MOST_CHANNELS:
+                                message.channel = None
                             writer(message)
                             count += 1
                 except KeyboardInterrupt:
