@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from drive_env.master import pace as module
 from drive_env.master.pace import RealTimePace, Timing
+from drive_env.master.sampling import run_cycles
 
 CYCLE = 0.001
 
@@ -67,3 +69,21 @@ def test_within_a_run_a_sync_more_than_a_cycle_late_shifts_the_others(clock):
     assert pace.timing == Timing(5, 1, pytest.approx(0.0015))
     pace.begin()
     assert pace.timing.cycles == 0 and pace.total.cycles == 5
+
+
+def test_the_first_set_points_do_not_wait_for_the_sync_they_belong_to(clock):
+    """Their frames take time of the bus that a policy has left; later ones go out just before their SYNC."""
+    sent = []
+
+    class Port:
+        receive = staticmethod(clock.receive)
+
+        def send(self, can_id, data=b""):
+            sent.append((can_id, round(1e3 * (clock.now - 5.0), 6)))
+
+    pace = RealTimePace(CYCLE)
+    pace.begin()
+    pace.wait(clock.receive)  # a SYNC at 0
+    clock.now += 0.0004  # a policy thinks
+    run_cycles(Port(), pace, 2, [(0x201, np.zeros((2, 4), np.uint8))], None, 1.0)
+    assert sent == [(0x201, 0.4), (0x80, 1.0), (0x201, 2.0), (0x80, 2.0)]
