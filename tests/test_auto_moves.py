@@ -14,7 +14,7 @@ from drive_env.master.pace import Timing
 from tuning import auto_search
 from tuning.auto import auto, tell_of_lateness
 from tuning.auto_certificate import certificate
-from tuning.auto_moves import _keep_what_is_better
+from tuning.auto_moves import _ease, _keep_what_is_better
 from tuning.auto_result import AxisRun
 from tuning.auto_run import Run as AutoRun
 from tuning.auto_search import calm_gains
@@ -252,3 +252,17 @@ def test_syncs_that_were_late_are_told(late, told):
     tell_of_lateness(run)
     wanted = "7 of 9000 SYNCs were more than a cycle late, the worst by 3.1 ms: this computer is busy"
     assert [note.startswith(wanted) for note in axis.notes] == [True] * told
+
+
+@pytest.mark.parametrize(("again", "spare", "gains_now", "said"), [
+    (True, (9, 9, 9, 9, 9), (9, 9, 9, 9, 9), "the second best of the trial"),
+    (True, (0, 0, 0, 0, 0), (4000, 1000, 800, 400, 240), "slowed to 80 % after the trial"),
+    (False, (9, 9, 9, 9, 9), (4000, 1000, 1000, 500, 300), "it shakes at rest: its current swung by 7 %"),
+])  # fmt: skip
+def test_who_shakes_at_rest_takes_calmer_gains_where_there_is_a_move_for_it(again, spare, gains_now, said):
+    axis = AxisRun(Gains(1, 1, 1, 1, 1), Gains(1, 1, 1, 1, 1))
+    run = SimpleNamespace(axes=[axis], gains=np.array([[4000, 1000, 1000, 500, 300]]), spare=np.array([spare]))
+    _ease(run, 0, 0.07, again)
+    assert tuple(run.gains[0]) == gains_now
+    assert run.spare.any() == (not again)
+    assert len(axis.notes) == 1 and axis.notes[0].startswith(said)
