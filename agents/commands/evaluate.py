@@ -113,7 +113,8 @@ def evaluate(
     with errors_as_exit_codes():
         for name, value in (("--episodes", episodes), ("--gap", gap), ("--seed", seed + 1)):
             if value is not None and value < 1:
-                raise ValueError(f"{name} {value - (name == '--seed')} is too small")
+                least = 0 if name == "--seed" else 1
+                raise ValueError(f"{name} {value - 1 + least} is too small; give {least} or more")
         for name, limit in (("--stall", stall), ("--saturation", saturation)):
             if limit is not None and not 0.0 <= limit < math.inf:
                 raise ValueError(f"{name} {limit:g} must be a time [s], 0 for any")
