@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
 from contextlib import contextmanager
 
@@ -85,25 +86,49 @@ def files(folder):
     return [path for path in folder.rglob("*before*.toml") if not path.name.startswith(".")]
 
 
+@contextmanager
+def standing_still_once(machine, is_under_way):
+    """Let no time pass at a node from the moment on when something is so, until the end; yield the event of it.
+
+    Whoever watches a run from another thread may see it when it is over: the node itself must stop.
+    """
+    reached, over, advance = threading.Event(), threading.Event(), machine.advance
+
+    def stop_there(duration):
+        if not reached.is_set() and is_under_way():
+            reached.set()
+            over.wait(PATIENCE)
+        advance(duration)
+
+    machine.advance = stop_there
+    try:
+        yield reached
+    finally:
+        machine.advance = advance
+        over.set()
+
+
 def killed(machine, command, bus, folder):
     """Run a command, kill it once the axis is enabled and other than before; return the file that it left."""
 
     def is_under_way():
         # A response is measured with the gains and ramps that there are: it changes PDOs alone.
-        changed = command == "response" or any(differences(machine, file) for file in files(folder))
-        return changed and status_is(machine, motion.OPERATION_ENABLED)
+        return status_is(machine, motion.OPERATION_ENABLED) and (
+            command == "response" or any(differences(machine, file) for file in files(folder))
+        )
 
     app, arguments = COMMANDS[command]
     program = "drive_agent" if app is drive_agent else "drive_tune"
-    process = subprocess.Popen(
-        [sys.executable, "-c", f"from drive_env.commands import {program} as run; run()", *arguments, *bus],
-        cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    try:
-        wait_until(is_under_way, process)
-    finally:
-        process.kill()
-        _, said = process.communicate()
+    with standing_still_once(machine, is_under_way) as reached:
+        process = subprocess.Popen(
+            [sys.executable, "-c", f"from drive_env.commands import {program} as run; run()", *arguments, *bus],
+            cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        try:
+            wait_until(reached.is_set, process)
+        finally:
+            process.kill()
+            _, said = process.communicate()
     assert process.returncode == -signal.SIGKILL, said
     (file,) = files(folder)
     return file
