@@ -204,6 +204,31 @@ def test_an_axis_that_still_turns_is_stopped_before_gains_are_judged_on_it():
     assert proof.overshoot[0] == pytest.approx(proof.overshoot[1], abs=0.05)
 
 
+STIFF, SOFT = (4021, 1573, 806, 1233, 1172), (4021, 1573, 445, 329, 118)
+
+
+@pytest.mark.parametrize("kick", [12, 40])  # cycles
+@pytest.mark.parametrize("gains_then", [STIFF, SOFT])
+def test_a_move_for_the_record_begins_at_rest_with_its_own_gains(gains_then, kick):
+    everyone = np.ones(1, bool)
+    with emulated(load="two_mass", num_threads=1) as target:
+        drives, stiff = target.drives, np.array([STIFF])
+        ground = ProvingGround(target, [Plant.from_machine(drives)], (target.low, target.high), stiff, stiff)
+        ground.show(stiff, everyone)
+        # It turns and swings, as a frequency response may leave it, and its integrator works against that.
+        motion.select_mode(drives, "csv")
+        speed = 1_000_000 * np.sin(2.0 * np.pi * np.arange(kick) / 25.0)
+        drives.record([0x6064], kick * 1e-3, {0x60FF: np.rint(speed).astype(int)[:, None]})
+        assert abs(int(drives.read(0x606C)[0])) > 300_000
+        motion.select_mode(drives, "pp")
+        ground.begin_here(everyone)
+        shown = ground.show(np.array([gains_then]), everyone)
+    way = shown.actual[:, 0] * np.sign(shown.demand[-1, 0])
+    assert shown.reason == ("",) and way[-1] > 1.0
+    assert way[:20].min() >= -2.0 * 2.0 * np.pi / target.motor.encoder_counts
+    assert abs(shown.current[0, 0]) < 0.2
+
+
 RINGING = (11883, 382, 1437, 1007, 1370)  # of a belt: good while it moves, and a limit cycle within an encoder count
 
 

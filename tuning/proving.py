@@ -6,7 +6,7 @@ envelope may be faster: it quick-stops all drives, so that the trial is repeated
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -48,6 +48,7 @@ RETURN_MOVES, RETURN_SPEED = 3.0, 0.5  # moves that are as short a way as one; o
 RECOVERIES = 6  # attempts to reset a fault, with such a time between them
 SETTLING = 0.03  # s at rest before a trial, once the set-point is where the axis is
 STOPPING, STOPPING_LOOK = 400, 20  # cycles: the longest wait for axes to stand, and how often it is looked
+HOLDING = 400  # cycles: the longest wait for axes to stand with other gains, before a move for the record
 STEP_COUNTS = 1.5  # of the encoder: what is less is no motion, and no step
 RETURN_LOOKS, RETURN_LOOK = 8, 0.05  # looks whether it is back, and the time between them [s]
 OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
@@ -201,22 +202,18 @@ class ProvingGround:
         """Record one move with gains, and judge it; what oscillates or trips gets gains that hold within 50 ms."""
         drives, rated = self.target.drives, self.target.motor.rated_current
         self._begin(where)
+        self._hold_still(where)
         write_gains(drives, gains, where)
+        stopped = self._hold_still(where, watched=True)
         write_profile(drives, self.move, where)
         away = self._origin + self._direction * self.move.distance
         start(drives, wrapped(away).astype(np.int64), where)
         self.moves[where] += 1
         objects = [POSITION, DEMAND, CURRENT, STATUS]
-        traces, stopped = [], np.zeros(self.target.num_axes, bool)
-        mask, enabled = motion.OPERATION_ENABLED
+        traces = []
         for _ in range(TRIAL // WATCH):
             traces.append(drives.record(objects, WATCH * CYCLE))
-            change = np.diff(traces[-1][CURRENT], axis=0) * 1e-3
-            shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * rated
-            new = where & ~stopped & (shaking | (traces[-1][STATUS][-1] & mask != enabled))
-            if new.any():
-                write_gains(drives, self.safe, new)
-                stopped |= new
+            stopped |= self._stop_what_shakes(traces[-1], where & ~stopped)
         swing = drives.record([CURRENT], REST)[CURRENT][round(REST / CYCLE) // 3 :].std(axis=0) * 1e-3 / rated
         position, demanded, current = (np.concatenate([part[name] for part in traces]) for name in objects[:3])
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
@@ -236,6 +233,43 @@ class ProvingGround:
         self._direction = np.where(where, -self._direction, self._direction)
         t = np.arange(len(demand), dtype=np.float64) * CYCLE
         return Shown(t, demand, actual, current * 1e-3, where, reason, costs, swing)
+
+    def _hold_still(self, where: Mask, watched: bool = False) -> Mask:
+        """Come to rest with the gains there are, and take that for the beginning.
+
+        Other gains divide what holds an axis otherwise between error and integrator. What its integrator has kept for
+        the gains before would move it, and pass for these gains' doing.
+
+        Args:
+            where: The axes.
+            watched: Stop what shakes: gains that are new. What others are still swinging from is not their doing.
+
+        Returns:
+            What was stopped, (num_axes,).
+        """
+        stopped = np.zeros(self.target.num_axes, bool)
+        for _ in range(HOLDING // WATCH):
+            seen = self.target.drives.record([POSITION, CURRENT, STATUS], WATCH * CYCLE)
+            if watched:
+                stopped |= self._stop_what_shakes(seen, where & ~stopped)
+            if not np.any(where & ~stopped & ~self._stands(seen[POSITION])):
+                break
+        self._begin_without_a_step(where)
+        return stopped
+
+    def _stop_what_shakes(self, seen: Mapping[object, Any], where: Mask) -> Mask:
+        """Give gains that hold to axes that oscillated in a recording or went off in it, and return which did."""
+        change = np.diff(seen[CURRENT], axis=0) * 1e-3
+        mask, enabled = motion.OPERATION_ENABLED
+        shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * self.target.motor.rated_current
+        new: Mask = where & (shaking | (seen[STATUS][-1] & mask != enabled))
+        if new.any():
+            write_gains(self.target.drives, self.safe, new)
+        return new
+
+    def _stands(self, positions: Integers) -> Mask:
+        """Return which axes stood in a recording of their positions, (cycles, num_axes)."""
+        return np.asarray(np.abs(wrapped(positions - positions[-1])).max(axis=0) <= STEP_COUNTS * self._count)
 
     def _run(self, gains: Integers, where: Mask) -> Trial:
         self._begin(where)
@@ -267,7 +301,7 @@ class ProvingGround:
         drives.write(TARGET_VELOCITY, 0, where=where)
         for _ in range(STOPPING // STOPPING_LOOK):
             seen = drives.record([POSITION], STOPPING_LOOK * CYCLE)[POSITION]
-            if not np.any(where & (np.abs(wrapped(seen - seen[-1])).max(axis=0) > STEP_COUNTS * self._count)):
+            if not np.any(where & ~self._stands(seen)):
                 break
         self.begin_here(where)
 
