@@ -8,8 +8,10 @@ from drive_env.master.description import Description
 
 ANSWER_PATIENCE = 20.0  # a busy machine may keep a thread waiting for longer than any drive takes to answer [s]
 
-# A shell starts what runs in the background deaf to Ctrl-C; some tests press it.
+# A shell starts what runs in the background deaf to Ctrl-C, and nohup to the terminal's end; some tests send both.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP"):
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture

@@ -450,7 +450,7 @@ def test_a_channel_whose_name_ends_in_a_large_number_is_logged(tmp_path, monkeyp
 
     monkeypatch.setattr("drive_env.master.port.open_bus", lambda *_, **__: Bus())
     file = tmp_path / f"session.{ending}"
-    done = CliRunner().invoke(app, ["log", str(file), "--duration", "0.02"])
+    done = CliRunner().invoke(app, ["log", str(file), "--duration", "1"])
     assert done.exit_code == 0, done.exception
     with can.LogReader(str(file)) as reader:
         assert [(one.arbitration_id, bytes(one.data)) for one in reader] == [(0x181, b"\1\2")]
