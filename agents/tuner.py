@@ -21,6 +21,7 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 TRIAL_SECONDS = 0.75
+PATIENCE = 2  # windows of 25 ms for which an axis may shake; what it does with the incumbent then decays or does not
 
 
 class TrialShown(NamedTuple):
@@ -63,7 +64,12 @@ class Tuned(NamedTuple):
 
 
 def tune_target(
-    target: Target, policy: Any, *, show: Callable[[TrialShown], None] = lambda trial: None, trials: int | None = None
+    target: Target,
+    policy: Any,
+    *,
+    show: Callable[[TrialShown], None] = lambda trial: None,
+    trials: int | None = None,
+    calm: Integers | None = None,
 ) -> Tuned:
     """Let a policy for GainTuning tune a target; the drives have the answer's gains and are disabled afterwards.
 
@@ -72,6 +78,8 @@ def tune_target(
         policy: What proposes, with its `bundle` for the configuration.
         show: Called after every trial.
         trials: How many; the agent's own number by default.
+        calm: Gains for an axis that shakes on though its trial was stopped, (num_axes, 5): the incumbent's, with which
+            it goes on, may be so near to the edge. By default those of the data sheet.
 
     Raises:
         PolicyStoppedError: If the policy gives no number, or no answer within the envelope's limit for a stall (on
@@ -82,9 +90,12 @@ def tune_target(
     from drive_env import motion
     from drive_env.envs.gain_tuning import GainTuning
     from drive_env.gains import write_gains
+    from tuning.calming import CalmedDrives
     from tuning.trial_bench import first_gains
 
-    drives, axes = target.drives, target.axes_per_machine
+    axes = target.axes_per_machine
+    drives = CalmedDrives(target.drives, target.motor.rated_current, windows=PATIENCE)
+    drives.calm = first_gains(target) if calm is None else calm
     configuration = dict(policy.bundle.configuration) | ({} if trials is None else {"trials": trials})
     write_gains(drives, first_gains(target))  # before anything is enabled: the drives may have any
     reach = np.where(target.high >= -target.low, target.high, target.low)

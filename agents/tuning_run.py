@@ -92,7 +92,7 @@ def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
     try:
         # The trials stop by themselves what oscillates, within 50 ms, and go on.
         with run.spending(going), swinging_allowed(target.drives):
-            tuned = tune_target(replace(target, low=low, high=high), policy, show=show)
+            tuned = tune_target(replace(target, low=low, high=high), policy, show=show, calm=run.fallbacks[-1])
     except SafetyError as error:
         run.stop(going, f"the envelope stopped the trials: {error}")
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,9 +17,11 @@ from agents.policy import PolicyError, load_policy
 from agents.shipped import shipped
 from agents.tuner import surrogate, tune_target
 from agents.tuning_run import run as run_agent
+from drive_env.envs.gain_trial import Trials
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.motion import OPERATION_ENABLED
 from tuning.certificate import load_certificate
+from tuning.meter import KINDS, MeteredDrives
 from tuning.snapshot import load_snapshot
 from tuning.target import emulated
 
@@ -205,6 +208,19 @@ def test_where_every_trial_was_stopped_the_drive_has_what_it_had(tmp_path, monke
         assert not done.result.kept and not done.certificate.axes[0].accepted
         assert np.array_equal(gains(target), before) and np.array_equal(settings(target), set_before)
         assert not is_enabled(target).any()
+
+
+def test_what_shakes_on_with_the_incumbent_is_calmed(monkeypatch):
+    """A trial that is stopped goes on with the incumbent's gains, and those may be near to the edge, too."""
+    run, wild = Trials.run, np.array([4021, 1573, 30_000, 3000, 30_000])
+    monkeypatch.setattr(
+        Trials, "run", lambda self, gains, incumbent, *rest: run(self, gains, wild + 0 * incumbent, *rest)
+    )
+    with emulated("tmcm1636", "inertia", "qbl4208") as target:
+        meter = MeteredDrives(target)
+        done = tune_target(replace(target, drives=meter), Reckless(), trials=2)
+    assert [bool(trial.aborted) for trial in done.trials] == [False, True, True]
+    assert meter.violations[KINDS.index("oscillated")].tolist() == [0]  # never for 100 ms
 
 
 def test_a_wrong_wiring_ends_the_run_before_any_trial_with_code_1_and_the_reason(tmp_path, monkeypatch):

@@ -19,26 +19,28 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-WINDOWS = 3  # of 25 ms in a row: a trial has acted after the first or second
+WINDOWS = 3  # of 25 ms in a row: a trial has acted after the first, and good gains have had the second to calm it
 
 
 class CalmedDrives:
-    """Drives whose axes get calm gains when they shake for 75 ms; everything else is theirs.
+    """Drives whose axes get calm gains when they shake for long; everything else is theirs.
 
     Args:
         drives: The drives.
         rated_current: Of their motors [A].
+        windows: Of 25 ms in a row in which it shakes; a trial has acted after the first.
 
     Attributes:
         calm: Gains to calm with, (num_axes, 5), or None as long as none are known.
         calmed: Axes that got them since the last `begin`, (num_axes,).
     """
 
-    def __init__(self, drives: Any, rated_current: float) -> None:
+    def __init__(self, drives: Any, rated_current: float, windows: int = WINDOWS) -> None:
         self.calm: Integers | None = None
         self.calmed: Mask = np.zeros(drives.num_axes, bool)
         self._drives = drives
         self._threshold = OSCILLATION * rated_current
+        self._most = windows
         self._windows = np.zeros(drives.num_axes, np.int64)
 
     def __getattr__(self, name: str) -> Any:
@@ -56,7 +58,7 @@ class CalmedDrives:
             change = np.diff(trace[CURRENT], axis=0) * 1e-3
             shaking = np.sqrt(np.mean(change**2, axis=0)) > self._threshold
             self._windows = np.where(shaking, self._windows + 1, 0)
-            late = self._windows >= WINDOWS
+            late = self._windows >= self._most
             if late.any():
                 write_gains(self._drives, self.calm, late)
                 self.calmed |= late
