@@ -113,7 +113,7 @@ class Machines:
             )
         check_parameter(name, rows)
         if name.startswith("load."):
-            drives._groups[0].load.check(name.removeprefix("load."), rows)
+            drives._groups[0].load.values.check(name.removeprefix("load."), rows)
         drives._schedule += [(drives._now + cycle, name, row, mask) for cycle, row in zip(cycles, rows, strict=True)]
         drives._schedule.sort(key=lambda change: change[0])
 

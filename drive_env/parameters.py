@@ -180,7 +180,7 @@ def check_parameter(name: str, values: Floats) -> None:
         return
     if name == "stage.adc_bits" and values.min() < 1.0:
         raise ValueError(f"{name} must be 1 or more, not {values.min():g}")
-    # Of a load, its field decides whether it may vanish: mechanics/packed.py refuses a body without mass.
+    # Of a load, its field decides whether it may vanish: mechanics/load_values.py refuses a body without mass.
     if name.startswith("load.") or any(name.endswith(word) for word in _MAY_VANISH):
         if values.min() < 0.0:
             raise ValueError(f"{name} must be 0 or more, not {values.min():g}")

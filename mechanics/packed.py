@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mechanics.friction import BRISTLE_DAMPING, FrictionModel, find_friction
-from mechanics.load import Combination, Friction, Load, Parameter
+from mechanics.load import Combination, Friction, Load
+from mechanics.load_values import FRICTION_COLUMNS, LoadValues
 from mechanics.modal import corrections
 from mechanics.model import compile_packed, is_constant, is_constrained, is_varying, motion_of, read_model
 from mechanics.plant import Plant
@@ -23,11 +24,6 @@ Floats = NDArray[np.float64]
 
 # Above this phase per step [rad] the discrete resonance cannot be put at the true one any more with good accuracy.
 MAX_PHASE_PER_STEP = 0.7
-# Columns of the frictions, contacts and rolls as the rows give them.
-FRICTION_COLUMNS = ("coulomb", "breakaway", "stribeck", "viscous", "drag", "bristle", "efficiency")
-CONTACT_COLUMNS = ("low", "high", "contact_stiffness", "contact_damping")
-ROLL_COLUMNS = ("start", "core", "thickness", "density")
-_BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos")
 _DISABLED = (
     mujoco.mjtDisableBit.mjDSBL_ACTUATION
     | mujoco.mjtDisableBit.mjDSBL_SENSOR
@@ -56,6 +52,10 @@ class PackedLoad:
         template: Compiled model to copy instead of compiling again.
         first_machine: Number of copy 0, for messages.
         weigh_every: Steps after which the inertias that friction sees are brought to the present position.
+
+    Attributes:
+        joints: Names of a copy's joints, in the order of its degrees of freedom.
+        values: What each copy has of its own; `set`, `set_motor` and `set_all` change it and what is stepped.
 
     Raises:
         ValueError: If a resonance is too fast for the step, or a parameter is unknown.
@@ -101,8 +101,7 @@ class PackedLoad:
         if load.rolls:
             # MuJoCo takes the inertia of simple joints from a constant; a roll's grows.
             self.model.dof_simplenum[:] = 0
-        self._body_numbers: dict[str, NDArray[np.int64]] = {}
-        self._joints = [
+        self.joints = [
             str(self.model.joint(int(self.model.dof_jntid[d])).name).removeprefix("0/") for d in range(self.num_dofs)
         ]
         # Rotor angle from joints: the bearings' friction acts on this motion.
@@ -115,28 +114,15 @@ class PackedLoad:
         apart = [row.motion for k, row in enumerate(load.frictions) if k not in self._merged]
         self._motions = turning + apart + [row.motion for row in load.contacts]
         self.num_frictions = self.num_axes + len(apart)
-        self._friction = np.zeros((self.copies, self.num_axes + len(load.frictions), len(FRICTION_COLUMNS)))
-        self._friction[:, :, FRICTION_COLUMNS.index("efficiency")] = 1.0
-        self._friction[:, : self.num_axes, :4] = motor_friction
-        for k, row in enumerate(load.frictions, self.num_axes):
-            self._friction[:, k] = [getattr(row, column) for column in FRICTION_COLUMNS]
-        rows = [(row.low, row.high, row.stiffness, row.damping) for row in load.contacts]
-        self._contact = np.tile(np.array(rows, float).reshape(-1, 4), (self.copies, 1, 1))
-        rolls = [[getattr(row, column) for column in ROLL_COLUMNS] for row in load.rolls]
-        self._roll = np.tile(np.array(rolls, float).reshape(-1, 4), (self.copies, 1, 1))
-        self._armature = np.array(armature)
-        self._stiffness = self._by_copy(self.model.jnt_stiffness).copy()
-        self._damping = self._by_copy(self.model.dof_damping).copy()
-        springs = any(p.field == "jnt_stiffness" for p in load.parameters) or bool(np.any(self._stiffness))
-        self._elastic = self.staggered and springs
         self._passive_armature = self._by_copy(self.model.dof_armature).copy()
         self.start = np.array(self.model.qpos0[: self.num_dofs])
         for joint, position in load.start.items():
-            self.start[self._joints.index(joint)] = position
-        for parameter in load.parameters:
-            self._check_parameter(parameter)
+            self.start[self.joints.index(joint)] = position
+        self.values = LoadValues(load, self.model, self.joints, armature, motor_friction)
+        springs = any(p.field == "jnt_stiffness" for p in load.parameters) or bool(np.any(self.values.stiffness))
+        self._elastic = self.staggered and springs
         for name, values in parameters.items():
-            self._store(self._parameter(name), np.asarray(values, float), slice(None))
+            self.values.store(name, np.asarray(values, float), slice(None))
         self.data = mujoco.MjData(self.model)
         self.plant = self._new_plant()
         self._apply()
@@ -145,27 +131,16 @@ class PackedLoad:
     # --- parameters -----------------------------------------------------------------------------------------------
     def get(self, name: str) -> Floats:
         """Return a parameter of every copy, shape (copies,)."""
-        parameter = self._parameter(name)
-        if parameter.field in _BODY_FIELDS:
-            bodies = self._bodies(parameter.element)
-            if parameter.field == "body_ipos":
-                return np.array([np.linalg.norm(place) for place in self.model.body_ipos[bodies]])
-            return np.array(self.model.body_mass[bodies] if parameter.field == "body_mass"
-                            else self.model.body_inertia[bodies, 0])  # fmt: skip
-        if parameter.field == "gap":
-            low, high = (self._column(parameter, field) for field in ("low", "high"))
-            return np.asarray(high - low)
-        return self._column(parameter, parameter.field).copy()
+        return self.values.get(name)
 
     def set(self, name: str, values: Floats, where: NDArray[np.bool_]) -> None:
         """Set a parameter of the copies where the mask is true; ValueError leaves all as it was."""
         before = self.get(name)
-        parameter = self._parameter(name)
-        self._store(parameter, np.asarray(values, float)[where], where)
+        self.values.store(name, np.asarray(values, float)[where], where)
         try:
             self._apply(where)
         except ValueError:
-            self._store(parameter, before, slice(None))
+            self.values.store(name, before, slice(None))
             self._apply(where)
             raise
 
@@ -179,15 +154,15 @@ class PackedLoad:
                 f"rotor inertia must be above 0 and friction not negative; the least are {armature.min():g} kg*m^2 "
                 f"and {friction.min():g}"
             )
-        before = self._armature.copy()
-        self._armature[:] = armature
+        before = self.values.armature.copy()
+        self.values.armature[:] = armature
         try:
             self._apply()
         except ValueError:
-            self._armature[:] = before
+            self.values.armature[:] = before
             self._apply()
             raise
-        self._friction[:, : self.num_axes, :4] = friction
+        self.values.motor_friction[:] = friction
         self._apply()
 
     def set_all(
@@ -203,17 +178,17 @@ class PackedLoad:
                 f"and {friction.min():g}"
             )
         before = {name: self.get(name) for name in parameters}
-        motors = self._armature.copy(), self._friction[:, : self.num_axes, :4].copy()
+        motors = self.values.armature.copy(), self.values.motor_friction.copy()
         changed = where | np.any(armature != motors[0], axis=1) | np.any(friction != motors[1], axis=(1, 2))
         try:
             for name, values in parameters.items():
-                self._store(self._parameter(name), np.asarray(values, float)[where], where)
-            self._armature[:], self._friction[:, : self.num_axes, :4] = armature, friction
+                self.values.store(name, np.asarray(values, float)[where], where)
+            self.values.armature[:], self.values.motor_friction[:] = armature, friction
             self._apply(changed)
         except ValueError:
             for name, values in before.items():
-                self._store(self._parameter(name), values, slice(None))
-            self._armature[:], self._friction[:, : self.num_axes, :4] = motors
+                self.values.store(name, values, slice(None))
+            self.values.armature[:], self.values.motor_friction[:] = motors
             self._apply(changed)
             raise
 
@@ -245,7 +220,7 @@ class PackedLoad:
     @property
     def armature(self) -> Floats:
         """Rotor inertia of every axis [kg*m^2], shape (copies, axes)."""
-        return self._armature
+        return self.values.armature
 
     def set_profile(self, at: Floats, torque: Floats, *, of_position: bool, period: float) -> None:
         """Add a torque from a table to the load torque: `torque`, shape (copies, n), over `at`, shape (n,).
@@ -272,86 +247,6 @@ class PackedLoad:
     # --- inside ---------------------------------------------------------------------------------------------------
     def _by_copy(self, array: Floats) -> Floats:
         return array.reshape(self.copies, self.num_dofs)
-
-    def _bodies(self, element: str) -> NDArray[np.int64]:
-        """Return the numbers of every copy's body of a name."""
-        if element not in self._body_numbers:
-            numbers = [self.model.body(f"{k}/{element}").id for k in range(self.copies)]
-            self._body_numbers[element] = np.array(numbers, np.int64)
-        return self._body_numbers[element]
-
-    def _parameter(self, name: str) -> Parameter:
-        for parameter in self.load.parameters:
-            if parameter.name == name:
-                return parameter
-        names = ", ".join(p.name for p in self.load.parameters)
-        raise ValueError(f"load {self.load.name!r} has no parameter {name!r}; it has {names}")
-
-    def _check_parameter(self, parameter: Parameter) -> None:
-        """Refuse a parameter that lives nowhere, with the places that there are."""
-        load, field = self.load, parameter.field
-        bodies = [str(self.model.body(k).name) for k in range(1, self.model.nbody)]
-        places = {
-            _BODY_FIELDS: [name.removeprefix("0/") for name in bodies if name.startswith("0/")],
-            ("jnt_stiffness", "dof_damping"): self._joints,
-            FRICTION_COLUMNS: [row.name for row in load.frictions],
-            (*CONTACT_COLUMNS, "gap"): [row.name for row in load.contacts],
-            ROLL_COLUMNS: [row.name for row in load.rolls],
-        }
-        for fields, names in places.items():
-            if field in fields and parameter.element in names:
-                return
-            if field in fields:
-                raise ValueError(
-                    f"load {load.name!r}: its parameter {parameter.name!r}, a {field}, names {parameter.element!r}; "
-                    f"there are {', '.join(names) or '(none)'}"
-                )
-        known = ", ".join(name for fields in places for name in fields)
-        raise ValueError(f"load {load.name!r}: its parameter {parameter.name!r} is no {field!r}; there are {known}")
-
-    def _column(self, parameter: Parameter, field: str) -> Floats:
-        """Return the view, shape (copies,), in which a parameter lives that is not a body's."""
-        element = parameter.element
-        if field in FRICTION_COLUMNS:
-            row = self.num_axes + [f.name for f in self.load.frictions].index(element)
-            return self._friction[:, row, FRICTION_COLUMNS.index(field)]
-        if field in CONTACT_COLUMNS:
-            return self._contact[:, [c.name for c in self.load.contacts].index(element), CONTACT_COLUMNS.index(field)]
-        if field in ROLL_COLUMNS:
-            return self._roll[:, [r.name for r in self.load.rolls].index(element), ROLL_COLUMNS.index(field)]
-        array = {"jnt_stiffness": self._stiffness, "dof_damping": self._damping}[field]
-        return array[:, self._joints.index(element)]
-
-    def check(self, name: str, values: Floats) -> None:
-        """Raise ValueError unless every value is one that the parameter can have."""
-        parameter = self._parameter(name)
-        label = f"{parameter.name} of load {self.load.name!r}"
-        if np.any(values < 0.0) or not np.all(np.isfinite(values)):
-            raise ValueError(f"{label} must be finite and not negative [{parameter.unit}], not {values.min():g}")
-        if parameter.field == "efficiency" and np.any((values <= 0.0) | (values > 1.0)):
-            raise ValueError(f"{label} must lie above 0 and up to 1, not {values.min():g}...{values.max():g}")
-        if parameter.field in _BODY_FIELDS and np.any(values <= 0.0):
-            raise ValueError(f"{label} must be above 0 {parameter.unit}")
-
-    def _store(self, parameter: Parameter, values: Floats, where: slice | NDArray[np.bool_]) -> None:
-        self.check(parameter.name, values)
-        if parameter.field in _BODY_FIELDS:
-            bodies = self._bodies(parameter.element)[where]
-            chosen = np.broadcast_to(values, bodies.shape)
-            if parameter.field == "body_ipos":
-                for body, value in zip(bodies, chosen, strict=True):
-                    place = self.model.body_ipos[body]
-                    self.model.body_ipos[body] = place * (value / np.linalg.norm(place))
-            elif parameter.field == "body_mass":
-                self.model.body_mass[bodies] = chosen
-            else:
-                self.model.body_inertia[bodies] = chosen[:, None]
-        elif parameter.field == "gap":
-            middle = 0.5 * (self._column(parameter, "low") + self._column(parameter, "high"))[where]
-            self._column(parameter, "low")[where] = middle - 0.5 * values
-            self._column(parameter, "high")[where] = middle + 0.5 * values
-        else:
-            self._column(parameter, parameter.field)[where] = values
 
     def _new_plant(self) -> Plant:
         copies, dofs, axes = self.copies, self.num_dofs, self.num_axes
@@ -415,7 +310,7 @@ class PackedLoad:
             holding=np.zeros((frictions, copies)),
             contact=np.zeros((contacts, 6, copies)),
             carried=np.zeros((copies, contacts)),
-            roll_dof=np.array([self._joints.index(row.joint) for row in self.load.rolls], np.int64),
+            roll_dof=np.array([self.joints.index(row.joint) for row in self.load.rolls], np.int64),
             roll=np.zeros((copies, len(self.load.rolls), 4)),
             roll_armature=np.zeros((copies, len(self.load.rolls))),
             roll_inertia=np.zeros((copies, len(self.load.rolls))),
@@ -436,7 +331,7 @@ class PackedLoad:
         rows = np.zeros((len(motions), self.num_dofs))
         for row, motion in zip(rows, motions, strict=True):
             for joint, coefficient in motion.items():
-                row[self._joints.index(joint)] += coefficient
+                row[self.joints.index(joint)] += coefficient
         return rows
 
     def _apply(self, changed: NDArray[np.bool_] | None = None) -> None:
@@ -455,17 +350,17 @@ class PackedLoad:
         inertia = self.mass_matrix()[copies]
         plant.bias[:, copies] = self._by_copy(self.data.qfrc_bias)[copies].T
         self.data.qpos[:], self.data.qvel[:] = moving
-        plant.damping[:] = self._damping.T
+        plant.damping[:] = self.values.damping.T
         if self.staggered:
-            found = corrections(inertia, self._stiffness[copies], plant.axis_motion, self.h)
+            found = corrections(inertia, self.values.stiffness[copies], plant.axis_motion, self.h)
             self._check_phase(found.phase, found.shapes, copies)
             plant.stiffness[..., copies] = _copies_last(found.stiffness)
             plant.held[..., copies] = _copies_last(found.held)
             plant.held_moment[..., copies] = _copies_last(found.held_moment)
             plant.axis_kick[..., copies] = _copies_last(found.kick)
         # The springs' force is the plant's, since the corrected one is no spring of a joint any more.
-        self._by_copy(self.model.jnt_stiffness)[:] = 0.0 if self.staggered else self._stiffness
-        self._by_copy(self.model.dof_damping)[:] = self._damping * (0.5 if self.staggered else 1.0)
+        self._by_copy(self.model.jnt_stiffness)[:] = 0.0 if self.staggered else self.values.stiffness
+        self._by_copy(self.model.dof_damping)[:] = self.values.damping * (0.5 if self.staggered else 1.0)
         inverse = np.linalg.inv(inertia)
         share = np.einsum("cde,fe->fdc", inverse, plant.motion)
         mass = 1.0 / np.einsum("fd,fdc->fc", plant.motion, share)
@@ -473,7 +368,7 @@ class PackedLoad:
         plant.share[..., copies] = share * mass[:, None]
         self._apply_frictions(copies)
         self._apply_contacts(copies)
-        plant.roll[:] = self._roll
+        plant.roll[:] = self.values.roll
         dofs = plant.roll_dof
         wound = self._by_copy(self.model.dof_armature)[:, dofs] - plant.roll_armature
         plant.roll_inertia[copies] = inertia[:, dofs, dofs] - wound[copies]
@@ -483,16 +378,16 @@ class PackedLoad:
         armature = self._by_copy(self.model.dof_armature)
         armature[:] = self._passive_armature
         for axis, (name, gear) in enumerate(zip(self.load.joints, self.load.gears, strict=True)):
-            values = self._armature[:, axis] * gear**2
-            if name in self._joints:
-                armature[:, self._joints.index(name)] = values
+            values = self.values.armature[:, axis] * gear**2
+            if name in self.joints:
+                armature[:, self.joints.index(name)] = values
             else:
                 for k, value in enumerate(values):
                     self.model.tendon_armature[self.model.tendon(f"{k}/{name}").id] = value
         for k, row in enumerate(self.load.rolls):
-            dof = self._joints.index(row.joint)
+            dof = self.joints.index(row.joint)
             self.plant.roll_armature[:, k] = armature[:, dof]
-            start, core, _, density = self._roll[:, k].T
+            start, core, _, density = self.values.roll[:, k].T
             armature[:, dof] += 0.5 * np.pi * density * (np.maximum(start, core) ** 4 - core**4)
 
     def _apart(self) -> list[int]:
@@ -502,7 +397,7 @@ class PackedLoad:
 
     def _apply_frictions(self, copies: NDArray[np.intp]) -> None:
         chosen, plant = self._model_of_friction, self.plant
-        own = self._friction[copies]
+        own = self.values.friction[copies]
         column = {name: own[:, :, k] for k, name in enumerate(FRICTION_COLUMNS)}
         # The motors' bearings keep theirs: it is theirs to be without friction.
         loads = np.arange(own.shape[1]) >= self.num_axes
@@ -529,8 +424,8 @@ class PackedLoad:
         plant.friction[:, 6, copies] = 2.0 * BRISTLE_DAMPING * np.sqrt(stiffness.T * mass)
 
     def _apply_contacts(self, copies: NDArray[np.intp]) -> None:
-        plant, stiffness = self.plant, self._contact[copies, :, 2].T
-        plant.contact[:, :4, copies] = _copies_last(self._contact[copies])
+        plant, stiffness = self.plant, self.values.contact[copies, :, 2].T
+        plant.contact[:, :4, copies] = _copies_last(self.values.contact[copies])
         phase = 0.5 * self.h * np.sqrt(stiffness / plant.mass[self.num_frictions :, copies])
         if self.staggered:
             # As in modal.py, for the mode that the spring has while it is pressed.
@@ -545,8 +440,8 @@ class PackedLoad:
         if 2.0 * phase.max() > MAX_PHASE_PER_STEP:
             worst, mode = np.unravel_index(int(phase.argmax()), phase.shape)
             # The joint whose spring takes most of that mode's energy.
-            dof = int(np.argmax(self._stiffness[copies[worst]] * shapes[worst, :, mode] ** 2))
-            self._refuse(f"joint {self._joints[dof]!r}", int(copies[worst]), float(phase.max()))
+            dof = int(np.argmax(self.values.stiffness[copies[worst]] * shapes[worst, :, mode] ** 2))
+            self._refuse(f"joint {self.joints[dof]!r}", int(copies[worst]), float(phase.max()))
 
     def _refuse(self, what: str, copy_: int, phase: float) -> None:
         raise ValueError(

@@ -54,15 +54,15 @@ def _mechanics(load: PackedLoad, copy: int) -> tuple[float, float, tuple[float, 
     """Return inertia and viscous friction at the rotor, and anti-resonance, resonance [Hz], damping of the first."""
     rotor = load.plant.axis_motion[0]
     M = load.mass_matrix()[copy]
-    K = np.diag(load._stiffness[copy]).astype(float)
-    D = np.diag(load._damping[copy]).astype(float)
-    D += load._friction[copy, 0, 3] * np.outer(rotor, rotor)
+    K = np.diag(load.values.stiffness[copy]).astype(float)
+    D = np.diag(load.values.damping[copy]).astype(float)
+    D += load.values.friction[copy, 0, 3] * np.outer(rotor, rotor)
     for k, friction in enumerate(load.load.frictions, load.num_axes):
-        D += load._friction[copy, k, 3] * _outer(load, friction.motion)
+        D += load.values.friction[copy, k, 3] * _outer(load, friction.motion)
     for k, contact in enumerate(load.load.contacts):
         if contact.transmits:
-            K += load._contact[copy, k, 2] * _outer(load, contact.motion)
-            D += load._contact[copy, k, 3] * _outer(load, contact.motion)
+            K += load.values.contact[copy, k, 2] * _outer(load, contact.motion)
+            D += load.values.contact[copy, k, 3] * _outer(load, contact.motion)
     squares, modes = _modes(M, K)
     free = squares <= RIGID * max(squares.max(), 1.0)
     turning = np.flatnonzero(free)
@@ -91,5 +91,5 @@ def _modes(M: Floats, K: Floats) -> tuple[Floats, Floats]:
 
 
 def _outer(load: PackedLoad, motion: Any) -> Floats:
-    row = np.array([motion.get(name, 0.0) for name in load._joints])
+    row = np.array([motion.get(name, 0.0) for name in load.joints])
     return np.outer(row, row)

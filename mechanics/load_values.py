@@ -1,0 +1,170 @@
+"""What each copy of a load has of its own: its numbers by the names of the load's parameters, and where each lives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from mechanics.load import Load, Parameter
+
+Floats = NDArray[np.float64]
+
+# Columns of the frictions, contacts and rolls as the rows give them.
+FRICTION_COLUMNS = ("coulomb", "breakaway", "stribeck", "viscous", "drag", "bristle", "efficiency")
+CONTACT_COLUMNS = ("low", "high", "contact_stiffness", "contact_damping")
+ROLL_COLUMNS = ("start", "core", "thickness", "density")
+_BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos")
+
+
+class LoadValues:
+    """The numbers of copies of a load and of their rotors, which begin as the row and its MJCF have them.
+
+    A body's live in the packed model itself, all others in the arrays here. To store one moves nothing: `PackedLoad`
+    derives from them what is stepped.
+
+    Args:
+        load: The row, resolved (model.py).
+        model: Its packed model, not stepped yet.
+        joints: Names of a copy's joints.
+        armature: Rotor inertia of each copy's axes [kg*m^2], shape (copies, axes).
+        motor_friction: Of each copy's axes, shape (copies, axes, 4): coulomb, breakaway, stribeck, viscous.
+
+    Attributes:
+        armature: As given, a copy of it.
+        friction: Of the axes' bearings, then of the load's rows, shape (copies, axes + rows, FRICTION_COLUMNS).
+        contact: Shape (copies, contacts, CONTACT_COLUMNS).
+        roll: Shape (copies, rolls, ROLL_COLUMNS).
+        stiffness: Of the joints' springs, shape (copies, D).
+        damping: Of the joints, shape (copies, D).
+
+    Raises:
+        ValueError: If a parameter of the row lives nowhere.
+    """
+
+    def __init__(
+        self, load: Load, model: mujoco.MjModel, joints: Sequence[str], armature: Floats, motor_friction: Floats
+    ) -> None:
+        self._load = load
+        self._model = model
+        self._joints = joints
+        self._copies, self._axes = armature.shape
+        self._body_numbers: dict[str, NDArray[np.int64]] = {}
+        self.armature: Floats = np.array(armature)
+        self.friction = np.zeros((self._copies, self._axes + len(load.frictions), len(FRICTION_COLUMNS)))
+        self.friction[:, :, FRICTION_COLUMNS.index("efficiency")] = 1.0
+        self.motor_friction[:] = motor_friction
+        for k, row in enumerate(load.frictions, self._axes):
+            self.friction[:, k] = [getattr(row, column) for column in FRICTION_COLUMNS]
+        rows = [(row.low, row.high, row.stiffness, row.damping) for row in load.contacts]
+        self.contact = np.tile(np.array(rows, float).reshape(-1, 4), (self._copies, 1, 1))
+        rolls = [[getattr(row, column) for column in ROLL_COLUMNS] for row in load.rolls]
+        self.roll = np.tile(np.array(rolls, float).reshape(-1, 4), (self._copies, 1, 1))
+        self.stiffness: Floats = model.jnt_stiffness.reshape(self._copies, len(joints)).copy()
+        self.damping: Floats = model.dof_damping.reshape(self._copies, len(joints)).copy()
+        for parameter in load.parameters:
+            self._check_place(parameter)
+
+    @property
+    def motor_friction(self) -> Floats:
+        """The bearings' columns of `friction`, a view of the shape of the constructor's."""
+        return self.friction[:, : self._axes, :4]
+
+    def get(self, name: str) -> Floats:
+        """Return a parameter of every copy, shape (copies,)."""
+        parameter = self._parameter(name)
+        if parameter.field in _BODY_FIELDS:
+            bodies = self._bodies(parameter.element)
+            if parameter.field == "body_ipos":
+                return np.array([np.linalg.norm(place) for place in self._model.body_ipos[bodies]])
+            return np.array(self._model.body_mass[bodies] if parameter.field == "body_mass"
+                            else self._model.body_inertia[bodies, 0])  # fmt: skip
+        if parameter.field == "gap":
+            low, high = (self._column(parameter, field) for field in ("low", "high"))
+            return np.asarray(high - low)
+        return self._column(parameter, parameter.field).copy()
+
+    def store(self, name: str, values: Floats, where: slice | NDArray[np.bool_]) -> None:
+        """Store a parameter of the copies chosen, one value each; ValueError leaves all as it was."""
+        self.check(name, values)
+        parameter = self._parameter(name)
+        if parameter.field in _BODY_FIELDS:
+            bodies = self._bodies(parameter.element)[where]
+            chosen = np.broadcast_to(values, bodies.shape)
+            if parameter.field == "body_ipos":
+                for body, value in zip(bodies, chosen, strict=True):
+                    place = self._model.body_ipos[body]
+                    self._model.body_ipos[body] = place * (value / np.linalg.norm(place))
+            elif parameter.field == "body_mass":
+                self._model.body_mass[bodies] = chosen
+            else:
+                self._model.body_inertia[bodies] = chosen[:, None]
+        elif parameter.field == "gap":
+            middle = 0.5 * (self._column(parameter, "low") + self._column(parameter, "high"))[where]
+            self._column(parameter, "low")[where] = middle - 0.5 * values
+            self._column(parameter, "high")[where] = middle + 0.5 * values
+        else:
+            self._column(parameter, parameter.field)[where] = values
+
+    def check(self, name: str, values: Floats) -> None:
+        """Raise ValueError unless every value is one that the parameter can have."""
+        parameter = self._parameter(name)
+        label = f"{parameter.name} of load {self._load.name!r}"
+        if np.any(values < 0.0) or not np.all(np.isfinite(values)):
+            raise ValueError(f"{label} must be finite and not negative [{parameter.unit}], not {values.min():g}")
+        if parameter.field == "efficiency" and np.any((values <= 0.0) | (values > 1.0)):
+            raise ValueError(f"{label} must lie above 0 and up to 1, not {values.min():g}...{values.max():g}")
+        if parameter.field in _BODY_FIELDS and np.any(values <= 0.0):
+            raise ValueError(f"{label} must be above 0 {parameter.unit}")
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _parameter(self, name: str) -> Parameter:
+        for parameter in self._load.parameters:
+            if parameter.name == name:
+                return parameter
+        names = ", ".join(p.name for p in self._load.parameters)
+        raise ValueError(f"load {self._load.name!r} has no parameter {name!r}; it has {names}")
+
+    def _check_place(self, parameter: Parameter) -> None:
+        """Refuse a parameter that lives nowhere, with the places that there are."""
+        load, field = self._load, parameter.field
+        bodies = [str(self._model.body(k).name) for k in range(1, self._model.nbody)]
+        places = {
+            _BODY_FIELDS: [name.removeprefix("0/") for name in bodies if name.startswith("0/")],
+            ("jnt_stiffness", "dof_damping"): self._joints,
+            FRICTION_COLUMNS: [row.name for row in load.frictions],
+            (*CONTACT_COLUMNS, "gap"): [row.name for row in load.contacts],
+            ROLL_COLUMNS: [row.name for row in load.rolls],
+        }
+        for fields, names in places.items():
+            if field in fields and parameter.element in names:
+                return
+            if field in fields:
+                raise ValueError(
+                    f"load {load.name!r}: its parameter {parameter.name!r}, a {field}, names {parameter.element!r}; "
+                    f"there are {', '.join(names) or '(none)'}"
+                )
+        known = ", ".join(name for fields in places for name in fields)
+        raise ValueError(f"load {load.name!r}: its parameter {parameter.name!r} is no {field!r}; there are {known}")
+
+    def _bodies(self, element: str) -> NDArray[np.int64]:
+        """Return the numbers of every copy's body of a name."""
+        if element not in self._body_numbers:
+            numbers = [self._model.body(f"{k}/{element}").id for k in range(self._copies)]
+            self._body_numbers[element] = np.array(numbers, np.int64)
+        return self._body_numbers[element]
+
+    def _column(self, parameter: Parameter, field: str) -> Floats:
+        """Return the view, shape (copies,), in which a parameter lives that is not a body's."""
+        element = parameter.element
+        if field in FRICTION_COLUMNS:
+            row = self._axes + [f.name for f in self._load.frictions].index(element)
+            return self.friction[:, row, FRICTION_COLUMNS.index(field)]
+        if field in CONTACT_COLUMNS:
+            return self.contact[:, [c.name for c in self._load.contacts].index(element), CONTACT_COLUMNS.index(field)]
+        if field in ROLL_COLUMNS:
+            return self.roll[:, [r.name for r in self._load.rolls].index(element), ROLL_COLUMNS.index(field)]
+        array = {"jnt_stiffness": self.stiffness, "dof_damping": self.damping}[field]
+        return array[:, self._joints.index(element)]
