@@ -111,7 +111,7 @@ def test_a_heavier_payload_needs_more_current():
             payload_every=0.01, excitation="sine",
         )  # fmt: skip
         environment.reset(seed=2)
-        environment._change_at[:] = 0
+        environment._payload_changes.at[:] = 0
         reach = [np.ptp([environment.step(np.zeros((1, 3)))[0][0, 8] for _ in range(100)])]
         currents.append(reach[0] / environment.reach.acceleration[0])
     assert currents[1] > 3.0 * currents[0]

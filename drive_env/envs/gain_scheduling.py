@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drive_env import motion
 from drive_env.envs.bus_delays import BusDelays
+from drive_env.envs.changing_payload import PayloadChanges, find_payload
 from drive_env.envs.configuration import configured
 from drive_env.envs.lanes import Info, Lanes, Stepped, check_choice
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
@@ -38,8 +39,6 @@ MODES = ("csp", "csv")
 # What can be scheduled: the integers of 2041h are computed from R and L, and are no part of it.
 GAINS = {"velocity_p": (0x2042, 1), "velocity_i": (0x2042, 2), "position_p": (0x2043, 1)}
 BASES = ("rule", "present")
-PAYLOADS = ("load.payload", "load.mass", "load.inertia")  # which "auto" takes: the first there is
-NO_PAYLOAD = "none"
 ROUGH = 0.03  # increment of current from sample to sample, of rated: DESIGN's score counts it so
 
 POSITION, VELOCITY, CURRENT, STATUSWORD = (0x6064, 0), (0x606C, 0), (0x6077, 0), (0x6041, 0)
@@ -209,7 +208,9 @@ class GainScheduling(Lanes):
         self._cycles = round(self.config.step / CYCLE)
         self._steps = round(self.config.duration / self.config.step)
         self._action: Floats = np.zeros(0)  # of every axis
-        self._payload, self._payload_range = self._find_payload(row)
+        self._parameters: dict[str, Floats] = {}  # the true machines
+        c = self.config
+        self._payload = find_payload(row, c.payload, c.payload_low, c.payload_high)
         self._pictures: Pictures | None = None
         self._owned = drives is None
         self.drives = self._new_drives() if drives is None else drives
@@ -230,7 +231,8 @@ class GainScheduling(Lanes):
         self._programme.draw(self.config.excitation, self.reach, self.rngs, mask)
         if self._machines is not None:
             self._machines.redraw(self.rngs, mask, self.stage)
-            self._plan_payloads(mask)
+            self._payload_changes.draw(self.rngs, mask)
+            self._parameters = {name: values.copy() for name, values in self._machines.values.items()}
         else:
             self._bring_back(axes)
         self._now[mask] = 0
@@ -255,7 +257,8 @@ class GainScheduling(Lanes):
     def _step_lanes(self, action: Any) -> Stepped:
         chosen = np.clip(np.asarray(action, float).reshape(self._action.shape), -1.0, 1.0)
         self._action = np.nan_to_num(chosen)
-        self._change_payloads()
+        if self._machines is not None:
+            self._parameters = self._payload_changes.apply(self._now, self._parameters)
         targets = self._through_bus()
         rows = self._run(targets)
         error, velocity, current = self._measured(targets, rows)
@@ -306,7 +309,7 @@ class GainScheduling(Lanes):
         motor, alone = find_motor(self.config.motor), one(load)
         shaft, turning = shaft_load(alone), way(alone)
         self._nominal_inertia = motor.inertia + shaft.inertia[0]
-        heaviest = motor.inertia + self._payload_range[1] * shaft.inertia[0]
+        heaviest = motor.inertia + self._payload.high * shaft.inertia[0]
         torque = np.maximum(motor.rated_torque - shaft.gravity[0] - shaft.friction[0], 0.3 * motor.rated_torque)
         room = np.minimum(np.minimum(-turning.low, turning.high) * 0.8, 4.0 * 2.0 * np.pi)
         self.reach = Reach(
@@ -323,21 +326,6 @@ class GainScheduling(Lanes):
         self._rated_current = motor.rated_current
         self._per_rad = self.drives.read(INCREMENTS_PER_TURN) / (2.0 * np.pi)
 
-    def _find_payload(self, load: Load) -> tuple[str, tuple[float, float]]:
-        """Return which parameter changes, and the range of its factor."""
-        c = self.config
-        known = [f"load.{p.name}" for p in load.parameters]
-        name = next((n for n in PAYLOADS if n in known), NO_PAYLOAD) if c.payload == "auto" else c.payload
-        if name == NO_PAYLOAD:
-            return name, (1.0, 1.0)
-        check_choice("payload", name, ("auto", NO_PAYLOAD, *known))
-        row = load.parameters[known.index(name)]
-        low = row.low if c.payload_low is None else c.payload_low
-        high = row.high if c.payload_high is None else c.payload_high
-        if not 0.0 < low <= high < np.inf:
-            raise ValueError(f"payload_low and payload_high must be above 0 and in order, not {low:g} and {high:g}")
-        return name, (low, high)
-
     def _prepare_machines(self) -> None:
         machine, laws = self.drives.machine, self.config.distributions
         self._machines: RandomMachines | None = None
@@ -348,12 +336,8 @@ class GainScheduling(Lanes):
         if laws is None:
             laws = self.config.load if self.config.load in shipped() else {"parameters": {}}
         self._machines = RandomMachines(self.drives, Distributions.load(laws))
-        self._parameters: dict[str, Floats] = {}
-        if self._payload != NO_PAYLOAD:
-            self._payload_default = machine.parameters[self._payload]
         changes = max(1, round(self.config.duration / self.config.payload_every))
-        self._change_at = np.zeros((self.num_envs, changes), np.int64)
-        self._change_to = np.ones((self.num_envs, changes))
+        self._payload_changes = PayloadChanges(self._payload, machine, self.num_envs, self._steps, changes)
 
     def _prepare_gains(self) -> None:
         """Keep the five raw gains of every axis that an action of 0 means, shape (num_axes, 5)."""
@@ -476,40 +460,6 @@ class GainScheduling(Lanes):
         if self._machines is not None:
             info["parameters"] = self._parameters
         return info
-
-    # --- payload --------------------------------------------------------------------------------------------------
-    def _plan_payloads(self, mask: Mask) -> None:
-        assert self._machines is not None
-        low, high = self._payload_range
-        changes = self._change_at.shape[1]
-        for lane in map(int, np.flatnonzero(mask)):
-            chance = self.rngs[lane].random((2, changes))
-            self._change_at[lane] = np.floor((np.arange(changes) + chance[0]) / changes * self._steps)
-            self._change_to[lane] = low * (high / low) ** chance[1]
-        self._parameters = {name: values.copy() for name, values in self._machines.values.items()}
-
-    def _change_payloads(self) -> None:
-        """Give the lanes whose time has come another payload; one that cannot be stepped keeps the one it has."""
-        if self._machines is None or self._payload == NO_PAYLOAD:
-            return
-        due = self._change_at == self._now[:, None]
-        lanes = due.any(axis=1)
-        if not lanes.any():
-            return
-        last = self._change_at.shape[1] - 1 - due[:, ::-1].argmax(axis=1)
-        factors = np.take_along_axis(self._change_to, last[:, None], axis=1)[:, 0]
-        values = self._payload_default * factors
-        machine = self.drives.machine
-        try:
-            machine.set_all({self._payload: values}, lanes)
-        except ValueError:
-            for lane in np.flatnonzero(lanes):
-                one_lane = np.arange(self.num_envs) == lane
-                try:
-                    machine.set_all({self._payload: values}, one_lane)
-                except ValueError:
-                    lanes[lane] = False
-        self._parameters = self._parameters | {self._payload: np.where(lanes, values, self._parameters[self._payload])}
 
     # --- on a bus -------------------------------------------------------------------------------------------------
     def _bring_back(self, axes: Mask) -> None:

@@ -1,0 +1,118 @@
+"""A payload that changes while machines run: which parameter of the load it is, when it changes, and to what."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.envs.lanes import check_choice
+
+if TYPE_CHECKING:
+    from drive_env.machine import Machines
+    from mechanics.load import Load
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+PAYLOADS = ("load.payload", "load.mass", "load.inertia")  # which "auto" takes: the first there is
+NO_PAYLOAD = "none"
+
+
+class Payload(NamedTuple):
+    """The parameter that changes, or "none", and the range of its factor on the nominal value."""
+
+    name: str
+    low: float
+    high: float
+
+
+def find_payload(load: Load, chosen: str, low: float | None, high: float | None) -> Payload:
+    """Return what changes of a load.
+
+    Args:
+        load: The row.
+        chosen: A parameter's name; "auto" for the load's payload, mass or inertia, "none" for nothing.
+        low: Of the factor's range; None is the load's own.
+        high: Likewise.
+
+    Raises:
+        ValueError: For a parameter that there is not, naming those that there are, or a range that is none.
+    """
+    known = [f"load.{p.name}" for p in load.parameters]
+    name = next((n for n in PAYLOADS if n in known), NO_PAYLOAD) if chosen == "auto" else chosen
+    if name == NO_PAYLOAD:
+        return Payload(name, 1.0, 1.0)
+    check_choice("payload", name, ("auto", NO_PAYLOAD, *known))
+    row = load.parameters[known.index(name)]
+    low = row.low if low is None else low
+    high = row.high if high is None else high
+    if not 0.0 < low <= high < np.inf:
+        raise ValueError(f"payload_low and payload_high must be above 0 and in order, not {low:g} and {high:g}")
+    return Payload(name, low, high)
+
+
+class PayloadChanges:
+    """When the payload of each lane's machine changes in an episode, and to what: once in each of its equal parts.
+
+    Args:
+        payload: What changes.
+        machines: Emulated ones, one per lane, with the nominal value.
+        num_lanes: Lanes.
+        steps: Of an episode.
+        count: Changes in an episode.
+
+    Attributes:
+        at: Step of each change, shape (num_lanes, count).
+        factor: On the nominal value, from then on, shape (num_lanes, count).
+    """
+
+    def __init__(self, payload: Payload, machines: Machines, num_lanes: int, steps: int, count: int) -> None:
+        self._payload = payload
+        self._machines = machines
+        self._steps = steps
+        if payload.name != NO_PAYLOAD:
+            self._nominal = machines.parameters[payload.name]
+        self.at = np.zeros((num_lanes, count), np.int64)
+        self.factor = np.ones((num_lanes, count))
+
+    def draw(self, rngs: Sequence[np.random.Generator], where: Mask) -> None:
+        """Draw new changes for the lanes where the mask is true."""
+        _, low, high = self._payload
+        count = self.at.shape[1]
+        for lane in map(int, np.flatnonzero(where)):
+            chance = rngs[lane].random((2, count))
+            self.at[lane] = np.floor((np.arange(count) + chance[0]) / count * self._steps)
+            self.factor[lane] = low * (high / low) ** chance[1]
+
+    def apply(self, now: Integers, parameters: dict[str, Floats]) -> dict[str, Floats]:
+        """Give the lanes whose time has come another payload; one that cannot be stepped keeps the one it has.
+
+        Args:
+            now: The lanes' present step, shape (num_lanes,).
+            parameters: The true machines before.
+
+        Returns:
+            The true machines after.
+        """
+        name = self._payload.name
+        due = self.at == now[:, None]
+        lanes = due.any(axis=1)
+        if name == NO_PAYLOAD or not lanes.any():
+            return parameters
+        last = self.at.shape[1] - 1 - due[:, ::-1].argmax(axis=1)
+        factors = np.take_along_axis(self.factor, last[:, None], axis=1)[:, 0]
+        values = self._nominal * factors
+        try:
+            self._machines.set_all({name: values}, lanes)
+        except ValueError:
+            for lane in np.flatnonzero(lanes):
+                one_lane = np.arange(len(lanes)) == lane
+                try:
+                    self._machines.set_all({name: values}, one_lane)
+                except ValueError:
+                    lanes[lane] = False
+        return parameters | {name: np.where(lanes, values, parameters[name])}
