@@ -27,7 +27,8 @@ from drive_env import CanDrives, EmulatedDrives, Limits, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.envs.gain_tuning import IDENTIFIED, GainTuning
+from drive_env.envs.gain_observation import IDENTIFIED
+from drive_env.envs.gain_tuning import GainTuning
 
 SHORT = {"load": "two_mass", "mode": "csp", "action": "offset", "duration": 0.05}
 SCORE = "RMS following error [rev]"

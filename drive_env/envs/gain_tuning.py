@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -16,6 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import find_device
 from drive_env.envs.configuration import configured
+from drive_env.envs.gain_observation import (
+    RATIO_MAX,
+    TRIED,
+    identified_entries,
+    rows_of,
+    tried_entries,
+    true_entries,
+)
 from drive_env.envs.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
 from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Stepped, check_choice
 from drive_env.envs.pictures import Pictures
@@ -27,36 +35,7 @@ from drive_env.score import HiddenScore
 
 Integers = NDArray[np.int64]
 
-LOG_MAX = math.log(RAW_MAX)
 ALL_GAINS = Gains._fields
-RATIO_MAX = 100.0  # of a true parameter over its default
-
-
-class Row(NamedTuple):
-    """An entry of the observation: name, unit, bounds."""
-
-    name: str
-    unit: str
-    low: float
-    high: float
-
-
-IDENTIFIED = (
-    Row("ln of total inertia over three rotors", "1", -5.0, 7.0),
-    Row("dry friction", "rated current", 0.0, 5.0),
-    Row("viscous friction at rated speed", "rated current", 0.0, 5.0),
-    Row("constant load", "rated current", -5.0, 5.0),
-)
-PHASE = (
-    Row("ln t_s/t_0", "1", 0.0, 5.0),
-    Row("ln(1 + n/3 %)", "1", 0.0, 7.0),
-    Row("overshoot", "the move", 0.0, 5.0),
-    Row("ln of the following error's integral over the rule's", "1", -10.0, 10.0),
-    Row("stopped: it oscillated or tripped", "1", 0.0, 1.0),
-)
-COST = Row("ln J by measured terms, of the lane", "1", -10.0, 4.0)
-WAVE = Row("error of the move", "the move", -5.0, 5.0)
-LEFT = Row("trials left", "those of an episode", 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -251,18 +230,14 @@ class GainTuning(Lanes):
 
     def _spaces(self) -> tuple[gymnasium.Space[Any], Box]:
         c = self.config
-        count = len(c.gains)
-        log_gain = Row("ln of a gain over the rule's", "1", -LOG_MAX, LOG_MAX)
-        trial = [*PHASE * len(PHASES), COST]
-        axis = [*IDENTIFIED, *[log_gain] * (2 * count), *trial, *trial, *[WAVE] * c.waveform]
-        rows = [*axis * self._axes, LEFT]
+        rows = rows_of(self._axes, len(c.gains), c.waveform)
         low, high = (np.array([getattr(row, end) for row in rows], np.float32) for end in ("low", "high"))
         self._low, self._high = low, high
         observation: gymnasium.Space[Any] = Box(low, high, dtype=np.float32)
         if c.privileged:
             true = Box(-RATIO_MAX, RATIO_MAX, (len(self._defaults),), np.float32)
             observation = gymnasium.spaces.Dict({"observation": observation, "privileged": true})
-        return observation, Box(-c.step, c.step, (self._axes * count,), np.float32)
+        return observation, Box(-c.step, c.step, (self._axes * len(c.gains),), np.float32)
 
     def _prepare(self, given_reach: ArrayLike | None) -> None:
         c, n, axes = self.config, self.num_envs, self.drives.num_axes
@@ -278,7 +253,7 @@ class GainTuning(Lanes):
         self._safe, self._rule, self._best, self._last = (np.ones((axes, len(ALL_GAINS)), np.int64) for _ in range(4))
         self._best_is_stable = np.ones(axes, bool)
         self._following = np.ones((len(PHASES), axes))  # the rule's
-        blank = np.zeros((axes, len(PHASE) * len(PHASES) + 1))
+        blank = np.zeros((axes, len(TRIED)))
         self._last_features, self._best_features = blank, blank.copy()
         self._wave = np.zeros((axes, c.waveform))
         self._measured, self._hidden_now = np.ones(n), np.ones(n)
@@ -419,7 +394,7 @@ class GainTuning(Lanes):
         better = mask if better is None else better
         axes, best = np.repeat(mask, self._axes), np.repeat(better, self._axes)
         self._last = np.where(axes[:, None], gains, self._last)
-        features = self._features(tried, measured)
+        features = tried_entries(tried, self._following, np.repeat(measured, self._axes))
         self._last_features = np.where(axes[:, None], features, self._last_features)
         if self.config.waveform:
             at = np.linspace(0, TRIAL - 1, self.config.waveform).round().astype(int)
@@ -430,32 +405,8 @@ class GainTuning(Lanes):
         self._measured = np.where(better, measured, self._measured)
 
     # --- what is told ---------------------------------------------------------------------------------------------
-    def _features(self, tried: Trial, measured: Floats) -> Floats:
-        terms = tried.terms
-        rows = np.stack(
-            [
-                np.log(terms.settling),
-                np.log1p(terms.noise / 0.03),
-                terms.overshoot,
-                np.log(tried.following / self._following),
-                tried.aborted.astype(float),
-            ],
-            axis=-1,
-        )
-        flat = rows.transpose(1, 0, 2).reshape(len(self._origin), -1)
-        return np.concatenate([flat, np.log(np.repeat(measured, self._axes))[:, None]], axis=1)
-
     def _observe(self) -> Any:
-        found, motor = self._identified, self.motor
-        identified = np.stack(
-            [
-                np.log(np.maximum(found.inertia, 1e-12) / (3.0 * motor.inertia)),
-                found.coulomb / motor.rated_current,
-                found.viscous * motor.rated_speed / motor.rated_current,
-                found.offset / motor.rated_current,
-            ],
-            axis=-1,
-        )
+        identified = identified_entries(self._identified, self.motor)
         rule = np.log(self._rule[:, self._columns])
         last, best = (np.log(gains[:, self._columns]) - rule for gains in (self._last, self._best))
         axes = np.concatenate([identified, last, best, self._last_features, self._best_features, self._wave], axis=1)
@@ -464,17 +415,7 @@ class GainTuning(Lanes):
         observation = np.clip(np.nan_to_num(values), self._low, self._high).astype(np.float32)
         if not self.config.privileged:
             return observation
-        true = np.stack(
-            [
-                (self._parameters[name] - default) / np.where(default == 0.0, 1.0, np.abs(default))
-                for name, default in self._defaults.items()
-            ],
-            axis=-1,
-        )
-        return {
-            "observation": observation,
-            "privileged": np.clip(true, -RATIO_MAX, RATIO_MAX).astype(np.float32),
-        }
+        return {"observation": observation, "privileged": true_entries(self._parameters, self._defaults)}
 
     def _told(self) -> Info:
         n = self.num_envs

@@ -1,0 +1,108 @@
+"""What GainTuning shows of identification, trials and the true machine: rows with their bounds, and their values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.envs.gain_trial import PHASES, Identified, Trial
+from drive_env.gains import RAW_MAX
+from drive_env.motors import Motor
+
+Floats = NDArray[np.float64]
+
+LOG_MAX = math.log(RAW_MAX)
+RATIO_MAX = 100.0  # of a true parameter over its default
+
+
+class Row(NamedTuple):
+    """An entry of the observation: name, unit, bounds."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+IDENTIFIED = (
+    Row("ln of total inertia over three rotors", "1", -5.0, 7.0),
+    Row("dry friction", "rated current", 0.0, 5.0),
+    Row("viscous friction at rated speed", "rated current", 0.0, 5.0),
+    Row("constant load", "rated current", -5.0, 5.0),
+)
+PHASE = (
+    Row("ln t_s/t_0", "1", 0.0, 5.0),
+    Row("ln(1 + n/3 %)", "1", 0.0, 7.0),
+    Row("overshoot", "the move", 0.0, 5.0),
+    Row("ln of the following error's integral over the rule's", "1", -10.0, 10.0),
+    Row("stopped: it oscillated or tripped", "1", 0.0, 1.0),
+)
+COST = Row("ln J by measured terms, of the lane", "1", -10.0, 4.0)
+TRIED = (*PHASE * len(PHASES), COST)
+LOG_GAIN = Row("ln of a gain over the rule's", "1", -LOG_MAX, LOG_MAX)
+WAVE = Row("error of the move", "the move", -5.0, 5.0)
+LEFT = Row("trials left", "those of an episode", 0.0, 1.0)
+
+
+def rows_of(axes: int, gains: int, waveform: int) -> list[Row]:
+    """Return the entries of a lane: of each axis in turn, of the last trial before the incumbent's, then of the lane.
+
+    Args:
+        axes: Of the lane.
+        gains: How many the action changes.
+        waveform: Points of the last move's error.
+    """
+    axis = [*IDENTIFIED, *[LOG_GAIN] * (2 * gains), *TRIED, *TRIED, *[WAVE] * waveform]
+    return [*axis * axes, LEFT]
+
+
+def identified_entries(found: Identified, motor: Motor) -> Floats:
+    """Return the values of IDENTIFIED, shape (num_axes, 4)."""
+    return np.stack(
+        [
+            np.log(np.maximum(found.inertia, 1e-12) / (3.0 * motor.inertia)),
+            found.coulomb / motor.rated_current,
+            found.viscous * motor.rated_speed / motor.rated_current,
+            found.offset / motor.rated_current,
+        ],
+        axis=-1,
+    )
+
+
+def tried_entries(tried: Trial, following: Floats, measured: Floats) -> Floats:
+    """Return the values of TRIED, shape (num_axes, 16).
+
+    Args:
+        tried: The trial.
+        following: That of the rule's trial, shape (phases, num_axes).
+        measured: J by measured terms of each axis's lane, shape (num_axes,).
+    """
+    terms = tried.terms
+    rows = np.stack(
+        [
+            np.log(terms.settling),
+            np.log1p(terms.noise / 0.03),
+            terms.overshoot,
+            np.log(tried.following / following),
+            tried.aborted.astype(float),
+        ],
+        axis=-1,
+    )
+    flat = rows.transpose(1, 0, 2).reshape(len(measured), -1)
+    return np.concatenate([flat, np.log(measured)[:, None]], axis=1)
+
+
+def true_entries(parameters: Mapping[str, Floats], defaults: Mapping[str, Floats]) -> NDArray[np.float32]:
+    """Return each true parameter's difference from its default over the default's size, shape (lanes, parameters)."""
+    true = np.stack(
+        [
+            (parameters[name] - default) / np.where(default == 0.0, 1.0, np.abs(default))
+            for name, default in defaults.items()
+        ],
+        axis=-1,
+    )
+    return np.clip(true, -RATIO_MAX, RATIO_MAX).astype(np.float32)
