@@ -19,7 +19,7 @@ from tuning.margins import margins
 
 if TYPE_CHECKING:
     from tuning.auto_run import Run
-    from tuning.frequency_response import FrequencyResponse
+    from tuning.measured_loop import MeasuredLoop
 
 Mask = NDArray[np.bool_]
 
@@ -72,7 +72,7 @@ def measure(run: Run) -> None:
     _go_on_after_faults(run, faults)
 
 
-def _calm(run: Run, k: int, response: FrequencyResponse) -> bool:
+def _calm(run: Run, k: int, response: MeasuredLoop) -> bool:
     """Lower the gains of an axis whose measured loop comes too near to instability; return whether it was so.
 
     The loop scales with P.

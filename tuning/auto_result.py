@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from drive_env.gains import Gains
 
 if TYPE_CHECKING:
-    from tuning.frequency_response import FrequencyResponse
     from tuning.identification import Identification
     from tuning.linear_model import Plant
     from tuning.margins import Margins
+    from tuning.measured_loop import MeasuredLoop
     from tuning.proving import Shown
 
 Floats = NDArray[np.float64]
@@ -73,7 +73,7 @@ class Result(NamedTuple):
     violations: Integers
     shown: Shown | None
     earlier: Shown | None
-    response: FrequencyResponse | None
+    response: MeasuredLoop | None
     file: Path
     kept: bool
 

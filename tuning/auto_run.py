@@ -17,7 +17,7 @@ from tuning.auto_result import AxisRun, Result
 from tuning.ladder import OTHERS
 
 if TYPE_CHECKING:
-    from tuning.frequency_response import FrequencyResponse
+    from tuning.measured_loop import MeasuredLoop
     from tuning.proving import ProvingGround, Shown
     from tuning.target import DriveTime, Target
 
@@ -76,7 +76,7 @@ class Run:
         self.ground: ProvingGround | None = None
         self.shown: Shown | None = None
         self.earlier: Shown | None = None
-        self.response: FrequencyResponse | None = None
+        self.response: MeasuredLoop | None = None
         # Axes of one machine are shaken one after the other.
         self.response_time = RESPONSE_TIME * target.axes_per_machine
         self.spent: Floats = np.zeros(n)

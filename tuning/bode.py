@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.linear_model import Plant, position_open_loop, velocity_open_loop
+from tuning.measured_loop import COHERENT, MeasuredLoop
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from tuning.frequency_response import FrequencyResponse
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -23,7 +22,7 @@ _FINE = 600
 _TICKS = (1, 2, 5, 10, 20, 50, 100, 200, 400, 1000)  # Hz
 
 
-def bode_figure(response: FrequencyResponse, axis: int = 0, plant: Plant | None = None) -> Figure:
+def bode_figure(response: MeasuredLoop, axis: int = 0, plant: Plant | None = None) -> Figure:
     """Return magnitude, phase and coherence over frequency, and the Nyquist curve around -1.
 
     Args:
@@ -56,12 +55,12 @@ def bode_figure(response: FrequencyResponse, axis: int = 0, plant: Plant | None 
     return figure
 
 
-def write_bode(path: Path, response: FrequencyResponse, axis: int = 0, plant: Plant | None = None) -> None:
+def write_bode(path: Path, response: MeasuredLoop, axis: int = 0, plant: Plant | None = None) -> None:
     """Write `bode_figure` to a file; its ending decides the format: .png, .svg, .pdf."""
     bode_figure(response, axis, plant).savefig(path, dpi=120)
 
 
-def _model(response: FrequencyResponse, axis: int, plant: Plant | None) -> tuple[Floats, Complex] | None:
+def _model(response: MeasuredLoop, axis: int, plant: Plant | None) -> tuple[Floats, Complex] | None:
     if plant is None:
         return None
     loop = {"velocity": velocity_open_loop, "position": position_open_loop}[response.loop]
@@ -69,7 +68,7 @@ def _model(response: FrequencyResponse, axis: int, plant: Plant | None) -> tuple
     return f, loop(response.device, plant, response.gains[axis], f)
 
 
-def _draw_bode(magnitude: Any, phase: Any, response: FrequencyResponse, axis: int, plant: Plant | None) -> None:
+def _draw_bode(magnitude: Any, phase: Any, response: MeasuredLoop, axis: int, plant: Plant | None) -> None:
     from tuning.certificate_pictures import PHASES, draw_margins
 
     f, L = response.f, response.open_loop[:, axis]
@@ -112,9 +111,7 @@ def _draw_bode(magnitude: Any, phase: Any, response: FrequencyResponse, axis: in
         plot.grid(True, which="both", linewidth=0.3, alpha=0.6)
 
 
-def _draw_coherence(plot: Any, response: FrequencyResponse, axis: int) -> None:
-    from tuning.frequency_response import COHERENT
-
+def _draw_coherence(plot: Any, response: MeasuredLoop, axis: int) -> None:
     good = response.trusted[:, axis]
     for chosen, colour in ((~good, GREY), (good & ~response.traced, MEASURED), (good & response.traced, TRACED)):
         plot.vlines(response.f[chosen], 0.0, response.coherence[chosen, axis], color=colour, linewidth=1.0)
@@ -123,7 +120,7 @@ def _draw_coherence(plot: Any, response: FrequencyResponse, axis: int) -> None:
     plot.grid(True, which="both", linewidth=0.3, alpha=0.6)
 
 
-def _draw_nyquist(plot: Any, response: FrequencyResponse, axis: int, plant: Plant | None) -> None:
+def _draw_nyquist(plot: Any, response: MeasuredLoop, axis: int, plant: Plant | None) -> None:
     L, good = response.open_loop[:, axis], response.trusted[:, axis]
     if (model := _model(response, axis, plant)) is not None:
         plot.plot(model[1].real, model[1].imag, color=MODEL, linewidth=0.9)
@@ -148,7 +145,7 @@ def _draw_nyquist(plot: Any, response: FrequencyResponse, axis: int, plant: Plan
     plot.set_title("Nyquist", fontsize=9)
 
 
-def _title(response: FrequencyResponse, axis: int) -> str:
+def _title(response: MeasuredLoop, axis: int) -> str:
     found = response.margins(axis)
     gains = ", ".join(str(int(gain)) for gain in response.gains[axis])
     trusted = 100.0 * float(response.trusted[~response.traced, axis].mean())

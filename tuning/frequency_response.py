@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.safety import swinging_allowed
-from tuning import margins as margins_
 from tuning.dead_time import dead_time_resistance
 from tuning.excitation import CREST, Lines, dimension, peak, plan_lines
 from tuning.held_samples import split, unhold
 from tuning.lags import velocity_noise
 from tuning.linear_model import Plant, controllers
+from tuning.measured_loop import COHERENT, GOOD_MISFIT, MeasuredLoop, merged
 from tuning.oscillation_watch import OscillationError, shaken
 from tuning.plant_fit import PlantFit, Seen, fit_plant
 from tuning.shaking import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
@@ -31,7 +31,6 @@ from tuning.transfer import directions, transfer
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from tuning.identification import Estimate
     from tuning.target import Target
 
 Floats = NDArray[np.float64]
@@ -42,16 +41,12 @@ Mask = NDArray[np.bool_]
 LOOPS = ("velocity", "position")
 RANGE = {"velocity": (5.0, 400.0), "position": (5.0, 50.0)}  # Hz
 RESOLUTION = 5.0  # Hz
-COHERENT = 0.95  # from which on a line is trusted
 # From which on a line is fitted, with the weight that its noise leaves it, once all together say as much as `WORTH`
 # lines that are trusted.
 FITTED, WORTH = 0.5, 4.0
 BUS_LIMIT = 400.0  # Hz; above, a bus's samples hold more of the images than of the line
 TRACED_TOP = 495.0  # Hz, of the set-points in a traced measurement
 TRACE_LIMIT = 1000.0  # Hz
-FINE = 10  # points between two lines, where margins are looked for
-GOOD_MISFIT = 2.0  # of a fit that is good enough to read margins between lines by
-SMOOTHING = 1.5  # lines, standard deviation
 PASSES, PERIODS = 2, 3  # of a measurement; the trial before it has one of each
 SOFTER = 2  # how often the gains of an axis that oscillates are lowered
 CONFIRMING, LESS = 6, 0.5  # passes of one that is confirmed, and the share of its strength in the second half of them
@@ -64,87 +59,6 @@ TRIAL_SWING, SWING = 0.42, 0.65  # RMS over 25 ms, beyond which it is not the sh
 IN_RAMP = 0.5  # of what the shaking takes, for changing the speed
 TRAVEL = 0.85
 OVER_NOISE = 5.0  # least RMS of the shaken velocity over the encoder's noise, also where the motion then reverses
-
-
-@dataclass(frozen=True)
-class FrequencyResponse:
-    """A loop as measured; arrays are (n,) over frequencies or (n, axes).
-
-    Attributes:
-        device: What was measured.
-        loop: "velocity" or "position".
-        f: Frequencies [Hz].
-        open_loop: L; nan where nothing was measured.
-        coherence: Of set-point with answer and with error, the lower of the two, 0...1.
-        traced: Which frequencies come from an emulator's trace at the velocity loop's rate; no bus shows them.
-        gains: Raw gains in force, shape (axes, 5).
-        fits: What the linear model makes of each axis; None of the position loop.
-        peak_speed, peak_current: Of the shaking [rad/s], [A], shape (axes,).
-        drive_time: Time that passed on the drives [s].
-        notes: Of each axis, for people.
-    """
-
-    device: Device
-    loop: str
-    f: Floats
-    open_loop: Complex
-    coherence: Floats
-    traced: Mask
-    gains: Integers
-    fits: tuple[PlantFit | None, ...]
-    peak_speed: Floats
-    peak_current: Floats
-    drive_time: float
-    notes: tuple[tuple[str, ...], ...]
-
-    @property
-    def trusted(self) -> Mask:
-        """Which lines are coherent enough to be taken as truth, (n, axes)."""
-        return np.asarray((self.coherence >= COHERENT) & np.isfinite(self.open_loop))
-
-    @property
-    def closed_loop(self) -> Complex:
-        """From set-point to answer."""
-        return np.asarray(self.open_loop / (1.0 + self.open_loop))
-
-    def margins(self, axis: int = 0) -> margins_.Margins:
-        """Return the margins of an axis, by its trusted lines; what those do not show is nan."""
-        found = margins_.margins(*self.refined(axis))
-        # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
-        return found if math.isfinite(found.gain_db) else found._replace(gain_db=math.nan)
-
-    def refined(self, axis: int = 0) -> tuple[Floats, Complex, Mask]:
-        """Return frequencies, open loop, and which of them are trusted, between the lines too.
-
-        Where the linear model fits, what is measured is its quotient with the model, which changes slowly, also where
-        a resonance is narrower than the lines' distance: averaged over neighbours and interpolated, it has a fraction
-        of a line's noise. Without a fit the lines stand as they are.
-        """
-        fit, L, good = self.fits[axis], self.open_loop[:, axis], self.trusted[:, axis]
-        if fit is None or fit.reason or fit.misfit > GOOD_MISFIT or good.sum() < 2:
-            return self.f, L, good
-        lines = np.arange(len(self.f))
-        at = np.interp(np.arange(FINE * (len(self.f) - 1) + 1) / FINE, lines, self.f)
-        model, fine = (fit.open_loop(self.device, self.gains[axis], x) for x in (self.f, at))
-        # A line says as much as its coherence: its weight is one over its variance.
-        clear = np.clip(self.coherence[:, axis], 0.0, 1.0 - 1e-6)
-        certain = np.where(np.isfinite(L) & (clear > 0.5), clear / (1.0 - clear), 0.0)
-        near = certain * np.exp(-0.5 * ((lines - np.arange(len(at))[:, None] / FINE) / SMOOTHING) ** 2)
-        quotient = np.where(certain > 0.0, L / model, 0.0)
-        total = near.sum(axis=1)
-        # Neighbours together may be as certain as one line must be.
-        known = total >= COHERENT / (1.0 - COHERENT)
-        return at, fine * np.where(known, near @ quotient / np.maximum(total, np.finfo(float).tiny), 1.0), known
-
-    def estimates(self, axis: int = 0) -> dict[str, Estimate]:
-        """Return inertia, velocity_filter, loop_delay, anti_resonance, resonance and damping of an axis.
-
-        Each has its interval, or the reason why it is refused.
-        """
-        fit = self.fits[axis]
-        if fit is None:
-            raise ValueError(f"the {self.loop} loop says nothing of the plant; measure the velocity loop")
-        return fit.estimates
 
 
 def measure(
@@ -160,7 +74,7 @@ def measure(
     confirmed: bool = False,
     softened: bool = False,
     progress: Callable[[float], None] | None = None,
-) -> FrequencyResponse:
+) -> MeasuredLoop:
     """Measure a loop's frequency response on its axes; they end where they began, as they were found.
 
     Axes of one machine are shaken one after the other, machines side by side. The others hold their places; where all
@@ -221,12 +135,12 @@ def measure(
             free = let_go(target, axes & ~chosen, chosen) if target.linked else nullcontext()
             with free, swinging_allowed(target.drives):
                 results.append(measurement.run(show))
-    merged = _merge(results)
+    whole = merged(results)
     open_loop = "a gain is 0 and the loop is open: give the drive gains first"
     notes = tuple(
-        (*own, open_loop) if without else own for own, without in zip(merged.notes, axes & ~closed, strict=True)
+        (*own, open_loop) if without else own for own, without in zip(whole.notes, axes & ~closed, strict=True)
     )
-    return replace(merged, notes=notes)
+    return replace(whole, notes=notes)
 
 
 def _closed_loops(target: Target, loop: str) -> Mask:
@@ -249,7 +163,7 @@ class _Measurement:
         self._notes: list[list[str]] = [[] for _ in range(target.num_axes)]
         self._where = where
 
-    def run(self, progress: Callable[[float], object]) -> FrequencyResponse:
+    def run(self, progress: Callable[[float], object]) -> MeasuredLoop:
         target = self._target
         self._gains = np.stack([target.drives.read(name) for name in GAIN_OBJECTS], axis=1)
         where = self._where
@@ -370,7 +284,7 @@ class _Measurement:
             )
 
     # --- what it says ---------------------------------------------------------------------------------------------
-    def _evaluate(self, seen: Pass, less: Pass | None, where: Mask) -> FrequencyResponse:
+    def _evaluate(self, seen: Pass, less: Pass | None, where: Mask) -> MeasuredLoop:
         lines = self._lines._replace(f=self._lines.f[self._lines.f <= self._top])
         f = lines.f
         closed, coherence, spread = transfer(seen.set_point, seen.answer, lines)
@@ -399,7 +313,7 @@ class _Measurement:
             coherence = np.concatenate([coherence, np.where(where, fast[2], 0.0)])
             traced = np.concatenate([traced, np.ones(len(fast[0]), bool)])
         speed = np.abs(seen.answer).max(axis=0) if self._loop == "velocity" else np.full(len(where), np.nan)
-        return FrequencyResponse(
+        return MeasuredLoop(
             self._device, self._loop, f, open_loop, coherence, traced, self._gains, tuple(fits), speed,
             seen.peak_current, self._drive_time, tuple(tuple(notes) for notes in self._notes),
         )  # fmt: skip
@@ -473,21 +387,3 @@ def _fast(device: Device, seen: Pass, lines: Lines) -> tuple[Floats, Complex, Fl
     folded = np.minimum(bins % lines.samples, -bins % lines.samples)
     lit = np.isin(folded, lines.bins)
     return all_lines.f[lit], (closed / (1.0 - closed))[lit], coherence[lit]
-
-
-def _merge(results: list[FrequencyResponse]) -> FrequencyResponse:
-    """Put measurements of different axes together; each axis was in one of them."""
-    whole = results[0]
-    for other in results[1:]:
-        mine = np.asarray(np.isfinite(other.open_loop).any(axis=0))
-        whole = replace(
-            whole,
-            open_loop=np.where(mine, other.open_loop, whole.open_loop),
-            coherence=np.where(mine, other.coherence, whole.coherence),
-            fits=tuple(b if m else a for a, b, m in zip(whole.fits, other.fits, mine, strict=True)),
-            peak_speed=np.where(mine, other.peak_speed, whole.peak_speed),
-            peak_current=np.where(mine, other.peak_current, whole.peak_current),
-            drive_time=whole.drive_time + other.drive_time,
-            notes=tuple(a + b for a, b in zip(whole.notes, other.notes, strict=True)),
-        )
-    return whole

@@ -26,7 +26,7 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.frequency_response import FrequencyResponse
+    from tuning.measured_loop import MeasuredLoop
 
 FEWEST = 0.1  # of an axis's frequencies must be coherent for its response to say anything
 COLUMNS = (
@@ -86,11 +86,11 @@ def response(
             fail(f"less than a tenth of an axis's frequencies is coherent: it was shaken too little{late}", REFUSED)
 
 
-def _axes(measured: FrequencyResponse) -> range:
+def _axes(measured: MeasuredLoop) -> range:
     return range(measured.open_loop.shape[1])
 
 
-def _write(folder: Path, measured: FrequencyResponse) -> None:
+def _write(folder: Path, measured: MeasuredLoop) -> None:
     import numpy as np
 
     from tuning.bode import write_bode
@@ -114,7 +114,7 @@ def _write(folder: Path, measured: FrequencyResponse) -> None:
                     table.writerow((f"{f:g}", *row))
 
 
-def _as_json(measured: FrequencyResponse) -> list[dict[str, Any]]:
+def _as_json(measured: MeasuredLoop) -> list[dict[str, Any]]:
     rows = []
     for axis in _axes(measured):
         on_bus = ~measured.traced
@@ -134,7 +134,7 @@ def _as_json(measured: FrequencyResponse) -> list[dict[str, Any]]:
     return rows
 
 
-def _plant(measured: FrequencyResponse, axis: int) -> dict[str, Any] | None:
+def _plant(measured: MeasuredLoop, axis: int) -> dict[str, Any] | None:
     if measured.fits[axis] is None:
         return None
     return {
@@ -144,7 +144,7 @@ def _plant(measured: FrequencyResponse, axis: int) -> dict[str, Any] | None:
     }
 
 
-def _print(measured: FrequencyResponse, out: Path | None) -> None:
+def _print(measured: MeasuredLoop, out: Path | None) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
