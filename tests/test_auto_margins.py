@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from drive_env import motion
+from drive_env.gains import Gains
 from drive_env.positioning import POSITION
 from tuning import auto_margins, frequency_response
+from tuning.auto_result import AxisRun
 from tuning.auto_run import Run
 from tuning.target import emulated, timed
 
@@ -38,3 +40,16 @@ def test_the_response_is_measured_within_what_is_left_of_the_travel(moved, left,
         run.ground = SimpleNamespace(move=SimpleNamespace(distance=np.array([16384])))
         auto_margins.measure(run)
     assert asked == [pytest.approx(left, abs=5e-3)]
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_where_no_phase_margin_is_told_it_says_which_lines_hide_it(hidden):
+    f = np.arange(5.0, 405.0, 5.0)
+    coherent = ~((f > 80.0) & (f < 120.0)) if hidden else np.ones(f.shape, bool)
+    response = SimpleNamespace(f=f, open_loop=(100.0 / (1j * f))[:, None], trusted=coherent[:, None])
+    axis = AxisRun(Gains(1, 1, 1, 1, 1), Gains(1, 1, 1, 1, 1))
+    run = SimpleNamespace(axes=[axis], gains=np.ones((1, 5), np.int64))
+    assert not auto_margins._calm(run, 0, response)
+    note = "no phase margin is told: the gain passes 1 between 80 and 120 Hz, where the coherence is below 0.95"
+    assert axis.notes == ([note] if hidden else [])
+    assert np.isnan(axis.margins.phase_deg) == hidden

@@ -15,7 +15,8 @@ from drive_env.safety import SafetyError
 from tuning.auto_moves import show
 from tuning.auto_run import MOVE_TIME, TRIAL_TIME
 from tuning.auto_trials import BY_TRIAL, FOLLOWING_WINDOW, watch_following
-from tuning.margins import margins
+from tuning.margins import hidden_crossing, margins
+from tuning.measured_loop import COHERENT
 
 if TYPE_CHECKING:
     from tuning.auto_run import Run
@@ -91,6 +92,11 @@ def _calm(run: Run, k: int, response: MeasuredLoop) -> bool:
         axis.reason = f"the measured loop is {found.ms:.1f} times as sensitive as an open one: {SENSITIVITY:g} is most"
         return False
     axis.margins = found
+    if (hidden := hidden_crossing(f, factor * L, trusted)) is not None:
+        axis.notes.append(
+            f"no phase margin is told: the gain passes 1 between {hidden[0]:.0f} and {hidden[1]:.0f} Hz, where the "
+            f"coherence is below {COHERENT:g}"
+        )
     axis.verified = f"{BY_TRIAL}; and by the measured frequency response of the velocity loop, Ms {found.ms:.1f}"
     if factor == 1.0:
         return False

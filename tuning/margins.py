@@ -70,11 +70,11 @@ def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None
         falling = gains[[log_gain[np.searchsorted(at, x, side="right") - 1] > 0.0 for x in gains]]
         crossover = float(falling[0]) if falling.size else float(gains[0])
     known = np.flatnonzero(good)
-    unseen = known[:-1][(np.diff(known) > 1) & (np.diff(np.sign(log_gain[known])) != 0.0)]
+    unseen = _unseen(known, log_gain)
     if unseen.size:
         # The gain passes 1 where nothing is trusted: the phase there is not known, and it may be the worst.
         phase = phase_at = math.nan
-        crossover = math.nan if not crossover < at[unseen[0]] else crossover
+        crossover = math.nan if not crossover < at[known[unseen[0]]] else crossover
     gain, gain_at = _gain_margin(at, log_gain, off, phases)
     left, right = known[:-1], known[1:]
     hidden = (right - left > 1) & (off[left] * off[right] < 0.0) & (np.abs(off[left] - off[right]) < math.pi)
@@ -85,6 +85,22 @@ def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None
     closed = np.where(good, np.abs(L / (1.0 + L)), math.nan)
     sensitivity = 1.0 / np.abs(1.0 + L[good]) if good.any() else np.array([math.nan])
     return Margins(phase, gain, crossover, _bandwidth(at, closed), float(sensitivity.max()), phase_at, gain_at)
+
+
+def hidden_crossing(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike) -> tuple[float, float] | None:
+    """Return between which two frequencies [Hz] the gain passes 1 with none trusted, the lowest; None if nowhere.
+
+    `margins` has no phase margin then.
+    """
+    at, L = np.asarray(f, float), np.asarray(open_loop, complex)
+    known = np.flatnonzero(np.asarray(trusted, bool) & np.isfinite(L))
+    unseen = _unseen(known, np.log(np.abs(np.where(np.isfinite(L), L, 1.0))))
+    return (float(at[known[unseen[0]]]), float(at[known[unseen[0] + 1]])) if unseen.size else None
+
+
+def _unseen(known: NDArray[np.int64], log_gain: Floats) -> NDArray[np.int64]:
+    """Return after which of the trusted frequencies others follow among which the gain passes 1."""
+    return np.flatnonzero((np.diff(known) > 1) & (np.diff(np.sign(log_gain[known])) != 0.0))
 
 
 def _crossings(f: Floats, value: Floats, where: NDArray[np.bool_]) -> Floats:
