@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from agents.evaluation import Evaluation
 from agents.scores import Interval, interval
+from tuning.bootstrap import bootstrap_interval
 
 Floats = NDArray[np.float64]
-
-RESAMPLES = 2000
 
 
 class Gap(NamedTuple):
@@ -72,7 +71,6 @@ def text(gaps: list[Gap], first: str, second: str) -> list[str]:
 
 def _medians(one: Floats, two: Floats, paired: bool) -> tuple[float, float, float]:
     """Return the quotient of medians less 1 between the ends of its bootstrap interval."""
-    rng = np.random.default_rng(0)
     if paired:
         both = np.isfinite(one) & np.isfinite(two)
         one, two = one[both], two[both]
@@ -80,21 +78,20 @@ def _medians(one: Floats, two: Floats, paired: bool) -> tuple[float, float, floa
         one, two = one[np.isfinite(one)], two[np.isfinite(two)]
     if not len(one) or not len(two) or np.median(one) == 0.0:
         return float("nan"), float("nan"), float("nan")
-    drawn = rng.integers(0, len(one), (RESAMPLES, len(one)))
-    medians = np.median(one[drawn], axis=1)
-    others = np.median(two[drawn if paired else rng.integers(0, len(two), (RESAMPLES, len(two)))], axis=1)
+    low, high = bootstrap_interval(_excess_of_medians, one, two, paired=paired)
+    return low, float(np.median(two) / np.median(one) - 1.0), high
+
+
+def _excess_of_medians(one: Floats, two: Floats) -> Floats:
+    """Return the second median over the first less 1, of draws where the first is not 0."""
+    medians, others = np.median(one, axis=1), np.median(two, axis=1)
     held = medians != 0.0
-    low, high = np.quantile(others[held] / medians[held] - 1.0, (0.025, 0.975))
-    return float(low), float(np.median(two) / np.median(one) - 1.0), float(high)
+    return np.asarray(others[held] / medians[held] - 1.0)
 
 
 def _unpaired(one: Floats, two: Floats) -> Interval:
     """Return the difference of two means with a bootstrap interval."""
     one, two = one[np.isfinite(one)], two[np.isfinite(two)]
-    rng = np.random.default_rng(0)
-    means = [x[rng.integers(0, len(x), (RESAMPLES, len(x)))].mean(axis=1) for x in (one, two)]
-    low, high = np.quantile(means[1] - means[0], (0.025, 0.975))
+    low, high = bootstrap_interval(lambda x, y: y.mean(axis=1) - x.mean(axis=1), one, two, paired=False)
     count = min(len(one), len(two))
-    return Interval(
-        float(two.mean() - one.mean()), float(low), float(high), float(np.median(two) - np.median(one)), count
-    )
+    return Interval(float(two.mean() - one.mean()), low, high, float(np.median(two) - np.median(one)), count)

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tuning.bootstrap import bootstrap_interval
+
 Floats = NDArray[np.float64]
 
 
@@ -156,13 +158,11 @@ class Interval(NamedTuple):
     episodes: int
 
 
-def interval(values: Any, seed: int = 0, resamples: int = 2000) -> Interval:
+def interval(values: Any) -> Interval:
     """Return mean, percentile bootstrap interval (95 %) and median of a figure; NaN ones are left out."""
     found = np.asarray(values, float)
     found = found[np.isfinite(found)]
     if not len(found):
         return Interval(float("nan"), float("nan"), float("nan"), float("nan"), 0)
-    rng = np.random.default_rng(seed)
-    means = found[rng.integers(0, len(found), (resamples, len(found)))].mean(axis=1)
-    low, high = np.quantile(means, (0.025, 0.975))
-    return Interval(float(found.mean()), float(low), float(high), float(np.median(found)), len(found))
+    low, high = bootstrap_interval(lambda x: x.mean(axis=1), found)
+    return Interval(float(found.mean()), low, high, float(np.median(found)), len(found))

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from agents.bundle import Bundle, installed
 from agents.surrogate import CONTEXT, IDENTIFIED, SHOWN, SurrogatePolicy
+from tuning.bootstrap import bootstrap_interval
 
 Floats = NDArray[np.float64]
 Array = NDArray[np.float32]
@@ -232,7 +233,6 @@ def judge(policy: Any, machines: int, seed: int, rows: Sequence[tuple[str, str]]
 def figures_of(ratios: Floats) -> dict[str, Any]:
     """Return what a card says of hidden J over the rule's, each with its 95 % interval (bootstrap over machines)."""
     flat = ratios.ravel()
-    drawn = np.random.default_rng(0).choice(flat, (2000, flat.size))
     figures: dict[str, Any] = {}
     for name, of in (
         ("median", lambda x: np.median(x, axis=-1)),
@@ -240,7 +240,7 @@ def figures_of(ratios: Floats) -> dict[str, Any]:
         ("share more than 5 % worse", lambda x: np.mean(x > 1.05, axis=-1)),
     ):
         figures[name] = round(float(of(flat)), 3)
-        figures[f"{name}, 95 % interval"] = [round(float(x), 3) for x in np.quantile(of(drawn), (0.025, 0.975))]
+        figures[f"{name}, 95 % interval"] = [round(end, 3) for end in bootstrap_interval(of, flat)]
     return figures
 
 

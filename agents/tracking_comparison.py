@@ -22,6 +22,7 @@ from agents.scores import FIGURES, Episode, Interval, current, figures, followin
 from agents.shipped import find_agent
 from agents.tasks import make_lanes
 from agents.training import with_figures
+from tuning.bootstrap import bootstrap_interval
 
 Floats = NDArray[np.float64]
 
@@ -130,20 +131,17 @@ def compare(
     return Compared(own, ratios, fell)
 
 
-def ratio(values: Any, others: Any, seed: int = 0, resamples: int = 2000) -> Interval:
+def ratio(values: Any, others: Any) -> Interval:
     """Return mean over mean with its percentile bootstrap interval (95 %), pairs kept; `median` is of the pairs.
 
     Args:
         values: Of some episodes, shape (n,).
         others: Of the same ones.
-        seed: Of the resampling.
-        resamples: How many.
     """
     values, others = np.asarray(values, float), np.asarray(others, float)
-    chosen = np.random.default_rng(seed).integers(0, len(values), (resamples, len(values)))
-    low, high = np.quantile(values[chosen].mean(axis=1) / others[chosen].mean(axis=1), (0.025, 0.975))
+    low, high = bootstrap_interval(lambda x, y: x.mean(axis=1) / y.mean(axis=1), values, others)
     middle = float(np.median(values / others))
-    return Interval(float(values.mean() / others.mean()), float(low), float(high), middle, len(values))
+    return Interval(float(values.mean() / others.mean()), low, high, middle, len(values))
 
 
 def identified_lags(error: Floats, speed: Floats, acceleration: Floats) -> Floats:

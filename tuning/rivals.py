@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tuning.bootstrap import bootstrap_interval
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from tuning.compare import Comparison
-
-RESAMPLES = 2000  # of the bootstrap
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,8 @@ def against_the_best(comparison: Comparison, tuner: str, rivals: Sequence[str]) 
     own = np.array([row.hidden for row in comparison.of(tuner)])
     best = np.min([[row.hidden for row in comparison.of(name)] for name in rivals], axis=0)
     ratio = own / best
-    drawn = np.random.default_rng(0).integers(0, len(ratio), (RESAMPLES, len(ratio)))
-    low, high = np.quantile(np.median(ratio[drawn], axis=1), (0.025, 0.975))
-    return RivalRow(
-        tuner, ", ".join(rivals), len(ratio), float(np.median(ratio)), float(low), float(high), int(np.sum(ratio < 1.0))
-    )
+    low, high = bootstrap_interval(lambda drawn: np.median(drawn, axis=1), ratio)
+    return RivalRow(tuner, ", ".join(rivals), len(ratio), float(np.median(ratio)), low, high, int(np.sum(ratio < 1.0)))
 
 
 def all_rivals(comparison: Comparison) -> tuple[RivalRow, ...]:
