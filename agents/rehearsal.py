@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from drive_env.dictionary.access import ObjectAccessError
+from drive_env.gains import GAIN_NAMES, GAIN_OBJECTS
 from drive_env.master.lifeline import MASTER
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ READS = 50  # of the statusword, to see how fast answers come
 SLOWEST = 0.01  # s, the median of those; a trial that watches for oscillation asks more often
 AT_REST = 0.02  # of the speed limit
 BY_ENCODER = 3  # 2055h
-LOOP_GAINS = ("torque P", "torque I", "velocity P", "velocity I", "position P")
 # What a trial samples besides the envelope's own, and what it plays (gain_trial.py, frequency_response.py).
 SAMPLED, PLAYED = (0x6064, 0x6062, 0x6077, 0x6041), (0x607A,)
 
@@ -280,7 +280,7 @@ def _gains(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _named(gains: Any) -> str:
-    return ", ".join(f"{name} {value}" for name, value in zip(LOOP_GAINS, gains, strict=True))
+    return ", ".join(f"{name} {value}" for name, value in zip(GAIN_NAMES, gains, strict=True))
 
 
 LOOKS = (_identity, _state, _answers, _samples, _error_control, _motor, _supply, _travel, _envelope, _limits, _gains)
@@ -296,9 +296,8 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, st
     finite = all(np.isfinite(end).all() for end in ends)
     way = f"{round(float(np.min(here + ends[0])))}...{round(float(np.max(here + ends[1])))}" if finite else "any"
     amperes = round(1e3 * target.current)
-    for index, sub, name in ((0x2041, 1, "torque P"), (0x2041, 2, "torque I"), (0x2042, 1, "velocity P"),
-                             (0x2042, 2, "velocity I"), (0x2043, 1, "position P")):  # fmt: skip
-        yield (index, sub), "1...32767", f"gain on trial, {name}", True
+    for key, name in zip(GAIN_OBJECTS, GAIN_NAMES, strict=True):
+        yield key, "1...32767", f"gain on trial, {name}", True
     yield (0x6040, 0), "0, 2, 6, 7, Fh, 1Fh, 80h", "enable, start moves, stop, clear a fault", False
     yield (0x6060, 0), "0, 1, 8, 9, 10", "pp for moves, csp, csv and cst for what identifies", False
     yield (0x607A, 0), way, "moves", False

@@ -36,7 +36,9 @@ class Gains(NamedTuple):
     position_p: int
 
 
-GAIN_OBJECTS = ((0x2041, 1), (0x2041, 2), (0x2042, 1), (0x2042, 2), (0x2043, 1))  # in the order of Gains
+# In the order of Gains.
+GAIN_OBJECTS = ((0x2041, 1), (0x2041, 2), (0x2042, 1), (0x2042, 2), (0x2043, 1))
+GAIN_NAMES = ("torque P", "torque I", "velocity P", "velocity I", "position P")
 
 
 class Bandwidths(NamedTuple):
@@ -102,17 +104,17 @@ def gains_from_bandwidths(
         ValueError: If a gain leaves 1...32767.
     """
     w_v = 2.0 * math.pi * velocity_hz
-    raw = {
-        "torque P": _torque_p_scale(device, motor, supply) * 2.0 * math.pi * current_hz,
-        "torque I": 65536.0 / device.current_rate * motor.R_s / motor.L_q,
-        "velocity P": _velocity_p_scale(device, motor, inertia) * w_v,
-        "velocity I": 65536.0 / device.velocity_rate * w_v / integration,
-        "position P": _POSITION_P_SCALE * 2.0 * math.pi * position_hz,
-    }
-    for name, value in raw.items():
+    raw = (
+        _torque_p_scale(device, motor, supply) * 2.0 * math.pi * current_hz,
+        65536.0 / device.current_rate * motor.R_s / motor.L_q,
+        _velocity_p_scale(device, motor, inertia) * w_v,
+        65536.0 / device.velocity_rate * w_v / integration,
+        _POSITION_P_SCALE * 2.0 * math.pi * position_hz,
+    )
+    for name, value in zip(GAIN_NAMES, raw, strict=True):
         if not 0.5 <= value < RAW_MAX + 0.5:
             raise ValueError(f"{name} would be {value:.0f}, outside 1...{RAW_MAX}; choose another bandwidth")
-    return Gains(*(round(value) for value in raw.values()))
+    return Gains(*(round(value) for value in raw))
 
 
 def bandwidths_from_gains(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from drive_env.dictionary.units import RPM
-from drive_env.gains import RAW_MAX, Gains
+from drive_env.gains import GAIN_NAMES, RAW_MAX, Gains
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
 COARSE = 0.05  # a gain that an integer misses by more than this share is worth a note
 
-_TITLES = {"torque_p": "torque P", "torque_i": "torque I", "velocity_p": "velocity P", "velocity_i": "velocity I",
-           "position_p": "position P"}  # fmt: skip
+_TITLES = dict(zip(Gains._fields, GAIN_NAMES, strict=True))
 
 
 class Proposal(NamedTuple):

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
 
+from drive_env.gains import GAIN_NAMES, GAIN_OBJECTS
 from tuning.certificate_pictures import bode_picture, step_picture
 
 if TYPE_CHECKING:
     from tuning.certificate import AxisCertificate, Certificate
 
-GAIN_NAMES = ("torque P", "torque I", "velocity P", "velocity I", "position P")
-GAIN_OBJECTS = ("2041h:01", "2041h:02", "2042h:01", "2042h:02", "2043h:01")
 SEAL = "<!-- sha256 of all before this line: "
 
 STYLE = """
@@ -116,9 +115,10 @@ def _axis(axis: AxisCertificate) -> list[str]:
 def _gains(axis: AxisCertificate) -> str:
     rows = []
     si = list(zip(axis.before_si.items(), axis.after_si.values(), strict=True))
-    for k, (name, index) in enumerate(zip(GAIN_NAMES, GAIN_OBJECTS, strict=True)):
+    for k, (name, (index, sub)) in enumerate(zip(GAIN_NAMES, GAIN_OBJECTS, strict=True)):
         (meaning, before), after = si[k] if k < len(si) else (("", math.nan), math.nan)
-        cells = [name, index, axis.before[k], axis.after[k], meaning, _figure(before), _figure(after)]
+        label = f"{index:04X}h:{sub:02X}"
+        cells = [name, label, axis.before[k], axis.after[k], meaning, _figure(before), _figure(after)]
         rows.append([str(cell) for cell in cells])
     return _table(("gain", "object", "before", "after", "in SI", "before", "after"), rows, numbers=(2, 3, 5, 6))
 

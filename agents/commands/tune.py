@@ -28,7 +28,6 @@ from drive_env.tools.options import DeviceName, Yes
 from tuning.commands.options import MotorName, Supply, TravelRange
 
 PATIENCE = 30.0  # s, for a node in this process: one that is slow says that the computer is busy, not that it is gone
-GAIN_NAMES = ("torque P", "torque I", "velocity P", "velocity I", "position P")
 
 if TYPE_CHECKING:
     from agents.tuner import TrialShown
@@ -288,6 +287,8 @@ def _report(done: Run, folder: Path, json: bool, bus: bool) -> None:
 
 
 def _print(done: Run, refused: list[str], rule: float | None) -> None:
+    from drive_env.gains import GAIN_NAMES
+
     result = done.result
     axis, certified = result.axes[0], done.certificate.axes[0]
     print(f"{'':<7}{''.join(f'{name:>12}' for name in GAIN_NAMES)}")
