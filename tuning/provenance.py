@@ -44,6 +44,14 @@ def run_folder(kind: str, parent: str | Path = "runs") -> Path:
     return name
 
 
+def nearest_place(path: Path) -> tuple[Path, bool]:
+    """Return the nearest thing above a new file or folder that exists, and whether one may write there."""
+    place = path.absolute().parent
+    while not place.exists():
+        place = place.parent
+    return place, os.access(place, os.W_OK | os.X_OK)
+
+
 def check_folder(folder: str | Path) -> None:
     """Raise OSError unless results can be written into the folder: new or empty, and its place writable.
 
@@ -58,12 +66,10 @@ def check_folder(folder: str | Path) -> None:
             raise FileExistsError(f"the folder {path} is not empty; choose another --out or remove it")
     elif path.exists():
         raise FileExistsError(f"{path} is a file; choose another --out")
-    place = path.absolute().parent
-    while not place.exists():
-        place = place.parent
+    place, writable = nearest_place(path)
     if not place.is_dir():
         raise NotADirectoryError(f"{place} is a file, so that {path} cannot be a folder; choose another --out")
-    if not os.access(place, os.W_OK | os.X_OK):
+    if not writable:
         raise PermissionError(f"the folder {place} cannot be written; choose another --out or change its permissions")
 
 

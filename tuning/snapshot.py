@@ -28,7 +28,7 @@ from drive_env.master.description import Description, Key, describe
 from drive_env.master.errors import BusError
 from drive_env.master.parameters import Difference, read_parameters, write_all_or_none
 from drive_env.safety import SafetyError
-from tuning.provenance import run_folder
+from tuning.provenance import nearest_place, run_folder
 from tuning.toml_tables import toml
 
 if TYPE_CHECKING:
@@ -228,12 +228,10 @@ def check_place(file: Path) -> None:
     """Raise OSError unless a new file can be written there: before a drive is asked for anything."""
     if file.exists():
         raise OSError(f"{file} is there already, and may hold the state before an earlier run; choose another file")
-    place = file.absolute().parent
-    while not place.exists():
-        place = place.parent
+    place, writable = nearest_place(file)
     if not place.is_dir():
         raise OSError(f"the state before cannot be written to {file}: {place} is a file; choose another place")
-    if not os.access(place, os.W_OK | os.X_OK):
+    if not writable:
         raise OSError(f"the state before cannot be written to {file}: {place} is not yours to write; choose another")
 
 
