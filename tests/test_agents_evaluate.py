@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -211,7 +212,13 @@ def test_a_policy_on_a_bus_has_half_as_far_again_as_its_task_and_twice_its_speed
 def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = run("evaluate", "tracking_two_mass", "--channel", "socket://127.0.0.1:1", "--node", 3)
-    assert found.exit_code == 2 and "The motor of node 3 will turn. Is its way clear?" in found.output
+    assert (found.exit_code, found.stderr) == (
+        2, "drive-agent: The motor of node 3 will turn. Is its way clear? Nobody is there to ask; say --yes\n",
+    )  # fmt: skip
+    monkeypatch.setattr("drive_env.tools.options.sys", SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True)))
+    monkeypatch.setattr("typer.confirm", lambda question: False)
+    found = run("evaluate", "tracking_two_mass", "--channel", "socket://127.0.0.1:1", "--node", 3)
+    assert (found.exit_code, found.stderr) == (1, "drive-agent: nothing was changed\n")
     assert not any(tmp_path.iterdir())
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -92,6 +93,15 @@ def test_a_channel_of_the_environment_alone_moves_no_motor(tmp_path, monkeypatch
     monkeypatch.setenv("DRIVE_ENV_CHANNEL", "socket://127.0.0.1:1")
     result = CliRunner().invoke(app, ["tune", "--trials", "1", "--load", "inertia", "--out", str(tmp_path / "run")])
     assert result.exit_code == 0 and "inertia, emulated, node 1 of socket://127.0.0.1:" in result.stdout
+
+
+def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("agents.commands.tune._on_bus", lambda *_: nullcontext())
+    code, _, error = command("--interface", "virtual", "--channel", "none", "--node", 3, "--travel", "-1:1")
+    assert code == 2
+    assert error == "drive-agent: The motor of node 3 will turn. Is its way clear? Nobody is there to ask; say --yes\n"
+    assert not any(tmp_path.iterdir())
 
 
 def test_json_for_programs(tmp_path):

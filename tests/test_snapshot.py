@@ -327,7 +327,7 @@ def test_an_enabled_axis_is_left_alone(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("arguments", "code", "message"), [
     (["restore", "none.toml"], 2, "drive-tune: cannot read none.toml: No such file"),
     (["restore", "emulated.toml"], 2, "was taken from emulated drives, which ended with their program"),
-    (["restore", "bus.toml"], 2, "Nobody is there to ask; say --yes"),
+    (["restore", "bus.toml"], 2, "drive-tune: Restore node 1, 2, 3 on x? Nobody is there to ask; say --yes"),
     (["restore", "bus.toml", "--yes", "--interface", "none"], 2, "cannot open interface 'none'"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line(target, tmp_path, monkeypatch, arguments, code, message):

@@ -24,7 +24,8 @@ from agents.commands.options import (
     print_json,
     progress_bar,
 )
-from drive_env.tools.options import Yes, ask
+from drive_env.tools.options import Yes
+from tuning.commands.options import ask_to_turn
 
 EMULATOR = "emulator"
 BUS_EPISODES, EPISODES = 8, 64
@@ -141,7 +142,7 @@ def evaluate(
         options = {"episodes": count, "seed": seed, "guard": guard, "name": policy}
         before = _way_back(out) if on_bus else None
         if on_bus and not lockstep:  # what waits for SYNC is emulated
-            ask(f"The motor of node {', '.join(map(str, node or [1]))} will turn. Is its way clear?", yes)
+            ask_to_turn(node, yes)
         found = (
             _on_bus(loaded, configuration, options, sensor, before, device=device, interface=interface,
                     channel=channel, nodes=node or (1,), lockstep=lockstep,

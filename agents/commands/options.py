@@ -80,7 +80,7 @@ def errors_as_exit_codes() -> Iterator[None]:
         fail(f"{error}{remedy}")
     except (ObjectAccessError, ValueError, ImportError) as error:
         fail(error)
-    except RuntimeError as error:  # motion: an axis is in fault
+    except RuntimeError as error:  # motion: an axis is in fault; ask: the user says no
         if type(error) is not RuntimeError:
             raise
         fail(error, REFUSED)

@@ -25,7 +25,7 @@ from agents.commands.options import (
     print_json,
 )
 from drive_env.tools.options import DeviceName, Yes
-from tuning.commands.options import MotorName, Supply, TravelRange
+from tuning.commands.options import MotorName, Supply, TravelRange, ask_to_turn
 
 PATIENCE = 30.0  # s, for a node in this process: one that is slow says that the computer is busy, not that it is gone
 
@@ -73,7 +73,6 @@ def tune(
     with errors_as_exit_codes():
         from agents.policy import load_policy
         from agents.shipped import find_agent
-        from drive_env.tools.options import ask
 
         bus = _is_of_a_bus(context)
         if bus and seed is not None:
@@ -101,7 +100,7 @@ def tune(
                     fail("a run would not begin: see the lines with 'no'", REFUSED)
                 return
             if bus:
-                ask(f"The motor of node {', '.join(map(str, node or [1]))} will turn. Is its way clear?", yes)
+                ask_to_turn(node, yes)
             result = _run(target, policy, folder, agent, store, json)
         _report(result, folder, json, bus)
 

@@ -91,7 +91,7 @@ def errors_as_exit_codes() -> Iterator[None]:
         fail(error, REFUSED)
     except (ObjectAccessError, ValueError) as error:
         fail(error, USER_ERROR)
-    except RuntimeError as error:  # motion: an axis is in fault
+    except RuntimeError as error:  # motion: an axis is in fault; ask: the user says no
         if type(error) is not RuntimeError:
             raise
         fail(error, REFUSED)
@@ -129,13 +129,18 @@ def check_free(file: Path, remedy: str = "choose another file") -> None:
 
 
 def ask(question: str, yes: bool) -> None:
-    """Go on if the user agrees, or end the command."""
+    """Go on if the user agrees; else each program's `errors_as_exit_codes` ends it under its own name.
+
+    Raises:
+        ValueError: If nobody is there to ask.
+        RuntimeError: If the user says no.
+    """
     if yes:
         return
     if not sys.stdin.isatty():
-        fail(f"{question} Nobody is there to ask; say --yes", USER_ERROR)
+        raise ValueError(f"{question} Nobody is there to ask; say --yes")
     if not typer.confirm(question):
-        fail("nothing was changed", REFUSED)
+        raise RuntimeError("nothing was changed")
 
 
 def increments_per_revolution(drives: CanDrives) -> list[float | None]:

@@ -20,6 +20,7 @@ from drive_env.tools.options import Interface as Interface
 from drive_env.tools.options import Json as Json
 from drive_env.tools.options import Nodes as Nodes
 from drive_env.tools.options import Yes as Yes
+from drive_env.tools.options import ask as ask
 from drive_env.tools.options import print_json as print_json
 
 if TYPE_CHECKING:
@@ -172,18 +173,8 @@ def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool) -
 
 
 def ask_to_turn(nodes: list[int] | None, yes: bool) -> None:
-    """Go on if the user lets the motors of a bus turn, or end the command."""
+    """Go on if the user lets the motors of a bus turn; raises as `ask` does."""
     ask(f"The motor of node {', '.join(map(str, nodes or [1]))} will turn. Is its way clear?", yes)
-
-
-def ask(question: str, yes: bool) -> None:
-    """Go on if the user agrees, or end the command."""
-    if yes:
-        return
-    if not sys.stdin.isatty():
-        fail(f"{question} Nobody is there to ask; say --yes")
-    if not typer.confirm(question):
-        fail("nothing was changed", REFUSED)
 
 
 def open_target(
@@ -286,7 +277,7 @@ def errors_as_exit_codes() -> Iterator[None]:
         fail(error, REFUSED)
     except (ObjectAccessError, ValueError) as error:
         fail(error)
-    except RuntimeError as error:  # motion: an axis is in fault
+    except RuntimeError as error:  # motion: an axis is in fault; ask: the user says no
         if type(error) is not RuntimeError:
             raise
         fail(error, REFUSED)
