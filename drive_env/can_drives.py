@@ -18,6 +18,7 @@ import can
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env.arguments import checked_mask, whole_cycles
 from drive_env.dictionary.access import ObjectAccessError, check_readable, check_writable, checked_values
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.emergency import EmergencyMessage
@@ -153,7 +154,7 @@ class CanDrives:
         self._enter()
         entry = self._description.dictionary.find(name)
         check_writable(entry)
-        axes = self._axis_mask(where)
+        axes = checked_mask(where, self.num_axes)
         if isinstance(value, str) and not self._description.is_number(entry):
             for axis in np.flatnonzero(axes):
                 self.write_axis(entry, int(axis), value)
@@ -243,7 +244,7 @@ class CanDrives:
             NoAnswerError: If a node does not boot; ValueError if only some axes of a node are chosen.
         """
         self._enter()
-        axes = self._axis_mask(where).reshape(len(self.nodes), self._description.num_axes)
+        axes = checked_mask(where, self.num_axes).reshape(len(self.nodes), self._description.num_axes)
         if np.any(axes.any(axis=1) != axes.all(axis=1)):
             raise ValueError("a node is reset with all its axes; choose all axes of a node or none")
         chosen = [k for k in range(len(self.nodes)) if axes[k].any()]
@@ -408,25 +409,8 @@ class CanDrives:
         """Return when an emulator in lockstep has simulated every SYNC: it answers in order."""
         self.read_axis(self._description.dictionary.find(_DEVICE_TYPE), 0)
 
-    def _axis_mask(self, where: Mask | None) -> Mask:
-        if where is None:
-            return np.ones(self.num_axes, bool)
-        mask = np.asarray(where)
-        if mask.shape != (self.num_axes,) or mask.dtype != bool:
-            raise ValueError(
-                f"where must be a boolean array of shape ({self.num_axes},), not {mask.dtype} {mask.shape}"
-            )
-        return mask
-
     def _cycles(self, duration: float) -> int:
-        cycle = self._description.cycle
-        cycles = round(duration / cycle)
-        if not duration >= 0.0 or abs(cycles * cycle - duration) > 1e-9:
-            raise ValueError(
-                f"{duration:g} s is not a whole number of communication cycles of {cycle:g} s; "
-                f"use {max(cycles, 0) * cycle:g} s"
-            )
-        return cycles
+        return whole_cycles(duration, self._description.cycle)
 
 
 @contextlib.contextmanager

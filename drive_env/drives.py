@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env.arguments import checked_mask, whole_cycles
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.entries import ObjectName
 from drive_env.emergency import EmergencyMessage
@@ -149,7 +150,7 @@ class EmulatedDrives:
         Raises:
             ObjectAccessError: With the SDO abort code, if the object, the value or the state does not allow it.
         """
-        self._objects.write(name, value, self._axis_mask(where))
+        self._objects.write(name, value, checked_mask(where, self.num_axes))
 
     def advance(self, duration: float) -> None:
         """Let `duration` [s] pass, whole communication cycles of 1 ms."""
@@ -230,7 +231,7 @@ class EmulatedDrives:
 
     def reset_node(self, where: Mask | None = None) -> None:
         """Reset the drives (NMT reset node): values return to the stored ones, the automaton starts anew."""
-        self._objects.restart(self._axis_mask(where))
+        self._objects.restart(checked_mask(where, self.num_axes))
 
     def close(self) -> None:
         """Give the threads back; the drives cannot be used afterwards."""
@@ -385,29 +386,13 @@ class EmulatedDrives:
         inertia = np.concatenate([group.load.plant.mass[:axes].T.reshape(-1) for group in self._groups])
         set_lanes(self._records, "J_rotor", inertia)
 
-    def _axis_mask(self, where: Mask | None) -> Mask:
-        if where is None:
-            return np.ones(self.num_axes, bool)
-        mask = np.asarray(where)
-        if mask.shape != (self.num_axes,) or mask.dtype != bool:
-            raise ValueError(
-                f"where must be a boolean array of shape ({self.num_axes},), not {mask.dtype} {mask.shape}"
-            )
-        return mask
-
     # --- time -----------------------------------------------------------------------------------------------------
     @property
     def _cycle(self) -> float:
         return 1.0 / self.device.profile_rate
 
     def _cycles(self, duration: float) -> int:
-        cycles = round(duration / self._cycle)
-        if not duration >= 0.0 or abs(cycles * self._cycle - duration) > 1e-9:
-            raise ValueError(
-                f"{duration:g} s is not a whole number of communication cycles of {self._cycle:g} s; "
-                f"use {max(cycles, 0) * self._cycle:g} s"
-            )
-        return cycles
+        return whole_cycles(duration, self._cycle)
 
     def _run(self, cycles: int, call: Call) -> None:
         begin, done, diverged = self._now, 0, False

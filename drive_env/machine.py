@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env.arguments import checked_mask
 from drive_env.firmware.record import STATE, get_lanes, set_lanes
 from drive_env.lane_image import LaneImage
 from drive_env.parameters import check_parameter
@@ -293,14 +294,7 @@ class Machines:
         return get_lanes(self._drives._records, name, self._drives.num_axes).astype(float)
 
     def _mask(self, where: Mask | None) -> Mask:
-        if where is None:
-            return np.ones(self._drives.num_machines, bool)
-        mask = np.asarray(where)
-        if mask.shape != (self._drives.num_machines,) or mask.dtype != bool:
-            raise ValueError(
-                f"where must be a boolean array of shape ({self._drives.num_machines},), not {mask.dtype} {mask.shape}"
-            )
-        return mask
+        return checked_mask(where, self._drives.num_machines)
 
     def _per_machine(self, value: ArrayLike, name: str) -> Floats:
         values = np.asarray(value, float)

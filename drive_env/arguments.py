@@ -1,0 +1,37 @@
+"""What either side of the Drives interface is given, checked: which axes or machines, and whole cycles."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.bool_]
+
+
+def checked_mask(where: Mask | None, count: int) -> Mask:
+    """Return which of so many axes or machines are meant, all of them by default.
+
+    Raises:
+        ValueError: If it is no boolean array of that length.
+    """
+    if where is None:
+        return np.ones(count, bool)
+    mask = np.asarray(where)
+    if mask.shape != (count,) or mask.dtype != bool:
+        raise ValueError(f"where must be a boolean array of shape ({count},), not {mask.dtype} {mask.shape}")
+    return mask
+
+
+def whole_cycles(duration: float, cycle: float) -> int:
+    """Return how many communication cycles [s] fill a duration [s].
+
+    Raises:
+        ValueError: If no whole number of them does.
+    """
+    cycles = round(duration / cycle)
+    if not duration >= 0.0 or abs(cycles * cycle - duration) > 1e-9:
+        raise ValueError(
+            f"{duration:g} s is not a whole number of communication cycles of {cycle:g} s; "
+            f"use {max(cycles, 0) * cycle:g} s"
+        )
+    return cycles
