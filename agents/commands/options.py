@@ -16,6 +16,7 @@ from drive_env.tools.options import Channel as Channel
 from drive_env.tools.options import Interface as Interface
 from drive_env.tools.options import Json as Json
 from drive_env.tools.options import Nodes as Nodes
+from drive_env.tools.options import ending_by
 from drive_env.tools.options import print_json as print_json
 
 # Whatever takes long to import (torch, the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
@@ -65,29 +66,15 @@ def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: 1 for what drive, bus or the watch say, 2 for the user's mistake, 130 for Ctrl-C."""
     from agents.policy import PolicyError
-    from drive_env.dictionary.access import ObjectAccessError
-    from drive_env.master.errors import BusError, OpenError
+    from drive_env.master.errors import BusError
     from drive_env.safety import SafetyError
 
-    try:
-        yield
-    except OpenError as error:
-        fail(error)
-    except (PolicyError, SafetyError, BusError, TimeoutError) as error:
-        fail(error, REFUSED)
-    except ModuleNotFoundError as error:
-        remedy = f"; {EXTRA}" if (error.name or "").partition(".")[0] in OF_EXTRA else ""
-        fail(f"{error}{remedy}")
-    except (ObjectAccessError, ValueError, ImportError) as error:
-        fail(error)
-    except RuntimeError as error:  # motion: an axis is in fault; ask: the user says no
-        if type(error) is not RuntimeError:
-            raise
-        fail(error, REFUSED)
-    except OSError as error:
-        fail(f"{error.filename}: {error.strerror}" if error.filename else error)
-    except KeyboardInterrupt:
-        fail("interrupted", INTERRUPTED)
+    with ending_by(fail, refused=(PolicyError, SafetyError, BusError, TimeoutError), mistakes=(ImportError,)):
+        try:
+            yield
+        except ModuleNotFoundError as error:
+            remedy = f"; {EXTRA}" if (error.name or "").partition(".")[0] in OF_EXTRA else ""
+            fail(f"{error}{remedy}")
 
 
 def fail(error: object, code: int = USER_ERROR) -> NoReturn:

@@ -6,7 +6,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -77,19 +77,38 @@ def connect(
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one red line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
-    from drive_env.dictionary.access import ObjectAccessError
-    from drive_env.master.errors import BusError, OpenError, RefusedError
+    from drive_env.master.errors import BusError, RefusedError
     from drive_env.safety import SafetyError
 
+    with ending_by(fail, refused=(RefusedError, SafetyError, BusError, TimeoutError)):
+        yield
+
+
+@contextmanager
+def ending_by(
+    fail: Callable[[object, int], NoReturn],
+    *,
+    refused: tuple[type[Exception], ...],
+    mistakes: tuple[type[Exception], ...] = (),
+) -> Iterator[None]:
+    """End a program by its own `fail`, which takes what to say and the exit code.
+
+    Args:
+        fail: What ends it.
+        refused: Errors that end it with 1 besides a plain RuntimeError; a bus that cannot be opened is a mistake.
+        mistakes: Errors that end it with 2 besides a ValueError, an object that cannot be had and a file's.
+    """
+    from drive_env.dictionary.access import ObjectAccessError
+    from drive_env.master.errors import OpenError
+
+    mistaken: tuple[type[Exception], ...] = (ObjectAccessError, ValueError, *mistakes)
     try:
         yield
-    except (RefusedError, SafetyError) as error:
-        fail(error, REFUSED)
     except OpenError as error:
         fail(error, USER_ERROR)
-    except (BusError, TimeoutError) as error:
+    except refused as error:
         fail(error, REFUSED)
-    except (ObjectAccessError, ValueError) as error:
+    except mistaken as error:
         fail(error, USER_ERROR)
     except RuntimeError as error:  # motion: an axis is in fault; ask: the user says no
         if type(error) is not RuntimeError:

@@ -21,6 +21,7 @@ from drive_env.tools.options import Json as Json
 from drive_env.tools.options import Nodes as Nodes
 from drive_env.tools.options import Yes as Yes
 from drive_env.tools.options import ask as ask
+from drive_env.tools.options import ending_by
 from drive_env.tools.options import print_json as print_json
 
 if TYPE_CHECKING:
@@ -264,27 +265,12 @@ def tell_before(file: Path | None) -> None:
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
-    from drive_env.dictionary.access import ObjectAccessError
-    from drive_env.master.errors import BusError, OpenError
+    from drive_env.master.errors import BusError
     from drive_env.safety import SafetyError
     from tuning.pools import PoolError
 
-    try:
+    with ending_by(fail, refused=(SafetyError, BusError, PoolError, TimeoutError)):
         yield
-    except OpenError as error:
-        fail(error)
-    except (SafetyError, BusError, PoolError, TimeoutError) as error:
-        fail(error, REFUSED)
-    except (ObjectAccessError, ValueError) as error:
-        fail(error)
-    except RuntimeError as error:  # motion: an axis is in fault; ask: the user says no
-        if type(error) is not RuntimeError:
-            raise
-        fail(error, REFUSED)
-    except OSError as error:
-        fail(f"{error.filename}: {error.strerror}" if error.filename else error)
-    except KeyboardInterrupt:
-        fail("interrupted", INTERRUPTED)
 
 
 @contextmanager
