@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
     from drive_env.can_drives import CanDrives
     from drive_env.dictionary.entries import ObjectName
 
@@ -124,6 +127,20 @@ def fail(error: object, code: int) -> NoReturn:
     """End the command with a red line."""
     typer.secho(f"drive-env: {error}", fg=typer.colors.RED, err=True)
     raise typer.Exit(code)
+
+
+def progress_on(console: Console, *, transient: bool = False) -> Progress:
+    """Return bars for a console: what is under way, the share done and the time since; transient ones vanish."""
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+    )
+    return Progress(*columns, console=console, transient=transient)
 
 
 def print_json(value: Any) -> None:

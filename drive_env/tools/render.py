@@ -6,12 +6,13 @@ import json
 import re
 import sys
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 
+from drive_env.tools.options import USER_ERROR, fail, progress_on
+
 # Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported when it is needed.
-USER_ERROR = 2
 
 
 def render(
@@ -61,24 +62,16 @@ def render(
             new_context(16, 16).free()  # before the run, and before anything imports MuJoCo, which may fail for it
         _render(row, film, view)
     except (DemonstrationError, OpenGLError, PictureFileError) as error:
-        _fail(error)
+        fail(error, USER_ERROR)
     except OSError as error:
-        _fail(f"{error.filename or out}: {error.strerror or error}; choose another --out")
+        fail(f"{error.filename or out}: {error.strerror or error}; choose another --out", USER_ERROR)
 
 
 def _render(row: Any, film: Path | None, view: bool) -> None:
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     console = Console()
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    with progress_on(console) as progress:
         # The kernels compile once, on the first run ever: 30 seconds.
         task = progress.add_task("simulating", total=1.0)
         from drive_env.demonstration import perform
@@ -106,8 +99,3 @@ def _with_overrides(config: Path, **overrides: str | int | None) -> str:
             found = re.search(rf"(?m)^{key}\s*=\s*(\"[^\"]*\"|'[^']*'|\d+)", text)
             text = f"{text[: found.start()]}{line}{text[found.end() :]}" if found else f"{line}\n{text}"
     return text
-
-
-def _fail(error: object) -> NoReturn:
-    typer.secho(f"drive-env: {error}", fg=typer.colors.RED, err=True)
-    raise typer.Exit(USER_ERROR)

@@ -23,6 +23,7 @@ from drive_env.tools.options import Yes as Yes
 from drive_env.tools.options import ask as ask
 from drive_env.tools.options import ending_by
 from drive_env.tools.options import print_json as print_json
+from drive_env.tools.options import progress_on as progress_on
 
 if TYPE_CHECKING:
     from tuning.snapshot import Transaction
@@ -277,16 +278,8 @@ def errors_as_exit_codes() -> Iterator[None]:
 def progress_bar(description: str) -> Iterator[Callable[[float], None]]:
     """Show a bar on stderr while something long goes on; what is given takes the share done, 0 to 1."""
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    with progress_on(Console(stderr=True), transient=True) as progress:
         task = progress.add_task(description, total=1.0)
         yield lambda share: progress.update(task, completed=share)
 

@@ -18,6 +18,7 @@ from tuning.commands.options import (
     Workers,
     errors_as_exit_codes,
     fail,
+    progress_on,
     what_an_interrupt_leaves,
 )
 
@@ -106,8 +107,6 @@ def _note(console: Any, text: str) -> None:
 
 
 def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folder: Path) -> Any:
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
     from tuning import unfinished
     from tuning.sweep import run
 
@@ -115,13 +114,6 @@ def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folde
         "compiling": "loading the kernels (the first time: 30 seconds)",
         "simulating": f"simulating {experiment.size()} machines",
     }
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-    )
 
     said: set[str] = set()
 
@@ -141,7 +133,7 @@ def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folde
 
     before = signal.signal(signal.SIGINT, stop)
     try:
-        with Progress(*columns, console=console) as progress, warnings.catch_warnings():
+        with progress_on(console) as progress, warnings.catch_warnings():
             warnings.showwarning = say
             task = progress.add_task(texts["compiling"], total=1.0)
             return run(
