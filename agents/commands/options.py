@@ -5,12 +5,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
 
+from drive_env.tools.options import INTERRUPTED as INTERRUPTED
+from drive_env.tools.options import REFUSED as REFUSED
+from drive_env.tools.options import USER_ERROR as USER_ERROR
 from drive_env.tools.options import Bitrate as Bitrate
 from drive_env.tools.options import Channel as Channel
 from drive_env.tools.options import Interface as Interface
@@ -18,9 +20,10 @@ from drive_env.tools.options import Json as Json
 from drive_env.tools.options import Nodes as Nodes
 from drive_env.tools.options import ending_by
 from drive_env.tools.options import print_json as print_json
+from tuning.provenance import run_folder
 
 # Whatever takes long to import (torch, the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
-REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
+
 # Packages of the extra `agents`, which training and ONNX need.
 OF_EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard", "onnx", "onnxruntime", "yaml")
 EXTRA = "pip install 'drive-env[agents]'"
@@ -44,7 +47,7 @@ def new_folder(path: Path | None, name: str) -> Path:
         ValueError: If it holds something.
     """
     if path is None:
-        path = Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{name}"
+        path = run_folder(name)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise ValueError(f"--out {path} holds something already; choose a new folder")
     return path

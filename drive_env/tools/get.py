@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from drive_env.tools.options import (
+    REFUSED,
     Bitrate,
     Channel,
     DeviceName,
@@ -26,7 +27,6 @@ from drive_env.tools.options import (
     print_json,
 )
 
-REFUSED = 1
 Raw = Annotated[bool, typer.Option("--raw", help="Integers as the wire carries them, without units.")]
 
 

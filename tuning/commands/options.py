@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 
 import typer
 
+from drive_env.tools.options import INTERRUPTED as INTERRUPTED
+from drive_env.tools.options import REFUSED as REFUSED
+from drive_env.tools.options import USER_ERROR as USER_ERROR
 from drive_env.tools.options import Bitrate as Bitrate
 from drive_env.tools.options import Channel as Channel
 from drive_env.tools.options import Interface as Interface
@@ -30,7 +33,6 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 # Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
-REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
 
 DeviceName = Annotated[str, typer.Option("--device", help="Drive by name.")]
 MotorName = Annotated[str, typer.Option("--motor", help="Motor by name; its data sheet values are taken.")]
