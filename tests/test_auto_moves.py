@@ -9,7 +9,7 @@ import pytest
 from test_auto import gains, standing_in
 
 from drive_env import motion
-from drive_env.gains import Gains, write_gains
+from drive_env.gains import Gains, rule_gains, write_gains
 from drive_env.master.pace import Timing
 from tuning import auto_search
 from tuning.auto import auto, tell_of_lateness
@@ -180,6 +180,52 @@ def test_the_axes_of_a_machine_are_tuned_together_and_each_says_why_it_did_not_m
     assert [len(notes) for notes in said] == [1, 1]
     assert "another axis of its machine could not make it" in said[0][0]
     assert "a P gain is 0" in said[1][0]
+
+
+def proving(target, safe):
+    known = gantry_known(target, None)
+    plants = [Plant.from_identification(target.device, target.motor, 24.0, one) for one in known]
+    return ProvingGround(target, plants, (target.low, target.high), safe, safe)
+
+
+def fitted(target):
+    inertia = np.concatenate([moved_inertia(group.load).reshape(-1) for group in target.drives._groups])
+    return np.array([rule_gains(target.device, target.motor, J, supply=24.0)[0] for J in inertia])
+
+
+@pytest.mark.parametrize("what", ["run", "show", "recover"])
+def test_axes_that_pull_at_one_thing_move_together_or_not_at_all(what):
+    """Of two gantries one drive is to be tried: the other end of its bridge goes along, the other gantry stands."""
+    with emulated(load="gantry", num_machines=2, num_threads=1) as target:
+        drives, good = target.drives, fitted(target)
+        ground = proving(target, good)
+        ground.show(good, np.ones(4, bool))
+        began, one = drives.read(0x6064), np.array([False, True, False, False])
+        if what == "recover":
+            write_gains(drives, np.ones_like(good))
+            ground.recover(one)
+            assert np.all(gains(drives) == np.where([[True], [True], [False], [False]], good, 1))
+            return
+        getattr(ground, what)(good, one)
+        way = np.abs(drives.read(0x6064) - began)
+    assert way[0] == pytest.approx(way[1], rel=0.02)
+    assert way[:2].min() > 1000 > 100 > way[2:].max()
+
+
+def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tmp_path):
+    """One joint of an arm is given wild gains: it gets slower ones, those of the other joints are tried again."""
+    with emulated(load="robot", num_machines=1, num_threads=1) as target:
+        wanted = fitted(target)
+        wanted[3, 2:] = 32767
+        proof = proving(target, fitted(target)).run(wanted, np.ones(6, bool))
+        assert proof.stopped.all()
+        assert proof.culprit.tolist() == [False, False, False, True, False, False]
+        finds(monkeypatch, wanted)
+        result = auto(target, tmp_path / "before.toml", experiments=gantry_known, budget=4.0)
+    assert result.accepted.all(), [axis.reason for axis in result.axes]
+    failed = [any(note.startswith("no pass with the gains found") for note in axis.notes) for axis in result.axes]
+    assert failed == [False, False, False, True, False, False]
+    assert all(axis.after.velocity_p >= 0.9 * wanted[k, 2] for k, axis in enumerate(result.axes) if k != 3)
 
 
 # --- where a trial begins ---------------------------------------------------------------------------------------------

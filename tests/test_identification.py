@@ -473,6 +473,25 @@ def test_axes_that_pull_at_one_thing_move_together():
     assert sum(axis.value("inertia") for axis in found) == pytest.approx(travelling, rel=0.03)
 
 
+def test_the_joints_of_an_arm_are_identified_briefly_one_after_the_other():
+    """Each by its own inertia: moved at once they pull at each other, and one seems to have a fifth of it."""
+    with emulated(load="robot", num_machines=2, randomise=["load"], seed=0, num_threads=2) as target:
+        load = target.drives._groups[0].load
+        turning = way(load).joints
+        alone = np.einsum("ad,cde,ae->ca", turning, load.mass_matrix(), turning)
+        found = np.array([axis.value("inertia") for axis in identify_briefly(target)]).reshape(alone.shape)
+    assert found == pytest.approx(alone, rel=0.25)
+
+
+def test_of_axes_that_pull_at_one_thing_a_brief_response_says_nothing_of_the_own_inertia():
+    """An end of a gantry that is shaken alone moves all of the bridge, twice what it moves otherwise."""
+    with emulated(load="gantry", num_threads=1) as target:
+        half = 0.5 * target.drives._groups[0].load.mass_matrix()[0][0, 0] * (0.04 / TURN) ** 2
+        for axis in identify_briefly(target):
+            assert axis.value("inertia") == pytest.approx(half, rel=0.2)
+            assert not axis.told["inertia"].is_known
+
+
 # --- over the bus -----------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 @pytest.mark.parametrize(("load", "motor", "seed"), [

@@ -49,6 +49,26 @@ def test_what_is_tried_next(outcomes, rungs):
             assert one.fallback is not None or one.factor == pytest.approx(other.factor)
 
 
+@pytest.mark.parametrize(
+    ("outcomes", "rungs"),
+    [
+        ((BEST, BEST), [F(1.0), B, RULE]),  # before it is over, the rule's gains have their trial
+        ((BEST, BEST, WORSE), [F(1.0), B, RULE, NONE]),
+        ((BEST, BEST, FAIL), [F(1.0), B, RULE, NONE]),
+        ((FAIL, BEST, BEST), [F(1.0), F(0.6), F(0.8), RULE]),
+        ((FAIL, FAIL, BEST), [F(1.0), F(0.6), RULE, NONE]),  # they had it
+        ((FAIL, FAIL, FAIL, BEST), [F(1.0), F(0.6), RULE, SOFT, NONE]),
+    ],
+)
+def test_where_axes_are_coupled_the_rule_is_tried_in_any_case(outcomes, rungs):
+    ladder, found = Ladder(3, coupled=True), []
+    for passed, better, loud in outcomes:
+        found.append(ladder.rung)
+        ladder.step(passed, better, loud)
+    for one, other in zip([*found, ladder.rung], rungs, strict=True):
+        assert (one and (one.fallback, one.other)) == (other and (other.fallback, other.other))
+
+
 def test_nothing_at_or_above_what_failed_is_tried_again():
     ladder = Ladder(1)
     tried = []

@@ -116,7 +116,7 @@ def _try_again(run: Run, calmed: Mask) -> None:
     run.note(calmed & ~where, "a move was the only trial of the calmed gains: the drive time was used up")
     assert run.ground is not None, "proving makes it"
     if where.any():
-        with run.spending(where):
+        with run.spending(run.target.together(where)):
             proof = run.ground.run(run.gains, where)
         for k in map(int, np.flatnonzero(where)):
             axis = run.axes[k]
@@ -135,7 +135,7 @@ def _go_on_after_faults(run: Run, faults: Mapping[int, str]) -> None:
         only = np.arange(run.target.num_axes) == axis
         _without_response(run, only, f"the drive went into fault while it was shaken for it ({causes})")
     assert run.ground is not None, "proving makes it"
-    with run.spending(where):
+    with run.spending(run.target.together(where)):
         run.ground.recover(where)
     run.drop_faults("its frequency response was measured, and stays in it")
     show(run, where & run.going)

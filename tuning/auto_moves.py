@@ -23,7 +23,7 @@ EASED = 0.8  # the factor of gains with which an axis shook at rest
 
 def show(run: Run, where: Mask | None = None) -> None:
     """Record a move with the new gains, of all axes or some; one that fails is refused."""
-    going = run.going if where is None else where
+    going = run.going if where is None else run.target.together(where)
     if not going.any():
         return
     assert run.ground is not None, "proving makes it"

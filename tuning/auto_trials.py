@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import Gains, scaled
+from drive_env.gains import Gains, scaled, write_gains
 from tuning.auto_run import MOVE_TIME, TRIAL_TIME
 from tuning.ladder import Ladder, Rung
 from tuning.proving import ProvingGround
 
 if TYPE_CHECKING:
     from tuning.auto_run import Run
+    from tuning.proving import Proof
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -34,7 +35,7 @@ def prove(run: Run) -> None:
     run.ground = ground = ProvingGround(run.target, plants, run.room(), run.fallbacks[-1], run.reference)
     watch_following(run, going)
     run.stop(going & ground.too_short(), "the travel is too short for a move that proves anything")
-    ladders = [Ladder(len(run.fallbacks)) for _ in run.axes]
+    ladders = [Ladder(len(run.fallbacks), coupled=run.target.axes_per_machine > 1) for _ in run.axes]
     n = run.target.num_axes
     best, cost, last = run.fallbacks[-1].copy(), np.full(n, np.inf), [""] * n
     second = cost.copy()
@@ -46,8 +47,11 @@ def prove(run: Run) -> None:
         open_ &= run.affordable(TRIAL_TIME + ground.way_back() + then)
         if not open_.any():
             break
-        tried = np.array([_meant(run, k, ladder.rung) for k, ladder in enumerate(ladders)])
-        with run.spending(open_):
+        meant = np.array([_meant(run, k, ladder.rung) for k, ladder in enumerate(ladders)])
+        # What is through holds its place with its best, or goes along where it pulls at the same thing.
+        tried = np.where(open_[:, None], meant, best)
+        write_gains(run.target.drives, best, run.going & ~open_)
+        with run.spending(run.target.together(open_)):
             proof = ground.run(tried, open_)
         better = open_ & proof.passed & (proof.cost < cost)
         # What was the best is the second best now; or what was tried is.
@@ -55,7 +59,8 @@ def prove(run: Run) -> None:
         second = np.where(spare, np.where(better, cost, proof.cost), second)
         run.spare = np.where(spare[:, None], np.where(better[:, None], best, tried), run.spare)
         best, cost = np.where(better[:, None], tried, best), np.where(better, proof.cost, cost)
-        for k in map(int, np.flatnonzero(open_)):
+        # What another axis of its machine has stopped is tried again, and says nothing yet.
+        for k in map(int, np.flatnonzero(open_ & ~(proof.stopped & ~_to_blame(run, proof, open_)))):
             if not proof.passed[k] and not ladders[k].passed:
                 last[k] = proof.reason[k]
             ladders[k].step(bool(proof.passed[k]), bool(better[k]), bool(proof.ripple[k] > LOUD))
@@ -70,6 +75,15 @@ def prove(run: Run) -> None:
             failed = ", ".join(rung.words for rung in ladder.failures)
             axis.notes.append(f"no pass with the {failed}: the last time {last[k]}")
     run.gains = best
+
+
+def _to_blame(run: Run, proof: Proof, where: Mask) -> Mask:
+    """Return which axes have stopped their machines: all of them, if none that was tried did or they are linked."""
+    culprit = where & proof.culprit
+    if run.target.linked:
+        return np.ones_like(where)
+    known = culprit.reshape(-1, run.target.axes_per_machine).any(axis=1)
+    return culprit | ~np.repeat(known, run.target.axes_per_machine)
 
 
 def _meant(run: Run, axis: int, rung: Rung | None) -> Integers:

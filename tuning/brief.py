@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import motion
-from drive_env.envs.gain_trial import Trials
+from drive_env.envs.gain_trial import Identified, Trials
 from drive_env.gains import write_gains
 from tuning.experiments import MECHANICS, PULSED, RESPONSE, UNITS, WORST_MISFIT, Experiments
 from tuning.frequency_response import measure
@@ -43,6 +43,10 @@ NOT_TOLD = {
     "viscous": f"{SHORT} dry friction; {LONGER}",
     "offset": f"{SHORT} friction; {LONGER}",
 }
+OF_ALL = (
+    "in the response an axis moved what all axes of its machine share, and two moves of a quarter of a second tell its "
+    "own part too roughly"
+)
 # Dead time and friction make it up to 0.09 ms shorter here, to one side, which no scatter shows.
 NO_DELAY = "so short a response tells it to 0.1 ms, which is no better than the period of the drive's velocity loop"
 
@@ -50,7 +54,9 @@ NO_DELAY = "so short a response tells it to 0.1 ms, which is no better than the 
 def identify_briefly(
     target: Target, where: NDArray[np.bool_] | None = None, progress: Progress | None = None
 ) -> list[Identification]:
-    """Identify axes, all by default, in about four seconds; otherwise as `tuning.identification.identify`.
+    """Identify axes, all by default, in about four seconds for each of a machine.
+
+    Otherwise as `tuning.identification.identify`; those of one machine move one after the other, or all if linked.
 
     Returns:
         One per axis. Its `told` is what is identified; in place of most of what is refused there its `estimates` have
@@ -92,8 +98,18 @@ class _Brief(Experiments):
         down, up = working.room()
         # t_0 scales a figure that is not asked for here.
         trials = Trials(drives, target.motor, target.axes_per_machine, 1.0)
-        found, _ = trials.identify(np.where(up >= -down, up, down), working.where)
-        for k in map(int, np.flatnonzero(working.where)):
+        inertia = np.full(target.num_axes, GUESS * target.motor.inertia)
+        for moving in _turns(working):
+            found, _ = trials.identify(np.where(up >= -down, up, down), moving)
+            self._take_moved(found, moving)
+            inertia[moving] = found.inertia[moving]
+        working = self.calm(working)
+        self.begin("resonance, delay, filter", 0.55, RESPONSE)
+        switch_off(drives, working.where)
+        self.respond(working, inertia)
+
+    def _take_moved(self, found: Identified, where: NDArray[np.bool_]) -> None:
+        for k in map(int, np.flatnonzero(where)):
             self.found[k] |= {
                 "inertia": _about(found.inertia[k], INERTIA_ERROR, "kg*m^2"),
                 "coulomb": _about(found.coulomb[k], FRICTION_ERROR, "A"),
@@ -101,10 +117,6 @@ class _Brief(Experiments):
                 "offset": _about(found.offset[k], FRICTION_ERROR, "A"),
             }
             self._told[k] = {name: refused(UNITS[name], reason) for name, reason in NOT_TOLD.items()}
-        working = self.calm(working)
-        self.begin("resonance, delay, filter", 0.55, RESPONSE)
-        switch_off(drives, working.where)
-        self.respond(working, np.asarray(found.inertia, float))
 
     def respond(self, working: Working, inertia: NDArray[np.float64]) -> None:
         target, drives = working.target, working.target.drives
@@ -129,14 +141,27 @@ class _Brief(Experiments):
                 # A fit of few lines may come to rest anywhere, and the two moves went well enough.
                 self._no_response(k, f"the response would be that of {ratio:.2g} times the inertia that was moved")
                 continue
+            moved = self.found[k]["inertia"]
             self.found[k] |= _guessed(fit)
             self._told[k] |= _told(fit, float(response.f[-1]))
+            if target.linked:
+                self.found[k]["inertia"] = moved
+                self._told[k]["inertia"] = refused(UNITS["inertia"], OF_ALL)
 
     def _no_response(self, k: int, reason: str) -> None:
         self.refuse(k, RESPONSE, reason)
         self._told[k]["inertia"] = refused(UNITS["inertia"], (
             f"two moves of a quarter of a second tell it too roughly, and the response does not: {reason}"
         ))  # fmt: skip
+
+
+def _turns(working: Working) -> list[NDArray[np.bool_]]:
+    """Return which axes move when: those of a machine one after the other, since each pulls at the next; or linked."""
+    lanes = working.target.axes_per_machine
+    if working.target.linked:
+        return [working.where]
+    position = np.arange(working.target.num_axes) % lanes
+    return [turn for k in range(lanes) if (turn := working.where & (position == k)).any()]
 
 
 def _told(fit: PlantFit, highest: float) -> dict[str, Estimate]:

@@ -35,6 +35,7 @@ class Ladder:
 
     Args:
         fallbacks: How many sets of gains there are to fall back on, the fastest first.
+        coupled: Other axes pull at this one, which no twin knows: the first of the fallbacks is tried in any case.
 
     Attributes:
         rung: What is to be tried next; None when it is over.
@@ -42,11 +43,12 @@ class Ladder:
         failures: What failed before that.
     """
 
-    def __init__(self, fallbacks: int) -> None:
+    def __init__(self, fallbacks: int, coupled: bool = False) -> None:
         self.rung: Rung | None = Rung()
         self.passed = False
         self.failures: list[Rung] = []
         self._fallbacks = fallbacks
+        self._owed = coupled  # a trial of the first fallback
         self._trials = 0
         self._best = 1.0  # factor
         self._tried: list[float] = []
@@ -67,8 +69,9 @@ class Ladder:
             self._tried.append(rung.factor)
             if not passed:
                 self._ceiling = min(self._ceiling, rung.factor)
+        self._owed &= rung.fallback is None
         if self.passed:
-            self.rung = self._beside(rung, better)
+            self.rung = self._beside(rung, better) if rung.fallback is None else None
         elif not passed:
             self.failures.append(rung)
             self.rung = self._below(rung)
@@ -80,6 +83,8 @@ class Ladder:
             else:
                 # Below gains that failed: half way up again.
                 self.rung = self._open(DOWN) if self.failures else Rung(other=SLIPPERY if loud else BOLD)
+        if self.rung is None and self.passed and self._owed:
+            self.rung = Rung(fallback=0)
 
     def _below(self, rung: Rung) -> Rung | None:
         """Return what is slower than what failed."""

@@ -64,14 +64,14 @@ class Proof(NamedTuple):
     """What a trial showed of every axis, each of shape (num_axes,).
 
     cost: J by measured terms. stopped: Whether it oscillated, tripped, or left its envelope in any phase.
-    in_probe_only: Whether that was with the probe's velocity P alone.
+    culprit: Whether it did so itself: the other axes of its machine are stopped with it.
     reason: Why it does not pass, "" if it does. ripple: RMS increment of the current over the rated one, of the worst
     phase. overshoot: Of the move, the largest of move and reversal. settling: t_s/t_0, mean of move and reversal.
     """
 
     cost: Floats
     stopped: Mask
-    in_probe_only: Mask
+    culprit: Mask
     reason: tuple[str, ...]
     ripple: Floats
     overshoot: Floats
@@ -141,6 +141,12 @@ class ProvingGround:
         self.reach: Floats = np.where(high >= -low, high, low)
         motor, drives = target.motor, target.drives
         inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
+        if target.linked:
+            # What pulls at one thing goes as far and as fast as its slowest end.
+            ends = (-1, target.axes_per_machine)
+            inertia = np.repeat(inertia.reshape(ends).max(axis=1), ends[1])
+            shortest = np.abs(self.reach).reshape(ends).argmin(axis=1)
+            self.reach = np.repeat(self.reach.reshape(ends)[np.arange(len(shortest)), shortest], ends[1])
         corner = [target.device.stage["velocity_filter"].default if p is None else p.velocity_filter for p in plants]
         self.move: Move = plan_move(motor, inertia, drives.read((0x2058, 0)), self.reach)
         self._count: Floats = self.move.increments / self.move.counts  # increments
@@ -171,6 +177,7 @@ class ProvingGround:
 
     def recover(self, where: Mask) -> None:
         """Reset faults of axes, and have them hold with gains that are known to; one that cannot stays as it is."""
+        where = self.target.together(where)
         write_gains(self.target.drives, self.safe, where)
         for _ in range(RECOVERIES):
             self._trials.recover(where)
@@ -181,7 +188,11 @@ class ProvingGround:
         self._shaken |= where
 
     def run(self, gains: Integers, where: Mask) -> Proof:
-        """Try gains, raw integers of shape (num_axes, 5), on some axes; the others' figures mean nothing."""
+        """Try gains, raw integers of shape (num_axes, 5), on some axes; the others' figures mean nothing.
+
+        Axes that pull at one thing move together, all of them with these gains.
+        """
+        where = self.target.together(where)
         count, lanes = self.target.num_axes, self.target.axes_per_machine
         try:
             return self._proof(gains, self._run(gains, where), where)
@@ -199,12 +210,16 @@ class ProvingGround:
         return _merged(proofs)
 
     def show(self, gains: Integers, where: Mask) -> Shown:
-        """Record one move with gains, and judge it; what oscillates or trips gets gains that hold within 50 ms."""
+        """Record one move with gains, and judge it; what oscillates or trips gets gains that hold within 50 ms.
+
+        Axes that pull at one thing move together, all of them with these gains.
+        """
         drives, rated = self.target.drives, self.target.motor.rated_current
+        where = self.target.together(where)
         self._begin(where)
-        self._hold_still(where)
+        self._hold_still(where, patience=1)
         write_gains(drives, gains, where)
-        stopped = self._hold_still(where, watched=True)
+        stopped = self._hold_still(where)
         write_profile(drives, self.move, where)
         away = self._origin + self._direction * self.move.distance
         start(drives, wrapped(away).astype(np.int64), where)
@@ -213,7 +228,7 @@ class ProvingGround:
         traces = []
         for _ in range(TRIAL // WATCH):
             traces.append(drives.record(objects, WATCH * CYCLE))
-            stopped |= self._stop_what_shakes(traces[-1], where & ~stopped)
+            stopped |= self._stop(where & ~stopped & self._shakes(traces[-1]))
         swing = drives.record([CURRENT], REST)[CURRENT][round(REST / CYCLE) // 3 :].std(axis=0) * 1e-3 / rated
         position, demanded, current = (np.concatenate([part[name] for part in traces]) for name in objects[:3])
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
@@ -234,38 +249,39 @@ class ProvingGround:
         t = np.arange(len(demand), dtype=np.float64) * CYCLE
         return Shown(t, demand, actual, current * 1e-3, where, reason, costs, swing)
 
-    def _hold_still(self, where: Mask, watched: bool = False) -> Mask:
-        """Come to rest with the gains there are, and take that for the beginning.
+    def _hold_still(self, where: Mask, patience: int = 0) -> Mask:
+        """Come to rest with the gains there are, and take that for the beginning; return what was stopped meanwhile.
 
         Other gains divide what holds an axis otherwise between error and integrator. What its integrator has kept for
         the gains before would move it, and pass for these gains' doing.
 
         Args:
             where: The axes.
-            watched: Stop what shakes: gains that are new. What others are still swinging from is not their doing.
-
-        Returns:
-            What was stopped, (num_axes,).
+            patience: Windows of 25 ms for which an axis may shake: it may still be swinging from what was before.
         """
-        stopped = np.zeros(self.target.num_axes, bool)
+        stopped, windows = np.zeros(self.target.num_axes, bool), np.zeros(self.target.num_axes, np.int64)
         for _ in range(HOLDING // WATCH):
             seen = self.target.drives.record([POSITION, CURRENT, STATUS], WATCH * CYCLE)
-            if watched:
-                stopped |= self._stop_what_shakes(seen, where & ~stopped)
-            if not np.any(where & ~stopped & ~self._stands(seen[POSITION])):
+            windows = np.where(self._shakes(seen), windows + 1, 0)
+            stopped |= self._stop(where & ~stopped & (windows > patience))
+            if not np.any(where & ~self._stands(seen[POSITION])):
                 break
         self._begin_without_a_step(where)
         return stopped
 
-    def _stop_what_shakes(self, seen: Mapping[object, Any], where: Mask) -> Mask:
-        """Give gains that hold to axes that oscillated in a recording or went off in it, and return which did."""
+    def _shakes(self, seen: Mapping[object, Any]) -> Mask:
+        """Return which axes oscillated in a recording, or are off at its end."""
         change = np.diff(seen[CURRENT], axis=0) * 1e-3
         mask, enabled = motion.OPERATION_ENABLED
         shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * self.target.motor.rated_current
-        new: Mask = where & (shaking | (seen[STATUS][-1] & mask != enabled))
-        if new.any():
-            write_gains(self.target.drives, self.safe, new)
-        return new
+        return np.asarray(shaking | (seen[STATUS][-1] & mask != enabled))
+
+    def _stop(self, where: Mask) -> Mask:
+        """Give axes, and those that pull at the same thing, gains that hold; return which got them."""
+        where = self.target.together(where)
+        if where.any():
+            write_gains(self.target.drives, self.safe, where)
+        return where
 
     def _stands(self, positions: Integers) -> Mask:
         """Return which axes stood in a recording of their positions, (cycles, num_axes)."""
@@ -283,7 +299,7 @@ class ProvingGround:
     def _begin(self, where: Mask) -> None:
         """Enable axes with gains that hold where they are not enabled yet, and bring back what went astray."""
         drives = self.target.drives
-        down = where & self._trials.down()
+        down = self.target.together(where & self._trials.down())
         if down.any():
             write_gains(drives, self.safe, down)
             self._come_to_rest(down)
@@ -316,7 +332,7 @@ class ProvingGround:
             velocity=np.ceil(self.move.velocity * faster).astype(np.int64),
             acceleration=np.ceil(self.move.acceleration * faster).astype(np.int64),
         )
-        astray = where & ((off > near) | self._shaken)
+        astray = self.target.together(where & ((off > near) | self._shaken))
         if not astray.any():
             return
         write_gains(drives, self.safe, astray)
@@ -354,7 +370,7 @@ class ProvingGround:
         self._trials.recover(where)
         count = self.target.num_axes
         zero = np.zeros(count)
-        return Proof(zero + TRIP, zero == 0.0, zero != 0.0, (why,) * count, zero, zero, zero)
+        return Proof(zero + TRIP, zero == 0.0, zero == 0.0, (why,) * count, zero, zero, zero)
 
     def _proof(self, gains: Integers, tried: Trial, where: Mask) -> Proof:
         terms: Terms = tried.terms
@@ -368,11 +384,10 @@ class ProvingGround:
             np.abs(self.move.distance), 1
         )
         left = np.maximum(np.abs(tried.error[TRIAL - 1]), now)
-        in_probe_only: Mask = np.asarray(stopped & ~tried.aborted[:2].any(axis=0))
         return Proof(
             costs,
             stopped,
-            in_probe_only,
+            tried.culprit,
             self._reasons(tried.aborted, overshoot, left),
             terms.noise.max(axis=0),
             overshoot,

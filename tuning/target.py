@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mechanics.load import Load
 
 Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 Travel = tuple[float, float]  # how far a rotor may turn from where it stands [rad], low <= 0 <= high
 
 POSITION_SCALER = (0x2058, 0)
@@ -89,6 +90,13 @@ class Target:
     def num_axes(self) -> int:
         """Number of axes."""
         return int(self.drives.num_axes)
+
+    def together(self, where: Mask) -> Mask:
+        """Return which axes move where some do: of a machine whose axes pull at one thing, all or none."""
+        if not self.linked:
+            return where
+        lanes = self.axes_per_machine
+        return np.asarray(np.repeat(where.reshape(-1, lanes).any(axis=1), lanes))
 
     def increments(self) -> Floats:
         """Return the position increments per radian of every rotor, 2058h over 2 pi, shape (num_axes,)."""

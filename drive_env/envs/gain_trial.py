@@ -73,12 +73,15 @@ class Trial(NamedTuple):
 
     following: integral of |demand - actual| dt over the whole of a phase, over the move's size.
     error: demand less actual of the move over its size, shape (TRIAL, num_axes).
+    culprit: Axes that oscillated or tripped themselves when their lane was stopped, (num_axes,): others of the lane are
+    stopped with them.
     """
 
     terms: Terms  # its disturbance is 1
     following: Floats
     aborted: Mask
     error: Floats
+    culprit: Mask
 
     def costs(self, softness: Floats) -> Floats:
         """Return J by measured terms of every phase, (phases, num_axes).
@@ -167,7 +170,7 @@ class Trials:
         away = origin + direction * move.distance
         count = drives.num_axes
         aborted = np.zeros((len(PHASES), count), bool)
-        stopped = np.zeros(count, bool)
+        stopped, culprit = np.zeros((2, count), bool)
         shape = (len(PHASES), count)
         settling, noise, overshoot, following = (np.zeros(shape) for _ in range(4))
         first_error = np.zeros((TRIAL, count))
@@ -176,7 +179,8 @@ class Trials:
         probe[:, VELOCITY_P] = scaled(gains[:, VELOCITY_P], PROBE)
         for phase, (target, tried) in enumerate(((away, gains), (origin, gains), (away, probe))):
             write_gains(drives, np.where(stopped[:, None], incumbent, tried), where)
-            position, demand, current, stopped = self._phase(target, incumbent, stopped, where)
+            position, demand, current, stopped, new = self._phase(target, incumbent, stopped, where)
+            culprit |= new
             aborted[phase] = stopped
             sign = np.where(move.distance < 0, -1, 1) * direction * (-1 if phase == 1 else 1)
             settling[phase], noise[phase], overshoot[phase] = move_terms(
@@ -187,7 +191,8 @@ class Trials:
             following[phase] = np.maximum(np.abs(error).sum(axis=0), 0.5) * CYCLE
             if phase == 0:
                 first_error = error
-        return Trial(Terms(settling, np.ones(shape), noise, overshoot, aborted), following, aborted, first_error)
+        terms = Terms(settling, np.ones(shape), noise, overshoot, aborted)
+        return Trial(terms, following, aborted, first_error, culprit)
 
     def recover(self, where: Mask) -> None:
         """Bring axes to pp, enabled, whatever state they are in, within 50 ms; one that cannot stays as it is."""
@@ -207,11 +212,12 @@ class Trials:
 
     def _phase(
         self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask
-    ) -> tuple[Floats, Floats, Floats, Mask]:
-        """Move and watch; return position, demand and current, and which axes' lanes have been stopped so far."""
+    ) -> tuple[Floats, Floats, Floats, Mask, Mask]:
+        """Move and watch; return position, demand, current, whose lanes have been stopped so far, and by whom now."""
         drives, to = self._drives, _on_the_counter(target)
         objects = [POSITION, DEMAND, CURRENT, STATUS]
         traces = []
+        culprit = np.zeros(len(stopped), bool)
         self._prepare(objects)
         start(drives, to, where)
         for _ in range(TRIAL // WATCH):
@@ -227,11 +233,12 @@ class Trials:
             if new.any():
                 write_gains(drives, incumbent, new)
                 stopped = stopped | new
+                culprit |= new & (down | shaking)
             if down.any():
                 clear(drives, down)
                 start(drives, to, down)
         position, demand, current = (np.concatenate([trace[name] for trace in traces]) for name in objects[:3])
-        return position, demand, current, stopped
+        return position, demand, current, stopped, culprit
 
     def _prepare(self, objects: list[Any]) -> None:
         """Have a bus map what will be recorded: in real time the samples of a move would miss the 10 ms that takes."""
