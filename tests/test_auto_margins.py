@@ -42,14 +42,14 @@ def test_the_response_is_measured_within_what_is_left_of_the_travel(moved, left,
     assert asked == [pytest.approx(left, abs=5e-3)]
 
 
-@pytest.mark.parametrize("hidden", [False, True])
-def test_where_no_phase_margin_is_told_it_says_which_lines_hide_it(hidden):
+@pytest.mark.parametrize(("hidden", "linked"), [(False, False), (True, False), (False, True)])
+def test_where_no_phase_margin_is_told_it_says_which_lines_hide_it(hidden, linked):
     f = np.arange(5.0, 405.0, 5.0)
     coherent = ~((f > 80.0) & (f < 120.0)) if hidden else np.ones(f.shape, bool)
     response = SimpleNamespace(f=f, open_loop=(100.0 / (1j * f))[:, None], trusted=coherent[:, None])
     axis = AxisRun(Gains(1, 1, 1, 1, 1), Gains(1, 1, 1, 1, 1))
-    run = SimpleNamespace(axes=[axis], gains=np.ones((1, 5), np.int64))
+    run = SimpleNamespace(axes=[axis], gains=np.ones((1, 5), np.int64), target=SimpleNamespace(linked=linked))
     assert not auto_margins._calm(run, 0, response)
     note = "no phase margin is told: the gain passes 1 between 80 and 120 Hz, where the coherence is below 0.95"
-    assert axis.notes == ([note] if hidden else [])
+    assert axis.notes == [note] * hidden + [auto_margins.ALONE] * linked
     assert np.isnan(axis.margins.phase_deg) == hidden

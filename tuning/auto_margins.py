@@ -29,6 +29,10 @@ SENSITIVITY = 4.0  # greatest |1/(1+L)| that a measured velocity loop may have: 
 SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5)  # factors of velocity P and position P by which a lively loop is calmed
 CALMED = [Gains._fields.index(name) for name in ("velocity_p", "position_p")]
 LEAST_WAY = 1e-3  # rad; an axis without any way is shaken as little as can be, and its response says so
+ALONE = (
+    "its response is that of an axis that moves alone what all axes of its machine share, with the others let go: with "
+    "all of them moving it the loop's gain is higher, and the gain margin less, by as much as their share"
+)
 FREE_WINDOW = 100  # turns of following error that trip a frequency response: it means nothing there
 
 
@@ -97,6 +101,8 @@ def _calm(run: Run, k: int, response: MeasuredLoop) -> bool:
             f"no phase margin is told: the gain passes 1 between {hidden[0]:.0f} and {hidden[1]:.0f} Hz, where the "
             f"coherence is below {COHERENT:g}"
         )
+    if run.target.linked:
+        axis.notes.append(ALONE)
     axis.verified = f"{BY_TRIAL}; and by the measured frequency response of the velocity loop, Ms {found.ms:.1f}"
     if factor == 1.0:
         return False

@@ -26,6 +26,8 @@ Mask = NDArray[np.bool_]
 Travel = tuple[float, float]  # how far a rotor may turn from where it stands [rad], low <= 0 <= high
 
 POSITION_SCALER = (0x2058, 0)
+# How axes of a bus belong together: machines of their own; joints of one; ends of one thing, none of which goes alone.
+AXES = ("apart", "coupled", "linked")
 LOCKSTEP_PATIENCE = 5.0  # s, for an answer where time waits: a late one says that the computer is busy
 FREE: Travel = (-math.inf, math.inf)
 # Of the travel, how far the envelope lets an axis overshoot it, and the least and the most of that [rad].
@@ -201,6 +203,7 @@ def on_bus(
     travel: Travel | Iterable[Travel],
     speed: float | None = None,
     current: float | None = None,
+    axes: str = "apart",
     **options: Any,
 ) -> Target:
     """Return the drives of a bus as a target, inside the envelope.
@@ -218,11 +221,14 @@ def on_bus(
         travel: How far the rotors may turn from where they stand [rad]: one (low, high), or one per axis.
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
+        axes: How the nodes' axes belong together, one of `AXES`; a bus does not show it.
         options: What `CanDrives` takes besides.
 
     Raises:
         ValueError: For an unknown name or a travel that does not hold 0; BusError if a node does not answer.
     """
+    if axes not in AXES:
+        raise ValueError(f"--axes {axes} must be one of {', '.join(AXES)}")
     from drive_env import CanDrives
     from drive_env.motors import find_motor
 
@@ -236,7 +242,9 @@ def on_bus(
         limits = _limits(row, drives.num_axes, volts, speed, current)
         bus = _address(interface, channel, numbers, options)
         machine = f"{bus.get('channel', 'a bus')}, node {', '.join(map(str, numbers))}"
-        target = Target(drives, drives.device, row, low=low, high=high, machine=machine, bus=bus, **limits)
+        lanes = 1 if axes == "apart" else drives.num_axes
+        target = Target(drives, drives.device, row, low=low, high=high, axes_per_machine=lanes,
+                        linked=axes == "linked", machine=machine, bus=bus, **limits)  # fmt: skip
         if "safety" not in options:
             _hold_to_travel(target)
     except BaseException:

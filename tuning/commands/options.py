@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 # Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
 
+APART = "apart"  # of `tuning.target.AXES`
 DeviceName = Annotated[str, typer.Option("--device", help="Drive by name.")]
 MotorName = Annotated[str, typer.Option("--motor", help="Motor by name; its data sheet values are taken.")]
 LoadName = Annotated[str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF.")]
@@ -51,6 +52,15 @@ TravelRange = Annotated[
         "--travel",
         help="How far the rotor may turn from where it stands [turns]: LOW:HIGH, e.g. -0.15:0.15, or free; one for "
         "all axes, or one for each with commas between. Needed on a bus; an emulated load knows its own.",
+    ),
+]
+Axes = Annotated[
+    str,
+    typer.Option(
+        "--axes",
+        help="Of several nodes of a bus, how their axes belong together: apart (each is a machine of its own), coupled "
+        "(joints of one machine, which are moved one after the other) or linked (ends of one thing, as of a gantry, "
+        "which are moved together). An emulated load knows.",
     ),
 ]
 Machines = Annotated[int, typer.Option("--machines", help="Emulated machines.")]
@@ -83,12 +93,13 @@ class DriveOptions:
     lockstep: Lockstep = False
     supply: Supply = None
     travel: TravelRange = None
+    axes: Axes = APART
     yes: Yes = False
 
     def machine(self) -> dict[str, Any]:
         """Return what `tuning.target.emulated` takes of these options; raises as `open_target` does."""
         check_seed(self.seed)
-        check_no_bus(self.nodes, self.bitrate, self.lockstep)
+        check_no_bus(self.nodes, self.bitrate, self.lockstep, self.axes)
         named = {name: getattr(self, name) for name in ("device", "load", "motor", "seed", "supply")}
         return named | {"travel": None if self.travel is None else parse_travels(self.travel)}
 
@@ -167,13 +178,15 @@ def check_seed(seed: int) -> None:
         raise ValueError(f"--seed must be 0 or more, not {seed}")
 
 
-def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool) -> None:
+def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool, axes: str = APART) -> None:
     """Raise ValueError for options of a bus where --bus was not said.
 
     Interface and channel may stand in the environment: alone they say nothing, and a motor must not turn by surprise.
     """
     if nodes or bitrate is not None or lockstep:
         raise ValueError("--node, --bitrate and --lockstep are of drives on a bus; add --bus, or leave them out")
+    if axes != APART:
+        raise ValueError(f"--axes {axes} is of drives on a bus, an emulated load knows; add --bus, or leave it out")
 
 
 def ask_to_turn(nodes: list[int] | None, yes: bool) -> None:
@@ -197,6 +210,7 @@ def open_target(
     lockstep: bool = False,
     supply: float | None = None,
     travel: str | None = None,
+    axes: str = APART,
 ) -> Target:
     """Return what a command's options name: drives on a bus if any of the bus's options is given, or emulated ones.
 
@@ -209,7 +223,7 @@ def open_target(
     if machines < 1:
         raise ValueError(f"--machines must be 1 or more, not {machines}")
     if not bus:
-        check_no_bus(nodes, bitrate, lockstep)
+        check_no_bus(nodes, bitrate, lockstep, axes)
         ends = None if travel is None else parse_travels(travel)
         return emulated(
             device, load, motor, num_machines=machines, seed=seed, randomise=randomise, supply=supply, travel=ends
@@ -227,6 +241,7 @@ def open_target(
         nodes=nodes or (1,),
         supply=supply,
         travel=parse_travels(travel),
+        axes=axes,
         **options,
     )
 
