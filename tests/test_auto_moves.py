@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ from test_auto import gains, standing_in
 from drive_env import motion
 from drive_env.gains import Gains, rule_gains, write_gains
 from drive_env.master.pace import Timing
+from drive_env.positioning import CURRENT, WATCH
 from tuning import auto_search
 from tuning.auto import auto, tell_of_lateness
 from tuning.auto_certificate import certificate
@@ -221,10 +223,23 @@ def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tm
         assert proof.stopped.all()
         assert proof.culprit.tolist() == [False, False, False, True, False, False]
         finds(monkeypatch, wanted)
+        run, holding = ProvingGround.run, []
+
+        def noted(self, tried, where):
+            holding.append((~where, gains(self.target.drives)))
+            return run(self, tried, where)
+
+        monkeypatch.setattr(ProvingGround, "run", noted)
         result = auto(target, tmp_path / "before.toml", experiments=gantry_known, budget=4.0)
     assert result.accepted.all(), [axis.reason for axis in result.axes]
     failed = [any(note.startswith("no pass with the gains found") for note in axis.notes) for axis in result.axes]
     assert failed == [False, False, False, True, False, False]
+    # Who is through holds its place with what it keeps, not with what its last trial ended with.
+    (idle, having) = holding[-1]
+    assert 0 < idle.sum() < 6
+    assert [tuple(row) for row in having[idle]] == [
+        axis.after for axis, one in zip(result.axes, idle, strict=True) if one
+    ]
     assert all(axis.after.velocity_p >= 0.9 * wanted[k, 2] for k, axis in enumerate(result.axes) if k != 3)
 
 
@@ -273,6 +288,38 @@ def test_a_move_for_the_record_begins_at_rest_with_its_own_gains(gains_then, kic
     assert shown.reason == ("",) and way[-1] > 1.0
     assert way[:20].min() >= -2.0 * 2.0 * np.pi / target.motor.encoder_counts
     assert abs(shown.current[0, 0]) < 0.2
+
+
+def test_what_shakes_before_a_move_for_the_record_is_stopped():
+    everyone, wild = np.ones(1, bool), np.array([[4021, 1573, 30_000, 3000, 30_000]])
+    with emulated(load="inertia", num_threads=1) as target:
+        good = np.array([propose("margin_55", target.device, target.motor, Plant.from_machine(target.drives)).gains])
+        watched = CurrentsSeen(target.drives)
+        ground = ProvingGround(replace(target, drives=watched), [Plant.from_machine(target.drives)],
+                               (target.low, target.high), good, good)  # fmt: skip
+        ground.show(good, everyone)
+        write_gains(target.drives, wild)
+        watched.windows.clear()
+        shown = ground.show(good, everyone)
+    shaking = [window > 0.4 * target.motor.rated_current for window in watched.windows]
+    assert 1 <= sum(shaking) <= 3 and not any(shaking[3:])
+    assert shown.reason == ("",)
+
+
+class CurrentsSeen:
+    """Drives that remember the RMS change of the current of every 25 ms that were recorded [A]."""
+
+    def __init__(self, drives):
+        self._drives, self.windows = drives, []
+
+    def __getattr__(self, name):
+        return getattr(self._drives, name)
+
+    def record(self, objects, duration, *arguments, **options):
+        trace = self._drives.record(objects, duration, *arguments, **options)
+        if CURRENT in objects and len(trace) == WATCH:
+            self.windows.append(float(np.sqrt(np.mean(np.diff(trace[CURRENT][:, 0] * 1e-3) ** 2))))
+        return trace
 
 
 RINGING = (11883, 382, 1437, 1007, 1370)  # of a belt: good while it moves, and a limit cycle within an encoder count

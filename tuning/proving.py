@@ -48,7 +48,7 @@ RETURN_MOVES, RETURN_SPEED = 3.0, 0.5  # moves that are as short a way as one; o
 RECOVERIES = 6  # attempts to reset a fault, with such a time between them
 SETTLING = 0.03  # s at rest before a trial, once the set-point is where the axis is
 STOPPING, STOPPING_LOOK = 400, 20  # cycles: the longest wait for axes to stand, and how often it is looked
-HOLDING = 400  # cycles: the longest wait for axes to stand with other gains, before a move for the record
+HOLDING, PATIENCE = 400, 2  # before a move for the record: cycles to wait for rest, windows for which an axis may shake
 STEP_COUNTS = 1.5  # of the encoder: what is less is no motion, and no step
 RETURN_LOOKS, RETURN_LOOK = 8, 0.05  # looks whether it is back, and the time between them [s]
 OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
@@ -217,15 +217,14 @@ class ProvingGround:
         drives, rated = self.target.drives, self.target.motor.rated_current
         where = self.target.together(where)
         self._begin(where)
-        self._hold_still(where, patience=1)
+        self._hold_still(where)
         write_gains(drives, gains, where)
-        stopped = self._hold_still(where)
         write_profile(drives, self.move, where)
         away = self._origin + self._direction * self.move.distance
         start(drives, wrapped(away).astype(np.int64), where)
         self.moves[where] += 1
         objects = [POSITION, DEMAND, CURRENT, STATUS]
-        traces = []
+        traces, stopped = [], np.zeros(self.target.num_axes, bool)
         for _ in range(TRIAL // WATCH):
             traces.append(drives.record(objects, WATCH * CYCLE))
             stopped |= self._stop(where & ~stopped & self._shakes(traces[-1]))
@@ -249,25 +248,19 @@ class ProvingGround:
         t = np.arange(len(demand), dtype=np.float64) * CYCLE
         return Shown(t, demand, actual, current * 1e-3, where, reason, costs, swing)
 
-    def _hold_still(self, where: Mask, patience: int = 0) -> Mask:
-        """Come to rest with the gains there are, and take that for the beginning; return what was stopped meanwhile.
+    def _hold_still(self, where: Mask) -> None:
+        """Come to rest with the gains there are, and take that for the beginning: a response leaves an axis turning.
 
-        Other gains divide what holds an axis otherwise between error and integrator. What its integrator has kept for
-        the gains before would move it, and pass for these gains' doing.
-
-        Args:
-            where: The axes.
-            patience: Windows of 25 ms for which an axis may shake: it may still be swinging from what was before.
+        What swings on beyond a second window of 25 ms is stopped.
         """
-        stopped, windows = np.zeros(self.target.num_axes, bool), np.zeros(self.target.num_axes, np.int64)
+        windows = np.zeros(self.target.num_axes, np.int64)
         for _ in range(HOLDING // WATCH):
             seen = self.target.drives.record([POSITION, CURRENT, STATUS], WATCH * CYCLE)
             windows = np.where(self._shakes(seen), windows + 1, 0)
-            stopped |= self._stop(where & ~stopped & (windows > patience))
+            self._stop(where & (windows == PATIENCE))
             if not np.any(where & ~self._stands(seen[POSITION])):
                 break
         self._begin_without_a_step(where)
-        return stopped
 
     def _shakes(self, seen: Mapping[object, Any]) -> Mask:
         """Return which axes oscillated in a recording, or are off at its end."""
