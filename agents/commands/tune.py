@@ -297,7 +297,7 @@ def _print(done: Run, refused: list[str], rule: float | None) -> None:
         print(said)
     if axis.accepted and rule is not None:
         print(f"J {axis.proof:.3f}, {100.0 * axis.proof / rule:.0f} % of the fitted rule's {rule:.3f}; "
-              f"{certified.hardware_seconds:.1f} s of drive time, {certified.aborts} trials stopped")  # fmt: skip
+              f"{certified.hardware_seconds:.1f} s of drive time, trials stopped: {certified.aborts}")  # fmt: skip
     for loop in certified.frequency_responses:
         if loop.tuned:
             margins = {n: f"{value:.3g}" if math.isfinite(value) else "not seen" for n, value in loop.margins.items()}
