@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 import typer
 
+from agents.commands.options import errors_as_exit_codes as errors_of_drive_agent
 from drive_env import EmulatedDrives, SafetyError, motion
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
+from drive_env.dictionary.access import ObjectAccessError
+from drive_env.master.errors import refused
 from mechanics.loads import LOADS
 from tuning.commands.options import errors_as_exit_codes, open_target, parse_travel
 from tuning.target import FREE, emulated, on_bus, timed
@@ -172,12 +175,15 @@ def test_a_mistake_in_the_options_says_what_to_do(options, message):
 @pytest.mark.parametrize(("error", "code"), [
     (ValueError("x"), 2),
     (FileNotFoundError(2, "No such file or directory", "x"), 2),
+    (ObjectAccessError(0x06020000, "x"), 2),  # found before anything was sent
+    (refused("node 1", "the read of 1234h:00", 0x06020000), 1),  # the drive's answer
     (SafetyError("x"), 1),
     (TimeoutError("x"), 1),
     (RuntimeError("x"), 1),
     (KeyboardInterrupt(), 130),
 ])  # fmt: skip
-def test_errors_end_with_a_line_and_their_code(error, code, capsys):
+@pytest.mark.parametrize("errors_as_exit_codes", [errors_as_exit_codes, errors_of_drive_agent])
+def test_errors_end_with_a_line_and_their_code(errors_as_exit_codes, error, code, capsys):
     with pytest.raises(typer.Exit) as found, errors_as_exit_codes():
         raise error
     assert found.value.exit_code == code

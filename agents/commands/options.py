@@ -69,10 +69,12 @@ def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: 1 for what drive, bus or the watch say, 2 for the user's mistake, 130 for Ctrl-C."""
     from agents.policy import PolicyError
-    from drive_env.master.errors import BusError
+    from drive_env.master.errors import BusError, RefusedError
     from drive_env.safety import SafetyError
 
-    with ending_by(fail, refused=(PolicyError, SafetyError, BusError, TimeoutError), mistakes=(ImportError,)):
+    with ending_by(
+        fail, refused=(PolicyError, SafetyError, BusError, RefusedError, TimeoutError), mistakes=(ImportError,)
+    ):
         try:
             yield
         except ModuleNotFoundError as error:

@@ -283,11 +283,11 @@ def tell_before(file: Path | None) -> None:
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
-    from drive_env.master.errors import BusError
+    from drive_env.master.errors import BusError, RefusedError
     from drive_env.safety import SafetyError
     from tuning.pools import PoolError
 
-    with ending_by(fail, refused=(SafetyError, BusError, PoolError, TimeoutError)):
+    with ending_by(fail, refused=(SafetyError, BusError, RefusedError, PoolError, TimeoutError)):
         yield
 
 
