@@ -18,7 +18,7 @@ from agents.served import Served, draw_machines, emulated, in_lockstep, in_real_
 from agents.tasks import environment_name, make_lanes
 from drive_env.bus.config import Machine
 from drive_env.master.errors import BusError
-from drive_env.safety import SafetyError
+from drive_env.safety.envelope import SafetyError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

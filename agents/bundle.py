@@ -9,8 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
@@ -20,12 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mechanics.untrusted import TooLargeError, parse_json, read_arrays
+
 FORMAT, FORMAT_VERSION = "drive-agent", 1
 MAX_BYTES = 1_000_000  # of a file: what ships in the package and is read by a small computer
+MOST_UNPACKED = 20_000_000  # bytes; weights hardly pack, so that an agent of MAX_BYTES has some 2 MB
+# What the JSON says besides format and hash.
+KINDS_OF_ABOUT = {"kind": str, "settings": dict, "environment": str, "configuration": dict, "card": dict,
+                  "versions": dict}  # fmt: skip
 ABOUT = "about"  # the array with the JSON, as bytes
 AN_AGENT = "the .npz that drive-agent train writes, or the name of an agent that ships"
-# What NumPy, zip and JSON raise at a file that is another one: what they advise (allow_pickle) helps nobody here.
-NOT_OURS = (OSError, EOFError, KeyError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, zlib.error)
 
 
 class BundleError(ValueError):
@@ -102,14 +104,15 @@ class Bundle:
         """
         path = Path(path)
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-            about = json.loads(bytes(arrays.pop(ABOUT)).decode())
+            arrays = read_arrays(path, MOST_UNPACKED)
+            about = parse_json(bytes(arrays.pop(ABOUT)))
         except FileNotFoundError:
             raise BundleError(f"there is no file {path}") from None
         except (IsADirectoryError, PermissionError) as error:
             raise BundleError(f"cannot read {path}: {error.strerror}; give {AN_AGENT}") from None
-        except NOT_OURS:
+        except TooLargeError as error:
+            raise BundleError(f"{error} Give {AN_AGENT}") from None
+        except (OSError, KeyError, ValueError):
             raise BundleError(f"{path} is no agent; give {AN_AGENT}") from None
         if not isinstance(about, dict) or about.get("format") != FORMAT:
             raise BundleError(f"{path} is no agent; give {AN_AGENT}")
@@ -118,10 +121,9 @@ class Bundle:
                 f"{path} has format {about.get('format_version')} and this drive-env reads {FORMAT_VERSION}; "
                 "use the drive-env that wrote it, or train again"
             )
-        names = ("kind", "settings", "environment", "configuration", "card", "versions")
-        if not all(name in about for name in names):
+        if not all(isinstance(about.get(name), kind) for name, kind in KINDS_OF_ABOUT.items()):
             raise BundleError(f"{path} is no agent; give {AN_AGENT}")
-        bundle = cls(arrays=arrays, **{name: about[name] for name in names})
+        bundle = cls(arrays=arrays, **{name: about[name] for name in KINDS_OF_ABOUT})
         if bundle.hash != about.get("hash"):
             raise BundleError(f"{path} was changed after it was written: its hash is {bundle.hash[:12]}…; get it anew")
         return bundle

@@ -2,7 +2,8 @@
 
 SB3 saves networks, optimisers and counters. Added are `drive_agent.json` (the run), the normaliser, the replay buffer
 and the states of all random generators, so that the file alone can be resumed, exported and evaluated. Like every file
-of SB3 it holds pickles: open only your own.
+of SB3 it holds pickles, and whoever unpickles runs what its writer wished: it is loaded only with `trust`, also where a
+run goes on, since nothing in a folder proves who wrote it. What a file says of its run is JSON and needs none.
 """
 
 from __future__ import annotations
@@ -17,11 +18,20 @@ from typing import Any
 
 import numpy as np
 
+from mechanics.untrusted import MOST_TEXT, parse_json, read_member
+
+MOST_UNPACKED = 16_000_000_000  # bytes of a replay buffer: a million observations of a thousand entries, twice
+# What the JSON of a run has besides: it is read before anybody is trusted.
+_OF_A_RUN = {"algorithm": str, "environment": str, "configuration": dict, "timesteps": int, "run": dict}
 RUN, NORMALISER, BUFFER, RANDOM = "drive_agent.json", "normaliser.pkl", "replay_buffer.pkl", "random_states.pkl"
 
 
 class CheckpointError(ValueError):
     """A file is no checkpoint of ours, or damaged; the message says what to do."""
+
+
+class UntrustedError(CheckpointError):
+    """A file would run what its writer wished, and nobody said that he is trusted."""
 
 
 def save(path: Path, model: Any, normaliser: Any, run: dict[str, Any]) -> None:
@@ -47,23 +57,42 @@ def read_run(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: If it is none.
     """
-    run: dict[str, Any] = json.loads(_read(path, RUN))
+    try:
+        run: Any = parse_json(_read(path, RUN))
+    except ValueError as error:
+        raise CheckpointError(f"{path} is no checkpoint of drive-agent: {error}") from None
+    if not isinstance(run, dict) or any(not isinstance(run.get(name), kind) for name, kind in _OF_A_RUN.items()):
+        raise CheckpointError(f"{path} is no checkpoint of drive-agent: {RUN} lacks {', '.join(_OF_A_RUN)}")
+    if not isinstance(run["run"].get("seed"), int) or not isinstance(run["run"].get("hyperparameters"), dict):
+        raise CheckpointError(f"{path} is no checkpoint of drive-agent: {RUN} says no seed, or no hyper-parameters")
     return run
 
 
-def load(path: Path, env: Any = None) -> tuple[Any, Any]:
+def check_trust(path: Path, trust: bool) -> None:
+    """Raise UntrustedError unless the writer of a checkpoint is trusted."""
+    if not trust:
+        raise UntrustedError(
+            f"{path} holds pickles: to load it runs whatever its writer put there, with your rights (your files, your "
+            "network, the drives). If it is yours, or of somebody whom you would let run a program here, say --trust "
+            "(in Python trust=True); an agent.npz runs nothing and needs no trust"
+        )
+
+
+def load(path: Path, env: Any = None, *, trust: bool = False) -> tuple[Any, Any]:
     """Return model and normaliser of a checkpoint; the model without an environment, if none is given.
 
     Args:
         path: The file.
         env: The VecEnv without a normaliser, which is put around it.
+        trust: Its writer is trusted: what he put there is run.
 
     Raises:
-        CheckpointError: If the file is none.
+        CheckpointError: If the file is none; UntrustedError without `trust`.
     """
     from agents.training import algorithm_class
 
     run = read_run(path)
+    check_trust(path, trust)
     names = _names(path)
     normaliser = pickle.loads(_read(path, NORMALISER)) if NORMALISER in names else None
     if normaliser is not None and env is not None:
@@ -89,7 +118,7 @@ def random_states(model: Any) -> dict[str, Any]:
 
 
 def restore_random_states(path: Path, model: Any) -> None:
-    """Put the random generators back to where they were when the checkpoint was written."""
+    """Put the random generators back to where they were when a checkpoint that is trusted was written."""
     import torch
 
     states = pickle.loads(_read(path, RANDOM))
@@ -106,12 +135,13 @@ def _names(path: Path) -> list[str]:
 
 def _read(path: Path, name: str) -> bytes:
     try:
-        with zipfile.ZipFile(path) as archive:
-            return archive.read(name)
+        return read_member(path, name, MOST_TEXT if name == RUN else MOST_UNPACKED)
     except FileNotFoundError:
         raise CheckpointError(f"there is no file {path}") from None
-    except zipfile.BadZipFile:
-        raise CheckpointError(f"{path} is no checkpoint: it is no .zip, or not whole") from None
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise CheckpointError(f"{path} is no checkpoint: it is no .zip, or not whole ({error})") from None
     except KeyError:
         raise CheckpointError(
             f"{path} is no checkpoint of drive-agent: it holds no {name}. A bare file of Stable-Baselines3 lacks the "

@@ -31,7 +31,8 @@ for panel, names in PANELS.items():
 def drive_agent() -> None:
     """Train agents for servo drives, judge them, and let them act: on emulated drives, and on real ones over CAN.
 
-    Exit codes: 0 done, 1 drive, bus or the watch over the agent said no, 2 a mistake in the command, 130 Ctrl-C.
+    Exit codes: 0 done, 1 drive, bus or the watch over the agent said no, 2 a mistake in the command, 130
+    Ctrl-C, 141 nobody takes the output any more.
     """
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from agents.bundle import plain
 from agents.guard import PATIENT, GuardedPolicy
 from agents.scores import Episode
+from mechanics.untrusted import parse_json, read_arrays
 
 
 class Recording(NamedTuple):
@@ -54,15 +54,23 @@ def load(path: Path) -> Recording:
         ValueError: If the file is none.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            about = json.loads(bytes(stored["about"]).decode())
-            ends = np.cumsum(stored["lengths"])[:-1]
-            observations, actions = (np.split(stored[name], ends) for name in ("observations", "actions"))
-        return Recording(about["environment"], about["configuration"], about["seeds"], observations, actions)
+        stored = read_arrays(path)
+        about = parse_json(bytes(stored["about"]))
+        lengths = [int(length) for length in stored["lengths"]]
+        rows = [stored[name].astype(np.float32) for name in ("observations", "actions")]
+        if not lengths or min(lengths) < 0 or any(one.ndim != 2 or len(one) != sum(lengths) for one in rows):
+            raise ValueError("its arrays do not fit each other")
+        if not all(np.isfinite(one).all() for one in rows):
+            raise ValueError("it holds values that are no numbers")
+        observations, actions = (np.split(one, np.cumsum(lengths)[:-1]) for one in rows)
+        configuration, seeds = dict(about["configuration"]), [int(seed) for seed in about["seeds"]]
+        return Recording(str(about["environment"]), configuration, seeds, observations, actions)
     except FileNotFoundError:
         raise ValueError(f"there is no file {path}") from None
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
-        raise ValueError(f"{path} holds no episodes; give the episodes.npz of `drive-agent evaluate --out`") from None
+    except (OSError, KeyError, ValueError, TypeError, OverflowError) as error:
+        raise ValueError(
+            f"{path} holds no episodes ({error}); give the episodes.npz of `drive-agent evaluate --out`"
+        ) from None
 
 
 def repeat(policy: Any, recording: Recording, told: Callable[[float], None] = lambda share: None) -> Repeated:

@@ -22,6 +22,7 @@ from agents.scores import Episode, Interval, figures, interval
 from agents.tasks import ENVIRONMENTS, configuration_of, environment_name, make_lanes
 from agents.tuner import TRIAL_SECONDS
 from drive_env.undisturbed import undisturbed
+from mechanics.untrusted import read_json
 
 LANES = 64
 FIRST_SEED = 1_000_000  # far from those of a training
@@ -88,7 +89,7 @@ class Evaluation:
             ValueError: If the file is none.
         """
         try:
-            table = json.loads(Path(path).read_text(encoding="utf-8"))
+            table = read_json(path)
             table.pop("intervals")
             table["values"] = {name: [float(one) for one in values] for name, values in table["values"].items()}
             return cls(**table)

@@ -50,7 +50,7 @@ def target_for(
         BusError: If the bus cannot be opened or a node does not answer.
     """
     from drive_env.can_drives import CanDrives
-    from drive_env.master.bounds import Limits
+    from drive_env.safety.limits import Limits
     from tuning.target import FREE, LOCKSTEP_PATIENCE, on_bus
 
     more: dict[str, Any] = {"device": device, "interface": interface, "channel": channel, "nodes": nodes}
@@ -64,9 +64,9 @@ def target_for(
         lanes.close()
         with CanDrives(**more) as drives:
             turn, at = drives.read(POSITION_SCALER), drives.read(0x6064)
-        reach = POSITION_SLACK * amplitude * float(np.max(turn))
-        position = (round(float(at.min()) - reach), round(float(at.max()) + reach))
-        velocity = round(SPEED_SLACK * speed * float(np.max(turn)))
+        reach = POSITION_SLACK * amplitude * turn
+        position = ((at - reach).tolist(), (at + reach).tolist())
+        velocity = (SPEED_SLACK * speed * turn).tolist()
     # A trial of gains may oscillate: it sees that and stops the lane by itself.
     oscillation = environment_name(environment) != "ServoDrive/GainTuning-v0"
     limits = Limits(position=position, velocity=velocity, oscillation=oscillation, stall=guard.stall)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.bundle import BundleError
 from agents.policy import PolicyError
+from mechanics.untrusted import check_size, parse_json
 
 METADATA = "drive_agent"
+MOST_BYTES = 100_000_000  # of a file: far more than any policy that makes its millisecond
 CARRIED = {"state": "next_state", "cell": "next_cell"}  # of recurrent agents
 
 
@@ -33,6 +34,7 @@ class OnnxPolicy:
             raise BundleError(f"{path} needs onnxruntime: pip install 'drive-env[agents]'") from None
         if not Path(path).is_file():
             raise BundleError(f"there is no file {path}")
+        check_size(Path(path), MOST_BYTES)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1  # threads cost more than such a network
         try:
@@ -46,10 +48,18 @@ class OnnxPolicy:
                 f"{path} takes {', '.join(inputs)} and gives {', '.join(outputs)}; a policy takes `observation`, shape "
                 "(lanes, entries), and gives `action`"
             )
-        about = json.loads(self._session.get_modelmeta().custom_metadata_map.get(METADATA, "{}"))
-        self.environment = about.get("environment")
-        self.configuration: dict[str, Any] = about.get("configuration", {})
-        self.card: dict[str, Any] = about.get("card", {})
+        try:
+            about = parse_json(self._session.get_modelmeta().custom_metadata_map.get(METADATA, "{}"))
+            self.environment: str | None = about.get("environment")
+            self.configuration: dict[str, Any] = dict(about.get("configuration", {}))
+            self.card: dict[str, Any] = dict(about.get("card", {}))
+        except (ValueError, TypeError, AttributeError) as error:
+            raise BundleError(f"{path}: its metadata {METADATA!r} is not ours: {error}; export it anew") from None
+        if not isinstance(self.environment, str | None):
+            raise BundleError(f"{path}: its metadata names {self.environment!r} as environment; export the agent anew")
+        for name in CARRIED:
+            if name in inputs and not (len(inputs[name]) == 2 and isinstance(inputs[name][1], int)):
+                raise BundleError(f"{path}: {name} has shape {inputs[name]}; a policy's is (lanes, cells)")
         self._outputs = ["action", *(CARRIED[name] for name in CARRIED if name in inputs)]
         self._cells = {name: int(inputs[name][1]) for name in CARRIED if name in inputs}
         self._carried: dict[str, NDArray[np.float32]] = {}

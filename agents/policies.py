@@ -19,6 +19,7 @@ import numpy as np
 from agents.policy import load_policy
 from agents.shipped import shipped, shipped_names
 
+CHECKPOINT = ".zip"  # ending of a file of Stable-Baselines3, which holds pickles
 ACTOR = "observation"  # the entry of a dict observation that the actor sees
 
 
@@ -45,12 +46,20 @@ class LoadedPolicy:
     card: Mapping[str, Any] = field(default_factory=dict)
 
 
-def open_policy(text: str) -> LoadedPolicy:
+def open_policy(text: str, *, trust: bool = False) -> LoadedPolicy:
     """Return the policy that a text names.
 
+    Args:
+        text: What names it.
+        trust: The writer of a checkpoint is trusted: to load it runs what he put there. The other files run nothing,
+            and a Python function is the user's own.
+
     Raises:
-        PolicyNotFoundError: If it is none; BundleError or CheckpointError if its file is not what it seems.
+        PolicyNotFoundError: If it is none; BundleError or CheckpointError if its file is not what it seems;
+            UntrustedError for a checkpoint without `trust`.
     """
+    if is_checkpoint(text):
+        return _checkpoint(text, trust)
     for ending, opened in OPENERS.items():
         if text.lower().endswith(ending):
             return opened(text)
@@ -60,7 +69,7 @@ def open_policy(text: str) -> LoadedPolicy:
         return replace(_bundle(str(shipped(text))), name=text)
     raise PolicyNotFoundError(
         f"{text!r} is no policy; give an agent that ships ({', '.join(shipped_names())}), a file "
-        f"({', '.join(OPENERS)}) or a Python function (module:function)"
+        f"({', '.join((*OPENERS, CHECKPOINT))}) or a Python function (module:function)"
     )
 
 
@@ -125,14 +134,30 @@ def _onnx(text: str) -> LoadedPolicy:
     return LoadedPolicy(text, policy, policy.environment, policy.configuration, policy.card)
 
 
-def _checkpoint(text: str) -> LoadedPolicy:
+def is_checkpoint(text: str) -> bool:
+    """Return whether a text names a checkpoint, the one kind of file that runs code of its writer."""
+    return text.lower().endswith(CHECKPOINT)
+
+
+def described_checkpoint(text: str) -> LoadedPolicy:
+    """Return what is known of a checkpoint, its policy None: nothing of its writer is run.
+
+    Raises:
+        CheckpointError: If the file is none.
+    """
     from agents import checkpoint
 
-    path = Path(text)
-    run = checkpoint.read_run(path)
-    model, normaliser = checkpoint.load(path)
+    run = checkpoint.read_run(Path(text))
     card = {"trained": f"{run['algorithm']}, {run['timesteps']} steps", "seeds": {"training": run["run"]["seed"]}}
-    return LoadedPolicy(text, ModelPolicy(model, normaliser), run["environment"], run["configuration"], card)
+    return LoadedPolicy(text, None, run["environment"], run["configuration"], card)
+
+
+def _checkpoint(text: str, trust: bool) -> LoadedPolicy:
+    from agents import checkpoint
+
+    described = described_checkpoint(text)
+    model, normaliser = checkpoint.load(Path(text), trust=trust)
+    return replace(described, policy=ModelPolicy(model, normaliser))
 
 
 def find_object(text: str) -> Any:
@@ -175,5 +200,5 @@ def _callable(text: str) -> LoadedPolicy:
     return LoadedPolicy(text, policy)
 
 
-# Ending of a file -> what opens it.
-OPENERS: dict[str, Callable[[str], LoadedPolicy]] = {".npz": _bundle, ".zip": _checkpoint, ".onnx": _onnx}
+# Ending of a file that runs nothing of its writer -> what opens it.
+OPENERS: dict[str, Callable[[str], LoadedPolicy]] = {".npz": _bundle, ".onnx": _onnx}

@@ -44,7 +44,12 @@ def policy_of(bundle: Bundle) -> Any:
     if bundle.kind not in KINDS:
         raise BundleError(f"an agent of kind {bundle.kind!r} needs a newer drive-env; this one has {', '.join(KINDS)}")
     module, _, name = KINDS[bundle.kind].partition(":")
-    return getattr(importlib.import_module(module), name)(bundle)
+    try:
+        return getattr(importlib.import_module(module), name)(bundle)
+    except BundleError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise BundleError(f"the agent's arrays and settings make no {bundle.kind!r}: {error}; get it anew") from None
 
 
 # --- pieces -----------------------------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ import numpy as np
 
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.gains import GAIN_NAMES, GAIN_OBJECTS
-from drive_env.master.lifeline import MASTER
 
 if TYPE_CHECKING:
     from tuning.target import Target
@@ -195,12 +194,11 @@ def _error_control(target: Target, axis: int) -> Iterator[Check]:
         value = _read(target, (0x1016, 1), axis)
         now = f"node {value >> 16 & 0x7F}, {value & 0xFFFF} ms" if value else "nobody"
         yield Check("heartbeat", OK, f"the drive can watch over its master: 1016h, now {now}; in real time it would be "
-                                     f"node {MASTER}, {1e3 * silence:.0f} ms")  # fmt: skip
+                                     f"{1e3 * silence:.0f} ms")  # fmt: skip
     elif description.has((0x100C, 0)) and description.has((0x100D, 0)):
         yield Check("heartbeat", OK, "the drive can guard its life: 100Ch and 100Dh would be set in real time")
     else:
-        yield Check("heartbeat", NOTE, "the drive would not stop by itself if this process died: keep the emergency "
-                                       "stop at hand")  # fmt: skip
+        yield Check("heartbeat", NO, "the drive would not stop by itself if this process died: no 1016h, no 100Ch")
 
 
 def _motor(target: Target, axis: int) -> Iterator[Check]:
@@ -330,8 +328,16 @@ def _communication(target: Target) -> Iterator[tuple[tuple[int, int], str, str, 
                     yield (entry.index, entry.sub), "", why, False
     for number in slots(target.drives.description, OUT_OF_DRIVE, 0).numbers[2:]:
         yield (0x1800 + number, 1), "", f"TPDO {number + 1} silent meanwhile, if it goes with SYNC", False
+    if np.isfinite(target.low).all() and np.isfinite(target.high).all():
+        for sub, end in ((1, "lower"), (2, "upper")):
+            if target.drives.description.has((0x607D, sub)):
+                yield (0x607D, sub), "the travel", f"{end} software limit, which the drive holds meanwhile", False
+    if target.drives.description.has(0x605A):
+        yield (0x605A, 0), "5, 6", "an axis that is stopped is held at first, in case a weight pulls it", False
+    if target.drives.time_waits and target.drives.description.has(0x1017):
+        yield (0x1017, 0), "1", "for a hundredth of a second: proof that time waits for SYNC", False
     in_real_time = (
-        ((0x1016, 1), "7F01F4h", "whom the drive watches, in real time"),
+        ((0x1016, 1), "this process, 500 ms", "whom the drive watches, in real time"),
         ((0x1029, 1), "0", "what it does when that one falls silent, where it was 1"),
     )
     for key, values, why in in_real_time:

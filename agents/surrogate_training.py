@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from agents.bundle import Bundle, installed
 from agents.surrogate import CONTEXT, IDENTIFIED, SHOWN, SurrogatePolicy
+from mechanics.untrusted import read_arrays
 from tuning.bootstrap import bootstrap_interval
 
 Floats = NDArray[np.float64]
@@ -194,8 +195,8 @@ def _kept(file: Path | None) -> Any:
 
     if file is None or not file.exists():
         return None
-    with np.load(file, allow_pickle=False) as stored:
-        return Trials(**{name: stored[name] for name in Trials._fields})
+    stored = read_arrays(file)
+    return Trials(**{name: stored[name] for name in Trials._fields})
 
 
 def _keep(file: Path | None, trials: Any) -> Any:

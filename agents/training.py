@@ -110,7 +110,9 @@ class Progress(NamedTuple):
 Report = Callable[[Progress], None]
 
 
-def train(run: Run, folder: str | Path, *, report: Report | None = None, resume: bool = False) -> Bundle:
+def train(
+    run: Run, folder: str | Path, *, report: Report | None = None, resume: bool = False, trust: bool = False
+) -> Bundle:
     """Train an agent and return it; the folder gets agent.npz, checkpoint.zip, training.csv and TensorBoard's files.
 
     Args:
@@ -118,9 +120,11 @@ def train(run: Run, folder: str | Path, *, report: Report | None = None, resume:
         folder: Where results go.
         report: Is told how far it is, some 200 times.
         resume: Go on from the folder's checkpoint.
+        trust: Its writer is trusted; needed to resume, see `agents.checkpoint`.
 
     Raises:
-        CheckpointError: If there is nothing to resume; MissingPackageError without the extra `agents`.
+        CheckpointError: If there is nothing to resume, or it is not trusted; MissingPackageError without the extra
+            `agents`.
         HyperparameterError: For hyper-parameters that the algorithm does not take.
         DivergedError: If the networks come to hold what nothing can act with; the last checkpoint is from before.
     """
@@ -131,12 +135,13 @@ def train(run: Run, folder: str | Path, *, report: Report | None = None, resume:
     path = folder / CHECKPOINT
     if resume:
         run = run_to_resume(folder)
+        checkpoint.check_trust(path, trust)
     threads = torch.get_num_threads()
     torch.set_num_threads(run.torch_threads)
     lanes, env = make_env(run)
     try:
         if resume:
-            model, normaliser = checkpoint.load(path, env)
+            model, normaliser = checkpoint.load(path, env, trust=trust)
         else:
             model, normaliser = make_model(run, env)
             agent_of(model, normaliser, run, configuration_of(lanes))  # what no bundle holds is told now
@@ -184,7 +189,7 @@ def run_to_resume(folder: str | Path) -> Run:
         raise checkpoint.CheckpointError(
             f"there is no file {path} to go on with: a run writes its first one after a tenth of its steps"
         )
-    return Run(**checkpoint.read_run(path)["run"])
+    return _run_of(checkpoint.read_run(path), path)
 
 
 def agent_of(model: Any, normaliser: Any, run: Run, configuration: Mapping[str, Any]) -> Bundle:
@@ -200,15 +205,23 @@ def agent_of(model: Any, normaliser: Any, run: Run, configuration: Mapping[str, 
     return bundle_of(model, normaliser, environment=run.environment, configuration=configuration, card=card)
 
 
-def bundle_of_checkpoint(path: str | Path) -> Bundle:
+def bundle_of_checkpoint(path: str | Path, *, trust: bool = False) -> Bundle:
     """Return the agent of a checkpoint.
 
     Raises:
-        CheckpointError: If the file is none.
+        CheckpointError: If the file is none, or its writer is not trusted.
     """
     table = checkpoint.read_run(Path(path))
-    model, normaliser = checkpoint.load(Path(path))
-    return agent_of(model, normaliser, Run(**table["run"]), table["configuration"])
+    model, normaliser = checkpoint.load(Path(path), trust=trust)
+    return agent_of(model, normaliser, _run_of(table, Path(path)), table["configuration"])
+
+
+def _run_of(table: Mapping[str, Any], path: Path) -> Run:
+    """Return the run that a checkpoint tells of."""
+    try:
+        return Run(**table["run"])
+    except TypeError as error:
+        raise checkpoint.CheckpointError(f"{path} is no checkpoint of this drive-agent: {error}") from None
 
 
 def with_figures(bundle: Bundle, figures: Mapping[str, Any], seeds: Mapping[str, Any]) -> Bundle:

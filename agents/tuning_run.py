@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -38,6 +39,7 @@ def run(
     keep: bool = True,
     show: Callable[[TrialShown], None] = lambda trial: None,
     say: Callable[[str], None] = lambda what: None,
+    files: Callable[[Certificate], AbstractContextManager[object]] = nullcontext,
 ) -> Run:
     """Tune a target; gains that fail a check are rolled back, and the result says why.
 
@@ -51,9 +53,11 @@ def run(
         keep: Whether drives on a bus keep the gains over a power cycle.
         show: Called after every trial.
         say: Called with what is under way.
+        files: Writes the certificate down, before the drives keep the gains; its files vanish if the block in it fails.
 
     Raises:
-        PolicyError: If the policy gives no number; BusError, RuntimeError or TimeoutError for the drives.
+        PolicyError: If the policy gives no number; BusError, RuntimeError or TimeoutError for the drives; OSError for
+            a file that cannot be written.
     """
     from tuning.auto import prove_found
     from tuning.auto_certificate import certificate
@@ -72,15 +76,21 @@ def run(
         if share < 1.0:
             say(what)
 
-    result = prove_found(target, file, find, keep=keep, progress=told, budget=math.inf)
-    return Run(result, certificate(target, result, 0, tuner=f"agent {name}"), tuple(trials))
+    certificates: list[Certificate] = []
+
+    def written(result: Result) -> AbstractContextManager[object]:
+        certificates.append(certificate(target, result, 0, tuner=f"agent {name}"))
+        return files(certificates[0])
+
+    result = prove_found(target, file, find, keep=keep, progress=told, budget=math.inf, files=written)
+    return Run(result, certificates[0], tuple(trials))
 
 
 def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
     """Have the policy make its trials; leave its answer, what was second best, and where moves go on from."""
     from dataclasses import replace
 
-    from drive_env.safety import SafetyError, swinging_allowed
+    from drive_env.safety.envelope import SafetyError, swinging_allowed
     from tuning.auto_trials import BY_TRIAL, watch_following
     from tuning.proving import ProvingGround
 

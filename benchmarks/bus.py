@@ -1,4 +1,4 @@
-"""Figures of the bus: SDO per second in-process and through the hub, PDO latency, lateness of the 1 kHz cycle."""
+"""Figures of the bus: SDO per second in-process, through the hub, beside a flood; PDO latency, lateness of cycles."""
 
 from __future__ import annotations
 
@@ -15,10 +15,24 @@ import numpy as np
 from drive_env import EmulatedDrives
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
+from drive_env.master.slcan_socket import SlcanSocket
 
 SECONDS = 5.0  # of 1 kHz SYNC
 TRANSFERS = 2000
 READ_STATUSWORD = bytes.fromhex("40 41 60 00 00 00 00 00")
+FLOOD_SECONDS = 2.0  # of SDO beside a flood, and without it
+FLOOD = """
+import socket, sys, threading
+connection = socket.create_connection((sys.argv[1], int(sys.argv[2])))
+connection.sendall(b"O\\r")
+def read():
+    while connection.recv(65536):
+        pass
+threading.Thread(target=read, daemon=True).start()
+print("it floods", flush=True)
+while True:
+    connection.sendall(b"t7FF81122334455667788\\r" * 500)
+"""
 SERVE = "import typer; from drive_env.tools.serve import serve; typer.run(serve)"
 
 
@@ -86,6 +100,34 @@ def sdo_through_hub(*arguments: str) -> float:
             send(bus, 0x601, READ_STATUSWORD)
             wait_for(bus, 0x581)
         return TRANSFERS / (time.perf_counter() - start)
+
+
+def sdo_beside_a_flood(*arguments: str) -> tuple[float, float]:
+    """Return expedited uploads per second alone, and while another client sends frames 7FFh as fast as it can.
+
+    The master is ours: python-can's own takes most of a processor to read a full bus, and would measure itself.
+    """
+    with served(*arguments) as (_, stock):
+        host, port = stock.serialPortOrig._socket.getpeername()  # type: ignore[attr-defined]
+        with SlcanSocket(f"socket://{host}:{port}") as bus:
+            alone = transfers_per_second(bus)
+            flood = subprocess.Popen([sys.executable, "-c", FLOOD, host, str(port)], stdout=subprocess.PIPE, text=True)
+            try:
+                assert flood.stdout is not None
+                flood.stdout.readline()
+                return alone, transfers_per_second(bus)
+            finally:
+                flood.kill()
+                flood.wait()
+
+
+def transfers_per_second(bus: can.BusABC) -> float:
+    count, start = 0, time.perf_counter()
+    while time.perf_counter() < start + FLOOD_SECONDS:
+        send(bus, 0x601, READ_STATUSWORD)
+        wait_for(bus, 0x581)
+        count += 1
+    return count / (time.perf_counter() - start)
 
 
 def write(bus: can.BusABC, index: int, sub: int, value: int, size: int) -> None:
@@ -184,10 +226,15 @@ def policy_loop() -> dict[str, float]:
 
 def figures() -> dict[str, float]:
     """Return all figures of the bus."""
+    lockstep, real = sdo_beside_a_flood("--lockstep"), sdo_beside_a_flood()
     return {
         "SDO/s, in-process": sdo_in_process(),
         "SDO/s, hub, lockstep": sdo_through_hub("--lockstep"),
         "SDO/s, hub, real time (1 Mbit/s)": sdo_through_hub(),
+        "SDO/s, hub, lockstep, our client": lockstep[0],
+        "SDO/s, hub, lockstep, our client, beside a flood": lockstep[1],
+        "SDO/s, hub, real time, our client": real[0],
+        "SDO/s, hub, real time, our client, beside a flood": real[1],
         **real_time(),
         **policy_loop(),
     }

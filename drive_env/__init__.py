@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from drive_env.can_drives import CanDrives as CanDrives
     from drive_env.dictionary.access import ObjectAccessError as ObjectAccessError
     from drive_env.drives import EmulatedDrives as EmulatedDrives
-    from drive_env.master.bounds import Limits as Limits
-    from drive_env.safety import SafetyError as SafetyError
+    from drive_env.safety.envelope import SafetyError as SafetyError
+    from drive_env.safety.limits import Limits as Limits
     from drive_env.trace import Trace as Trace
 
 __all__ = ["CanDrives", "EmulatedDrives", "Limits", "ObjectAccessError", "SafetyError", "Trace", "motion"]
@@ -20,9 +20,9 @@ __all__ = ["CanDrives", "EmulatedDrives", "Limits", "ObjectAccessError", "Safety
 _HOMES = {
     "CanDrives": "can_drives",
     "EmulatedDrives": "drives",
-    "Limits": "master.bounds",
+    "Limits": "safety.limits",
     "ObjectAccessError": "dictionary.access",
-    "SafetyError": "safety",
+    "SafetyError": "safety.envelope",
     "Trace": "trace",
 }
 

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Mask = NDArray[np.bool_]
 
+LONGEST = 1e7  # s, that any one call, wait or recording may last: 115 days
+
 
 def checked_mask(where: Mask | None, count: int) -> Mask:
     """Return which of so many axes or machines are meant, all of them by default.
@@ -28,10 +30,13 @@ def whole_cycles(duration: float, cycle: float) -> int:
     Raises:
         ValueError: If no whole number of them does.
     """
-    cycles = round(duration / cycle)
-    if not duration >= 0.0 or abs(cycles * cycle - duration) > 1e-9:
+    if not 0.0 <= duration <= LONGEST:
         raise ValueError(
-            f"{duration:g} s is not a whole number of communication cycles of {cycle:g} s; "
-            f"use {max(cycles, 0) * cycle:g} s"
+            f"{duration:g} s is not a whole number of communication cycles; give a time of 0 s to {LONGEST:g} s"
+        )
+    cycles = round(duration / cycle)
+    if abs(cycles * cycle - duration) > 1e-9:
+        raise ValueError(
+            f"{duration:g} s is not a whole number of communication cycles of {cycle:g} s; use {cycles * cycle:g} s"
         )
     return cycles

@@ -22,7 +22,6 @@ from drive_env.arguments import checked_mask, whole_cycles
 from drive_env.dictionary.access import ObjectAccessError, check_readable, check_writable, checked_values
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.emergency import EmergencyMessage
-from drive_env.master.bounds import Limits
 from drive_env.master.cycle_runner import CycleRunner
 from drive_env.master.description import Description, check_timeout, describe
 from drive_env.master.dry_run import DryPort, DrySdoClient
@@ -34,7 +33,8 @@ from drive_env.master.port import Port, open_bus
 from drive_env.master.process_data import ProcessData
 from drive_env.master.sampling import run_cycles
 from drive_env.master.sdo import SdoClient
-from drive_env.safety import Envelope
+from drive_env.safety.envelope import Envelope
+from drive_env.safety.limits import Limits
 from drive_env.trace import Trace
 
 logger = logging.getLogger(__name__)
@@ -66,7 +66,8 @@ class CanDrives:
         timeouts: Object -> time-out [s], for those that need another.
         safety: Limits; False for none at all, which is for emulators.
         dry_run: Print frames and send none: answers are the dictionary's defaults. A function takes the lines instead.
-        options: Whatever the interface takes besides, e.g. `bitrate=1_000_000`.
+        options: Whatever the interface takes besides, e.g. `bitrate=1_000_000`; `token` for a hub that asks for one
+            (from DRIVE_ENV_TOKEN if not given).
 
     Raises:
         BusError: If the bus cannot be opened, a node does not answer or is another device.
@@ -122,6 +123,7 @@ class CanDrives:
             self._greet()
             if limits:
                 self.safety = Envelope(limits, self)
+                self._network.on_restart = self._on_restart
         except BaseException:
             self._port.close()
             raise
@@ -250,12 +252,11 @@ class CanDrives:
         chosen = [k for k in range(len(self.nodes)) if axes[k].any()]
         if not chosen:
             return
+        if self.safety is not None:
+            self.safety.before_reset(chosen)
         if not self._dry:
             self._network.reset([self.nodes[k] for k in chosen])
-        for k in chosen:
-            self._pdos[k].forget()
-        self._process.forget()
-        self._started = False
+        self.forget(chosen)
         if self.safety is not None:
             self.safety.after_reset(chosen)
 
@@ -263,13 +264,15 @@ class CanDrives:
         """Stop what still runs, put PDOs and error control back, and close the bus; the drives cannot be used after."""
         if self._closed:
             return
+        if self.safety is not None:
+            self.safety.close()  # if something ends this, close can be called again, and is at the interpreter's end
         self._closed = True
         atexit.unregister(self.close)
         try:
-            if self.safety is not None:
-                self.safety.close()
-            for pdos in self._pdos:
-                with _logged(f"the PDOs of node {self.nodes[self._pdos.index(pdos)]} stay as they are"):
+            for k, pdos in enumerate(self._pdos):
+                if self.safety is not None and self.safety.has_lost(k):
+                    continue  # it is left to its watchdog: what it hears is what it heard
+                with _logged(f"the PDOs of node {self.nodes[k]} stay as they are"):
                     pdos.restore()
         finally:
             self._port.close()
@@ -313,6 +316,50 @@ class CanDrives:
         client: SdoClient = self._sdo[node]
         return client
 
+    def write_raw(self, entry: Entry, axis: int, value: int) -> None:
+        """Write an object of one axis, past what is lent to it."""
+        node, index, sub, label = self._place_of(entry, axis)
+        data = self._description.encode(entry, value)
+        self._sdo[node].write(index, sub, data, f"{value} to {label}", self._description.patience(entry))
+
+    def read_raw(self, entry: Entry, axis: int) -> Any:
+        """Read an object of one axis as the drive has it, also where that is lent."""
+        node, index, sub, label = self._place_of(entry, axis)
+        data = self._sdo[node].read(index, sub, label, self._description.patience(entry))
+        return self._description.decode(entry, data)
+
+    def forget(self, nodes: Sequence[int]) -> None:
+        """Forget what nodes, by position, were configured to: they have restarted."""
+        for k in nodes:
+            self._pdos[k].forget()
+        self._process.forget()
+        self._started = False
+
+    def must_start(self) -> None:
+        """Take note that a node is not operational any more: the next command starts it."""
+        self._started = False
+
+    def hear_errors(self, hear: Callable[[bytes], None] | None) -> None:
+        """Have the error control messages of the nodes (heartbeats) handed to a function; None ends that."""
+        self._network.on_error_control = None if hear is None else lambda node, data: hear(data)
+
+    def prepare_watch(self, envelope: Envelope) -> None:
+        """Have mapped what an envelope watches."""
+        self._cycle_runner.prepare(envelope)
+
+    def sampled_entries(self) -> tuple[Entry, ...]:
+        """Return what comes with every SYNC."""
+        return self._cycle_runner.mapped()
+
+    def poll(self, envelope: Envelope) -> bool | None:
+        """Look at the drives by a SYNC of one's own, as `CycleRunner.poll`."""
+        return self._cycle_runner.poll(envelope)
+
+    @property
+    def is_dry(self) -> bool:
+        """Whether frames are printed and none are sent."""
+        return self._dry
+
     def start(self) -> None:
         """Take the nodes to NMT operational, once."""
         if not self._started:
@@ -328,21 +375,18 @@ class CanDrives:
         return np.array(values, np.int64 if entry.high is None or entry.high < 2**63 else np.uint64)
 
     def read_axis(self, entry: Entry, axis: int) -> Any:
-        """Read an object of one axis."""
-        node, part = divmod(axis, self._description.num_axes)
-        index, sub = self._description.key(entry, part)
-        label = self._description.label(entry, part)
-        return self._description.decode(
-            entry, self._sdo[node].read(index, sub, label, self._description.patience(entry))
-        )
+        """Read an object of one axis; of one that has another value meanwhile (`Limits`) the program's own."""
+        found = self.read_raw(entry, axis)
+        return found if self.safety is None or not isinstance(found, int) else self.safety.own(entry, axis, found)
 
     def write_axis(self, entry: Entry, axis: int, value: int | str) -> None:
         """Write an object of one axis without being watched."""
-        node, part = divmod(axis, self._description.num_axes)
-        index, sub = self._description.key(entry, part)
-        label = f"{value} to {self._description.label(entry, part)}"
-        data = self._description.encode(entry, value)
-        self._sdo[node].write(index, sub, data, label, self._description.patience(entry))
+        if isinstance(value, str):
+            node, index, sub, label = self._place_of(entry, axis)
+            data = self._description.encode(entry, value)
+            self._sdo[node].write(index, sub, data, f"{value} to {label}", self._description.patience(entry))
+        elif self.safety is None or not self.safety.write_lent(entry, axis, value):
+            self.write_raw(entry, axis, value)
 
     def pass_cycle(self) -> None:
         """Let one cycle pass without being watched."""
@@ -352,6 +396,11 @@ class CanDrives:
             self._catch_up()
 
     # --- inside ---------------------------------------------------------------------------------------------------
+    def _place_of(self, entry: Entry, axis: int) -> tuple[int, int, int, str]:
+        """Return the node of an axis by its position, and index, sub-index and label of an object there."""
+        node, part = divmod(axis, self._description.num_axes)
+        return node, *self._description.key(entry, part), self._description.label(entry, part)
+
     def _connect(
         self,
         dry_run: bool | Callable[[str], None],
@@ -400,6 +449,10 @@ class CanDrives:
             raise BusError("these drives are closed; open them again")
         if self.safety is not None:
             self.safety.enter()
+
+    def _on_restart(self, node: int) -> None:
+        if self.safety is not None:
+            self.safety.restarted(self.nodes.index(node))
 
     def _alive(self) -> None:
         if self.safety is not None:

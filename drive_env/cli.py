@@ -7,6 +7,7 @@ import sys
 import typer
 
 from drive_env.tools.compare import compare
+from drive_env.tools.fault import fault
 from drive_env.tools.get import get, set_object
 from drive_env.tools.jog import jog
 from drive_env.tools.log import log, replay
@@ -38,7 +39,7 @@ PANELS = {
     ),
     "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
     "Frames": (("log", log), ("replay", replay)),
-    "Emulated drives": (("serve", serve), ("render", render), ("compare", compare)),
+    "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("compare", compare)),
 }
 for panel, commands in PANELS.items():
     for name, function in commands:
@@ -49,8 +50,9 @@ for panel, commands in PANELS.items():
 def drive_env() -> None:
     """Servo drives: real ones and emulated ones, over CAN.
 
-    Interface, channel and time-out may stand in DRIVE_ENV_INTERFACE, DRIVE_ENV_CHANNEL and DRIVE_ENV_TIMEOUT. Exit
-    codes: 0 done, 1 the drive or the bus said no (or differs), 2 a mistake in the command, 130 Ctrl-C.
+    Interface, channel and time-out may stand in DRIVE_ENV_INTERFACE, DRIVE_ENV_CHANNEL and DRIVE_ENV_TIMEOUT, the token
+    of a hub that asks for one in DRIVE_ENV_TOKEN. Exit codes: 0 done, 1 the drive or the bus said no (or differs), 2 a
+    mistake in the command, 130 Ctrl-C, 141 nobody takes the output any more.
     """
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from drive_env import motion
 from drive_env.dictionary.access import ObjectAccessError
+from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.drives import EmulatedDrives
@@ -79,7 +80,7 @@ def load_demonstration(config: str | Path | None = None, **overrides: Any) -> De
     """
     path = DEFAULT if config is None else Path(config)
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = read_toml(path)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise DemonstrationError(f"cannot read the run {path}: {reason}; give --config a TOML file") from None

@@ -19,6 +19,7 @@ from drive_env.arguments import checked_mask, whole_cycles
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.entries import ObjectName
 from drive_env.emergency import EmergencyMessage
+from drive_env.faults.machine_faults import MachineFaults
 from drive_env.firmware import cycle
 from drive_env.firmware.cycle import Call
 from drive_env.firmware.protection import CAUSES
@@ -44,6 +45,7 @@ SWITCHES = ("left", "right", "home")  # bits of 60FDh
 
 MOST_IMAGES = 64  # calls of record that are kept prepared: more than any loop makes in turn
 
+MOST_MACHINES = 65_536  # some 50 kB each: 3 GB
 BRAKE_TORQUE = 2.0  # of the motor's rated torque, usual for holding brakes
 
 
@@ -97,6 +99,8 @@ class EmulatedDrives:
     ) -> None:
         if num_machines < 1:
             raise ValueError(f"num_machines must be 1 or more, not {num_machines}")
+        if num_machines > MOST_MACHINES:
+            raise ValueError(f"num_machines must be {MOST_MACHINES} at most, not {num_machines}")
         self.device: Device = find_device(device)
         self.motor = find_motor(motor or self.DEFAULT_MOTOR)
         self.load = find_load(load)
@@ -126,6 +130,7 @@ class EmulatedDrives:
         self._schedule: list[tuple[int, str, Floats, Mask]] = []
         self._images: dict[tuple[ObjectName | None, ...], ProcessImage] = {}  # of calls of record
         warn_of_misfits([group.load for group in self._groups], self.motor)
+        self._faults = MachineFaults(self)
         self.machine = Machines(self)
         preset = {} if motor is None else self.device.preset(motor)
         if motor is not None and not self.load.has_switches:
@@ -401,6 +406,8 @@ class EmulatedDrives:
                 _, name, values, where = self._schedule.pop(0)
                 self.machine.set(name, values, where)
             until = min([cycles, *(due - begin for due, *_ in self._schedule[:1])]) if self._schedule else cycles
+            if self._faults.some:
+                until = min(until, self._faults.act(begin + done) - begin)
             diverged |= self._run_groups(call, done, until, done == 0, until == cycles)
             done = until
             self._now = begin + done

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.arguments import checked_mask
+from drive_env.faults.machine_faults import InjectedFault
+from drive_env.faults.schedule import Order
 from drive_env.firmware.record import STATE, get_lanes, set_lanes
 from drive_env.lane_image import LaneImage
 from drive_env.parameters import check_parameter
@@ -151,7 +153,8 @@ class Machines:
         volts = np.broadcast_to(np.asarray(value, float), (drives.num_axes,))
         if not np.all(np.isfinite(volts)) or np.any(volts < 0.0):
             raise ValueError(f"supply voltage must be 0 V or more, not {np.min(volts):g} V")
-        set_lanes(drives._records, "supply_voltage", volts)
+        with drives._faults.suspended():
+            set_lanes(drives._records, "supply_voltage", volts)
 
     @property
     def rotor_angle(self) -> Floats:
@@ -182,7 +185,8 @@ class Machines:
     def enable_input(self, value: ArrayLike) -> None:
         drives = self._drives
         closed = np.broadcast_to(np.asarray(value, bool), (drives.num_axes,))
-        set_lanes(drives._records, "enable_input", closed.astype(np.int32))
+        with drives._faults.suspended():
+            set_lanes(drives._records, "enable_input", closed.astype(np.int32))
 
     @property
     def outputs(self) -> NDArray[np.int64]:
@@ -224,7 +228,8 @@ class Machines:
         mask = self._mask(where)
         check_parameter(name, self._per_machine(value, name)[mask])
         values = np.where(mask, self._per_machine(value, name), drives._parameters[name])
-        drives._apply_parameter(name, values, mask)
+        with drives._faults.suspended():
+            drives._apply_parameter(name, values, mask)
         drives._parameters[name] = values
 
     def set_all(self, values: Mapping[str, ArrayLike], where: Mask | None = None) -> None:
@@ -249,11 +254,56 @@ class Machines:
             check_parameter(name, self._per_machine(value, name)[mask])
             new[name] = np.where(mask, self._per_machine(value, name), drives._parameters[name])
         before = {name: drives._parameters[name] for name in new}
-        try:
-            drives._apply_parameters(new, mask)
-        except ValueError:
-            drives._apply_parameters(before, mask)
-            raise
+        with drives._faults.suspended():
+            try:
+                drives._apply_parameters(new, mask)
+            except ValueError:
+                drives._apply_parameters(before, mask)
+                raise
+
+    def fault(
+        self,
+        name: str,
+        *,
+        at: float = 0.0,
+        when: str = "",
+        duration: float | None = None,
+        where: Mask | None = None,
+        axis: int | None = None,
+        **parameters: float,
+    ) -> int:
+        """Let something fail on machines, by a schedule; what each fault does is in docs/faults.md.
+
+        A fault's change is on top of the machine as it was built, which `parameters` goes on to tell. It begins and
+        ends at communication cycles, and is the same for the same machine and seed.
+
+        Args:
+            name: A row of the table, as "encoder_stuck".
+            at: Time from now, or from when the condition holds for the first time [s], whole communication cycles.
+            when: What it waits for: "" nothing, "enabled" an axis in operation enabled, or a comparison of the true
+                rotor angle [rad] or its speed [rad/s], as "position > 3.1" or "speed > 100".
+            duration: Whole communication cycles [s]; None lasts until it is cleared or the machine is reset.
+            where: Machines.
+            axis: Number of the axis of each machine; all of them by default. Of a load's fault that is not of one axis
+                it has no meaning.
+            **parameters: Numbers of the fault, in the units of its row.
+
+        Returns:
+            Its number, for `clear_fault`.
+
+        Raises:
+            ValueError: For a fault, parameter, time or condition that is none, or one that this load cannot have.
+        """
+        order = Order(name, at, when, duration, axis=axis, parameters=parameters)
+        return self._drives._faults.add(order, self._mask(where))
+
+    def faults(self) -> list[InjectedFault]:
+        """Return the faults that are still to come or are there; one that has ended everywhere is forgotten."""
+        return self._drives._faults.listing()
+
+    def clear_fault(self, number: int | None = None, where: Mask | None = None) -> None:
+        """End a fault or call it off, None all of them; ValueError if there is none of that number."""
+        self._drives._faults.clear(number, self._mask(where))
 
     def seed_noise(self, seeds: ArrayLike, where: Mask | None = None) -> None:
         """Give machines another noise from their next reset on: whole numbers 1...2^32 - 1, shape (num_machines,)."""
@@ -268,9 +318,11 @@ class Machines:
         self._drives._noise_seeds[every] = (np.mod(apart, 2.0**32 - 1.0) + 1.0)[every]
 
     def reset(self, where: Mask | None = None) -> None:
-        """Put machines to rest at zero and switch their drives on anew; a diverged machine lives again."""
+        """Put machines to rest at zero and switch their drives on anew; a diverged machine lives again, faults end."""
         mask = self._mask(where)
         drives = self._drives
+        if drives._faults.some:
+            drives._faults.clear(None, mask)
         for group in drives._groups:
             group.load.reset(mask[group.machines])
         axes = np.repeat(mask, drives.num_axes // drives.num_machines)

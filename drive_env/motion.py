@@ -20,6 +20,9 @@ OPERATION_ENABLED = (0x6F, 0x27)
 QUICK_STOP_ACTIVE = (0x6F, 0x07)
 FAULT = (0x4F, 0x08)
 FAULT_BIT = (0x08, 0x08)  # fault or fault reaction active
+FAULT_REACTION_ACTIVE = (0x4F, 0x0F)
+# States in which a drive may turn its motor.
+LIVE = (OPERATION_ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE)
 TARGET_REACHED = (0x0400, 0x0400)
 SET_POINT_ACKNOWLEDGED = (0x1000, 0x1000)
 SET_POINT_TAKEN_BACK = (0x1000, 0x0000)
@@ -43,6 +46,16 @@ class Drives(Protocol):
 
     def advance(self, duration: float) -> None:
         """Let time pass [s]."""
+
+
+def is_enabling(controlword: int) -> bool:
+    """Return whether a controlword may enable an axis, or go on with one that is: bits 0 to 3 (CiA 402)."""
+    return controlword & 0x0F == 0x0F
+
+
+def is_live(statusword: int) -> bool:
+    """Return whether a drive in the state that 6041h shows may turn its motor."""
+    return any(statusword & mask == value for mask, value in LIVE)
 
 
 def wait_for(drives: Drives, pattern: tuple[int, int], timeout: float, what: str, where: Mask | None = None) -> None:

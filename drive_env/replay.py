@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from drive_env import motion
 from drive_env.envs.randomisation import BESIDE, Distributions, Law
+from mechanics.untrusted import MOST_RECORDING, check_size
 
 if TYPE_CHECKING:
     from drive_env.drives import EmulatedDrives
@@ -38,6 +39,7 @@ COMMANDS: tuple[tuple[Key, str, Key], ...] = (
 RESPONSES: tuple[Key, ...] = ((0x6064, 0), (0x606C, 0), (0x6077, 0))  # position, velocity, current
 _POSITIONS: tuple[Key, ...] = ((0x6062, 0), (0x6064, 0), (0x607A, 0))
 MAX_SHIFT = 0.02  # s, the longest time by which a response is looked for earlier or later
+LATEST = 1e7  # s: a stamp of 1e300 has no milliseconds any more
 AT_REST = 0.1  # of the range of the speed: noise of a quiet axis
 _COLUMN = re.compile(r"^([0-9A-Fa-f]{4})h:([0-9A-Fa-f]{2}) [^()]*?(?: \[[^]]*\])?(?: \((.+)\))?$")
 
@@ -117,8 +119,14 @@ def read_log(path: str | Path) -> Log:
     file = Path(path)
     if not file.is_file():
         raise ValueError(f"there is no log {file}; record one with drive-env scope")
-    with file.open(newline="", encoding="utf-8") as text:
-        rows = list(csv.reader(text))
+    check_size(file, MOST_RECORDING)
+    try:
+        with file.open(newline="", encoding="utf-8") as text:
+            rows = list(csv.reader(text))
+    except UnicodeDecodeError:
+        raise ValueError(f"{file} is no text; give the CSV that drive-env scope writes") from None
+    except csv.Error as error:
+        raise ValueError(f"{file} is no CSV: {error}; give the one that drive-env scope writes") from None
     if not rows or not rows[0] or rows[0][0] != "t [s]" or len(rows[0]) < 2:
         raise ValueError(f"{file}: the first line must begin with 't [s]', as drive-env scope writes it")
     columns: dict[Key, list[int]] = {}
@@ -130,10 +138,15 @@ def read_log(path: str | Path) -> Log:
     try:
         t = np.array([float(row[0]) for row in rows[1:]])
         raw = np.array([[int(value) for value in row[1:]] for row in rows[1:]], np.int64)
-    except ValueError as error:
+    except (ValueError, OverflowError, IndexError) as error:
         raise ValueError(f"{file}: every line needs a time and {len(rows[0]) - 1} whole numbers: {error}") from None
     if len(t) < 10 or raw.shape != (len(t), len(rows[0]) - 1):
         raise ValueError(f"{file}: needs at least 10 lines of {len(rows[0])} values each")
+    if not np.all(np.abs(t) <= LATEST):
+        wrong = int(np.argmax(~(np.abs(t) <= LATEST)))
+        raise ValueError(
+            f"{file}: line {wrong + 2} has the time {t[wrong]:g} s; times must lie within {LATEST:g} s of 0"
+        )
     steps = np.diff(t)
     if steps.min() <= 0.0 or np.ptp(steps) > 0.5 * CYCLE or abs(steps[0] / CYCLE - round(steps[0] / CYCLE)) > 0.01:
         raise ValueError(f"{file}: times must increase by the same whole number of milliseconds from line to line")
@@ -340,7 +353,7 @@ def _result(
         ends = sorted(float(law.value(share, default[name]) / scale) for share in (low, high))
         log_law = law.law == "loguniform" and ends[0] > 0.0
         fitted[name] = Law("loguniform" if log_law else "uniform", law.relative, ends[0], ends[1])
-    return Fit(Distributions(fitted, laws.curriculum), accepted, distances, base, narrowed)
+    return Fit(Distributions(fitted, laws.curriculum, laws.faults), accepted, distances, base, narrowed)
 
 
 def _best_shift(want: Floats, have: Floats, span: Floats, period: float) -> tuple[Floats, Floats]:

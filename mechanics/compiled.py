@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 import numba
 from numba import config, njit
 
+from mechanics.kernel_files import KernelCache
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 # error_model="numpy" makes a division by zero give inf as the hardware does; Python's raises, which is a branch in
@@ -65,12 +67,16 @@ def cached(*folders: Path, allocates: bool = True) -> Callable[[Function], Funct
             folder.mkdir(parents=True, exist_ok=True)
         except OSError:
             return njit(**options)(function)  # type: ignore[no-any-return]
+        kernel: Any = njit(**options)(function)
         before = config.CACHE_DIR
         config.CACHE_DIR = str(folder)
         try:
-            return njit(cache=True, **options)(function)  # type: ignore[no-any-return]
+            kernel._cache = KernelCache(function)  # what cache=True does, with files that can be trusted
+        except RuntimeError:  # Numba finds no folder that can be written
+            return kernel  # type: ignore[no-any-return]
         finally:
             config.CACHE_DIR = before
+        return kernel  # type: ignore[no-any-return]
 
     return decorate
 

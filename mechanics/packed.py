@@ -125,6 +125,7 @@ class PackedLoad:
             self.values.store(name, np.asarray(values, float), slice(None))
         self.data = mujoco.MjData(self.model)
         self.plant = self._new_plant()
+        self._jammed = self._jam_rows()
         self._apply()
         self.reset(np.ones(self.copies, bool))
 
@@ -207,6 +208,43 @@ class PackedLoad:
             self.plant.diverged[k] = 0
             self.plant.load_torque[k] = 0.0
             self.plant.clock[k] = 0.0
+
+    def jam(self, torque: Floats) -> None:
+        """Hold the loads of axes by dry friction that withstands a torque seen from the rotor.
+
+        It acts on the friction of the load that is farthest from the rotor, or on the rotor where the load has none.
+
+        Args:
+            torque: Of each axis [N*m], shape (copies, axes); 0 frees it.
+        """
+        plant = self.plant
+        held = np.zeros_like(plant.brake)
+        for axis, values in enumerate(torque.T):
+            row, ratio = self._jammed[axis]
+            held[row] = np.maximum(held[row], ratio * values)  # a part that two axes drive is held for both
+        plant.jam[:] = held[: self.num_axes]
+        plant.brake[self.num_axes :] = held[self.num_axes :]
+
+    def mend(self, name: str, where: NDArray[np.bool_]) -> None:
+        """Bring the parts that a stiffness joins together again, at rest to each other where the rotor is.
+
+        Args:
+            name: Parameter that is the stiffness of a joint or of a contact.
+            where: Copies.
+        """
+        element = next(parameter.element for parameter in self.load.parameters if parameter.name == name)
+        position, before = self._by_copy(self.data.qpos), self._by_copy(self.plant.qvel_before)
+        speed = self._by_copy(self.data.qvel)
+        if element in self.joints:
+            dof = self.joints.index(element)
+            position[where, dof] = self.plant.spring_zero[dof]
+            speed[where, dof] = before[where, dof] = 0.0
+            return
+        motion = next(row.motion for row in self.load.contacts if row.name == element)
+        joint = next(name for name in motion if name not in self.load.joints)
+        for array in (position, speed, before):
+            others = sum(c * array[where, self.joints.index(name)] for name, c in motion.items() if name != joint)
+            array[where, self.joints.index(joint)] = -others / motion[joint]
 
     def mass_matrix(self) -> Floats:
         """Return each copy's inertia matrix with the rotors', shape (copies, D, D), at the present position."""
@@ -322,7 +360,8 @@ class PackedLoad:
             profile_period=0.0,
             profile_now=np.zeros(copies),
             clock=np.zeros(copies),
-            brake=np.zeros((axes, copies)),
+            brake=np.zeros((frictions, copies)),
+            jam=np.zeros((axes, copies)),
             diverged=np.zeros(copies, np.int64),
         )
 
@@ -389,6 +428,28 @@ class PackedLoad:
             self.plant.roll_armature[:, k] = armature[:, dof]
             start, core, _, density = self.values.roll[:, k].T
             armature[:, dof] += 0.5 * np.pi * density * (np.maximum(start, core) ** 4 - core**4)
+
+    def _jam_rows(self) -> list[tuple[int, float]]:
+        """Return which friction of the plant holds the load of each axis, and its torque or force per rotor torque."""
+        found = []
+        apart = self._apart()
+        for axis in range(self.num_axes):
+            # What moves with the rotor: joints of its own motion, and those that a contact drives from them.
+            per_rotor = {name: 1.0 / c for name, c in self._motions[axis].items()}
+            for contact in self.load.contacts:
+                if len(contact.motion) > 1 and any(name in per_rotor for name in contact.motion):
+                    driver = next(name for name in contact.motion if name in per_rotor)
+                    for name, c in contact.motion.items():
+                        per_rotor.setdefault(name, -contact.motion[driver] * per_rotor[driver] / c)
+            best = (axis, 1.0)
+            for row, k in enumerate(apart):
+                if k < self.num_axes:
+                    continue
+                shared = [name for name in self._motions[row] if name in per_rotor and self._motions[row][name] != 0.0]
+                if shared:
+                    best = (row, abs(1.0 / (self._motions[row][shared[0]] * per_rotor[shared[0]])))
+            found.append(best)
+        return found
 
     def _apart(self) -> list[int]:
         """Return which frictions the plant has a row for: the axes' bearings, and those that are not merged in one."""

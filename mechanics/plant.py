@@ -85,5 +85,8 @@ class Plant(Bundle):
     profile_period: float
     profile_now: Vector  # (C,)
     clock: Vector  # (C,) time since the table was given [s]
-    brake: Matrix  # (A, C) torque of each axis's holding brake, 0 where it is open [N*m]
+    # (F, C) what holds each friction's motion beside the friction itself [N*m or N]: of the axes' bearings the holding
+    # brake and a jam, of the load's frictions a jam alone.
+    brake: Matrix
+    jam: Matrix  # (A, C) the axes' part of it that is a jam
     diverged: Numbers  # (C,) 1: frozen

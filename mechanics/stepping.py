@@ -211,7 +211,7 @@ def rub(plant, h):
     speed, applied, total, diverged = plant.speed, plant.applied, plant.total, plant.diverged
     motion, share, mass, bristle, stuck = plant.motion, plant.share, plant.mass, plant.bristle, plant.stuck
     holding, lane = plant.holding, plant.lane
-    A, F = plant.axis_motion.shape[0], friction.shape[0]
+    F = friction.shape[0]
     # Rows of `lane`.
     v, other, coulomb, breakaway, limit = 0, 1, 2, 3, 4
     for f in range(1, F):
@@ -233,7 +233,7 @@ def rub(plant, h):
                 diverged[copy] = 1
         # What holds beside the row's own: a brake, or a screw that is pressed.
         for copy in range(copies):
-            lane[limit, copy] = brake[f, copy] if f < A else 0.0
+            lane[limit, copy] = brake[f, copy]
         if carries[f] >= 0:
             for copy in range(copies):
                 lane[limit, copy] += friction[f, 7, copy] * abs(carried[copy, carries[f]])

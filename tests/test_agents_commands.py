@@ -45,9 +45,9 @@ def test_train_judge_resume_export(tmp_path, shrunk):
     figures = bundle.card["figures"]
     assert figures["RMS following error [rev]"]["episodes"] == 3 and figures["violations"] == {}
     assert bundle.card["seeds"] == {"training": 5, "evaluation": "1000000...1000002"}
-    again = run("train", "--resume", out)  # nothing is left to do: the same agent
+    again = run("train", "--resume", out, "--trust")  # nothing is left to do: the same agent
     assert again.exit_code == 0 and Bundle.load(out / "agent.npz").hash == bundle.hash
-    exported = run("export", out / "checkpoint.zip", "--out", tmp_path / "agent.onnx")
+    exported = run("export", out / "checkpoint.zip", "--trust", "--out", tmp_path / "agent.onnx")
     assert exported.exit_code == 0 and "largest difference from Stable-Baselines3" in exported.output
     assert (tmp_path / "agent.npz").is_file()
 

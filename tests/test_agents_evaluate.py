@@ -205,7 +205,7 @@ def test_a_policy_on_a_bus_has_half_as_far_again_as_its_task_and_twice_its_speed
     task = SHORT | {"amplitude": 1.0, "speed": 10.0}
     with target_for("tracking", task, PATIENT, channel=channel, lockstep=True) as target:
         limits = target.drives.safety.limits
-    assert limits.position == (at - 3 * TURN // 2, at + 3 * TURN // 2) and limits.velocity == 20 * TURN
+    assert limits.position == ([at - 3 * TURN // 2], [at + 3 * TURN // 2]) and limits.velocity == [20 * TURN]
     assert limits.oscillation and limits.stall == PATIENT.stall
 
 

@@ -81,7 +81,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(algorithm, tmp_path, monkeypa
         train(run, tmp_path / "cut", report=stop_later)
     cut = checkpoint.read_run(tmp_path / "cut" / CHECKPOINT)["timesteps"]
     assert 0 < cut < 300
-    resumed = train(run, tmp_path / "cut", resume=True)
+    resumed = train(run, tmp_path / "cut", resume=True, trust=True)
     assert np.array_equal(weights(resumed), weights(whole)) and resumed.hash == whole.hash
     rows = [list(csv.DictReader((tmp_path / name / TABLE).open())) for name in ("whole", "cut")]
     steps = [[int(row["timesteps"]) for row in table] for table in rows]
@@ -105,7 +105,7 @@ def test_a_curriculum_goes_on_where_a_run_was_cut(tmp_path, monkeypatch):
     with pytest.raises(StoppedError):
         train(run, tmp_path / "cut", report=stop_later)
     stages.clear()
-    assert train(run, tmp_path / "cut", resume=True).hash == whole.hash
+    assert train(run, tmp_path / "cut", resume=True, trust=True).hash == whole.hash
     assert stages == expected[-len(stages) :] and min(stages) > 0.4
 
 
@@ -125,7 +125,7 @@ def test_what_is_left_of_a_run(tmp_path):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_bundle_acts_as_the_model(algorithm, tmp_path):
     bundle = train(tiny(algorithm=algorithm), tmp_path)
-    model = open_policy(str(tmp_path / CHECKPOINT)).policy
+    model = open_policy(str(tmp_path / CHECKPOINT), trust=True).policy
     ours = policy_of(bundle)
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -267,7 +267,7 @@ def test_an_asymmetric_critic_sees_the_machine_and_the_actor_does_not(tmp_path):
     seen, all_ = (lanes.single_observation_space[key].shape[0] for key in ("observation", "privileged"))
     lanes.close()
     assert bundle.arrays["weight_0"].shape[0] == seen
-    loaded = open_policy(str(tmp_path / CHECKPOINT)).policy
+    loaded = open_policy(str(tmp_path / CHECKPOINT), trust=True).policy
     assert loaded.model.policy.mlp_extractor.value_net[0].in_features == seen + all_
     rows = np.random.default_rng(0).standard_normal((3, seen)).astype(np.float32)
     assert np.allclose(loaded.act(rows), policy_of(bundle).act(rows), atol=1e-5)
@@ -422,7 +422,7 @@ def test_a_search_without_any_agent_says_so(tmp_path, monkeypatch):
 
 def test_there_is_nothing_to_resume(tmp_path):
     with pytest.raises(ValueError, match=r"no file .*checkpoint\.zip to go on with: a run writes its first"):
-        train(tiny(), tmp_path, resume=True)
+        train(tiny(), tmp_path, resume=True, trust=True)
     (tmp_path / CHECKPOINT).write_bytes(b"no")
     with pytest.raises(ValueError, match="is no checkpoint"):
-        train(tiny(), tmp_path, resume=True)
+        train(tiny(), tmp_path, resume=True, trust=True)

@@ -105,7 +105,8 @@ def test_a_second_ctrl_c_waits_until_everything_is_back(monkeypatch, tmp_path):
     [
         ("Transaction", "interrupted; nothing was changed"),
         ("prove", "interrupted; the drives are disabled and have the gains from before"),
-        ("Run.result", "interrupted; the drives are disabled and have the new gains: drive-tune restore"),
+        ("Run.result", "interrupted; the drives are disabled and have the gains from before"),
+        ("Transaction.__exit__", "interrupted; the drives are disabled and have the new gains: drive-tune restore"),
     ],
 )
 def test_the_command_ends_with_130_and_says_what_the_drives_have(monkeypatch, tmp_path, stage, words):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_auto_command import drive_tune
 
-from drive_env import EmulatedDrives
+from drive_env import EmulatedDrives, SafetyError, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
@@ -57,3 +57,19 @@ def test_axes_of_a_bus_are_machines_as_was_said(gantry_on_a_bus, axes, lanes, li
     bus = {"interface": "slcan", "channel": channel, "nodes": (1, 2), "pace": "lockstep", "travel": (-1.0, 1.0)}
     with on_bus(axes=axes, **bus) as target:
         assert (target.axes_per_machine, target.linked) == (lanes, linked)
+
+
+def test_each_node_has_its_own_travel_and_one_that_turns_freely_frees_no_other(gantry_on_a_bus):
+    """A union of their ranges would let each go where only the other may."""
+    channel = gantry_on_a_bus[gantry_on_a_bus.index("--channel") + 1]
+    bus = {"interface": "slcan", "channel": channel, "nodes": (1, 2), "pace": "lockstep"}
+    with on_bus(travel=[(-2.0 * np.pi, 2.0 * np.pi), (-np.inf, np.inf)], **bus) as target:
+        low, high = target.drives.safety.limits.position
+        here = target.drives.read(0x6064)
+        assert high[0] - here[0] == pytest.approx(65536 * 1.1, rel=1e-3)  # and a twentieth of it to either side
+        assert here[0] - low[0] == pytest.approx(65536 * 1.1, rel=1e-3)
+        assert (low[1], high[1]) == (-np.inf, np.inf)
+        motion.enable(target.drives, mode="csp")
+        with pytest.raises(SafetyError, match=r"axis 0: .* beyond the limits"):
+            target.drives.write(0x607A, here + 65536 * 2)
+        target.drives.write(0x607A, here + np.array([0, 65536 * 2]))

@@ -154,7 +154,7 @@ def test_any_change_shows(certificate, tmp_path, where, value):
     ("", "is no certificate"),
     ("[1]", "is no certificate of format 1"),
     ('{"a": 1}', "is no certificate of format 1"),
-    ('{"format": 1, "sha256": "", "x": NaN}', "NaN is no JSON"),
+    ('{"format": 1, "sha256": "", "x": NaN}', "NaN is no number of JSON"),
     ('{"format": 1, "sha256": ""}', "is no certificate of this version: 'tuner'"),
 ])  # fmt: skip
 def test_what_is_no_certificate_is_said_to_be_none(tmp_path, text, message):

@@ -144,7 +144,8 @@ def test_a_run_that_is_killed_is_undone_by_one_command(tmp_path, command):
         machine.advance(0.2)
         left = parameters(bus)
         assert left != before
-        assert bool(differences(machine, file)) == (command != "response")
+        # The travel was lent to the drive as its software limits, which it keeps until the way back is gone.
+        assert bool(differences(machine, file) - {(0x607D, 1), (0x607D, 2)}) == (command != "response")
         if command in ("identify", "rules"):
             assert {COMMUTATION, RAMP, CURRENT_LIMIT} <= differences(machine, file)
             assert differences(machine, file) & set(GAIN_OBJECTS)

@@ -1,10 +1,15 @@
 """The slcan hub and the python-can port, with stock clients, and what neither rubbish nor a lost client may do."""
 
+import re
 import socket
 import struct
+import subprocess
+import sys
+import threading
 import time
+import tracemalloc
 import uuid
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import can
 import canopen
@@ -12,15 +17,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drive_env import EmulatedDrives
+from drive_env import EmulatedDrives, motion
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.faults import Faults
-from drive_env.bus.hub import MAX_CLIENTS, Hub
+from drive_env.bus.hub import CHUNK, LOG_LINES, MAX_CLIENTS, MAX_STRANGERS, MAX_UNSENT, MAX_WAITING, Hub
 from drive_env.bus.server import EARLY, Server
-from drive_env.bus.slcan import MAX_LINE, Channel, format_frame, parse_frame
+from drive_env.bus.slcan import MAX_LINE, TOKEN_WANTED, Channel, format_frame, parse_frame
 from drive_env.bus.wire import Wire
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
+from drive_env.master.errors import OpenError
+from drive_env.master.port import open_bus
+from drive_env.master.slcan_socket import SlcanSocket
 
 
 class Echo:
@@ -42,11 +50,11 @@ class Echo:
 
 
 @contextmanager
-def serving(**options):
+def serving(token=None, **options):
     """A hub with an echo as node 1, in a thread; yields the server."""
     world = World(**options)
     world.attach(1, Echo)
-    with Server(world, Hub(bit_rate=world.wire.bit_rate)) as server:
+    with Server(world, Hub(bit_rate=world.wire.bit_rate, token=token)) as server:
         yield server
 
 
@@ -87,6 +95,37 @@ def received(bus, count, timeout=10.0):
         if message is not None:
             frames.append(message)
     return frames
+
+
+def eventually(condition, timeout=30.0):
+    """Wait until a condition holds [s]."""
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, "it never came to hold"
+        time.sleep(0.005)
+
+
+def closed(connection, timeout=30.0):
+    """Whether the hub has closed a connection, once all that it sent is read."""
+    connection.settimeout(timeout)
+    try:
+        while connection.recv(1 << 16):
+            pass
+    except TimeoutError:
+        return False
+    except OSError:  # with something unread in it
+        pass
+    return True
+
+
+def is_answered(bus, timeout=30.0):
+    """Whether an answer of the echo comes, whatever else comes before it."""
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        answer = bus.recv(0.2)
+        if answer is not None and answer.arbitration_id == 0x581:
+            return True
+    return False
 
 
 def message(can_id, data=b"", **options):
@@ -239,6 +278,14 @@ def test_whatever_comes_is_survived_and_bounded(chunks):
 
 
 # --- what may not end it --------------------------------------------------------------------------------------------
+def test_each_client_has_time_stamps_or_not(hub):
+    with joined(hub) as bus, plain(hub) as stamped, plain(hub) as bare:
+        assert answers(stamped, b"Z1\rO\r", 2) == answers(bare, b"Z0\rO\r", 2) == b"\r\r"
+        bus.send(message(0x123, b"\x01"))
+        assert answers(bare, b"", 8) == b"t123101\r"
+        assert re.fullmatch(rb"t123101[0-9A-F]{4}\r", answers(stamped, b"", 12))
+
+
 def test_a_client_with_another_bit_rate_stays_off_the_bus(hub, caplog):
     with joined(hub, bitrate=500_000) as deaf, joined(hub, bitrate=1_000_000) as bus:
         bus.send(message(0x123))
@@ -289,39 +336,12 @@ def test_what_a_client_sent_before_it_went_is_still_heard(hub):
         assert [m.arbitration_id for m in received(bus, 2)] == [0x123, 0x124]
 
 
-def test_one_client_too_many_is_turned_away(hub):
-    connections = [socket.create_connection((hub.host, hub.port), timeout=10) for _ in range(MAX_CLIENTS)]
-    try:
-        for connection in connections:
-            assert answers(connection, b"V\r", 6) == b"V1013\r"
-        with plain(hub) as extra:
-            assert extra.recv(1) == b""
-    finally:
-        for connection in connections:
-            connection.close()
-    with joined(hub) as bus:
-        bus.send(message(0x601, b"\x01"))
-        assert len(received(bus, 1)) == 1
-
-
-def test_a_client_that_does_not_read_loses_frames_and_nobody_else_does(monkeypatch, hub):
-    monkeypatch.setattr("drive_env.bus.hub.MAX_UNSENT", 1_000)
-    count = 0
-    with plain(hub) as sleeper, joined(hub) as bus:
-        assert answers(sleeper, b"O\r", 1) == b"\r"
-        while not hub.lost:  # until the kernel's buffers are full, some megabytes
-            bus.serialPortOrig.write(b"T1ABCDEF081122334455667788\r" * 2_000)
-            bus.send(message(0x601, count.to_bytes(8, "big")))
-            assert [int.from_bytes(m.data, "big") for m in received(bus, 1)] == [count]
-            count += 1
-            assert count < 1_000
-
-
-def test_an_overrun_shows_in_the_flags_once():
-    channel = Channel(1_000_000)
-    channel.feed(b"O\r")
-    channel.overrun = True
-    assert channel.feed(b"F\rF\r")[1] == b"F08\rF00\r"
+def test_so_it_is_where_the_bus_takes_its_time():
+    with serving(lockstep=False, wire=Wire(10_000)) as server, joined(server.transport, bitrate=10_000) as bus:
+        with plain(server.transport) as connection:
+            connection.sendall(b"S0\rO\r" + b"".join(b"t1231%02X\r" % k for k in range(20)))
+        assert [m.data[0] for m in received(bus, 20)] == list(range(20))
+        eventually(lambda: len(server.transport._clients) == 1)  # and then it is forgotten
 
 
 def test_a_port_that_is_taken_is_refused(hub):
@@ -332,6 +352,471 @@ def test_a_port_that_is_taken_is_refused(hub):
 def test_it_listens_on_loopback(hub):
     assert hub.host == "127.0.0.1"
     assert hub.channel == f"socket://127.0.0.1:{hub.port}"
+
+
+# --- idle clients ---------------------------------------------------------------------------------------------------
+def crowd(hub, count, say=b""):
+    """Clients that say one thing and then nothing."""
+    connections = []
+    for _ in range(count):
+        connections.append(socket.create_connection((hub.host, hub.port), timeout=10))
+        connections[-1].sendall(say)
+    return connections
+
+
+@pytest.mark.parametrize("say", [b"", b"V\r", b"O\r"], ids=["nothing", "a command", "open"])
+def test_idle_clients_lock_nobody_out(hub, monkeypatch, caplog, say):
+    monkeypatch.setattr("drive_env.bus.hub.BUSY", 0.05)
+    connections = crowd(hub, MAX_CLIENTS, say)
+    try:
+        eventually(lambda: len(hub._clients) == MAX_CLIENTS)
+        time.sleep(0.1)  # longer than BUSY: they are silent
+        for _ in range(3):
+            with joined(hub) as bus:
+                bus.send(message(0x601, b"\x01"))
+                assert len(received(bus, 1)) == 1
+                assert len(hub._clients) <= MAX_CLIENTS
+        assert closed(connections[0])  # the oldest made room
+        assert "was dropped: a newcomer needs its place, and it has " in caplog.text
+        assert not closed(connections[-1], 0.05)
+    finally:
+        for connection in connections:
+            connection.close()
+
+
+def test_a_master_at_work_keeps_its_place_in_any_crowd(hub):
+    with joined(hub) as bus:
+        connections = []
+        for k in range(3 * MAX_CLIENTS):
+            connections += crowd(hub, 1, b"O\r" if k % 2 else b"")
+            bus.send(message(0x601, bytes([k])))
+            assert [m.data[0] for m in received(bus, 1)] == [k]
+        for connection in connections:
+            connection.close()
+
+
+def test_who_floods_gives_way_to_a_newcomer(monkeypatch, hub, caplog):
+    monkeypatch.setattr("drive_env.bus.hub.MAX_CLIENTS", 2)
+    monkeypatch.setattr("drive_env.bus.hub.BUSY", 0.2)
+    with flood(hub), flood(hub):
+        eventually(lambda: all(time.monotonic() - client.behind_since > 0.2 for client in hub._clients))
+        with joined(hub) as bus:
+            bus.send(message(0x601, b"\x01"))
+            assert is_answered(bus)
+    assert "it sends more than the bus takes" in caplog.text
+
+
+def test_where_all_are_busy_a_newcomer_is_turned_away_and_told_of(monkeypatch, hub, caplog):
+    monkeypatch.setattr("drive_env.bus.hub.MAX_CLIENTS", 2)
+    monkeypatch.setattr("drive_env.bus.hub.BUSY", 60.0)
+    with joined(hub) as left, joined(hub) as right:
+        with plain(hub) as extra:
+            assert closed(extra)
+        assert "was turned away: 2 clients are on the bus, and all of them are busy" in caplog.text
+        left.send(message(0x123))
+        assert [m.arbitration_id for m in received(right, 1)] == [0x123]
+
+
+def test_clients_that_leave_frames_behind_do_not_pile_up(monkeypatch):
+    with serving(lockstep=False, wire=Wire(10_000)) as server:  # 80 frames a second
+        hub, wire = server.transport, server.world.wire
+        for _ in range(4 * MAX_CLIENTS):
+            with plain(hub) as connection:
+                assert answers(connection, b"S0\rO\r" + b"t7FF81122334455667788\r" * 20, 2) == b"\r\r"
+        assert wire.statistics.most_waiting <= (MAX_CLIENTS + 1) * MAX_WAITING
+        assert len(hub._clients) <= MAX_CLIENTS
+        assert len(wire._senders) <= MAX_CLIENTS + 1
+        with joined(hub, bitrate=10_000) as bus:
+            bus.send(message(0x601, b"\x01"))
+            assert is_answered(bus)
+
+
+def test_a_crowd_does_not_fill_the_log(monkeypatch, hub, caplog):
+    monkeypatch.setattr("drive_env.bus.hub.MAX_CLIENTS", 1)
+    connections = crowd(hub, 5 * LOG_LINES)
+    eventually(lambda: closed(connections[-2]))
+    assert caplog.text.count("was dropped") == LOG_LINES
+    monkeypatch.setattr("drive_env.bus.hub.LOG_TIME", 0.0)
+    connections += crowd(hub, 2)
+    eventually(lambda: caplog.text.count("was dropped") > LOG_LINES)
+    assert "more lines about clients were left out" in caplog.text
+    for connection in connections:
+        connection.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX file numbers")
+def test_without_a_file_number_a_client_is_turned_away_and_serving_goes_on(monkeypatch, hub, caplog):
+    with joined(hub) as bus:
+        monkeypatch.setattr("drive_env.bus.hub.FILE_NUMBERS", 0)
+        with plain(hub) as extra:
+            assert closed(extra)
+        assert "this program has too many files open" in caplog.text
+        bus.send(message(0x601, b"\x01"))
+        assert len(received(bus, 1)) == 1
+    with pytest.raises(OSError, match="this program has too many files open"):
+        Hub()
+
+
+def test_who_goes_makes_room_for_who_comes(monkeypatch, caplog):
+    monkeypatch.setattr("drive_env.bus.hub.MAX_CLIENTS", 1)
+    hub, wire = Hub(), Wire(instant=True)
+    try:
+        with plain(hub) as old:
+            old.sendall(b"O\r")
+            while not any(client.was_open for client in hub._clients):
+                assert list(hub.wait(1.0, wire)) == []
+        with plain(hub) as newcomer:  # both are found in the same turn
+            assert list(hub.wait(1.0, wire)) == []
+            hub.flush()
+            assert not closed(newcomer, 0.05)
+            assert len(hub._clients) == 1
+    finally:
+        hub.close()
+    assert caplog.text == ""
+
+
+# --- clients that do not read ---------------------------------------------------------------------------------------
+@pytest.mark.parametrize("say", [b"V\r", b"xyz\r"], ids=["answers", "bells"])
+def test_who_asks_and_does_not_read_is_dropped_at_a_bounded_cost(hub, caplog, say):
+    tracemalloc.start()
+    try:
+        with plain(hub) as sleeper, joined(hub) as bus:
+            tracemalloc.reset_peak()
+            before = tracemalloc.get_traced_memory()[0]
+            with pytest.raises(OSError):
+                for _ in range(20_000):
+                    sleeper.sendall(say * 1_000)
+            bus.send(message(0x601, b"\x01"))
+            assert len(received(bus, 1)) == 1
+            assert tracemalloc.get_traced_memory()[1] - before < 2 * MAX_UNSENT
+    finally:
+        tracemalloc.stop()
+    assert caplog.text.count("was dropped") == 1
+    assert re.search(r"client 127\.0\.0\.1:\d+ was dropped: it does not read, and \d+ kB wait for it", caplog.text)
+
+
+def test_who_listens_and_does_not_read_is_dropped_and_nobody_else_loses_a_frame(monkeypatch, hub, caplog):
+    monkeypatch.setattr("drive_env.bus.hub.MAX_UNSENT", 10_000)
+    count = 0
+    with plain(hub) as sleeper, joined(hub) as bus:
+        assert answers(sleeper, b"O\r", 1) == b"\r"
+        while len(hub._clients) > 1:  # until the kernel's buffers are full
+            bus.serialPortOrig.write(b"T1ABCDEF081122334455667788\r" * 2_000)
+            bus.send(message(0x601, count.to_bytes(8, "big")))
+            assert [int.from_bytes(m.data, "big") for m in received(bus, 1, 30.0)] == [count]
+            count += 1
+            assert count < 1_000
+        assert closed(sleeper)
+    assert caplog.text.count("it does not read") == 1
+
+
+def test_who_pauses_loses_nothing_that_fits(hub):
+    count = 30_000  # 800 kB
+    with plain(hub) as sleeper, plain(hub) as sender:
+        assert answers(sleeper, b"O\r", 1) == b"\r"
+        for k in range(0, count, 1_000):
+            sender.sendall(b"O\r" * (k == 0) + b"".join(b"T1ABCDEF08%016X\r" % n for n in range(k, k + 1_000)))
+        eventually(lambda: any(client.blocked for client in hub._clients))
+        data = answers(sleeper, b"", 27 * count)
+        assert [int(line[10:], 16) for line in data.split()] == list(range(count))
+        eventually(lambda: not any(client.blocked for client in hub._clients))
+
+
+# --- floods ---------------------------------------------------------------------------------------------------------
+FLOOD = """
+import socket, sys, threading
+connection = socket.create_connection((sys.argv[1], int(sys.argv[2])))
+connection.sendall(b"O\\r")
+def read():
+    while connection.recv(65536):
+        pass
+threading.Thread(target=read, daemon=True).start()
+print("it floods", flush=True)
+try:
+    while True:
+        connection.sendall(bytes.fromhex(sys.argv[3]) * 500)
+except OSError:
+    pass
+"""
+FRAME = b"t7FF81122334455667788\r"
+
+
+@contextmanager
+def flood(hub, what=FRAME):
+    """A process that sends the same as fast as it can, and reads all that comes."""
+    arguments = [sys.executable, "-c", FLOOD, hub.host, str(hub.port), what.hex()]
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        assert process.stdout.readline() == "it floods\n"
+        yield
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def transfers_per_second(bus, seconds=0.5):
+    count, start = 0, time.perf_counter()
+    while time.perf_counter() < start + seconds:
+        bus.send(message(0x601, count.to_bytes(8, "big")))
+        while (answer := bus.recv(20.0)).arbitration_id != 0x581:
+            pass
+        assert int.from_bytes(answer.data, "big") == count
+        count += 1
+    return count / (time.perf_counter() - start)
+
+
+@pytest.mark.parametrize("lockstep", [True, False], ids=["lockstep", "real time"])
+@pytest.mark.parametrize("what", [FRAME, b"xyz\r" * 5], ids=["frames", "rubbish"])
+def test_a_flood_leaves_a_master_a_third_of_its_transfers(lockstep, what):
+    shares = []
+    with serving(lockstep=lockstep) as server, SlcanSocket(server.transport.channel) as bus:
+        for _ in range(5):  # on a busy machine one of the two may have had bad luck
+            alone = transfers_per_second(bus)
+            with flood(server.transport, what):
+                shares.append(transfers_per_second(bus) / alone)
+            if shares[-1] > 1 / 3:
+                break
+    assert max(shares) > 1 / 3, shares
+
+
+def test_clients_take_turns_frame_by_frame():
+    hub, wire = Hub(), Wire(instant=True)
+    try:
+        with plain(hub) as left, plain(hub) as right, plain(hub) as master:
+            for connection in (left, right):
+                connection.sendall(b"O\r" + FRAME * 5_000)
+            master.sendall(b"O\r" + b"t6010\r" * 3)
+            order = []
+            while order.count(0x601) < 3:
+                order += [incoming.frame.can_id for incoming in hub.wait(1.0, wire)]
+            first = order.index(0x601)
+            assert [k - first for k, can_id in enumerate(order) if can_id == 0x601] == [0, 3, 6]
+    finally:
+        hub.close()
+
+
+def test_a_client_has_few_frames_on_their_way_to_the_bus():
+    hub, wire = Hub(), Wire()  # nothing leaves this wire: nobody takes
+    try:
+        with plain(hub) as connection:
+            connection.sendall(b"O\r" + FRAME * 5_000)
+            for _ in range(100):
+                for frame, sender, extended in hub.wait(0.01, wire):
+                    wire.send(frame, sender, 0.0, extended)
+            (client,) = hub._clients
+            assert wire.waiting(client) == MAX_WAITING
+            assert 0 < len(client.frames) <= CHUNK // 5
+    finally:
+        hub.close()
+
+
+@pytest.mark.parametrize("what", [FRAME, b"t" * 1_000, b"\r" * 1_000, b"t7FF8112233", bytes(range(256))])
+def test_no_flood_makes_it_grow(what):
+    """Frames for a bus of 10 kbit/s, lines without end, empty lines, lines cut short, rubbish."""
+    with serving(lockstep=False, wire=Wire(10_000)) as server, joined(server.transport, bitrate=10_000) as bus:
+        stop = threading.Event()
+
+        def send(connection):
+            with suppress(BrokenPipeError):  # shut down below
+                while not stop.is_set():
+                    with suppress(TimeoutError):
+                        connection.sendall(what * 20)
+
+        with plain(server.transport) as vandal:
+            vandal.sendall(b"S0\rO\r")
+            vandal.settimeout(0.1)
+            threads = [threading.Thread(target=send, args=(vandal,)), threading.Thread(target=closed, args=(vandal,))]
+            for thread in threads:
+                thread.start()
+            tracemalloc.start()
+            try:
+                time.sleep(0.3)
+                before = tracemalloc.get_traced_memory()[0]
+                time.sleep(1.0)
+                assert tracemalloc.get_traced_memory()[0] - before < 100_000
+            finally:
+                tracemalloc.stop()
+                stop.set()
+                vandal.shutdown(socket.SHUT_RDWR)
+                for thread in threads:
+                    thread.join()
+        bus.send(message(0x601, b"\x01"))
+        assert is_answered(bus)
+
+
+# --- a flood and the drives -----------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("can_id", "state"), [(0x001, 0x08), (0x7FF, 0x07)], ids=["before all", "behind all"])
+def test_under_a_flood_that_outranks_heartbeats_a_turning_drive_stops_by_its_watchdog(can_id, state):
+    """The bus is full: with frames that win every arbitration, as on a real bus, or with those that lose it."""
+    world = World(lockstep=False)
+    with EmulatedDrives(load="inertia", num_threads=1) as drives:
+        world.add(drives, [1])
+        world.power_on()
+        motion.enable(drives, mode="pv")
+        drives.write("Target velocity", 500_000)
+        world.receive(Frame(0x601, bytes.fromhex("23 16 10 01 32 00 7F 00")), "master")  # 1016h: node 127, 50 ms
+        world.receive(Frame(0x000, b"\x01\x01"), "master")
+        for quarter in range(6_000):  # of a millisecond; the flood's frames that wait take four of them
+            world.run_until(quarter / 4e3)
+            if quarter % 40 == 0:
+                world.receive(Frame(0x77F, b"\x05"), "master")
+            if quarter == 2_000:
+                assert abs(int(drives.read("Velocity actual value")[0])) > 400_000
+            while quarter >= 2_000 and world.wire.waiting("vandal") < MAX_WAITING:  # as the hub hands them on
+                world.receive(Frame(can_id, bytes(8)), "vandal")
+        assert int(drives.read("Statusword")[0]) & 0x4F == state
+        if state == 0x08:
+            assert abs(int(drives.read("Velocity actual value")[0])) < 10_000
+    world.close()
+
+
+# --- the token ------------------------------------------------------------------------------------------------------
+TOKEN = "a-token_of_chance"
+
+
+@pytest.fixture
+def guarded():
+    with serving(token=TOKEN) as server:
+        yield server.transport
+
+
+def test_a_hub_that_others_can_reach_needs_a_token():
+    with pytest.raises(ValueError, match=r"0\.0\.0\.0 is no loopback address: it .* needs a token"):
+        Hub(host="0.0.0.0")
+
+
+@pytest.mark.parametrize("token", ["", "short", "with a space", "x" * 49, "käse-käse"])
+def test_a_token_that_cannot_be_is_refused_and_not_repeated(token):
+    with pytest.raises(ValueError, match="a token has 8 to 48 letters, digits, - and _") as error:
+        Hub(token=token)
+    assert not token or token not in str(error.value)
+
+
+def test_without_the_token_nothing_is_heard_and_nothing_is_told(guarded):
+    with joined_by_token(guarded) as bus, plain(guarded) as stranger:
+        stranger.sendall(b"O\rV\rt1230\rt6010\r" + b"x" * 200 + b"\r")
+        bus.send(message(0x601, b"\x01"))
+        assert [m.arbitration_id for m in received(bus, 1)] == [0x581]
+        assert bus.recv(0.1) is None
+        stranger.settimeout(0.2)
+        assert stranger.recv(100) == TOKEN_WANTED
+        with pytest.raises(TimeoutError):
+            stranger.recv(100)
+        stranger.sendall(b"K" + TOKEN.encode() + b"\rV\r")
+        stranger.settimeout(20.0)
+        assert answers(stranger, b"", 7) == b"\rV1013\r"
+
+
+@contextmanager
+def joined_by_token(hub):
+    """A stock python-can client, as `drive-env serve` says it joins."""
+    with can.Bus(interface="slcan", channel=hub.channel, sleep_after_open=0) as bus:
+        bus.serialPortOrig.write(b"K" + TOKEN.encode() + b"\r")
+        bus.open()
+        assert bus.get_version(20.0) == (10, 13)
+        yield bus
+
+
+def test_a_wrong_token_is_dropped_told_of_and_costs_its_address_a_second(monkeypatch, guarded, caplog):
+    monkeypatch.setattr("drive_env.bus.hub.GUESS_TIME", 60.0)
+    with joined_by_token(guarded) as bus, plain(guarded) as waiting:
+        assert answers(waiting, b"", 2) == TOKEN_WANTED
+        with plain(guarded) as guesser:  # two guesses at once: the second one, right, is not looked at
+            guesser.sendall(b"Kwrong-token\rK" + TOKEN.encode() + b"\rO\r")
+            assert closed(guesser)
+        assert closed(waiting, 5.0)  # a guess that waited for the outcome of another one
+        with plain(guarded) as again:
+            assert closed(again)
+        bus.send(message(0x601, b"\x01"))  # who is in stays in
+        assert len(received(bus, 1)) == 1
+        assert "was dropped: its token is wrong; its address waits 60 s" in caplog.text
+        assert TOKEN not in caplog.text
+        monkeypatch.setattr("drive_env.bus.hub.GUESS_TIME", 0.0)
+        guarded._penalties.clear()
+        with joined_by_token(guarded):
+            pass
+
+
+@pytest.mark.parametrize("token", ["", TOKEN[:-1], TOKEN + "x", TOKEN.upper(), "\xff" * 17, "K" + TOKEN])
+def test_only_the_whole_token_opens(guarded, token):
+    with plain(guarded) as guesser:
+        guesser.sendall(b"K" + token.encode("latin-1") + b"\r")
+        assert closed(guesser, 5.0)
+
+
+def test_guesses_come_one_a_second(guarded):
+    compared, ends = 0, time.monotonic() + 2.5
+    while time.monotonic() < ends:
+        with plain(guarded) as guesser, suppress(OSError):
+            told = guesser.recv(2)
+            guesser.sendall(b"Kwrong-token\r")
+            assert closed(guesser)
+            compared += told == TOKEN_WANTED
+    assert 1 <= compared <= 4
+
+
+def test_strangers_take_no_place_from_those_with_the_token(monkeypatch, guarded):
+    monkeypatch.setattr("drive_env.bus.hub.BUSY", 0.0)
+    with joined_by_token(guarded) as bus:
+        connections = crowd(guarded, MAX_CLIENTS + MAX_STRANGERS)
+        eventually(lambda: sum(client.channel.locked for client in guarded._clients) <= MAX_STRANGERS)
+        assert closed(connections[0])
+        assert not closed(connections[-1], 0.05)
+        with joined_by_token(guarded) as newcomer:
+            for master in (bus, newcomer):
+                master.send(message(0x601, b"\x01"))
+                assert is_answered(master)
+        for connection in connections:
+            connection.close()
+
+
+def test_who_shows_the_token_takes_the_place_of_another_who_has_it(monkeypatch, guarded, caplog):
+    monkeypatch.setattr("drive_env.bus.hub.BUSY", 0.0)
+    monkeypatch.setattr("drive_env.bus.hub.MAX_CLIENTS", 1)
+    with plain(guarded) as old, plain(guarded) as stranger:
+        assert answers(old, b"K" + TOKEN.encode() + b"\rO\r", 4) == TOKEN_WANTED + b"\r\r"
+        assert answers(stranger, b"", 2) == TOKEN_WANTED
+        with joined_by_token(guarded) as bus:
+            assert closed(old, 5.0)
+            assert not closed(stranger, 0.05)
+            bus.send(message(0x601, b"\x01"))
+            assert is_answered(bus)
+    assert "it has been silent for longest" in caplog.text
+
+
+def test_who_shows_no_token_in_time_is_dropped(monkeypatch, guarded, caplog):
+    monkeypatch.setattr("drive_env.bus.hub.TOKEN_TIME", 0.1)
+    with plain(guarded) as stranger:
+        assert closed(stranger)
+    assert "it has not shown the token within 0.1 s" in caplog.text
+
+
+def test_our_client_shows_its_token_and_says_what_is_wrong_with_it(monkeypatch, guarded, hub):
+    monkeypatch.setattr("drive_env.bus.hub.GUESS_TIME", 0.0)
+    monkeypatch.delenv("DRIVE_ENV_TOKEN", raising=False)
+    with (
+        pytest.raises(OpenError, match="asks for a token; set DRIVE_ENV_TOKEN"),
+        open_bus(None, guarded.channel) as bus,
+    ):
+        bus.recv(20.0)
+    with pytest.raises(OpenError, match="refuses the token; take the one that `drive-env serve` printed"):
+        open_bus(None, guarded.channel, token="wrong-token")
+    with pytest.raises(OpenError, match="a token has 8 to 48 letters") as error:
+        open_bus(None, guarded.channel, token="O\rt00081122")
+    assert "t000" not in str(error.value)
+    with pytest.raises(OpenError, match="a token is for the hub"):
+        open_bus("virtual", "x", token=TOKEN)
+    monkeypatch.setenv("DRIVE_ENV_TOKEN", TOKEN)
+    for place in (guarded, hub):  # one that asks for a token, and one that knows of none
+        with open_bus(None, place.channel) as bus:
+            bus.send(message(0x601, b"\x05"))
+            assert [m.arbitration_id for m in received(bus, 1)] == [0x581]
+
+
+def test_our_client_does_not_wait_for_ever_for_a_token_to_be_taken(monkeypatch):
+    monkeypatch.setattr("drive_env.master.slcan_socket.CONNECT_TIMEOUT", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as mute, pytest.raises(OpenError, match="does not answer to the token"):
+        SlcanSocket(f"socket://127.0.0.1:{mute.getsockname()[1]}", token=TOKEN)
 
 
 # --- any python-can interface ---------------------------------------------------------------------------------------

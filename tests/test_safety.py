@@ -19,11 +19,10 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.master.errors import BusError
-from drive_env.master.lifeline import Lifeline
+from drive_env.safety.supervisor import Supervisor
 
 QUICK_STOP = bytes.fromhex("2B 40 60 00 02 00 00 00")
 DISABLE = bytes.fromhex("2B 40 60 00 00 00 00 00")
-HEARTBEAT = 0x77F
 TURN = 65536
 
 
@@ -246,7 +245,7 @@ def test_a_quick_stop_of_the_envelope_ends_at_standstill():
             drives.record([0x6064], 0.5, play={0x6071: np.full(500, 800)})
         drives.advance(0.5)
         assert abs(drives.read(0x606C)[0]) < 10_000
-        assert drives.read(0x6041)[0] & 0x4F == 0x40  # switch on disabled
+        assert drives.read(0x6041)[0] & 0x4F == 0x40  # switch on disabled: no weight is to be held
 
 
 # --- stops --------------------------------------------------------------------------------------------------------
@@ -287,17 +286,19 @@ def test_a_silent_axis_does_not_keep_the_others_from_being_stopped(caplog):
     assert "node 1 did not answer" in caplog.text
 
 
-# --- the lifeline -------------------------------------------------------------------------------------------------
+# --- the watchdogs -------------------------------------------------------------------------------------------------
 def test_enabling_starts_heartbeats_that_the_drive_watches_and_closing_ends_both(bus, drive):
     drive.values[0x1029, 1] = (1, 1)  # a communication error would change nothing
     with CanDrives(bus=bus, safety=Limits(silence=0.06)) as drives:
         assert drive.get(0x1016, 1) == 0
         motion.enable(drives, mode="csv")
-        assert drive.get(0x1016, 1) == 127 << 16 | 60
+        own = drive.get(0x1016, 1) >> 16
+        assert own in range(96, 128)
+        assert drive.get(0x1016, 1) & 0xFFFF == 60
         assert drive.get(0x1029, 1) == 0
         motion.disable(drives)
-        until(lambda: len(bus.sent(HEARTBEAT)) >= 5)
-        beats = bus.sent(HEARTBEAT)
+        until(lambda: len(bus.sent(0x700 + own)) >= 8)
+        beats = bus.sent(0x700 + own)
         assert set(beats) == {b"\x05"}
     assert (drive.get(0x1016, 1), drive.get(0x1029, 1)) == (0, 1)
 
@@ -312,17 +313,20 @@ def test_without_a_heartbeat_consumer_life_is_guarded(tmp_path, bus, drive):
         assert (drive.get(0x100C), drive.get(0x100D)) == (20, 3)
         motion.disable(drives)
         until(lambda: sum(can_id == 0x701 and remote for can_id, _, remote in bus.log) >= 3)
-        assert not bus.sent(HEARTBEAT)
+        assert not any(0x760 <= can_id <= 0x77F for can_id, _, _ in bus.log)
     assert (drive.get(0x100C), drive.get(0x100D)) == (0, 0)
 
 
-def test_a_drive_that_cannot_watch_is_told(bus, drive, caplog):
+def test_a_drive_that_cannot_watch_is_not_moved_unless_the_user_wants_it(bus, drive, caplog):
     drive.refusals[0x1016, 1] = 0x06060000
     with CanDrives(bus=bus) as drives:
+        with pytest.raises(SafetyError, match=r"node 1 cannot watch over its master: .*Limits\(silence=None\)"):
+            motion.enable(drives, mode="csv")
+        assert 15 not in sent_controlwords(bus)
+    with CanDrives(bus=bus, safety=Limits(silence=None)) as drives:
         motion.enable(drives, mode="csv")
         motion.disable(drives)
-    assert "node 1 cannot watch over its master" in caplog.text
-    assert "keep the emergency stop at hand" in caplog.text
+    assert "no drive stops by itself when this process dies" in caplog.text
 
 
 def test_a_stalled_program_is_quick_stopped_and_told_once(bus, drive):
@@ -351,44 +355,32 @@ def test_waiting_and_recording_is_no_stall(bus):
         assert 2 not in sent_controlwords(bus)
 
 
-class LostBus:
-    """A port that takes what it is told to; `tried` counts what was sent."""
+def test_a_bus_that_is_lost_is_told_once_until_it_is_back(caplog):
+    error, tried = ["the bus did not take frame 77Fh"], [0]
 
-    def __init__(self):
-        self.error, self.tried = "the bus did not take frame 77Fh", 0
+    def turn():
+        tried[0] += 1
+        if error[0]:
+            raise BusError(error[0])
 
-    def send(self, *frame, **how):
-        self.tried += 1
-        if self.error:
-            raise BusError(self.error)
-
-
-class Watched:
-    kind = "heartbeat"
-
-
-def test_a_bus_that_is_lost_is_told_once_until_a_heartbeat_gets_out_again(caplog):
-    bus = LostBus()
-    lifeline = Lifeline(bus, [Watched()], [1], timeout=0.03, stall=None, stop=lambda: None)
-
-    def told_after_more_beats():
-        tried = bus.tried
-        until(lambda: bus.tried > tried + 3)
+    def told_after_more_turns():
+        before = tried[0]
+        until(lambda: tried[0] > before + 3)
         return [record.message for record in caplog.records]
 
-    error, bus.error = bus.error, ""
-    lifeline.start()
-    bus.error = error
+    supervisor = Supervisor(turn, fail=lambda: None)
+    first = error[0]
+    supervisor.start()
     try:
-        assert told_after_more_beats() == [error]
-        bus.error = "the adapter is gone"
-        assert told_after_more_beats() == [error, "the adapter is gone"]
-        bus.error = ""
-        told_after_more_beats()
-        bus.error = "the adapter is gone"
-        assert told_after_more_beats() == [error, "the adapter is gone", "the adapter is gone"]
+        assert told_after_more_turns() == [first]
+        error[0] = "the adapter is gone"
+        assert told_after_more_turns() == [first, "the adapter is gone"]
+        error[0] = ""
+        told_after_more_turns()
+        error[0] = "the adapter is gone"
+        assert told_after_more_turns() == [first, "the adapter is gone", "the adapter is gone"]
     finally:
-        lifeline.close()
+        supervisor.close()
 
 
 def until(condition, patience=30.0):

@@ -16,7 +16,10 @@ from typer.testing import CliRunner
 
 from drive_env.bus.config import Bus, BusConfigError, Machine, build_world, load_bus
 from drive_env.bus.faults import Faults
+from drive_env.bus.hub import Hub
 from drive_env.canopen.frames import Frame
+from drive_env.master.errors import OpenError
+from drive_env.master.port import open_bus
 from drive_env.tools.serve import serve
 
 ROOT = Path(__file__).parent.parent
@@ -78,6 +81,34 @@ def test_it_prints_two_lines_that_join_the_bus(tmp_path):
     assert re.search(r"\d+ frames in 0\.000 s of the drives' time, 0 error frames, 0 lost", output)
 
 
+def test_a_token_is_made_printed_and_asked_for(tmp_path, monkeypatch):
+    monkeypatch.delenv("DRIVE_ENV_TOKEN", raising=False)
+    with served("--token", "auto", "--lockstep", cwd=tmp_path) as (process, channel):
+        line = process.stdout.readline()
+        token = re.fullmatch(r'bus\.serialPortOrig\.write\(b"K([\w-]{16})\\r"\); bus\.open\(\)\n', line)[1]
+        assert process.stdout.readline().endswith(f"take the token from the environment: DRIVE_ENV_TOKEN={token}\n")
+        names = {"can": can}
+        exec(f'bus = can.Bus(interface="slcan", channel="{channel}", sleep_after_open=0)\n{line}', names)
+        with names["bus"] as bus:
+            assert bus.get_version(20.0) == (10, 13)
+        with pytest.raises(OpenError, match="asks for a token"), open_bus(None, channel) as bus:
+            bus.recv(20.0)
+        with open_bus(None, channel, token=token) as bus:
+            bus.send(can.Message(arbitration_id=0x000, data=b"\x82\x01", is_extended_id=False))
+            assert bus.recv(20.0).arbitration_id == 0x701
+
+
+def test_what_is_open_to_the_network_is_said(monkeypatch):
+    monkeypatch.setattr(Hub, "is_public", True)  # without opening anything to it
+    app = typer.Typer()
+    app.command()(serve)
+    arguments = ["--port", "0", "--token", "a-token_of_chance", "--duration", "0.05"]
+    done = CliRunner(env={"COLUMNS": "100", "NO_COLOR": "1"}).invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    assert "is open to the network: whoever reaches it and has the token may read and move these drives." in done.stdout
+    assert "Token and frames travel as plain text; where others listen, serve on 127.0.0.1 and use an" in done.stdout
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_with_code_0_and_one_line(tmp_path, number):
@@ -118,8 +149,14 @@ def test_any_interface_serves(tmp_path):
     (["--node", "0"], "drive-env: node 0 is out of range; identifiers are 1 to 127"),
     (["--node", "1", "--node", "2"], "2 node identifier(s) were given"),
     (["--port", "70000"], "drive-env: --port 70000 must be 0 to 65535"),
-    (["--host", "no.such.host.invalid"], "drive-env: cannot listen on no.such.host.invalid:29636"),
-    (["--host", ""], "drive-env: --host must be an address, e.g. 127.0.0.1; 0.0.0.0 lets the whole network in"),
+    (["--listen", "no.such.host.invalid"], "drive-env: cannot listen on no.such.host.invalid:29636"),
+    (["--listen", "x" * 70], "drive-env: cannot listen on xxx"),
+    (["--listen", ""], "drive-env: --listen must be an address, e.g. 127.0.0.1; 0.0.0.0 lets the whole network in"),
+    (["--listen", "0.0.0.0"], "drive-env: 0.0.0.0 is no loopback address: it lets the network in, which needs a token; "
+                              "say --token auto, --token TEXT of 8 characters or more, or --listen 127.0.0.1"),
+    (["--token", "short"], "drive-env: a token has 8 to 48 letters, digits, - and _; this one has 5 characters; say "),
+    (["--interface", "virtual", "--token", "auto"], "drive-env: --token is for the hub; --interface virtual cannot"),
+    (["--host", "127.0.0.1"], "No such option"),
     (["--seed", "-1"], "drive-env: seed = -1 must be 0 or more"),
     (["--bitrate", "123"], "drive-env: tmcm1636 has no bit rate of 123 bit/s; it has 20000, 50000"),
     (["--bitrate", "0"], "drive-env: bit_rate must be above 0 bit/s, not 0"),

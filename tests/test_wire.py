@@ -126,6 +126,18 @@ def test_a_frame_that_comes_while_the_bus_is_busy_waits_for_its_end():
     assert ends == pytest.approx([first, first + frame_bits(SYNC) / 500_000])
 
 
+def test_a_controller_that_leaves_takes_along_what_it_had_to_send():
+    wire = Wire()
+    wire.send(Frame(0x100), "gone", 0.0)
+    assert wire.take(0.0) is None  # it is on the wire
+    wire.send(Frame(0x101), "gone", 0.0)
+    wire.send(Frame(0x102), "other", 0.0)
+    wire.forget("gone")
+    wire.forget("never there")
+    assert [ended.frame.can_id for ended in drain(wire)] == [0x100, 0x102]
+    assert (wire.waiting("gone"), wire.next_event(), wire.statistics.lost) == (0, math.inf, 1)
+
+
 # --- what a bus can carry -------------------------------------------------------------------------------------------
 def test_one_mbit_carries_about_8000_frames_per_second_and_no_more():
     wire, numbers = Wire(), random.Random(1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from tuning.tuners import Outcome
 
 Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
+Files = Callable[["Result"], AbstractContextManager[object]]
 Find = Callable[[Run, Progress], None]  # finds gains for the axes that go on, and has tried them on the drives
 
 BUDGET = 10.0  # s of drive time
@@ -45,6 +47,7 @@ def auto(
     progress: Progress | None = None,
     experiments: Identify = identify_briefly,
     budget: float = BUDGET,
+    files: Files = nullcontext,
 ) -> Result:
     """Tune the axes of a target; what fails is rolled back, and its reason is in the result.
 
@@ -57,13 +60,17 @@ def auto(
         experiments: What identifies.
         budget: Most time that may pass on the drives for each axis of a machine [s]; what cannot be afforded is left
             out, and said.
+        files: Writes down what was done, before the drives keep it; what it raises rolls everything back. Its files
+            are to vanish if the block in it fails.
 
     Raises:
         BusError: If the drives cannot be reached any more: what then holds is said, and how to bring back what was.
+        OSError: If a file cannot be written: the drives have then what they had before.
     """
     return prove_found(
-        target, file, on_twins, seed=seed, keep=keep, progress=progress, experiments=experiments, budget=budget
-    )
+        target, file, on_twins, seed=seed, keep=keep, progress=progress, experiments=experiments, budget=budget,
+        files=files,
+    )  # fmt: skip
 
 
 def on_twins(run: Run, say: Progress) -> None:
@@ -84,6 +91,7 @@ def prove_found(
     progress: Progress | None = None,
     experiments: Identify = identify_briefly,
     budget: float = BUDGET,
+    files: Files = nullcontext,
 ) -> Result:
     """Check and identify axes, have gains found, and prove, write and keep them; what fails is rolled back.
 
@@ -97,6 +105,7 @@ def prove_found(
         progress: Called with what is under way, and the share done.
         experiments: What identifies.
         budget: Most time that may pass on the drives for each axis of a machine [s].
+        files: As `auto` takes it.
     """
     say = progress or (lambda what, share: None)
     with Transaction(target, file) as transaction, timed(target) as (watched, clock):
@@ -118,10 +127,15 @@ def prove_found(
         tell_of_lateness(run)
         say("writing", 0.96)
         accepted = write(run, transaction)
-        kept = keep and bool(accepted.any()) and transaction.store(accepted)
+        kept = keep and bool(accepted.any()) and bool(target.bus)
+        result = run.result(transaction.path, kept)
+        # What cannot be written down is not left in the drives, and nothing is written of what they did not keep.
+        with files(result):
+            if kept:
+                transaction.store(accepted)
         transaction.commit(accepted)
     say("done", 1.0)
-    return run.result(transaction.path, kept)
+    return result
 
 
 def tell_of_lateness(run: Run) -> None:

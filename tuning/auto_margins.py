@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env.gains import Gains, scaled, write_gains
 from drive_env.master.errors import BusError
-from drive_env.safety import SafetyError
+from drive_env.safety.envelope import SafetyError
 from tuning.auto_moves import show
 from tuning.auto_run import MOVE_TIME, TRIAL_TIME
 from tuning.auto_trials import BY_TRIAL, FOLLOWING_WINDOW, watch_following

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.safety import SafetyError
+from drive_env.safety.envelope import SafetyError
 from tuning.auto_run import MOVE_TIME, TRIAL_TIME
 from tuning.auto_trials import faster
 from tuning.proving import RESTLESS

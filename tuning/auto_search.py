@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drive_env.gains import Gains, gains_from_bandwidths, rule_gains
 from drive_env.master.errors import BusError
-from drive_env.safety import SafetyError, swinging_allowed
+from drive_env.safety.envelope import SafetyError, swinging_allowed
 from tuning.auto_checks import unsafe_gains, wrong_wiring
 from tuning.ladder import BOLD, SLIPPERY
 from tuning.linear_model import Plant

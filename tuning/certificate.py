@@ -6,10 +6,10 @@ certificate. It tells that nothing was changed by accident or in passing; it is 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from drive_env.whole_file import content_hash, files_to_be
+from mechanics.untrusted import parse_json, read_text
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -170,14 +173,21 @@ class Certificate:
 
     def save(self, folder: str | Path) -> tuple[Path, Path]:
         """Write certificate.json and report.html into a folder, made if needed, and return their paths."""
+        with self.files(folder) as paths:
+            return paths
+
+    @contextmanager
+    def files(self, folder: str | Path) -> Iterator[tuple[Path, Path]]:
+        """Have certificate.json and report.html on the disk while a block runs; they vanish again if it fails.
+
+        Raises:
+            OSError: If they cannot be written, with the file and the reason.
+        """
         from tuning.report import to_html
 
-        place = Path(folder)
-        place.mkdir(parents=True, exist_ok=True)
-        paths = place / "certificate.json", place / "report.html"
-        for path, text in zip(paths, (self.to_json(), to_html(self)), strict=True):
-            path.write_text(text, encoding="utf-8", newline="\n")
-        return paths
+        certificate, report = Path(folder) / "certificate.json", Path(folder) / "report.html"
+        with files_to_be({certificate: self.to_json(), report: to_html(self)}):
+            yield certificate, report
 
 
 # --- from what tuners have --------------------------------------------------------------------------------------------
@@ -249,12 +259,6 @@ def frequency_response(
 
 
 # --- reading and checking ---------------------------------------------------------------------------------------------
-def content_hash(content: Mapping[str, Any]) -> str:
-    """Return the hash over a certificate's content: over its JSON with sorted keys and no white space."""
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
     """Return the certificate of a JSON file, and whether it is unchanged since it was written.
 
@@ -288,7 +292,7 @@ def is_unchanged(path: str | Path) -> bool:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(_text(path), parse_constant=_no_constant)
+        data = parse_json(_text(path))
     except CertificateError:
         raise
     except ValueError as error:
@@ -300,15 +304,11 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return read_text(path)
     except OSError as error:
         raise CertificateError(f"cannot read {path}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise CertificateError(f"{path} is no text; give a certificate.json of drive-tune") from None
-
-
-def _no_constant(name: str) -> Any:
-    raise ValueError(f"{name} is no JSON")
 
 
 def _plain(value: Any) -> Any:

@@ -38,7 +38,8 @@ for panel, commands in PANELS.items():
 def drive_tune() -> None:
     """Tune servo drives: emulated ones, and with --bus real ones, inside the safety envelope.
 
-    Exit codes: 0 done, 1 the drive or the bus said no, 2 a mistake in the command, 130 Ctrl-C.
+    Exit codes: 0 done, 1 the drive or the bus said no, 2 a mistake in the command, 130 Ctrl-C, 141
+    nobody takes the output any more.
     """
 
 

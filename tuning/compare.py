@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from drive_env.gains import Gains, rule_gains
 from drive_env.positioning import plan_move
 from drive_env.score import HiddenScore
+from mechanics.untrusted import parse_json
 from tuning.meter import KINDS, MeteredDrives
 from tuning.moved_inertia import moved_inertia
 from tuning.shard_log import Arrays, ShardLog
@@ -152,7 +153,7 @@ def compare(
 
 
 def _rows_of(arrays: Arrays) -> list[MachineRow]:
-    return [MachineRow(**row) for row in json.loads(str(arrays["rows"]))]
+    return [MachineRow(**row) for row in parse_json(str(arrays["rows"]))]
 
 
 class Yardstick:

@@ -19,6 +19,7 @@ from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
+from mechanics.untrusted import read_toml
 from tuning.metrics import TRACKING, metric_names
 from tuning.toml_tables import ExperimentError as ExperimentError
 from tuning.toml_tables import as_table, as_value, check_keys, kind_of, read_table, toml, toml_lines
@@ -145,7 +146,7 @@ def load_experiment(config: str | Path | None = None, **overrides: Any) -> Exper
     """
     path = DEFAULT if config is None else Path(config)
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = read_toml(path)
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise ExperimentError(f"cannot read the experiment {path}: {reason}; give --config a TOML file") from None

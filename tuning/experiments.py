@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import gains_from_bandwidths, write_gains
-from drive_env.safety import swinging_allowed
+from drive_env.safety.envelope import swinging_allowed
 from tuning.encoder_check import EncoderCheck, check_encoders
 from tuning.frequency_response import measure
 from tuning.identification import NAMES, Estimate, Identification, Progress, refused

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import GAIN_OBJECTS
-from drive_env.safety import swinging_allowed
+from drive_env.safety.envelope import swinging_allowed
 from tuning.dead_time import dead_time_resistance
 from tuning.excitation import CREST, Lines, dimension, peak, plan_lines
 from tuning.held_samples import split, unhold

@@ -11,6 +11,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from drive_env.whole_file import keep_names
+
 HEADER = "# The whole experiment of this run. It repeats from this file: drive-tune sweep --config settings.toml\n"
 _PACKAGES = ("drive-env", "numpy", "numba", "llvmlite", "mujoco")
 
@@ -88,6 +90,11 @@ def new_folder(folder: str | Path) -> Iterator[Path]:
         if path.is_dir():
             path.rmdir()  # empty; a rename onto a folder fails on Windows
         partial.rename(path)
-    except BaseException:
+        keep_names(path.absolute().parent)
+    except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
+        if isinstance(error, OSError) and error.errno is not None:  # it names the partial folder, or nothing
+            named = None if error.filename is None else Path(error.filename)
+            name = path if named is None else path / named.name if named.is_relative_to(partial) else named
+            raise OSError(error.errno, error.strerror, str(name)) from None
         raise

@@ -30,7 +30,7 @@ from drive_env.positioning import (
     wrapped,
     write_profile,
 )
-from drive_env.safety import SafetyError
+from drive_env.safety.envelope import SafetyError
 from drive_env.score import TRIP, Terms, cost
 
 if TYPE_CHECKING:

@@ -6,13 +6,11 @@ A `Transaction` writes the file before anything else happens, so that even a pro
 
 from __future__ import annotations
 
-import os
-import signal
+import errno
 import sys
-import threading
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,14 +22,25 @@ from numpy.typing import NDArray
 from drive_env import motion
 from drive_env.dictionary.access import ObjectAccessError, check_in_range, check_writable
 from drive_env.gains import GAIN_OBJECTS
+from drive_env.held_signals import held_signals
 from drive_env.master.description import Description, Key, describe
 from drive_env.master.errors import BusError
-from drive_env.master.parameters import Difference, read_parameters, write_all_or_none
-from drive_env.safety import SafetyError
+from drive_env.master.identity import Identity, check_same_drive, load_identity, read_identity
+from drive_env.master.parameters import (
+    Difference,
+    check_at_rest,
+    check_no_commands,
+    read_parameters,
+    write_all_or_none,
+)
+from drive_env.safety.envelope import SafetyError
+from drive_env.whole_file import FORMAT, check_seal, sealed, write_whole
+from mechanics.untrusted import read_toml
 from tuning.provenance import nearest_place, run_folder
 from tuning.toml_tables import toml
 
 if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
     from drive_env.dictionary.entries import Entry
     from tuning.target import Target
 
@@ -56,12 +65,14 @@ class Snapshot:
         axes: Of every axis, (index, sub-index) -> raw integer.
         bus: What opens the drives again, for `CanDrives`; empty for emulated drives.
         stored: Whether the drives were told to keep what came afterwards: then the way back is to be kept, too.
+        identities: What each node said of itself; empty for emulated drives, and where a file does not say.
     """
 
     device: str
     axes: tuple[Mapping[Key, int], ...]
     bus: Mapping[str, Any] = field(default_factory=dict)
     stored: bool = False
+    identities: tuple[Identity, ...] = ()
 
     def save(self, path: str | Path) -> Path:
         """Write the snapshot as TOML and return its path; the file is complete or absent, also after a power cut.
@@ -70,33 +81,21 @@ class Snapshot:
             OSError: If it cannot be written.
         """
         where = Path(path)
-        partial = where.with_name(f".{where.name}.partial")
         try:
-            where.parent.mkdir(parents=True, exist_ok=True)
-            with partial.open("w", encoding="utf-8", newline="\n") as file:
-                file.write(self._toml(where.name))
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(where)
-            if os.name == "posix":  # the new name, too
-                folder = os.open(where.parent, os.O_RDONLY)
-                with suppress(OSError):  # some file systems know no such thing
-                    os.fsync(folder)
-                os.close(folder)
+            write_whole(where, sealed(self._toml(where.name)))
         except OSError as error:
-            with suppress(OSError):
-                partial.unlink(missing_ok=True)
-            raise OSError(
-                f"the state before cannot be written to {where}: {error.strerror}; choose another place"
-            ) from None
+            reason = f"the state before cannot be written: {error.strerror}; choose another place"
+            raise OSError(error.errno, reason, str(where)) from None
         return where
 
     def _toml(self, name: str) -> str:
         dictionary = describe(self.device, None).dictionary
         lines = [
-            f"# Parameters of {len(self.axes)} axes, read {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC before a change.",
-            f"# drive-tune restore {name} brings them back.",
+            f"# Parameters of {len(self.axes)} axes before a change: drive-tune restore {name} brings them back.",
+            "# The check sum at the end shows whether this file was changed.",
             "",
+            f"format = {FORMAT}",
+            f'written = "{datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC"',
             f"device = {toml(self.device)}",
             f"stored = {str(self.stored).lower()}  # whether the drives were told to keep what came then",
         ]
@@ -104,6 +103,8 @@ class Snapshot:
             lines += ["", "[bus]"]
             for key, value in self.bus.items():
                 lines.append(f"{key} = {value if isinstance(value, list) else toml(value)}")
+        for identity in self.identities:
+            lines += ["", "[[node]]", *identity.to_toml()]
         for axis, values in enumerate(self.axes):
             lines += ["", f"[[axis]]  # {axis}; index:sub-index, both hexadecimal"]
             for (index, sub), value in values.items():
@@ -116,30 +117,42 @@ def take(target: Target) -> Snapshot:
 
     Take it before the drives record anything: that maps PDOs on a bus, which are parameters, too.
     """
+    drives = target.drives
+    identities = [read_identity(drives, node) for node in range(len(drives.nodes))] if _is_on_bus(drives) else []
+    return Snapshot(target.device.name, _read_axes(target), target.bus, identities=tuple(identities))
+
+
+def _read_axes(target: Target) -> tuple[Mapping[Key, int], ...]:
     drives = _per_axis(target.drives)
-    axes = tuple(read_parameters(drives, axis) for axis in range(target.num_axes))
-    return Snapshot(target.device.name, axes, target.bus)
+    return tuple(read_parameters(drives, axis) for axis in range(target.num_axes))
 
 
-def load_snapshot(path: str | Path) -> Snapshot:
+def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
     """Return the snapshot of a file.
 
+    Args:
+        path: The file.
+        unchecked: Take also one that was changed since it was written, or that has no check sum.
+
     Raises:
-        SnapshotError: If the file is none.
+        SnapshotError: If the file is none; FileChangedError if it is not as it was written.
+        CommandObjectError: If it holds commands or services.
     """
     where = Path(path)
     try:
-        data = tomllib.loads(where.read_text(encoding="utf-8"))
+        data = read_toml(where)
     except OSError as error:
         raise SnapshotError(f"cannot read {where}: {error.strerror}; give a file that drive-tune left") from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise SnapshotError(f"{where} is no TOML: {error}; give a file that drive-tune left") from None
+        raise SnapshotError(f"{where} is no TOML, or is torn: {error}; give a file that drive-tune left") from None
     tables = data.get("axis")
     if not isinstance(tables, list) or not tables or not isinstance(data.get("device"), str):
         raise SnapshotError(f"{where} is no snapshot; give a file that drive-tune left before a change")
     dictionary = describe(data["device"], None).dictionary
     axes = []
     for table in tables:
+        if not isinstance(table, dict):
+            raise SnapshotError(f"{where}: {table!r} is no axis; give a file that drive-tune left before a change")
         values = {}
         for text, value in table.items():
             index, _, sub = text.partition(":")
@@ -151,8 +164,43 @@ def load_snapshot(path: str | Path) -> Snapshot:
             except (ValueError, ObjectAccessError) as error:
                 raise SnapshotError(f"{where}: {text} = {value!r}: {error}") from None
             values[key] = int(value)
+        check_no_commands(values, where)
         axes.append(values)
-    return Snapshot(data["device"], tuple(axes), data.get("bus", {}), bool(data.get("stored", False)))
+    check_seal(where, data, unchecked=unchecked)
+    nodes = [load_identity(table) for table in data.get("node", []) if isinstance(table, dict)]
+    identities = tuple(identity for identity in nodes if identity is not None)
+    bus = _checked_bus(where, data.get("bus", {}))
+    return Snapshot(data["device"], tuple(axes), bus, bool(data.get("stored", False)), identities)
+
+
+def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
+    """Return how drives are opened again; SnapshotError for what says nothing of that, which is not handed on."""
+    if not isinstance(bus, dict):
+        raise SnapshotError(f"{file}: bus = {bus!r} must be a table; give a file as drive-tune left it")
+    for key, value in bus.items():
+        if key not in _BUS:
+            raise SnapshotError(f"{file}: [bus] has a key {key!r}, which is none of {', '.join(_BUS)}; take it out")
+        numbers = value if isinstance(value, list) else [value]
+        if (isinstance(value, list) != (key == "nodes")) or any(type(one) is not _BUS[key] for one in numbers):
+            raise SnapshotError(f"{file}: [bus] {key} = {value!r} is no {_BUS[key].__name__}; give it as it was")
+    return bus
+
+
+_BUS = {"interface": str, "channel": str, "nodes": int, "bitrate": int, "pace": str}
+
+
+def check_same_drives(file: object, snapshot: Snapshot, drives: CanDrives, *, other_drive: bool = False) -> None:
+    """Raise OtherDriveError unless the nodes of a bus are those that a snapshot was taken of.
+
+    Args:
+        file: The snapshot's, for the message.
+        snapshot: What is to be written.
+        drives: The drives that are there.
+        other_drive: Let any drives pass.
+    """
+    # A file that does not say of which drives it is (`load_snapshot` wants its reader's word for that) fits any.
+    for node, written in zip(range(len(drives.nodes)), snapshot.identities, strict=False):
+        check_same_drive(file, written, read_identity(drives, node), other_drive=other_drive)
 
 
 def restore(
@@ -179,30 +227,20 @@ def restore(
     axes = np.ones(drives.num_axes, bool) if where is None else where
     single = _per_axis(drives)
     changed: list[list[Difference]] = [[] for _ in snapshot.axes]
+    wanted = [values if whole else _settings(values) for values in snapshot.axes]
     for axis in map(int, np.flatnonzero(axes)):
-        wanted = snapshot.axes[axis] if whole else _settings(snapshot.axes[axis])
-        changed[axis] = write_all_or_none(single, wanted, axis)
+        check_at_rest(single, wanted[axis], axis)  # before the first axis is written
+    for axis in map(int, np.flatnonzero(axes)):
+        changed[axis] = write_all_or_none(single, wanted[axis], axis)
     return changed
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
     """Have Ctrl-C, and what else ends a command, wait for the block's end: drives are not left half brought back."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # signals reach the main thread alone
-        return
-    pressed: list[int] = []
-    ends = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {number: signal.getsignal(number) for number in ends}
-    handled = {number: handler for number, handler in before.items() if callable(handler)}
-    for number in handled:
-        signal.signal(number, lambda number, frame: pressed.append(number))
-    try:
+    with held_signals() as noted:
         yield
-    finally:
-        for number, handler in handled.items():
-            signal.signal(number, handler)
-    if pressed:
+    if noted:
         raise KeyboardInterrupt
 
 
@@ -277,12 +315,15 @@ class Transaction:
         self.path = Path(path)
         self._target = target
         self._committed = np.zeros(target.num_axes, bool)
+        self._stored = np.zeros(target.num_axes, bool)
 
     def __enter__(self) -> Transaction:
         mask, enabled = motion.OPERATION_ENABLED
         self._ran: Mask = self._target.drives.read(0x6041) & mask == enabled
         self.before = take(self._target)
         self.before.save(self.path)
+        if load_snapshot(self.path) != self.before:  # the only way back
+            raise OSError(errno.EIO, "the state before does not read back as it was written", str(self.path))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: object) -> None:
@@ -298,17 +339,21 @@ class Transaction:
                     self.roll_back(left & ~self._untouched())
                 except SafetyError:  # after a stall the envelope refuses one call, to tell of it
                     self.roll_back(left & ~self._untouched())
+                if np.any(left & self._stored):
+                    store(self._target.drives, left & self._stored)
         except (BusError, ObjectAccessError, RuntimeError, TimeoutError) as failure:
             raise BusError(
                 f"{failure}; the drives may hold what was tried: drive-tune restore {self.path} brings back what was"
             ) from (error or failure)
+        if isinstance(error, OSError) and error.filename and not self.changed:  # a disk that is full, a folder gone
+            raise OSError(error.errno, f"{error.strerror}; {what_is_left(self.path)}", error.filename) from error
 
     def _untouched(self) -> Mask:
         """Return the axes that somebody else runs and that were let alone, as they are in a run that refuses them."""
         if not self._ran.any():
             return self._ran
-        now = take(self._target)
-        same = [_settings(one) == _settings(other) for one, other in zip(now.axes, self.before.axes, strict=True)]
+        now = _read_axes(self._target)
+        same = [_settings(one) == _settings(other) for one, other in zip(now, self.before.axes, strict=True)]
         untouched: Mask = self._ran & same
         return untouched
 
@@ -340,16 +385,16 @@ class Transaction:
             return False
         self.before = replace(self.before, stored=True)
         self.before.save(self.path)
+        self._stored |= True if where is None else where
         store(self._target.drives, where)
         return True
 
 
 def _switch_off(drives: Any, where: Mask) -> None:
-    """Switch the voltage off and wait until no axis is enabled; one in fault is off already."""
+    """Switch the voltage off and wait until no axis may turn; one in fault is off once its reaction has ended."""
     drives.write(0x6040, 0x00, where=where)
-    mask, enabled = motion.OPERATION_ENABLED
     for _ in range(SWITCH_OFF):
-        if not np.any(where & (drives.read(0x6041) & mask == enabled)):
+        if not np.any(where & [motion.is_live(int(word)) for word in drives.read(0x6041)]):
             return
         drives.advance(motion.STEP)
     raise TimeoutError(f"an axis stays enabled for {SWITCH_OFF * motion.STEP:g} s after its voltage was switched off")
@@ -366,7 +411,11 @@ def _settings(values: Mapping[Key, int]) -> dict[Key, int]:
 
 def _per_axis(drives: Any) -> Any:
     """Return drives whose objects are reached axis by axis, as those of a bus are."""
-    return drives if hasattr(drives, "read_axis") else _EmulatedPerAxis(drives)
+    return drives if _is_on_bus(drives) else _EmulatedPerAxis(drives)
+
+
+def _is_on_bus(drives: Any) -> bool:
+    return hasattr(drives, "read_axis")
 
 
 class _EmulatedPerAxis:

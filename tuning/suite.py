@@ -24,6 +24,7 @@ from drive_env.misfit import MisfitWarning
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
+from mechanics.untrusted import read_toml
 from tuning.linked_axes import are_linked
 from tuning.target import Target
 from tuning.toml_tables import ExperimentError, as_table, as_value, check_keys, kind_of
@@ -86,7 +87,9 @@ def load_suite(name_or_path: str | Path = "public", seed: int | None = None, cou
     """
     path = _path(name_or_path)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = read_toml(path)
+    except OSError as error:
+        raise ExperimentError(f"cannot read the suite {path}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ExperimentError(f"{path} is no TOML: {error}") from error
     where = path.name

@@ -30,8 +30,10 @@ POSITION_SCALER = (0x2058, 0)
 AXES = ("apart", "coupled", "linked")
 LOCKSTEP_PATIENCE = 5.0  # s, for an answer where time waits: a late one says that the computer is busy
 FREE: Travel = (-math.inf, math.inf)
+LONGEST_TRAVEL = 1e9  # rad: far beyond what counters of 32 bits hold
 # Of the travel, how far the envelope lets an axis overshoot it, and the least and the most of that [rad].
 SLACK, SLACK_ENDS = 0.05, (0.02 * 2.0 * np.pi, 0.5 * 2.0 * np.pi)
+SPEED_SLACK = 2.0  # of the rated speed: no excitation asks for more than that, and an overshoot may
 
 
 @dataclass(frozen=True)
@@ -208,8 +210,8 @@ def on_bus(
 ) -> Target:
     """Return the drives of a bus as a target, inside the envelope.
 
-    The envelope holds the position to the travel of all axes together and a twentieth of it to either side, unless
-    `safety` says otherwise; a tuner keeps each axis in its own, overshoot aside.
+    The envelope holds each axis to its own travel and a twentieth of it to either side, unless `safety` says
+    otherwise; a tuner keeps it inside, overshoot aside.
 
     Args:
         device: Name of the device.
@@ -293,6 +295,11 @@ def _ways(travel: Travel | Iterable[Travel], num_axes: int) -> tuple[Floats, Flo
         raise ValueError(
             f"{len(ways)} ranges of travel are given, for {num_axes} axis/axes; give one for all, or one for each"
         )
+    if np.any(np.isnan(ways) | (np.isfinite(ways) & (np.abs(ways) > LONGEST_TRAVEL))):
+        raise ValueError(
+            f"a travel of {ways.min():g} to {ways.max():g} rad cannot be; an axis has {LONGEST_TRAVEL:g} rad to either "
+            "side at most, or is free"
+        )
     low, high = np.broadcast_to(ways, (num_axes, 2)).T.copy()
     return low, high
 
@@ -325,13 +332,13 @@ _ADDRESS = ("bitrate", "pace")
 
 
 def _hold_to_travel(target: Target) -> None:
-    """Have the envelope stop an axis that leaves what all axes together may use, by more than a move overshoots."""
-    from drive_env.master.bounds import Limits
-    from drive_env.safety import Envelope
+    """Have the envelope hold each axis to its own travel, by more than a move overshoots, and to its motor's speed."""
+    from drive_env.safety.limits import Limits
 
-    if not np.all(np.isfinite(target.low) & np.isfinite(target.high)):
-        return
-    here, scale = target.drives.read(0x6064), target.increments()
-    slack = np.clip(SLACK * (target.high - target.low), *SLACK_ENDS)
-    low, high = np.floor(here + (target.low - slack) * scale), np.ceil(here + (target.high + slack) * scale)
-    target.drives.safety = Envelope(Limits(position=(int(low.min()), int(high.max()))), target.drives)
+    drives = target.drives
+    here, scale = drives.read(0x6064), target.increments()
+    width = np.where(np.isfinite(target.high - target.low), target.high - target.low, 0.0)
+    slack = np.clip(SLACK * width, *SLACK_ENDS)
+    low, high = here + (target.low - slack) * scale, here + (target.high + slack) * scale
+    speed = np.ceil(SPEED_SLACK * target.motor.rated_speed * scale)
+    drives.safety.change(Limits(position=(low.tolist(), high.tolist()), velocity=speed.tolist()))

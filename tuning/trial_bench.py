@@ -34,7 +34,7 @@ from drive_env.positioning import (
     wrapped,
     write_profile,
 )
-from drive_env.safety import SafetyError
+from drive_env.safety.envelope import SafetyError
 from drive_env.score import TRIP, cost
 from tuning.calming import CalmedDrives
 from tuning.oscillation_watch import SOFTER, VELOCITY_P, OscillationError, WatchedDrives

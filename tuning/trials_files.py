@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drive_env.gains import Gains
+from drive_env.whole_file import write_whole
+from mechanics.untrusted import read_toml
 from tuning.optimise import COST, Optimised, Row, Settings, objective_values, pareto
 from tuning.toml_tables import check_keys, toml
 from tuning.trial_bench import OBJECTIVES
@@ -40,21 +43,27 @@ def save(
         folder: Where to write.
         machine: What was searched: options of the command, by the names of `load_options`.
         versions: What computed it.
+
+    Raises:
+        OSError: If one cannot be written, with its name and the reason.
     """
-    with (folder / "trials.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["search", "trial", "axis", *Gains._fields, "cost", *OBJECTIVES, "stopped"])
-        for row in found.rows:
-            figures = [f"{value:.6g}" for value in (row.cost, *row.objectives)]
-            for axis, gains in enumerate(row.gains.tolist()):
-                writer.writerow([row.search, row.number, axis, *gains, *figures, row.aborted])
+    table = io.StringIO()
+    writer = csv.writer(table)
+    writer.writerow(["search", "trial", "axis", *Gains._fields, "cost", *OBJECTIVES, "stopped"])
+    for row in found.rows:
+        figures = [f"{value:.6g}" for value in (row.cost, *row.objectives)]
+        for axis, gains in enumerate(row.gains.tolist()):
+            writer.writerow([row.search, row.number, axis, *gains, *figures, row.aborted])
+    write_whole(folder / "trials.csv", table.getvalue())
     lines = _lines({name: getattr(settings, name) for name in _SEARCH})
     if settings.journal is not None:
         lines.append(f"# journal: {settings.journal}")
     lines += ["", "[machine]", *_lines(machine)]
     lines += ["", "[versions]", *(f"{toml(name)} = {toml(value)}" for name, value in versions.items())]
-    (folder / "settings.toml").write_text(HEADER + "\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-    trials_figure(found, settings).savefig(folder / "trials.png", dpi=120)
+    write_whole(folder / "settings.toml", HEADER + "\n".join(lines) + "\n")
+    picture = io.BytesIO()
+    trials_figure(found, settings).savefig(picture, dpi=120)
+    write_whole(folder / "trials.png", picture.getvalue())
 
 
 def load_options(path: str | Path) -> dict[str, Any]:
@@ -66,7 +75,7 @@ def load_options(path: str | Path) -> dict[str, Any]:
         ValueError: If the file cannot be read, or is not of a search.
     """
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        table = read_toml(path)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}; give settings.toml of drive-tune optimise") from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

@@ -18,6 +18,7 @@ from agents.commands.options import (
     Load,
     Nodes,
     Seed,
+    Trust,
     errors_as_exit_codes,
     fail,
     new_folder,
@@ -100,6 +101,7 @@ def evaluate(
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for report, episodes and pictures, new or empty.")
     ] = None,
+    trust: Trust = False,
     yes: Yes = False,
     json: Json = False,
 ) -> None:
@@ -129,7 +131,7 @@ def evaluate(
             raise ValueError(f"--gap serves machines of its own, an episode each; leave --{extra[0]} out")
         recording = None if replay is None or replay.suffix.lower() == ".csv" else _recording(replay)
         recorded = None if recording is None else recording.environment
-        loaded, configuration = _open(policy, environment, load, config, recorded)
+        loaded, configuration = _open(policy, environment, load, config, recorded, trust)
         if replay is not None:
             _replay(loaded, configuration, replay, recording, json)
             return
@@ -165,7 +167,12 @@ def _way_back(out: Path | None) -> Path:
 
 
 def _open(
-    text: str, environment: str | None, load: str | None, config: Path | None, otherwise: str | None = None
+    text: str,
+    environment: str | None,
+    load: str | None,
+    config: Path | None,
+    otherwise: str | None = None,
+    trust: bool = False,
 ) -> tuple[Any, dict[str, Any]]:
     """Return the policy, its environment filled in (`otherwise` if nobody says it), and the environment's options."""
     import tomllib
@@ -174,9 +181,10 @@ def _open(
     from agents.policies import LoadedPolicy, open_policy
     from agents.tasks import environment_name, make_lanes
     from drive_env.envs.randomisation import shipped as shipped_distributions
+    from mechanics.untrusted import read_toml
 
     names = {name for rows in BASELINES.values() for name in rows}
-    loaded = LoadedPolicy(text, None) if text in names else open_policy(text)
+    loaded = LoadedPolicy(text, None) if text in names else open_policy(text, trust=trust)
     if environment is not None:
         wanted = environment_name(environment)
         if loaded.environment not in (None, wanted):
@@ -188,7 +196,7 @@ def _open(
     configuration = dict(loaded.configuration)
     if config is not None:
         try:
-            configuration = tomllib.loads(config.read_text(encoding="utf-8"))
+            configuration = read_toml(config)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ValueError(f"--config {config} is no TOML: {error}") from None
     if load is not None:
@@ -424,9 +432,9 @@ def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
 
 def _tell_card(text: str, json: bool) -> None:
     """Print how an agent was trained and what it reaches."""
-    from agents.policies import open_policy
+    from agents.policies import described_checkpoint, is_checkpoint, open_policy
 
-    loaded = open_policy(text)
+    loaded = described_checkpoint(text) if is_checkpoint(text) else open_policy(text)
     about = {"environment": loaded.environment, **loaded.card}
     if not loaded.card:
         raise ValueError(f"{text} has no card: it was not made by drive-agent")
@@ -440,8 +448,13 @@ def _tell_card(text: str, json: bool) -> None:
 def _lines(table: Mapping[str, Any], indent: str = "") -> Iterator[str]:
     for name, value in table.items():
         if isinstance(value, Mapping):
-            yield f"{indent}{name}:"
+            yield _printable(f"{indent}{name}:")
             yield from _lines(value, indent + "  ")
         else:
             number = f"{value:.4g}" if isinstance(value, float) else value
-            yield f"{indent}{name}: {', '.join(map(str, value)) if isinstance(value, list) else number}"
+            yield _printable(f"{indent}{name}: {', '.join(map(str, value)) if isinstance(value, list) else number}")
+
+
+def _printable(text: str) -> str:
+    """Return a text of somebody's file without what would act on the terminal."""
+    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)

@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from agents.commands.options import Json, errors_as_exit_codes, print_json
+from agents.commands.options import Json, Trust, errors_as_exit_codes, print_json
 
 
 def export(
     agent: Annotated[str, typer.Argument(help="agent.npz, checkpoint.zip, or an agent that ships, by name.")],
     out: Annotated[Path | None, typer.Option("--out", help="The .onnx file.", show_default="beside the agent")] = None,
+    trust: Trust = False,
     json: Json = False,
 ) -> None:
     """Write an agent as ONNX, its normaliser inside, and check it against the original to 1e-5 of an action's range.
@@ -34,12 +35,12 @@ def export(
         path = Path(agent).with_suffix(".onnx") if out is None else out
         if path.suffix.lower() != ".onnx":
             raise ValueError(f"--out {path} must end in .onnx")
-        original = open_policy(agent)
+        original = open_policy(agent, trust=trust)
         found: dict[str, object] = {"file": str(path)}
         if agent.lower().endswith(".zip"):
             from agents.training import bundle_of_checkpoint
 
-            bundle = bundle_of_checkpoint(agent)
+            bundle = bundle_of_checkpoint(agent, trust=trust)
             bundle.save(path.with_suffix(".npz"))
         else:
             bundle = original.policy.bundle

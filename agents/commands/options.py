@@ -38,6 +38,12 @@ Steps = Annotated[int | None, typer.Option("--steps", help="Steps of all lanes t
 Out = Annotated[
     Path | None, typer.Option("--out", help="Folder for the results, new or empty.", show_default="runs/<timestamp>-…")
 ]
+Trust = Annotated[
+    bool,
+    typer.Option(
+        "--trust", help="Load a checkpoint (.zip). It holds pickles: loading it runs whatever its writer put there."
+    ),
+]
 
 
 def new_folder(path: Path | None, name: str) -> Path:
@@ -70,7 +76,7 @@ def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: 1 for what drive, bus or the watch say, 2 for the user's mistake, 130 for Ctrl-C."""
     from agents.policy import PolicyError
     from drive_env.master.errors import BusError, RefusedError
-    from drive_env.safety import SafetyError
+    from drive_env.safety.envelope import SafetyError
 
     with ending_by(
         fail, refused=(PolicyError, SafetyError, BusError, RefusedError, TimeoutError), mistakes=(ImportError,)

@@ -20,6 +20,7 @@ from agents.commands.options import (
     Preset,
     Seed,
     Steps,
+    Trust,
     errors_as_exit_codes,
     fail,
     new_folder,
@@ -42,7 +43,10 @@ def train(
     seed: Seed = 0,
     steps: Steps = None,
     out: Out = None,
-    resume: Annotated[Path | None, typer.Option("--resume", help="Go on with the run in this folder.")] = None,
+    resume: Annotated[
+        Path | None, typer.Option("--resume", help="Go on with the run in this folder; needs --trust.")
+    ] = None,
+    trust: Trust = False,
 ) -> None:
     """Train an agent with Stable-Baselines3 (pip install 'drive-env[agents]').
 
@@ -55,6 +59,8 @@ def train(
         from agents.training import train as run_training
 
         if resume is None:
+            if trust:
+                raise ValueError("--trust is of --resume: a new run loads nothing; leave it out")
             given = with_load(environment, algorithm, preset, load, config)
             if steps is not None:
                 if steps < 1:
@@ -63,18 +69,18 @@ def train(
             run = Run(environment, algorithm, given, seed=seed, preset=preset)
             folder = new_folder(out, f"{ENVIRONMENTS[run.environment].short}-{algorithm}")
         else:
-            given_too = [name for name in given_options(context) if name != "--resume"]
+            given_too = [name for name in given_options(context) if name not in ("--resume", "--trust")]
             if given_too:
                 raise ValueError(f"--resume goes on with the run as it began; leave {', '.join(given_too)} out")
             folder = resume
             run = run_to_resume(folder)
         try:
             with progress(f"{run.environment} {run.algorithm}") as report:
-                bundle = run_training(run, folder, report=report, resume=resume is not None)
+                bundle = run_training(run, folder, report=report, resume=resume is not None, trust=trust)
         except KeyboardInterrupt:
             if not (folder / CHECKPOINT).is_file():
                 raise
-            fail(f"interrupted; go on with: drive-agent train --resume {folder}", INTERRUPTED)
+            fail(f"interrupted; go on with: drive-agent train --resume {folder} --trust", INTERRUPTED)
         print(f"judging it in {EPISODES} episodes with seeds that it has not seen", file=sys.stderr)
         evaluation = judge(bundle)
         figures = {name: evaluation.interval(name)._asdict() for name in evaluation.values}

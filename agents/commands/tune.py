@@ -24,9 +24,10 @@ from agents.commands.options import (
     new_folder,
     print_json,
 )
-from drive_env.tools.options import DeviceName, Yes
+from drive_env.tools.options import DeviceName, Yes, look_first
 from tuning.commands.options import MotorName, Supply, TravelRange, ask_to_turn
 
+MOST_TRIALS = 10_000
 PATIENCE = 30.0  # s, for a node in this process: one that is slow says that the computer is busy, not that it is gone
 
 if TYPE_CHECKING:
@@ -77,8 +78,8 @@ def tune(
         bus = _is_of_a_bus(context)
         if bus and seed is not None:
             raise ValueError("--seed draws an emulated machine; leave it out on a bus")
-        if trials is not None and trials < 1:
-            raise ValueError(f"--trials {trials} must be 1 or more")
+        if trials is not None and not 1 <= trials <= MOST_TRIALS:
+            raise ValueError(f"--trials {trials} must be 1 or more, and {MOST_TRIALS} at most: each turns the motor")
         policy = load_policy(find_agent(agent))
         if policy.bundle.environment != "ServoDrive/GainTuning-v0":
             raise ValueError(
@@ -92,7 +93,7 @@ def tune(
                 target = stack.enter_context(_emulated_node(device, motor, load, seed, supply, travel))
             else:
                 if dry_run:
-                    _look_first(interface, channel, node or [1], bitrate, device)
+                    look_first(interface, channel, node or [1], bitrate, device)
                 target = stack.enter_context(_on_bus(interface, channel, node, bitrate, lockstep, device, motor, supply,
                                                      travel))  # fmt: skip
             if dry_run:
@@ -174,23 +175,6 @@ def _on_bus(
         yield target
 
 
-def _look_first(interface: str | None, channel: str | None, nodes: list[int], bitrate: int | None, device: str) -> None:
-    """Raise NoAnswerError for a node that is silent: to open it as drives would send it an NMT command."""
-    from drive_env.master.description import describe
-    from drive_env.master.errors import NoAnswerError
-    from drive_env.master.port import Port, open_bus
-    from drive_env.master.sdo import SdoClient
-
-    port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
-    try:
-        for node in nodes:
-            SdoClient(port, node).read(0x1000, 0, "1000h:00 Device type", describe(device, None).answer_timeout)
-    except NoAnswerError as error:
-        raise NoAnswerError(f"{error}; if it is stopped (NMT), a run would take it to pre-operational") from None
-    finally:
-        port.close()
-
-
 def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:
     """Print what was found and what a run would do; the drive is read, and nothing else. Return whether it would."""
     from agents.rehearsal import rehearse
@@ -261,11 +245,13 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
     if not json:
         print(f"agent {agent} tunes {target.device.name} with {target.motor.name}: {target.machine}")
     folder.mkdir(parents=True, exist_ok=True)
-    return run(target, policy, folder / "before.toml", name=agent, keep=store, show=show, say=say)
+    return run(
+        target, policy, folder / "before.toml", name=agent, keep=store, show=show, say=say,
+        files=lambda certificate: certificate.files(folder),
+    )  # fmt: skip
 
 
 def _report(done: Run, folder: Path, json: bool, bus: bool) -> None:
-    certificate, report = done.certificate.save(folder)
     result, rule = done.result, float(done.trials[0].measured[0]) if done.trials else None
     axis, seconds = result.axes[0], float(result.drive_seconds[0])
     refused = [f"axis {k} was rolled back: {one.reason}" for k, one in enumerate(result.axes) if not one.accepted]
@@ -274,7 +260,8 @@ def _report(done: Run, folder: Path, json: bool, bus: bool) -> None:
             {
                 "accepted": not refused, "reason": axis.reason, "notes": axis.notes, "before": list(axis.before),
                 "after": list(axis.after), "J of the rule": rule, "J": axis.proof, "drive seconds": seconds,
-                "stored": result.kept, "certificate": str(certificate), "report": str(report),
+                "stored": result.kept, "certificate": str(folder / "certificate.json"),
+                "report": str(folder / "report.html"),
             }
         )  # fmt: skip
     else:

@@ -8,6 +8,7 @@ without evaluating code.
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import yaml
 
 from agents.tasks import ENVIRONMENTS, environment_name
+from mechanics.untrusted import check_table, read_text
 
 FOLDER = Path(__file__).parent
 ALGORITHMS = ("ppo", "sac", "recurrent_ppo")
@@ -103,6 +105,10 @@ def read_value(value: Any) -> Any:
         return _literal(ast.parse(text, mode="eval").body)
     except SyntaxError as error:
         raise HyperparameterError(f"{value!r} cannot be read: {error.msg}") from None
+    except TypeError as error:  # a list as a key
+        raise HyperparameterError(f"{value!r} cannot be read: {error}") from None
+    except (RecursionError, MemoryError):  # Python's parser raises either
+        raise HyperparameterError(f"a value that begins with {text[:40]!r} nests too deep") from None
 
 
 def schedule(value: Any) -> Any:
@@ -128,7 +134,7 @@ class Linear:
 
 
 def _whole(file: Path, key: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != round(value) or value < 1:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 1 <= value < math.inf or value % 1:
         raise HyperparameterError(f"{file}: {key} must be a whole number of 1 or more, not {value!r}")
     return int(value)
 
@@ -141,15 +147,25 @@ def _file(environment: str, algorithm: str, path: str | Path | None) -> Path:
 
 def _read(file: Path) -> dict[str, Any]:
     try:
-        table = yaml.safe_load(file.read_text(encoding="utf-8"))
+        table = yaml.safe_load(read_text(file))
+        check_table(table)
     except FileNotFoundError:
         raise HyperparameterError(f"there is no file {file}") from None
     except OSError as error:
         raise HyperparameterError(f"{file} cannot be read: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise HyperparameterError(f"{file} is no YAML: {error}") from None
+    except RecursionError:
+        raise HyperparameterError(f"{file} is no YAML that we read: it nests too deep") from None
+    except (yaml.YAMLError, ValueError) as error:
+        raise HyperparameterError(f"{file} is no YAML that we read: {' '.join(str(error).split())}") from None
     if not isinstance(table, dict):
         raise HyperparameterError(f"{file} holds no sections; the first is the environment's name")
+    for name, section in table.items():
+        if (
+            not isinstance(name, str)
+            or not isinstance(section, dict | type(None))
+            or any(not isinstance(key, str) for key in section or ())
+        ):
+            raise HyperparameterError(f"{file}: section {name!r} must be a table of hyper-parameters by name")
     return table
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Iterator
 
 import can
 
 from drive_env.bus.transport import Incoming
-from drive_env.bus.wire import Transmission
+from drive_env.bus.wire import Transmission, Wire
 from drive_env.canopen.frames import Frame
 
 MAX_FRAMES = 256  # taken at a turn, so that a flood does not keep time from passing
@@ -27,7 +27,7 @@ class CanPort:
         self._bus = bus
         self.lost = 0  # frames that the interface did not take
 
-    def wait(self, timeout: float, waiting: Callable[[Hashable], int]) -> Iterator[Incoming]:
+    def wait(self, timeout: float, wire: Wire) -> Iterator[Incoming]:
         """Return the frames that have come, after at most `timeout` [s].
 
         Raises:

@@ -11,6 +11,7 @@ from typing import Any
 from drive_env.bus.faults import Faults
 from drive_env.bus.wire import BIT_RATE, Wire
 from drive_env.bus.world import World
+from mechanics.untrusted import read_toml
 
 FACTORY = "none"  # as a motor: the drive is not commissioned
 
@@ -57,7 +58,7 @@ def load_bus(path: Path) -> Bus:
         BusConfigError: For a file that cannot be read or a key or value that cannot be.
     """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = read_toml(path)
     except OSError as error:
         raise BusConfigError(f"cannot read the bus {path}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

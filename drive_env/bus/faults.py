@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
+
+LONGEST_DELAY = 3600.0  # s
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,10 @@ class Faults:
             if field.name == "only":
                 continue
             if field.name == "delay_max":
-                if not 0.0 <= value < math.inf:
-                    raise ValueError(f"faults: delay_max = {value!r} must be a time of 0 s or more")
+                if not 0.0 <= value <= LONGEST_DELAY:
+                    raise ValueError(
+                        f"faults: delay_max = {value!r} must be a time of 0 s or more, {LONGEST_DELAY:g} s at most"
+                    )
             elif not 0.0 <= value <= 1.0:
                 raise ValueError(f"faults: {field.name} = {value!r} must be a share of all frames, 0 to 1")
 

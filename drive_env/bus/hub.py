@@ -1,75 +1,149 @@
 """A hub on localhost: each TCP client is an slcan adapter on the same bus.
 
 Every stock python-can client joins with `interface="slcan", channel="socket://127.0.0.1:PORT"`.
+
+No client can keep the bus from the others, nor make the hub grow. Clients take turns, frame by frame; a few frames of
+each wait for the bus, a few more in the hub, and the rest stays in the client's own socket until the bus has taken
+those. Who does not read is dropped, and where all places are taken a newcomer gets that of the least active client.
 """
 
 from __future__ import annotations
 
 import errno
+import ipaddress
 import logging
 import os
 import select
 import socket
-from collections.abc import Callable, Hashable, Iterator
+import time
+from collections import deque
+from collections.abc import Iterator
 from typing import Any
 
-from drive_env.bus.slcan import Channel
+from drive_env.bus.slcan import TOKEN_WANTED, Channel, check_token
 from drive_env.bus.transport import Incoming
-from drive_env.bus.wire import BIT_RATE, Transmission
+from drive_env.bus.wire import BIT_RATE, Transmission, Wire
+from drive_env.canopen.frames import Frame
 
 LOOPBACK = "127.0.0.1"
-MAX_CLIENTS = 64  # select() takes no file number above 1,023 on most systems
-CHUNK = 65_536  # bytes read from a client at a turn
-MAX_UNSENT = 4 << 20  # bytes that may wait for a slow client; what comes beyond is lost, as in an adapter's buffer
-MAX_WAITING = 512  # frames of a client that wait for the bus before it is read no further
+MAX_CLIENTS = 64
+MAX_STRANGERS = 16  # clients beyond those, that have not shown the token yet
+FILE_NUMBERS = 1024  # select() takes none above on most systems
+CHUNK = 512  # bytes read from a client at a turn: 23 frames of eight bytes, at most 85 empty ones
+# Frames of a client that wait for the bus, where the lowest identifier wins; those behind them wait in its socket. More
+# would only let a flood with the identifiers of another master hold that one up for longer: 1 ms for 8 frames.
+MAX_WAITING = 8
+# Bytes that may wait for a client that does not read: five seconds of a full bus of 1 Mbit/s (216 kB/s as text), many
+# times what a garbage collection or a slow disk takes. The kernel holds KERNEL_BUFFER beside it.
+MAX_UNSENT = 1 << 20
+KERNEL_BUFFER = 1 << 18
+BUSY = 1.0  # s: a client that has sent within it is not idle; one that was behind all that time sends without end
+TOKEN_TIME = 10.0  # s in which a token must have come; stock clients wait 2 s before they send anything
+GUESS_TIME = 1.0  # s for which an address that presented a wrong token is turned away
+LOG_LINES, LOG_TIME = 20, 10.0  # warnings in so many seconds; a crowd of clients must not fill a disk
 
 logger = logging.getLogger(__name__)
 
 
 class _Client:
-    """One connection: the socket, its channel, and what could not be sent yet."""
+    """One connection: the socket, its channel, frames that have come, and what could not be sent yet.
 
-    def __init__(self, connection: socket.socket, name: str, bit_rate: float) -> None:
+    Attributes:
+        frames: That have come and are not on the wire; each extended or not.
+        unsent: Bytes for the client.
+        blocked: Its socket takes no more bytes at present.
+        came: When it connected [s].
+        spoke: When it sent something last [s].
+        behind_since: Since when more has come from it at every turn than was read [s].
+        was_open: Its channel has been on the bus.
+        ended: The connection is closed; frames that came before go on to the bus.
+        dropped: So it is, and they do not.
+        told: It was said that its bit rate is another one.
+    """
+
+    def __init__(self, connection: socket.socket, address: tuple[str, int], channel: Channel, now: float) -> None:
         self.socket = connection
-        self.name = name
-        self.channel = Channel(bit_rate)
+        self.host = address[0]
+        self.name = f"{address[0]}:{address[1]}"
+        self.channel = channel
+        self.frames: deque[tuple[Frame, bool]] = deque()
         self.unsent = bytearray()
-        self.told = False  # that its bit rate is another one
+        self.blocked = False
+        self.came = self.spoke = self.behind_since = now
+        self.was_open = False
+        self.ended = False
+        self.dropped = False
+        self.told = False
 
     def fileno(self) -> int:
         return self.socket.fileno()
+
+    def has_left(self) -> bool:
+        """Whether the client has closed the connection, and all that it sent before is read."""
+        try:
+            return not self.ended and not self.socket.recv(1, socket.MSG_PEEK)
+        except (BlockingIOError, InterruptedError):
+            return False
+        except OSError:
+            return True
+
+    def end(self) -> None:
+        """Close the connection; frames that have come go on to the bus."""
+        self.ended, self.blocked = True, False
+        self.channel.is_open = False
+        self.unsent.clear()
+        self.socket.close()
 
 
 class Hub:
     """The listening socket and its clients.
 
-    A client sees the frames of all others and of the nodes, never its own. Nothing that a client does ends the hub: a
-    line that is no command is answered with BELL, a client that is gone is forgotten.
+    A client sees the frames of all others and of the nodes, never its own. Nothing that a client does ends the hub or
+    starves the others: a line that is no command is answered with BELL, a client that is gone is forgotten, one that
+    does not read is dropped.
 
     Args:
         port: TCP port, 0 for a free one.
-        host: Address to listen on; anything but loopback lets the network in.
+        host: Address to listen on; anything but loopback lets the network in and needs a token.
         bit_rate: Of the bus [bit/s]; a client that sets another one stays closed.
+        token: What a client must present (command K) before it is heard, 8 to 48 letters, digits, - and _; None for
+            nothing.
 
     Raises:
         OSError: If the address cannot be had.
+        ValueError: For an address other than loopback without a token, and for a token that cannot be.
     """
 
-    def __init__(self, port: int = 0, host: str = LOOPBACK, bit_rate: float = BIT_RATE) -> None:
+    def __init__(
+        self, port: int = 0, host: str = LOOPBACK, bit_rate: float = BIT_RATE, *, token: str | None = None
+    ) -> None:
+        if token is not None:
+            check_token(token)
         self._bit_rate = bit_rate
+        self._token = token
         self._clients: list[_Client] = []
+        self._penalties: dict[str, float] = {}  # address -> until when it is turned away [s]
+        self._log_since, self._log_count = -LOG_TIME, 0
         self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
             if os.name == "posix":  # elsewhere it would let two hubs share a port
                 self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._listener.bind((host, port))
+            self.host, self.port = self._listener.getsockname()[:2]
+            if self.is_public and token is None:
+                raise ValueError(f"{host} is no loopback address: it lets the network in, which needs a token")
+            if self._too_high(self._listener):
+                raise OSError(errno.EMFILE, "this program has too many files open")
             self._listener.listen(MAX_CLIENTS)
-        except OSError:
+        except BaseException:
             self._listener.close()
             raise
         self._listener.setblocking(False)
-        self.host, self.port = self._listener.getsockname()[:2]
-        self.lost = 0  # frames that slow clients did not get
+
+    @property
+    def is_public(self) -> bool:
+        """Whether other computers reach it."""
+        return not ipaddress.ip_address(self.host).is_loopback
 
     @property
     def channel(self) -> str:
@@ -77,72 +151,194 @@ class Hub:
         everywhere = self.host == "0.0.0.0"
         return f"socket://{LOOPBACK if everywhere else self.host}:{self.port}"
 
-    def wait(self, timeout: float, waiting: Callable[[Hashable], int]) -> Iterator[Incoming]:
-        """Wait up to `timeout` [s] for clients and return their frames, in each client's order.
+    def wait(self, timeout: float, wire: Wire) -> Iterator[Incoming]:
+        """Wait up to `timeout` [s] for clients and return their frames, one of each client that has some.
 
         Args:
             timeout: Longest wait [s].
-            waiting: How many frames of a client the bus has not carried; above a limit it is not read.
+            wire: For which they are; a client of which MAX_WAITING frames wait there has to wait, too.
         """
-        # select.select, since selectors round the time-out of epoll up to whole milliseconds.
-        readable = [client for client in self._clients if waiting(client) < MAX_WAITING]
-        writable = [client for client in self._clients if client.unsent]
-        watched: list[Any] = [*readable, self._listener]  # who goes makes room for who comes
+        readable: list[Any] = [self._listener]
+        blocked = []
+        for client in self._clients:
+            if client.blocked:
+                blocked.append(client)
+            if not client.frames:
+                if not client.ended:
+                    readable.append(client)
+            elif wire.waiting(client) < MAX_WAITING:
+                timeout = 0.0
         try:
-            ready, sendable, _ = select.select(watched, writable, [], timeout)
-        except OSError:  # a connection that broke between two turns
-            self._forget_broken()
+            # select.select, since selectors round the time-out of epoll up to whole milliseconds.
+            ready, sendable, _ = select.select(readable, blocked, [], timeout)
+        except (OSError, ValueError):  # a connection that broke between two turns
+            self._end_broken()
             return
+        now = time.monotonic()
         for client in sendable:
             self._send(client)
-        for one in ready:
+        for one in reversed(ready):  # the listener last: who goes makes room for who comes
             if one is self._listener:
-                self._accept()
-            else:
-                yield from self._read(one)
+                self._accept(now)
+            elif not one.ended:
+                self._read(one, now)
+        if self._token is not None:
+            self._drop_mute_strangers(now)
+        for client in self._clients[:]:
+            if client.frames and wire.waiting(client) < MAX_WAITING:
+                frame, extended = client.frames.popleft()
+                yield Incoming(frame, client, extended)
+        self._forget_ended(wire)
 
     def deliver(self, ended: Transmission) -> None:
         """Hand a frame of the bus to every client but its sender; it leaves with the next `flush`."""
+        lines: dict[bool, bytes] = {}
         for client in self._clients:
             if client is ended.sender or not client.channel.is_open:
                 continue
-            if len(client.unsent) > MAX_UNSENT:
-                client.channel.overrun = True
-                self.lost += 1
-            else:
-                client.unsent += client.channel.format(ended.frame, ended.extended, ended.end)
+            stamped = client.channel.time_stamps
+            if stamped not in lines:
+                lines[stamped] = client.channel.format(ended.frame, ended.extended, ended.end)
+            self._append(client, lines[stamped])
 
     def flush(self) -> None:
         """Send what there is to send, without waiting for anybody."""
-        for client in self._clients[:]:
-            if client.unsent:
+        for client in self._clients:
+            if client.unsent and not client.blocked:
                 self._send(client)
 
     def close(self) -> None:
         """Close all connections and the port."""
         self.flush()
         for client in self._clients:
-            client.socket.close()
+            client.end()
         self._clients.clear()
         self._listener.close()
 
-    # --- inside ---------------------------------------------------------------------------------------------------
-    def _accept(self) -> None:
+    # --- who comes and goes ---------------------------------------------------------------------------------------
+    def _accept(self, now: float) -> None:
         try:
             connection, address = self._listener.accept()
-        except OSError:  # gone again already, or no file number left
+        except OSError as error:  # gone again already, or no file number left: somebody gives up his
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                self._make_room(now)
             return
-        name = f"{address[0]}:{address[1]}"
-        if len(self._clients) >= MAX_CLIENTS:
-            logger.warning("client %s was turned away: there are %d already", name, MAX_CLIENTS)
+        if self._too_high(connection):
+            self._warn("client %s:%d was turned away: this program has too many files open", *address)
+            connection.close()
+            return
+        if self._penalties.get(address[0], 0.0) > now:
             connection.close()
             return
         connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._clients.append(_Client(connection, name, self._bit_rate))
-        logger.info("client %s has come", name)
+        try:
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BUFFER)
+        except OSError:  # some systems say so here that the client has gone again
+            connection.close()
+            return
+        client = _Client(connection, address, Channel(self._bit_rate, self._token), now)
+        logger.info("client %s has come", client.name)
+        if self._token is None:
+            self._admit(client, now)
+            return
+        strangers = [other for other in self._clients if other.channel.locked and not other.ended]
+        if len(strangers) >= MAX_STRANGERS:  # they are in the order in which they came
+            self._drop(strangers[0], "it has not shown the token, and others have come")
+        self._clients.append(client)
+        self._append(client, TOKEN_WANTED)
 
-    def _read(self, client: _Client) -> Iterator[Incoming]:
+    def _admit(self, client: _Client, now: float) -> None:
+        """Give a client one of the places on the bus, if need be that of another one."""
+        taken = sum(not (other is client or other.channel.locked or other.dropped) for other in self._clients)
+        if taken >= MAX_CLIENTS and not self._make_room(now, client):
+            self._warn(
+                "client %s was turned away: %d clients are on the bus, and all of them are busy", client.name,
+                MAX_CLIENTS,
+            )  # fmt: skip
+            self._drop(client)
+        elif client not in self._clients:
+            self._clients.append(client)
+
+    def _make_room(self, now: float, newcomer: _Client | None = None) -> bool:
+        """Drop the client that needs its place least; False if all are busy.
+
+        That is one that has gone and left frames, then one that never opened its channel, then the one that has been
+        silent for longest, then one that sends more than the bus takes. A master at work keeps its place: it sends
+        several times a second, and waits for answers.
+        """
+        others = [c for c in self._clients if not (c is newcomer or c.channel.locked or c.dropped)]
+        for client in others:
+            if client.frames and client.has_left():  # as long as it has frames nobody reads it
+                client.end()
+        gone = [c for c in others if c.ended]
+        unopened = [c for c in others if not c.was_open]
+        silent = sorted((c for c in others if now - c.spoke > BUSY), key=lambda c: c.spoke)
+        flooding = sorted((c for c in others if now - c.behind_since > BUSY), key=lambda c: c.behind_since)
+        for found, why in (
+            (gone, ""),
+            (unopened, "a newcomer needs its place, and it has not opened its channel"),
+            (silent, "a newcomer needs its place, and it has been silent for longest"),
+            (flooding, "a newcomer needs its place, and it sends more than the bus takes"),
+        ):
+            if found:
+                self._drop(found[0], why)
+                return True
+        return False
+
+    def _refuse(self, client: _Client, now: float) -> None:
+        """Drop a client that presented a wrong token, and turn its address away for a while."""
+        self._warn("client %s was dropped: its token is wrong; its address waits %g s", client.name, GUESS_TIME)
+        self._penalties = {host: until for host, until in self._penalties.items() if until > now}
+        self._penalties[client.host] = now + GUESS_TIME
+        for other in self._clients:  # of guesses presented at once only the first one counts
+            if other.host == client.host and other.channel.locked:
+                self._drop(other)
+
+    def _drop_mute_strangers(self, now: float) -> None:
+        for client in self._clients:
+            if client.channel.locked and not client.ended and now - client.came > TOKEN_TIME:
+                self._drop(client, f"it has not shown the token within {TOKEN_TIME:g} s")
+
+    def _drop(self, client: _Client, why: str = "") -> None:
+        """End a client, with all that it wanted to send."""
+        if why:
+            self._warn("client %s was dropped: %s", client.name, why)
+        client.frames.clear()
+        client.dropped = True
+        client.end()
+
+    def _forget_ended(self, wire: Wire) -> None:
+        """Forget who has gone, once what it sent before is on the bus, and who was dropped at once."""
+        for client in [c for c in self._clients if c.ended]:
+            if client.dropped or not (client.frames or wire.waiting(client)):
+                self._clients.remove(client)
+                wire.forget(client)
+                logger.info("client %s has gone", client.name)
+
+    @staticmethod
+    def _too_high(one: socket.socket) -> bool:
+        """Whether select() cannot wait for a socket, for the number that it has."""
+        return os.name == "posix" and one.fileno() >= FILE_NUMBERS
+
+    def _end_broken(self) -> None:
+        for client in self._clients:
+            if client.fileno() < 0:
+                client.end()
+
+    def _warn(self, text: str, *values: object) -> None:
+        """Log a warning, and of a crowd of them the first ones."""
+        now = time.monotonic()
+        if now - self._log_since > LOG_TIME:
+            if self._log_count > LOG_LINES:
+                logger.warning("%d more lines about clients were left out", self._log_count - LOG_LINES)
+            self._log_since, self._log_count = now, 0
+        self._log_count += 1
+        if self._log_count <= LOG_LINES:
+            logger.warning(text, *values)
+
+    # --- what comes and goes --------------------------------------------------------------------------------------
+    def _read(self, client: _Client, now: float) -> None:
         try:
             data = client.socket.recv(CHUNK)
             self._acknowledge_at_once(client)
@@ -151,18 +347,29 @@ class Hub:
         except OSError:
             data = b""
         if not data:
-            self._forget(client)
+            client.end()
             return
-        frames, answer = client.channel.feed(data)
-        client.unsent += answer
-        if client.channel.refused and not client.told:
+        client.spoke = now
+        if len(data) < CHUNK:
+            client.behind_since = now
+        channel, was_locked = client.channel, client.channel.locked
+        frames, answer = channel.feed(data)
+        if channel.wrong_token:
+            self._refuse(client, now)
+            return
+        if was_locked and not channel.locked:
+            self._admit(client, now)
+            if client.ended:
+                return
+        client.was_open = client.was_open or channel.is_open
+        client.frames.extend(frames)
+        self._append(client, answer)
+        if channel.refused and not client.told:
             client.told = True
-            logger.warning(
+            self._warn(
                 "client %s asked for %g kbit/s and stays off the bus, which has %g kbit/s; give both the same",
-                client.name, client.channel.bit_rate / 1e3, self._bit_rate / 1e3,
+                client.name, channel.bit_rate / 1e3, self._bit_rate / 1e3,
             )  # fmt: skip
-        for frame, extended in frames:
-            yield Incoming(frame, client, extended)
 
     @staticmethod
     def _acknowledge_at_once(client: _Client) -> None:
@@ -174,25 +381,23 @@ class Hub:
         if hasattr(socket, "TCP_QUICKACK"):
             client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
+    def _append(self, client: _Client, data: bytes) -> None:
+        """Have bytes sent to a client; one that leaves too many of them unread is dropped."""
+        if len(client.unsent) + len(data) > MAX_UNSENT:
+            self._drop(client, f"it does not read, and {len(client.unsent) / 1e3:.0f} kB wait for it")
+        else:
+            client.unsent += data
+
     def _send(self, client: _Client) -> None:
         try:
             sent = client.socket.send(client.unsent)
         except (BlockingIOError, InterruptedError):
+            client.blocked = True
             return
         except OSError as error:
             if error.errno not in (errno.EPIPE, errno.ECONNRESET, errno.ECONNABORTED):
-                logger.warning("client %s: %s", client.name, error)
-            self._forget(client)
+                self._warn("client %s: %s", client.name, error)
+            client.end()
             return
         del client.unsent[:sent]
-
-    def _forget(self, client: _Client) -> None:
-        if client in self._clients:
-            self._clients.remove(client)
-            logger.info("client %s has gone", client.name)
-        client.socket.close()
-
-    def _forget_broken(self) -> None:
-        for client in self._clients[:]:
-            if client.fileno() < 0:
-                self._forget(client)
+        client.blocked = bool(client.unsent)

@@ -104,21 +104,21 @@ class Server:
         return self._stop.is_set() or time.perf_counter() >= self._end
 
     def _run_lockstep(self) -> None:
-        world, transport, waiting = self.world, self.transport, self.world.wire.waiting
-        transport.flush()
+        world, transport, wire = self.world, self.transport, self.world.wire
         while not self._over():
+            transport.flush()
             wait = min(LONGEST_WAIT, self._end - time.perf_counter())
-            for frame, sender, extended in transport.wait(max(0.0, wait), waiting):
+            for frame, sender, extended in transport.wait(max(0.0, wait), wire):
                 world.receive(frame, sender, extended=extended)
                 transport.flush()
 
     def _run_real_time(self) -> None:
-        world, transport, waiting = self.world, self.transport, self.world.wire.waiting
+        world, transport, wire = self.world, self.transport, self.world.wire
         while not self._over():
             self._catch_up()
             transport.flush()
             wait = min(LONGEST_WAIT, world.next_event() - self._now() - EARLY)
-            for frame, sender, extended in transport.wait(max(0.0, wait), waiting):
+            for frame, sender, extended in transport.wait(max(0.0, wait), wire):
                 self._catch_up()
                 world.receive(frame, sender, extended=extended)
 

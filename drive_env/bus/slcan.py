@@ -3,11 +3,15 @@
 python-can's slcan interface waits for no answer and reads each answer as a turn without a frame. Commands are answered
 all the same, as Lawicel's manual says; frames sent are not (nor does a CANable answer them), or every frame of a
 burst would cost the client a turn.
+
+One command is ours: K followed by a token. A channel that asks for one says "K" as its client comes (the hub sends it),
+and neither understands nor answers anything until it has got it.
 """
 
 from __future__ import annotations
 
 import re
+import secrets
 
 from drive_env.canopen.frames import Frame
 
@@ -18,6 +22,8 @@ BIT_RATES = {b"0": 10_000, b"1": 20_000, b"2": 50_000, b"3": 100_000, b"4": 125_
 VERSION = b"V1013\r"  # hardware 1.0, software 1.3
 SERIAL_NUMBER = b"NDE01\r"
 CLOCK = 8_000_000  # Hz, of the SJA1000's bit timing registers
+TOKEN_WANTED = b"K\r"
+TOKEN = re.compile(r"[A-Za-z0-9_-]{8,48}")  # lines are short, and at a guess a second nobody finds eight characters
 
 _STANDARD = re.compile(rb"[tr]([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 _EXTENDED = re.compile(rb"[TR]([01][0-9A-Fa-f]{7})([0-8])((?:[0-9A-Fa-f]{2})*)")
@@ -54,6 +60,12 @@ def format_frame(frame: Frame, extended: bool = False, timestamp_ms: int | None 
     return b"%b%b%d%b%b\r" % (kind, can_id, length, frame.data.hex().upper().encode(), stamp)
 
 
+def check_token(token: str) -> None:
+    """Raise ValueError for a token that no line can carry, or that is too short; the message does not repeat it."""
+    if TOKEN.fullmatch(token) is None:
+        raise ValueError(f"a token has 8 to 48 letters, digits, - and _; this one has {len(token)} characters")
+
+
 class Channel:
     """An adapter's channel as its client has set it.
 
@@ -62,21 +74,25 @@ class Channel:
         is_open: It takes part in the bus.
         listen_only: It sends nothing.
         time_stamps: Frames come with the time of their reception.
-        overrun: A frame could not be delivered; set from outside, read and forgotten by the command F.
         refused: It was to be opened with another bit rate than the bus has.
+        locked: Its token has not come yet.
+        wrong_token: Another one has come; nothing that follows is looked at.
 
     Args:
         bit_rate: Of the bus [bit/s].
+        token: What its client must present first; None for nothing.
     """
 
-    def __init__(self, bit_rate: float) -> None:
+    def __init__(self, bit_rate: float, token: str | None = None) -> None:
         self._bus_bit_rate = bit_rate
         self.bit_rate = bit_rate
         self.is_open = False
         self.listen_only = False
         self.time_stamps = False
-        self.overrun = False
         self.refused = False
+        self.locked = token is not None
+        self.wrong_token = False
+        self._token = (token or "").encode()
         self._line = b""
         self._overlong = False
 
@@ -86,7 +102,10 @@ class Channel:
         answer = bytearray()
         *lines, rest = (self._line + data).replace(b"\n", b"\r").split(b"\r")
         for line in lines:
-            answer += BELL if self._overlong else self._take(line, frames)
+            if self.locked:
+                answer += b"" if self._overlong else self._unlock(line)
+            else:
+                answer += BELL if self._overlong else self._take(line, frames)
             self._overlong = False
         if len(rest) > MAX_LINE:  # never a command: forget it up to its end
             self._overlong, rest = True, b""
@@ -98,6 +117,16 @@ class Channel:
         return format_frame(frame, extended, int(time * 1e3) if self.time_stamps else None)
 
     # --- inside ---------------------------------------------------------------------------------------------------
+    def _unlock(self, line: bytes) -> bytes:
+        if line[:1] != b"K" or self.wrong_token:
+            return b""
+        # Compared in constant time: how long it takes tells nothing of how much of it was right.
+        if not secrets.compare_digest(line[1:], self._token):
+            self.wrong_token = True
+            return b""
+        self.locked = False
+        return OK
+
     def _take(self, line: bytes, frames: list[tuple[Frame, bool]]) -> bytes:
         kind = line[:1]
         if kind in (b"t", b"T", b"r", b"R"):
@@ -123,8 +152,7 @@ class Channel:
         if kind == b"N" and not argument:
             return SERIAL_NUMBER
         if kind == b"F" and not argument and self.is_open:
-            flags, self.overrun = (0x08 if self.overrun else 0), False
-            return b"F%02X\r" % flags
+            return b"F00\r"  # no error: who is too slow is not told of an overrun but dropped
         if kind == b"Z" and argument in (b"0", b"1") and not self.is_open:
             self.time_stamps = argument == b"1"
             return OK

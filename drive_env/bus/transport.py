@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Hashable, Iterable
 from typing import NamedTuple, Protocol
 
-from drive_env.bus.wire import Transmission
+from drive_env.bus.wire import Transmission, Wire
 from drive_env.canopen.frames import Frame
 
 
@@ -20,8 +20,8 @@ class Incoming(NamedTuple):
 class Transport(Protocol):
     """A hub, or a python-can interface."""
 
-    def wait(self, timeout: float, waiting: Callable[[Hashable], int]) -> Iterable[Incoming]:
-        """Return the frames that have come, after at most `timeout` [s]."""
+    def wait(self, timeout: float, wire: Wire) -> Iterable[Incoming]:
+        """Return a few frames that have come for the wire, after at most `timeout` [s]."""
 
     def deliver(self, ended: Transmission) -> None:
         """Take a frame of the bus for all masters but its sender."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections import deque
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -83,6 +83,9 @@ class Wire:
         instant: Frames take no time, as in lockstep, but order, length and faults stay.
         faults: What disturbs it.
         seed: Seed of the faults.
+
+    Attributes:
+        injected: What else disturbs it at present.
     """
 
     def __init__(
@@ -92,6 +95,7 @@ class Wire:
             raise ValueError(f"bit_rate must be above 0 bit/s, not {bit_rate:g}")
         self.bit_rate = bit_rate
         self.faults = faults or Faults()
+        self.injected: list[Faults] = []
         self.statistics = WireStatistics()
         self._bit_time = 0.0 if instant else 1.0 / bit_rate
         self._random = random.Random(seed)
@@ -107,14 +111,26 @@ class Wire:
             controller = self._add(sender)
         waiting = _Waiting(frame, extended, max(now, controller.silent_until))
         self._enqueue(controller, waiting)
-        if self.faults and (not self.faults.only or frame.can_id in self.faults.only):
-            self._disturb_sending(controller, waiting, now)
+        for faults in self._disturbing(frame):
+            self._disturb_sending(faults, controller, waiting, now)
         self.statistics.most_waiting = max(self.statistics.most_waiting, self._num_waiting)
+
+    def silence(self, sender: Hashable, until: float) -> None:
+        """Take a sender's controller off the bus until `until` [s], as many errors do; what waited there is lost."""
+        controller = self._senders.get(sender)
+        self._give_up(self._add(sender) if controller is None else controller, until)
 
     def waiting(self, sender: Hashable) -> int:
         """Return how many frames a sender has not brought to the bus yet."""
         controller = self._senders.get(sender)
         return len(controller.queue) if controller else 0
+
+    def forget(self, sender: Hashable) -> None:
+        """Take a sender's controller off the bus, with all that it had to send; a transmission that has begun ends."""
+        controller = self._senders.pop(sender, None)
+        if controller is not None:
+            self._num_waiting -= len(controller.queue)
+            self.statistics.lost += len(controller.queue)
 
     @property
     def recovery_time(self) -> float:
@@ -163,8 +179,14 @@ class Wire:
         else:
             queue.append(waiting)
 
-    def _disturb_sending(self, controller: _Sender, waiting: _Waiting, now: float) -> None:
-        faults, draw = self.faults, self._random.random
+    def _disturbing(self, frame: Frame) -> Sequence[Faults]:
+        """Return what disturbs a frame."""
+        if not self.faults and not self.injected:
+            return ()
+        return [one for one in (self.faults, *self.injected) if one and (not one.only or frame.can_id in one.only)]
+
+    def _disturb_sending(self, faults: Faults, controller: _Sender, waiting: _Waiting, now: float) -> None:
+        draw = self._random.random
         if faults.delay and draw() < faults.delay:
             waiting.ready = max(waiting.ready, now + self._random.uniform(0.0, faults.delay_max))
         if faults.duplicate and draw() < faults.duplicate:
@@ -182,8 +204,9 @@ class Wire:
         waiting = controller.queue[0]
         frame, extended = waiting.frame, waiting.extended
         outcome: Outcome = "received"
-        if self.faults and (not self.faults.only or frame.can_id in self.faults.only):
-            frame, outcome = self._disturb_transmission(frame)
+        for faults in self._disturbing(frame):
+            if outcome == "received":
+                frame, outcome = self._disturb_transmission(faults, frame)
         bits = (broken_frame_bits if outcome == "error" else frame_bits)(frame, extended)
         end = start + bits * self._bit_time
         if outcome == "error":
@@ -199,8 +222,8 @@ class Wire:
         counts.lost += outcome == "lost"
         return Transmission(frame, name, end, extended, outcome)
 
-    def _disturb_transmission(self, frame: Frame) -> tuple[Frame, Outcome]:
-        faults, draw = self.faults, self._random.random
+    def _disturb_transmission(self, faults: Faults, frame: Frame) -> tuple[Frame, Outcome]:
+        draw = self._random.random
         if faults.corrupt and draw() < faults.corrupt:
             return frame, "error"
         if faults.drop and draw() < faults.drop:
@@ -217,13 +240,16 @@ class Wire:
         controller.error_counter += ERROR_STEP
         if controller.error_counter < BUS_OFF_LIMIT:
             return "error passive" if 0 <= controller.error_counter - PASSIVE_LIMIT < ERROR_STEP else "error"
+        self._give_up(controller, end + self.recovery_time)
+        return "bus off"
+
+    def _give_up(self, controller: _Sender, until: float) -> None:
         self.statistics.bus_offs += 1
         self.statistics.lost += len(controller.queue)
         self._num_waiting -= len(controller.queue)
         controller.queue.clear()
         controller.error_counter = 0
-        controller.silent_until = end + self.recovery_time
-        return "bus off"
+        controller.silent_until = until
 
 
 def _arbitration_field(waiting: _Waiting) -> tuple[int, bool, int, bool]:

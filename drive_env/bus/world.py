@@ -58,6 +58,7 @@ class World:
         nodes: Node identifier -> node.
         drives: All emulated drives, each a set with its nodes.
         listeners: Called with each frame that everybody received, also its own sender.
+        before_cycle: Called as a communication cycle begins; they may send by the wire.
         time: Time since the world began [s].
         cycles: Communication cycles that have passed.
 
@@ -72,6 +73,7 @@ class World:
         self.nodes: dict[int, BusNode] = {}
         self.drives: list[EmulatedDrives] = []
         self.listeners: list[Callable[[Transmission], None]] = []
+        self.before_cycle: list[Callable[[], None]] = []
         self.time = 0.0
         self.cycles = 0
         self._sync_objects: list[Port] = []  # 1005h of each node
@@ -177,6 +179,8 @@ class World:
 
     def cycle(self) -> None:
         """Let one communication cycle of 1 ms pass."""
+        for due in self.before_cycle:
+            due()
         for node_id in [node_id for node_id, back in self._off.items() if back <= self.time]:
             del self._off[node_id]
             self.nodes[node_id].bus_on(self.time)
@@ -191,6 +195,19 @@ class World:
         self.time = self.cycles * CYCLE
         for node in self.nodes.values():
             node.after_cycle(self.time)
+
+    def take_off_bus(self, node_id: int, until: float) -> None:
+        """Let a node be bus-off until `until` [s], not shorter than its controller needs to recover."""
+        until = max(until, self.time + self.wire.recovery_time)
+        self.wire.silence(("node", node_id), until)
+        self._off[node_id] = until
+        self.nodes[node_id].bus_off(self.time)
+
+    def let_recover(self, node_id: int) -> None:
+        """Let a node that is bus-off be back as the next communication cycle begins."""
+        if node_id in self._off:
+            self.wire.silence(("node", node_id), self.time)
+            self._off[node_id] = self.time
 
     def load(self) -> float:
         """Return the share of time in which the bus was busy."""

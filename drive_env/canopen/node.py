@@ -23,7 +23,7 @@ from drive_env.canopen.nmt import Command, State
 from drive_env.canopen.node_dictionary import NodeDictionary
 from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
 from drive_env.canopen.sdo import SdoServer
-from drive_env.canopen.store import Section, Store
+from drive_env.canopen.store import PowerLostError, Section, Store
 from drive_env.dictionary.access import (
     CANNOT_BE_STORED,
     HARDWARE_ERROR,
@@ -181,6 +181,15 @@ class Node:
         if abort is not None:
             self._transmit(Frame(frames.SDO_RESPONSE + self.node_id, abort))
 
+    @property
+    def saves_lose_power(self) -> bool:
+        """Whether the power fails, and comes back, in the middle of each save (1010h, 2706h); set likewise."""
+        return self._store.loses_power
+
+    @saves_lose_power.setter
+    def saves_lose_power(self, value: bool) -> None:
+        self._store.loses_power = value
+
     # --- conditions of the CAN controller -------------------------------------------------------------------------
     def bus_off(self, now: float) -> None:
         """Take the node off the bus, as a controller with too many errors does: the drive stops and is disabled."""
@@ -329,7 +338,11 @@ class Node:
     def _on_sdo(self, data: bytes, now: float) -> None:
         if not nmt.SERVICES[self.state].sdo:
             return
-        answer = self._sdo.request(data, now)
+        try:
+            answer = self._sdo.request(data, now)
+        except PowerLostError:
+            self.power_on(now)
+            return
         if answer is not None:
             self._transmit(Frame(frames.SDO_RESPONSE + self.node_id, answer))
         if self._leaves_for_bootloader:

@@ -10,14 +10,23 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 Key = tuple[int, int]
 Section = dict[Key, int]
 FORMAT = 1
 
 
+class PowerLostError(Exception):
+    """The power fails while values are being saved."""
+
+
 class Store:
     """Sections of a device, in a file if there is a path.
+
+    Attributes:
+        sections: What is stored.
+        loses_power: The power fails in the middle of each save.
 
     Args:
         path: The file; it need not exist.
@@ -31,6 +40,7 @@ class Store:
         self._path = path
         self._device = device
         self.sections: dict[str, Section] = {}
+        self.loses_power = False
         if path is not None and path.exists():
             self.sections = _parse(path, device)
 
@@ -39,6 +49,7 @@ class Store:
 
         Raises:
             OSError: If the file cannot be written.
+            PowerLostError: If the power fails meanwhile; what was stored before is stored still.
         """
         sections = {**self.sections, **changed}
         if self._path is not None:
@@ -50,13 +61,24 @@ class Store:
                     for name, section in sorted(sections.items())
                 },
             }
-            write_whole(self._path, json.dumps(content, indent=1) + "\n")
+            text = json.dumps(content, indent=1) + "\n"
+            if self.loses_power:
+                _unfinished(self._path).write_text(text[: len(text) // 2], encoding="utf-8")
+                raise PowerLostError
+            write_whole(self._path, text)
+        if self.loses_power:
+            raise PowerLostError
         self.sections = sections
+
+
+def _unfinished(path: Path) -> Path:
+    """Return the file in which a new content is written before it replaces the old one."""
+    return path.with_name(path.name + ".new")
 
 
 def write_whole(path: Path, text: str) -> None:
     """Write a file so that whoever kills the process or the power finds the old content or the new, never a mixture."""
-    new = path.with_name(path.name + ".new")
+    new = _unfinished(path)
     with new.open("w", encoding="utf-8") as file:
         file.write(text)
         file.flush()
@@ -76,13 +98,19 @@ def _parse(path: Path, device: str) -> dict[str, Section]:
         if content["format"] != FORMAT or content["device"] != device:
             raise ValueError(f"it is of format {content['format']} and of a {content['device']}")
         return {
-            str(name): {_key(text): int(raw) for text, raw in section.items()}
+            str(name): {_key(text): _raw(text, raw) for text, raw in section.items()}
             for name, section in content["sections"].items()
         }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
             f"{path} holds no parameters of a {device} ({error}); give another file, or delete it to start afresh"
         ) from error
+
+
+def _raw(text: str, raw: Any) -> int:
+    if type(raw) is not int:
+        raise ValueError(f"{text} is {raw!r}, no whole number")
+    return raw
 
 
 def _key(text: str) -> Key:

@@ -74,12 +74,16 @@ class MasterHints(NamedTuple):
         current_limit: Object that limits the current, in the unit of 6077h.
         timeout: Longest wait for an answer.
         timeouts: Index -> longest wait, of objects that take longer.
+        position_scale: Object that holds the increments of a revolution, of a device that has its own.
+        turns_positions_round: Objects that change what a position means besides its scale and zero: its direction.
     """
 
     rpdo_type: int
     current_limit: tuple[int, int]
     timeout: float
     timeouts: dict[int, float]
+    position_scale: tuple[int, int] | None = None
+    turns_positions_round: tuple[tuple[int, int], ...] = ((0x607E, 0),)
 
 
 class Device(NamedTuple):
@@ -200,6 +204,8 @@ def _master(data: dict[str, Any]) -> MasterHints:
         current_limit=_key(data["current_limit"]),
         timeout=data["timeout"],
         timeouts={int(index, 16): time for index, time in data["timeouts"].items()},
+        position_scale=_key(data["position_scale"]) if "position_scale" in data else None,
+        turns_positions_round=tuple(_key(text) for text in data["turns_positions_round"]),
     )
 
 

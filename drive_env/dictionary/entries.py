@@ -18,6 +18,7 @@ from drive_env.dictionary.access import (
     NO_SUCH_SUB_INDEX,
     ObjectAccessError,
 )
+from mechanics.untrusted import read_bytes
 
 # How callers name an object: index (sub-index 0), (index, sub-index), or a name of CiA's; a sub-object's name is
 # "Object.Sub-object". Case does not matter.
@@ -59,7 +60,7 @@ class Entry:
 
 def read_eds(path: Path, node_id: int = 1) -> canopen.ObjectDictionary:
     """Return python-canopen's model of an EDS; a file that is not UTF-8 is read as cp1252, which many vendors' are."""
-    raw = path.read_bytes()
+    raw = read_bytes(path)
     try:
         text = raw.decode("utf-8")
     except UnicodeDecodeError:

@@ -362,6 +362,7 @@ class GainTuning(Lanes):
             winding, stage = machine.temperatures
             new = (np.repeat(values[name], self._axes) for name in ("start.winding", "start.stage"))
             machine.set_temperatures(*(np.where(axes, a, b) for a, b in zip(new, (winding, stage), strict=True)))
+            self._machines.plan_faults(mask)
             power_up(drives, axes)
         else:
             self._trials.recover(axes)

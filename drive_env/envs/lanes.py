@@ -6,6 +6,7 @@ that it is the same among 1, 8 or 64 lanes and under any number of threads.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -147,6 +148,8 @@ class Lanes(VectorEnv[Any, Any, Any]):
 
         Raises:
             gymnasium.error.ResetNeeded: Before the first reset, or, with autoreset disabled, while a lane has ended.
+            ValueError: For an action that is no finite number, before any drive is told anything; that of a lane that
+                has ended is ignored.
         """
         if not self._has_begun:
             raise gymnasium.error.ResetNeeded("call reset() before the first step()")
@@ -156,6 +159,8 @@ class Lanes(VectorEnv[Any, Any, Any]):
                 f"lane {int(np.flatnonzero(before)[0])} has ended and autoreset is disabled; "
                 'call reset(options={"reset_mask": ended lanes})'
             )
+        if not _are_finite(actions):
+            actions = _finite_actions(actions, before)
         observation, reward, terminated, truncated, info = self._step_lanes(actions)
         if self._some_ended:
             begun, told = self._reset_lanes(before, {})
@@ -242,10 +247,12 @@ class OneLane(gymnasium.Env[Any, Any]):
         return one_of(observation), one_of(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
-        """Act once."""
+        """Act once; ValueError for an action that is no finite number, before the drive is told anything."""
         lanes = self.lanes
         if lanes._some_ended or not lanes._has_begun:
             raise gymnasium.error.ResetNeeded("the episode has ended or none has begun; call reset()")
+        if not _are_finite(action):
+            _finite_actions(_batch_of_one(action), np.zeros(1, bool))
         stepped = lanes._step_alone(action)
         if stepped[2] or stepped[3]:
             lanes._ended = np.ones(1, bool)
@@ -325,6 +332,33 @@ def _rows(tree: Observation, mask: Mask) -> NDArray[np.object_]:
     for lane in np.flatnonzero(mask):
         rows[lane] = {k: v[lane] for k, v in tree.items()} if isinstance(tree, dict) else tree[lane]
     return rows
+
+
+def _are_finite(actions: Any) -> bool:
+    """Return whether all are finite numbers; also False for some whose sum is beyond all numbers.
+
+    A sum in Python takes half of the time that NumPy takes to look at each.
+    """
+    return math.isfinite(sum(np.asarray(actions).ravel().tolist()))
+
+
+def _finite_actions(actions: Any, ignored: Mask) -> NDArray[Any]:
+    """Return actions with 0 for what is no number in lanes whose action is ignored.
+
+    Raises:
+        ValueError: For what is no number elsewhere: a drive would be told whatever its integer happens to be.
+    """
+    values = np.array(actions, float)
+    rows = values.reshape(len(ignored), -1)
+    wrong = np.argwhere(~np.isfinite(rows) & ~ignored[:, None])
+    if wrong.size:
+        lane, entry = wrong[0]
+        raise ValueError(
+            f"entry {entry} of the action of environment {lane} is {rows[lane, entry]:g}, no finite number; nothing "
+            "was sent. A policy whose training diverged gives such actions: take an earlier checkpoint of it"
+        )
+    rows[ignored & ~np.isfinite(rows).all(axis=1)] = 0.0
+    return values
 
 
 def _batch_of_one(action: Any) -> Any:

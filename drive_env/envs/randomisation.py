@@ -1,4 +1,4 @@
-"""Domain randomisation as data: laws of a machine's parameters, supply, temperatures and bus, and drawing from them.
+"""Domain randomisation as data: laws of a machine's parameters, supply, temperatures, bus and faults, and drawing.
 
 A set of laws is a TOML file (`distributions/`, one for every load); a curriculum widens it from the default machine to
 the whole range. A machine depends on the generator that it is drawn with, and on nothing else: a parameter's share of
@@ -12,13 +12,18 @@ import tomllib
 import zlib
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from drive_env.envs.random_faults import RandomFaults, check_ranges
+from drive_env.faults.schedule import Order
+from drive_env.faults.table import FAULTS, names_of
+from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.drives import EmulatedDrives
@@ -38,6 +43,9 @@ BESIDE: dict[str, tuple[str, float | None]] = {
     "bus.jitter": ("communication cycles", 0.0),
     "bus.lost_sync": ("1", 0.0),
 }
+
+# What an episode with faults tells: which of the table, counted from 1, 0 for none; when it begins [s].
+FAULT_VALUES = ("fault.number", "fault.at")
 
 LAWS = ("uniform", "loguniform", "normal", "choice")
 _KEYS = {"uniform": ("low", "high"), "loguniform": ("low", "high"), "normal": ("mean", "deviation"),
@@ -123,12 +131,15 @@ class Curriculum(NamedTuple):
 class Distributions:
     """Laws by the name of the parameter, and the curriculum that opens them.
 
-    Names are those of `drives.machine.parameters` and of `BESIDE`.
+    Names are those of `drives.machine.parameters` and of `BESIDE`. `faults` is the law of faults, None without any.
     """
 
-    def __init__(self, laws: Mapping[str, Law], curriculum: Curriculum | None = None) -> None:
+    def __init__(
+        self, laws: Mapping[str, Law], curriculum: Curriculum | None = None, faults: RandomFaults | None = None
+    ) -> None:
         self.laws = dict(laws)
         self.curriculum = curriculum or Curriculum()
+        self.faults = faults
         self._marks = np.array([zlib.crc32(name.encode()) for name in self.laws], np.uint64)
         self._widths: tuple[float, list[float]] = (math.nan, [])  # at the stage of the last draw
 
@@ -137,7 +148,9 @@ class Distributions:
         """Return a set of laws: a shipped one by its name (`shipped()`), a TOML file, or a table like one.
 
         Tables: `include`, names of sets whose laws come first; `parameters`, name -> law; `curriculum` with `steps`
-        and `stage`, and `opens`, group or parameter -> [from, to] in stages. A law false takes an included one away.
+        and `stage`, and `opens`, group or parameter -> [from, to] in stages; `faults` with `probability`, `names` (of
+        faults or groups), `at`, `duration` and `ranges`, as `RandomFaults` has them. A law false takes an included
+        one away, and so does `faults = false`.
 
         Raises:
             ValueError: For a set, law, key or number that is none, with those that are.
@@ -165,9 +178,16 @@ class Distributions:
         Raises:
             ValueError: For a stage out of range, or a law of a parameter that the machine does not have.
         """
+        return self.draw_with_fault(rng, defaults, stage)[0]
+
+    def draw_with_fault(
+        self, rng: np.random.Generator, defaults: Mapping[str, float], stage: float = 1.0
+    ) -> tuple[dict[str, float], Order | None]:
+        """Draw one machine as `draw` does, and the fault of its episode, None if it has none."""
         if not 0.0 <= stage <= 1.0:
             raise ValueError(f"stage of the curriculum must lie in 0...1, not {stage:g}")
-        shares = shares_of_chance(np.uint64(rng.integers(0, 2**64, dtype=np.uint64)), self._marks)
+        key = np.uint64(rng.integers(0, 2**64, dtype=np.uint64))
+        shares = shares_of_chance(key, self._marks)
         if stage != self._widths[0]:
             self._widths = stage, [self.curriculum.width(name, stage) for name in self.laws]
         drawn: dict[str, float] = {}
@@ -176,13 +196,20 @@ class Distributions:
                 drawn[name] = law.value(share, float(defaults[name]), width)
             elif name not in BESIDE:
                 raise ValueError(f"{name}: the machine has no such parameter; it has {', '.join(defaults)}")
-        return drawn
+        if self.faults is None:
+            return drawn, None
+        return drawn, self.faults.draw(partial(_chance, key), self.curriculum.width("faults", stage))
 
     def to_toml(self) -> str:
         """Return the set as TOML that `load` reads, included laws spelled out."""
         lines = ["[parameters]"]
         for name, law in self.laws.items():
             lines.append(f'"{name}" = {{ {", ".join(f"{k} = {_toml(v)}" for k, v in law.table().items())} }}')
+        if self.faults is not None:
+            table = self.faults.table()
+            ranges = table.pop("ranges", {})
+            lines += ["", "[faults]", *(f"{key} = {_toml(value)}" for key, value in table.items())]
+            lines += [f'ranges."{key}" = {_toml(ends)}' for key, ends in ranges.items()]
         standard = Curriculum()
         if self.curriculum != standard:
             lines += ["", "[curriculum]", f"steps = {_toml(list(self.curriculum.steps))}",
@@ -216,6 +243,11 @@ class RandomMachines:
             raise ValueError(f"{unknown[0]}: {drives.load.name!r} has no such parameter; it has "
                              f"{', '.join(self._defaults)}")  # fmt: skip
         self.values = {name: values.copy() for name, values in self._defaults.items()}
+        self._orders: list[Order | None] = [None] * machines
+        if distributions.faults is not None:
+            for name in distributions.faults.names:
+                drives._faults.check(Order(name))
+            self.values |= {name: np.zeros(machines) for name in FAULT_VALUES}
 
     def redraw(self, rngs: Sequence[np.random.Generator], where: Mask | None = None, stage: float = 1.0) -> None:
         """Draw the machines where the mask is true, put them to rest and switch their drives on anew.
@@ -228,6 +260,8 @@ class RandomMachines:
         """
         machine = self._drives.machine
         mask = np.ones(self._drives.num_machines, bool) if where is None else np.asarray(where, bool)
+        if self.distributions.faults is not None:
+            machine.clear_fault(where=mask)  # the next machine is drawn sound
         noise = np.ones(len(mask))
         for lane in map(int, np.flatnonzero(mask)):
             noise[lane] = rngs[lane].integers(1, 2**32)
@@ -247,10 +281,29 @@ class RandomMachines:
             np.where(axes, self._per_axis("start.winding"), winding),
             np.where(axes, self._per_axis("start.stage"), power_stage),
         )
+        self.plan_faults(mask)
+
+    def plan_faults(self, where: Mask) -> None:
+        """Schedule the faults of the episodes that begin where the mask is true; `redraw` does, a reset ends them."""
+        if self.distributions.faults is None:
+            return
+        for lane in map(int, np.flatnonzero(where)):
+            order = self._orders[lane]
+            for name in FAULT_VALUES:
+                self.values[name][lane] = 0.0
+            if order is None:
+                continue
+            try:
+                self._drives._faults.add(order, np.arange(len(where)) == lane)
+            except ValueError:  # a payload with which this machine cannot be stepped: it stays sound
+                continue
+            self.values["fault.number"][lane] = 1.0 + list(FAULTS).index(order.name)
+            self.values["fault.at"][lane] = order.at
 
     def _draw(self, lane: int, rng: np.random.Generator, stage: float) -> None:
         defaults = {name: float(values[lane]) for name, values in self._defaults.items()}
-        for name, value in self.distributions.draw(rng, defaults, stage).items():
+        drawn, self._orders[lane] = self.distributions.draw_with_fault(rng, defaults, stage)
+        for name, value in drawn.items():
             self.values[name][lane] = value
 
     def _set(self, mask: Mask) -> None:
@@ -290,15 +343,16 @@ def _shipped_set(name: str) -> Distributions:
 
 def _from_file(path: Path, includers: tuple[str, ...]) -> Distributions:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = read_toml(path)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is no TOML: {error}") from error
     return _from_table(path.name, table, includers)
 
 
 def _from_table(where: str, table: Mapping[str, Any], includers: tuple[str, ...]) -> Distributions:
-    _check_keys(where, table, ("include", "parameters", "curriculum"))
+    _check_keys(where, table, ("include", "parameters", "curriculum", "faults"))
     laws: dict[str, Law] = {}
+    faults: RandomFaults | None = None
     curriculum = Curriculum()
     include = table.get("include", [])
     for name in [include] if isinstance(include, str) else include:
@@ -309,6 +363,7 @@ def _from_table(where: str, table: Mapping[str, Any], includers: tuple[str, ...]
         other = _from_file(SHIPPED / f"{name}.toml", (*includers, name))
         laws |= other.laws
         curriculum = other.curriculum
+        faults = other.faults
     for name, row in _mapping(f"{where}: parameters", table.get("parameters", {})).items():
         if row is False:
             laws.pop(name, None)
@@ -316,7 +371,36 @@ def _from_table(where: str, table: Mapping[str, Any], includers: tuple[str, ...]
             laws[name] = _law(f"{where}: {name}", name, row)
     if "curriculum" in table:
         curriculum = _curriculum(f"{where}: curriculum", table["curriculum"])
-    return Distributions(laws, curriculum)
+    if "faults" in table:
+        faults = None if table["faults"] is False else _random_faults(f"{where}: faults", table["faults"])
+    return Distributions(laws, curriculum, faults)
+
+
+def _random_faults(where: str, table: Any) -> RandomFaults:
+    table = _mapping(where, table)
+    _check_keys(where, table, ("probability", "names", "at", "duration", "ranges"))
+    names = table.get("names", [])
+    if not isinstance(names, list | tuple) or not names or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{where}: names must be a list of faults or groups, as ['encoder_stuck', 'load']")
+    try:
+        known = tuple(dict.fromkeys(name for chosen in names for name in names_of(chosen)))
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+    pairs = {key: _pair(f"{where}: {key}", table[key]) for key in ("at", "duration") if key in table}
+    ranges = _mapping(f"{where}: ranges", table.get("ranges", {})).items()
+    faults = RandomFaults(
+        _numbers(f"{where}: probability", table.get("probability", 0.0)), known, pairs.get("at", (0.0, 1.0)),
+        pairs.get("duration"), {key: _pair(f"{where}: ranges: {key}", ends) for key, ends in ranges},
+    )  # fmt: skip
+    check_ranges(where, faults)
+    return faults
+
+
+def _pair(where: str, value: Any) -> tuple[float, float]:
+    pair = _numbers(where, value)
+    if not isinstance(pair, tuple) or len(pair) != 2:
+        raise ValueError(f"{where} must be [low, high], not {value!r}")
+    return pair
 
 
 def _law(where: str, name: str, row: Any) -> Law:
@@ -412,3 +496,8 @@ def shares_of_chance(key: np.uint64 | NDArray[np.uint64], marks: NDArray[np.uint
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         z = z ^ (z >> np.uint64(31))
     return np.asarray((z >> np.uint64(11)).astype(np.float64) * 2.0**-53)
+
+
+def _chance(key: np.uint64, name: str) -> float:
+    """Return the share of chance of one name."""
+    return float(shares_of_chance(key, np.array([zlib.crc32(name.encode())], np.uint64))[0])

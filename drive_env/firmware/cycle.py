@@ -27,7 +27,7 @@ from drive_env.firmware.power_stage import (
     refresh_winding,
 )
 from drive_env.firmware.record import LANES, RECORD
-from drive_env.firmware.sensors import measure_angle, measure_currents, measure_halls, measure_motion
+from drive_env.firmware.sensors import measure_angle, measure_currents, measure_halls, measure_motion, shake_encoders
 from mechanics import stepping
 from mechanics.bundle import Bundle, Cube, Matrix, Numbers, reader
 from mechanics.calls import call_hook, next_number
@@ -145,6 +145,8 @@ def start_window(drive, rates):
     """Read the encoder, close position and velocity loop, and prepare the winding for the ticks of this window."""
     if not drive.block_uses_halls[0]:
         measure_halls(drive, rates.window)
+    if drive.block_has_noisy_encoder[0]:
+        shake_encoders(drive)
     measure_motion(drive, rates.window)
     motion_loops(drive)
     for lane in range(LANES):
@@ -184,11 +186,15 @@ def supervise(drive, rates):
     # What few drives need is left out of the ticks of a block where none does.
     drive.block_uses_halls[0] = 0
     drive.block_has_open_phase[0] = 0
+    drive.block_has_noisy_encoder[0] = 0
     for lane in range(LANES):
         if drive.angle_source[lane] == alignment.HALL:
             drive.block_uses_halls[0] = 1
-        if drive.open_a[lane] > 0.0 or drive.open_b[lane] > 0.0:
+        if drive.open_a[lane] > 0.0 or drive.open_b[lane] > 0.0 or drive.open_c[lane] > 0.0:
             drive.block_has_open_phase[0] = 1
+        # Once more after the noise has ended, so that none of it is left in the angle.
+        if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
+            drive.block_has_noisy_encoder[0] = 1
 
 
 @stage
@@ -291,15 +297,15 @@ def mechanics_window(records, plant, rates, motion):
 @stage
 def meet(records, plant):
     """Once per millisecond: brakes close and open, and the rotors learn what they turn, where that changes."""
-    axes, copies = plant.brake.shape
-    brake, mass, varying = plant.brake, plant.mass, plant.varying
+    axes, copies = plant.jam.shape
+    brake, jam, mass, varying = plant.brake, plant.jam, plant.mass, plant.varying
     for copy in range(copies):
         for axis in range(axes):
             drive = records[(copy * axes + axis) // LANES]
             lane = (copy * axes + axis) % LANES
             mode = drive.brake_mode[lane]
             closed = mode == BRAKE_CLOSED or (mode == BRAKE_WITH_STAGE and drive.stage_on[lane] == 0.0)
-            brake[axis, copy] = drive.brake_torque[lane] if closed else 0.0
+            brake[axis, copy] = jam[axis, copy] + (drive.brake_torque[lane] if closed else 0.0)
             if varying:
                 drive.J_rotor[lane] = mass[axis, copy]
 
@@ -451,8 +457,10 @@ def power_on(records, where):
         s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
         drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
         count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI)
-        drive.count[lane] = count
-        drive.count_zero[lane] = count
+        gain = drive.encoder_gain[lane]
+        told = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI * gain
+        drive.count[lane] = np.floor(told)
+        drive.count_zero[lane] = drive.count[lane]
         drive.angle_zero[lane] = (
             drive.n_p[lane] * (count + 0.5) * TWO_PI / drive.encoder_counts[lane] + drive.commutation_offset[lane]
         )

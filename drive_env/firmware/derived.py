@@ -17,7 +17,7 @@ def derive(drive, dt):
         steps = drive.encoder_steps[lane] * drive.encoder_interpolation[lane]
         steps = steps if steps > 0.0 else 1.0
         drive.turns_per_count[lane] = (1.0 - 2.0 * drive.encoder_direction[lane]) / steps
-        drive.counts_per_rad[lane] = drive.encoder_counts[lane] * (1.0 / TWO_PI)
+        drive.counts_per_rad[lane] = drive.encoder_counts[lane] * (1.0 / TWO_PI) * drive.encoder_gain[lane]
         drive.adc_steps_per_ampere[lane] = 1.0 / drive.adc_step[lane]
         drive.ampere_per_lsb[lane] = drive.adc_step[lane] / drive.adc_step_lsb[lane]
         drive.dead_time_slope[lane] = 1.0 / drive.dead_time_current[lane]

@@ -160,6 +160,7 @@ def _enter(drive, lane, number, end):
     if number == 11 or number == 13:
         drive.stopping[lane] = 1
         drive.stop_time[lane] = 0.0
+        drive.braking[lane] = 0  # a halt's ramp that was under way is this one's no longer: it begins with the motion
     if number == 15:
         drive.fault[lane] = 0
         drive.error_register[lane] = 0

@@ -190,7 +190,7 @@ def open_phases(drive):
     for lane in range(LANES):
         s = drive.sin_e[lane]
         c = drive.cos_e[lane]
-        # Axes of phases A and B in the rotor frame; a DC motor's two legs are in series and share one.
+        # Axes of the phases in the rotor frame; a DC motor's two legs are in series and share one.
         is_dc = drive.is_dc[lane] > 0.5
         a_d = c
         a_q = -s
@@ -202,16 +202,25 @@ def open_phases(drive):
         i_d -= out * a_d
         i_q -= out * a_q
         out = drive.open_b[lane] * (i_d * b_d + i_q * b_q)
-        drive.i_d[lane] = i_d - out * b_d
-        drive.i_q[lane] = i_q - out * b_q
+        i_d -= out * b_d
+        i_q -= out * b_q
+        open_c = 0.0 if is_dc else drive.open_c[lane]
+        c_d = -a_d - b_d
+        c_q = -a_q - b_q
+        out = open_c * (i_d * c_d + i_q * c_q)
+        drive.i_d[lane] = i_d - out * c_d
+        drive.i_q[lane] = i_q - out * c_q
         m_d = drive.i_d_mean[lane]
         m_q = drive.i_q_mean[lane]
         out = drive.open_a[lane] * (m_d * a_d + m_q * a_q)
         m_d -= out * a_d
         m_q -= out * a_q
         out = drive.open_b[lane] * (m_d * b_d + m_q * b_q)
-        drive.i_d_mean[lane] = m_d - out * b_d
-        drive.i_q_mean[lane] = m_q - out * b_q
+        m_d -= out * b_d
+        m_q -= out * b_q
+        out = open_c * (m_d * c_d + m_q * c_q)
+        drive.i_d_mean[lane] = m_d - out * c_d
+        drive.i_q_mean[lane] = m_q - out * c_q
 
 
 @inlined

@@ -18,6 +18,20 @@ _BYTES_SCALE = 1.0 / (4.0 * 65535.0 / 12.0) ** 0.5
 
 
 @inlined
+def shake_encoders(drive):
+    """Draw the noise of the encoders for one window: writes encoder_shake [rad]; it has a generator of its own."""
+    for lane in range(LANES):
+        x = U32(drive.encoder_random[lane])
+        x = U32(x ^ U32(x << U32(13)))
+        x = U32(x ^ U32(x >> U32(17)))
+        x = U32(x ^ U32(x << U32(5)))
+        drive.encoder_random[lane] = x
+        pairs = U32(U32(x & U32(0x00FF00FF)) + U32(U32(x >> U32(8)) & U32(0x00FF00FF)))
+        total = np.int32(U32(U32(pairs & U32(0xFFFF)) + U32(pairs >> U32(16))))
+        drive.encoder_shake[lane] = drive.encoder_noise[lane] * (np.float64(total) - _BYTES_MEAN) * _BYTES_SCALE
+
+
+@inlined
 def measure_motion(drive, h):
     """Read the encoder at the velocity loop's rate, period h [s]: writes theta_meas, omega_meas.
 
@@ -26,7 +40,7 @@ def measure_motion(drive, h):
     """
     for lane in range(LANES):
         s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
-        drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
+        drive.encoder_error[lane] = drive.encoder_line_error[lane] * s + drive.encoder_shake[lane]
         count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.counts_per_rad[lane])
         before = drive.count[lane]
         count = before if drive.encoder_broken[lane] > 0.5 else count

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env.canopen.frames import SYNC
 from drive_env.dictionary.access import check_in_range, check_readable, check_writable
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.master.description import Description, Key
@@ -20,13 +22,16 @@ from drive_env.master.process_data import ProcessData
 from drive_env.master.sampling import Bytes, Samples, run_cycles
 
 if TYPE_CHECKING:
-    from drive_env.safety import Envelope
+    from drive_env.safety.envelope import Envelope
 
 logger = logging.getLogger(__name__)
 
 Integers = NDArray[np.int64]
 MOST_CALLS = 64  # that are remembered
 NOTHING: Sequence[Entry] = ()
+CONTROLWORD = (0x6040, 0)
+POLL_TIMEOUT = 0.008  # s for the samples of one SYNC
+_NOW = 0
 
 
 @dataclass(eq=False)
@@ -76,16 +81,50 @@ class CycleRunner:
         self._port, self._pace, self._process = port, pace, process
         self._start, self._catch_up, self._dry = start, catch_up, dry
         self._calls: dict[object, Call] = {}
+        self._running = threading.RLock()  # one user of SYNC at a time: the program, or its supervisor
         self._nothing = Call((), ())
 
     def pass_time(self, cycles: int, envelope: Envelope | None) -> None:
         """Let cycles pass by the clock: where this computer was late, SYNCs are left out."""
-        samples = None
-        if envelope is not None:
+        with self._running:
+            samples = None
+            if envelope is not None:
+                self._map(self._nothing, envelope)
+                samples = self._samples()
+            self._run(cycles, [], samples, envelope, skip_missed=True)
+            self._pace.end(self._port.receive)
+
+    def prepare(self, envelope: Envelope) -> None:
+        """Have mapped what the envelope watches, as far as it fits."""
+        with self._running:
             self._map(self._nothing, envelope)
-            samples = self._samples()
-        self._run(cycles, [], samples, envelope, skip_missed=True)
-        self._pace.end(self._port.receive)
+
+    def mapped(self) -> tuple[Entry, ...]:
+        """Return what comes with every SYNC."""
+        return self._process.sampled_entries()
+
+    def poll(self, envelope: Envelope) -> bool | None:
+        """Send a SYNC of the supervisor's own and look at what comes back.
+
+        Returns whether all of it came; None where the program's own cycles are under way, or nothing is mapped.
+        """
+        if not self._running.acquire(blocking=False):
+            return None
+        try:
+            samples, epoch = self._samples(), envelope.epoch
+            if samples is None:
+                return None
+            try:
+                self._port.send(SYNC)
+                if not self._port.wait(lambda: samples.complete() >= 1, POLL_TIMEOUT):
+                    return False
+            finally:
+                samples.close()
+            rows = self._process.decode(samples, 0, 1)
+        finally:
+            self._running.release()
+        envelope.observe(rows, epoch)
+        return True
 
     def call(self, objects: Sequence[ObjectName], play: Sequence[ObjectName]) -> Call:
         """Return what is known of a call.
@@ -138,10 +177,12 @@ class CycleRunner:
         """Let cycles pass and return what was sampled, each object of shape (cycles, num_axes)."""
         if envelope is not None:
             envelope.before_play(played)
-        self._map(call, envelope)
-        rpdos = self._process.encode(played) if played else []
-        samples = self._samples()
-        found = self._run(cycles, rpdos, samples, envelope)
+        with self._running:
+            self._map(call, envelope)
+            rpdos = self._process.encode(played) if played else []
+            samples = self._samples()
+            epoch = None if any((entry.index, entry.sub) == CONTROLWORD for entry in played) else _NOW
+            found = self._run(cycles, rpdos, samples, envelope, epoch=epoch)
         if envelope is not None and cycles:
             envelope.after_play(played)
         return found
@@ -160,6 +201,8 @@ class CycleRunner:
                 self._start()
                 self._process.map(direction, entries)
         call.mapping = self._process.mapping
+        if envelope is not None:
+            envelope.sampled(self._process.sampled_entries())
 
     def _samples(self) -> Samples | None:
         pdos = self._process.sampled()
@@ -173,17 +216,20 @@ class CycleRunner:
         envelope: Envelope | None,
         *,
         skip_missed: bool = False,
+        epoch: int | None = _NOW,
     ) -> dict[Key, Integers]:
         last: tuple[int, int, dict[Key, Integers]] | None = None
         watch = None
         if envelope is not None and samples is not None:
             # Bound here: the closure is called once a millisecond.
             watcher, held = envelope, samples
+            # Samples of a run that plays controlwords do not tell what these have done, or will have.
+            asked = envelope.epoch if epoch is _NOW else -1
 
             def watch(first: int, end: int) -> None:
                 nonlocal last
                 last = (first, end, self._process.decode(held, first, end))
-                watcher.observe(last[2])
+                watcher.observe(last[2], asked)
 
         try:
             run_cycles(

@@ -5,7 +5,6 @@ A known device brings its own; any other CiA 402 drive is described by its EDS a
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 
 from drive_env.devices import AxisOffset, Device, MasterHints, find_device
 from drive_env.dictionary.access import WRONG_TYPE, ObjectAccessError
-from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName, read_eds
+from drive_env.dictionary.entries import INTEGER_TYPES, Entry, ObjectDictionary, ObjectName, read_eds
 
 Key = tuple[int, int]
 
@@ -40,6 +39,11 @@ EMERGENCY_NAMES = {
 # Of a drive that is known by its EDS alone. CiA 301: 0 to 240 wait for the next SYNC, and 1 is what every device with
 # synchronous RPDOs takes. CiA 402: maximum current 6073h, in the thousandths of 6077h. Stores and restores erase flash,
 # for which users of python-canopen report up to seconds.
+# Objects whose integers are taken apart bit by bit, or tell where an axis is and goes: their length [bits] by CiA 402.
+KINDS: dict[Key, int] = {(0x6040, 0): 16, (0x6041, 0): 16, (0x6060, 0): 8, (0x6061, 0): 8, (0x6064, 0): 32,
+                         (0x606C, 0): 32, (0x6077, 0): 16, (0x607A, 0): 32, (0x60FF, 0): 32, (0x6071, 0): 16,
+                         (0x605A, 0): 16}  # fmt: skip
+LONGEST_TIMEOUT = 3600.0  # s: no drive takes so long, and a wait of 1e300 s is none that an operating system knows
 CIA_402 = MasterHints(rpdo_type=1, current_limit=(0x6073, 0), timeout=0.5, timeouts={0x1010: 10.0, 0x1011: 10.0})
 
 
@@ -174,7 +178,22 @@ def describe(device: str | None, eds: str | Path | None) -> Description:
     axes = sum((0x6041 + PROFILE_OFFSET * axis, 0) in types for axis in range(8))
     if axes == 0:
         raise ValueError(f"{path} describes no CiA 402 drive: it has no statusword 6041h")
+    _check_kinds(path, types, axes)
     return Description(path.stem, dictionary, axes, None, CIA_402, _types=types)
+
+
+def _check_kinds(path: Path, types: dict[Key, ODVariable], axes: int) -> None:
+    """Raise ValueError for objects that decide what a drive does and are no integers of CiA 402's length."""
+    for axis in range(axes):
+        for (index, sub), bits in KINDS.items():
+            variable = types.get((index + PROFILE_OFFSET * axis, sub))
+            found = None if variable is None else INTEGER_TYPES.get(variable.data_type or 0)
+            if variable is not None and (found is None or found[0] != bits):
+                said = "of no integer type" if found is None else f"an integer of {found[0]} bits"
+                raise ValueError(
+                    f"{path}: {variable.index:04X}h {variable.name} is {said} ({variable.data_type or 0:04X}h), and "
+                    f"CiA 402 has it with {bits} bits; correct its DataType"
+                )
 
 
 def _read_types(path: Path) -> dict[Key, ODVariable]:
@@ -187,6 +206,6 @@ def _read_types(path: Path) -> dict[Key, ODVariable]:
 
 def check_timeout(timeout: float) -> float:
     """Return a time-out [s]; ValueError for one that is not above 0 s or has no end."""
-    if not 0.0 < timeout < math.inf:
-        raise ValueError(f"a time-out of {timeout:g} s cannot be; give one above 0 s, e.g. 0.5")
+    if not 0.0 < timeout <= LONGEST_TIMEOUT:
+        raise ValueError(f"a time-out of {timeout:g} s cannot be; give one above 0 s, e.g. 0.5, up to an hour")
     return timeout

@@ -48,7 +48,7 @@ class DryPort(Port):
         """Write a frame down."""
         self._out(show_frame(can_id, data, remote))
 
-    def receive(self, timeout: float = 0.0) -> bool:
+    def receive(self, timeout: float = 0.0, done: Callable[[], bool] | None = None) -> bool:
         """Receive nothing, at once."""
         return False
 
@@ -84,6 +84,14 @@ class DrySdoClient:
         """Return what was written, or else the dictionary's default."""
         self._request(struct.pack("<BHB4x", 0x40, index, sub))
         return self._values.get((index, sub), b"\0\0\0\0")
+
+    def ask(self, index: int, sub: int, timeout: float) -> bytes | None:
+        """Return what `read` does."""
+        return self.read(index, sub, "", timeout)
+
+    def command(self, index: int, sub: int, data: bytes) -> None:
+        """Keep a value."""
+        self.write(index, sub, data, "", 0.0)
 
     def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
         """Keep a value that was there before."""

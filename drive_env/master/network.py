@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -40,6 +40,9 @@ class Network:
         self._nodes = tuple(nodes)
         self._emergencies: list[Emergency] = []
         self._booted: set[int] = set()
+        self._resets = False
+        self.on_restart: Callable[[int], None] = lambda node: None  # of a node that nobody here has reset
+        self.on_error_control: Callable[[int, bytes], None] | None = None
         for node in self._nodes:
             port.subscribe(EMCY + node, partial(self._on_emergency, node))
             port.subscribe(ERROR_CONTROL + node, partial(self._on_error_control, node))
@@ -63,6 +66,13 @@ class Network:
         """
         self._port.drain()
         self._booted.clear()
+        self._resets = True
+        try:
+            self._reset(nodes)
+        finally:
+            self._resets = False
+
+    def _reset(self, nodes: Collection[int]) -> None:
         self.command(RESET_NODE, nodes)
         if not self._port.wait(lambda: self._booted.issuperset(nodes), BOOT_TIMEOUT):
             silent = ", ".join(str(node) for node in sorted(set(nodes) - self._booted))
@@ -83,8 +93,12 @@ class Network:
             self._emergencies.append(Emergency(node, code, register, tuple(extra)))
 
     def _on_error_control(self, node: int, data: bytes) -> None:
+        if self.on_error_control is not None:
+            self.on_error_control(node, data)
         if data == bytes((BOOT_UP,)):
             self._booted.add(node)
+            if not self._resets:
+                self.on_restart(node)
 
 
 def check_nodes(nodes: Iterable[int]) -> tuple[int, ...]:

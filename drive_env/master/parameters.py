@@ -9,9 +9,11 @@ import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
+from drive_env import motion
 from drive_env.canopen.frames import INVALID
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.master.description import PROFILE_OFFSET
 from drive_env.master.errors import BusError
 
 if TYPE_CHECKING:
@@ -21,26 +23,32 @@ Key = tuple[int, int]
 
 # What can be written but is no parameter.
 COMMANDS = {
+    0x1003: "error history: a service",
     0x1010: "store: a service",
     0x1011: "restore defaults: a service",
     0x1F50: "program download: a service",
     0x1F51: "program control: a service",
+    0x1F52: "program verification: a service",
     0x2706: "store bus settings: a service",
     0x5FFF: "bootloader: a service",
     0x2703: "digital outputs: a command",
     0x6040: "controlword: a command",
+    0x6042: "vl target velocity: a command",
     0x6060: "modes of operation: a command",
     0x6071: "target torque: a command",
     0x607A: "target position: a command",
     0x60B0: "position offset: a command",
     0x60B1: "velocity offset: a command",
     0x60B2: "torque offset: a command",
+    0x60B8: "touch probe function: a command",
+    0x60C1: "interpolation data: a command",
     0x60FE: "digital outputs: a command",
     0x60FF: "target velocity: a command",
 }
 # Kept in a backup, never restored: the node would be somebody else after its next reset, or mute.
 IDENTITY_OF_THE_NODE = {0x2704: "CAN bit rate", 0x2705: "node-ID"}
-_OPERATION_ENABLED = (0x6F, 0x27)
+_DEVICE_OBJECTS = 0x2000  # from here on; what lies below is how a node talks
+_PROFILE = range(0x6000, 0xA000)  # the profile areas of up to eight axes (CiA 301)
 _COMMUNICATION = (range(0x1400, 0x1600), range(0x1800, 0x1A00))
 _MAPPING_ABOVE = 0x200  # the mapping of a PDO lies so far above its communication parameter
 
@@ -53,6 +61,10 @@ class Difference(NamedTuple):
     found: int | None
 
 
+class CommandObjectError(ValueError):
+    """An object that commands or serves stands among parameters."""
+
+
 class RollbackError(BusError):
     """A write failed and what was written before could not be taken back: the drive holds a mixture."""
 
@@ -61,12 +73,38 @@ class NotRestoredError(BusError):
     """A write failed; what was written before was taken back."""
 
 
+def of_first_axis(index: int) -> int:
+    """Return the index that an object of the profile area has on a node's first axis."""
+    if index not in _PROFILE:
+        return index
+    return _PROFILE.start + (index - _PROFILE.start) % PROFILE_OFFSET
+
+
+def command(index: int) -> str:
+    """Return what command or service an object is, "" for none; those of a node's further axes are the same."""
+    return COMMANDS.get(of_first_axis(index), "")
+
+
+def check_no_commands(keys: Iterable[Key], where: object) -> None:
+    """Raise CommandObjectError, naming them, if any of these objects are commands or services."""
+    found = dict.fromkeys(f"{index:04X}h ({command(index)})" for index, _ in keys if command(index))
+    if found:
+        raise CommandObjectError(
+            f"{where} holds what is no parameter: {', '.join(found)}. Nothing was written; take it out"
+        )
+
+
+def restorable(values: Mapping[Key, int]) -> dict[Key, int]:
+    """Return the values that are ever written back: not what makes a node somebody else, or mute."""
+    return {key: value for key, value in values.items() if key[0] not in IDENTITY_OF_THE_NODE}
+
+
 def parameters(drives: CanDrives) -> list[Entry]:
     """Return the entries that are parameters of a drive."""
     return [
         entry
         for entry in drives.description.dictionary
-        if entry.access in ("rw", "rwr", "rww") and entry.index not in COMMANDS and drives.description.is_number(entry)
+        if entry.access in ("rw", "rwr", "rww") and not command(entry.index) and drives.description.is_number(entry)
     ]
 
 
@@ -97,13 +135,13 @@ def write_all_or_none(drives: CanDrives, wanted: Mapping[Key, int], axis: int = 
     """Write what differs, read everything back, and take it all back if anything fails; return what was changed.
 
     Raises:
+        CommandObjectError: If there is a command or a service among them; nothing was written.
         NotRestoredError: If the drive refused or holds something else than was written; it is as it was before.
         RollbackError: If it could not be brought back; the message says what is left.
     """
-    status = int(drives.read_axis(drives.description.dictionary.find(0x6041), axis))
-    if status & _OPERATION_ENABLED[0] == _OPERATION_ENABLED[1]:
-        raise NotRestoredError("the axis is enabled, and parameters are not exchanged under way; disable it first")
-    chosen = {key: value for key, value in wanted.items() if key[0] not in IDENTITY_OF_THE_NODE}
+    check_no_commands(wanted, "what is to be written")
+    check_at_rest(drives, wanted, axis)
+    chosen = restorable(wanted)
     changes = compare(drives, chosen, axis)
     absent = [change.entry.label for change in changes if change.found is None]
     if absent:
@@ -113,10 +151,28 @@ def write_all_or_none(drives: CanDrives, wanted: Mapping[Key, int], axis: int = 
         _write(drives, {(c.entry.index, c.entry.sub): c.wanted for c in changes}, before, axis)
         left = compare(drives, {**before, **chosen}, axis)
         if left:
-            raise BusError("the drive does not hold what was written: " + _list(left))
+            raise BusError("the drive does not hold what was written: " + list_differences(left))
     except (ObjectAccessError, BusError, KeyboardInterrupt) as error:
         _roll_back(drives, before, axis, error)
     return changes
+
+
+def check_at_rest(drives: CanDrives, wanted: Iterable[Key], axis: int = 0) -> None:
+    """Raise NotRestoredError if a drive may turn an axis that these parameters touch."""
+    if any(_is_live(drives, other) for other in _affected(drives, wanted, axis)):
+        raise NotRestoredError("the axis is enabled, and parameters are not exchanged under way; disable it first")
+
+
+def _affected(drives: CanDrives, wanted: Iterable[Key], axis: int) -> Iterable[int]:
+    """Return the axes that a change touches: how a node talks is of all its axes."""
+    count = drives.description.num_axes
+    if all(index >= _DEVICE_OBJECTS for index, _ in wanted):
+        return (axis,)
+    return range(axis - axis % count, axis - axis % count + count)
+
+
+def _is_live(drives: CanDrives, axis: int) -> bool:
+    return motion.is_live(int(drives.read_axis(drives.description.dictionary.find(0x6041), axis)))
 
 
 def _roll_back(drives: CanDrives, before: Mapping[Key, int], axis: int, cause: BaseException) -> None:
@@ -133,8 +189,8 @@ def _roll_back(drives: CanDrives, before: Mapping[Key, int], axis: int, cause: B
         ) from cause
     if left:
         raise RollbackError(
-            f"{why}; and these could not be taken back: {_list(left)}. Reset the node, which brings back what it has "
-            "stored"
+            f"{why}; and these could not be taken back: {list_differences(left)}. Reset the node, which brings "
+            "back what it has stored"
         ) from cause
     raise NotRestoredError(f"{why}; everything was taken back, the drive is as it was") from cause
 
@@ -191,6 +247,7 @@ def _pdo_of(index: int) -> int | None:
     return None
 
 
-def _list(differences: list[Difference]) -> str:
+def list_differences(differences: list[Difference]) -> str:
+    """Return the first differences in words, and how many more there are."""
     shown = [f"{d.entry.label} is {d.found}, not {d.wanted}" for d in differences[:5]]
     return ", ".join(shown) + (f" and {len(differences) - 5} more" if len(differences) > 5 else "")

@@ -1,7 +1,8 @@
 """The master's port to a bus: frames go out, frames come in, and whoever waits for an identifier gets its data.
 
 There is no receiving thread: whoever waits receives, so a frame's way has no queue between threads in it. The bus
-(the kernel, the socket) keeps what arrives in the meantime.
+(the kernel, the socket) keeps what arrives in the meantime. Two threads may wait at a time, the program's and the
+supervisor's (drive_env/safety/supervisor.py): one receives for both.
 """
 
 from __future__ import annotations
@@ -21,9 +22,14 @@ from drive_env.master.slcan_socket import SlcanSocket
 Handler = Callable[[bytes], None]
 
 INTERFACE_VARIABLE, CHANNEL_VARIABLE = "DRIVE_ENV_INTERFACE", "DRIVE_ENV_CHANNEL"
+# No part of the channel, which messages, snapshots and certificates repeat, and no option of a command, which every
+# user of the computer can read.
+TOKEN_VARIABLE = "DRIVE_ENV_TOKEN"
 MOST_FRAMES = 10_000
 SEND_TIMEOUT = 0.5  # [s]
 _LINE_TIME = 0.002  # for the rest of a frame that has begun to arrive (slcan: a line of text) [s]
+_ORPHANED = 0.05  # s for which whoever has the turn does nothing with it
+_TURN = 0.0003  # how often a thread looks for what another one has received for it [s]
 
 
 def open_bus(interface: str | None = None, channel: str | None = None, **options: Any) -> can.BusABC:
@@ -32,7 +38,8 @@ def open_bus(interface: str | None = None, channel: str | None = None, **options
     Args:
         interface: As python-can names it; from DRIVE_ENV_INTERFACE if not given, slcan for a channel `socket://...`.
         channel: The channel; from DRIVE_ENV_CHANNEL if not given.
-        options: Whatever the interface takes besides, e.g. `bitrate`.
+        options: Whatever the interface takes besides, e.g. `bitrate`; `token` for a hub that asks for one (`drive-env
+            serve --token`), from DRIVE_ENV_TOKEN if not given.
 
     Raises:
         OpenError: If it cannot be opened, with what to try.
@@ -44,9 +51,15 @@ def open_bus(interface: str | None = None, channel: str | None = None, **options
             "no CAN channel is given; give interface and channel (--interface socketcan --channel can0, or --channel "
             f"socket://127.0.0.1:PORT of `drive-env serve`), or set {INTERFACE_VARIABLE} and {CHANNEL_VARIABLE}"
         )
+    token = options.pop("token", None)
     over_tcp = channel.startswith("socket://")
     if interface in (None, "slcan") and over_tcp and not options.keys() - {"bitrate"}:
-        return SlcanSocket(channel, options.get("bitrate"))
+        return SlcanSocket(channel, options.get("bitrate"), token or os.environ.get(TOKEN_VARIABLE) or None)
+    if token is not None:
+        raise OpenError(
+            "a token is for the hub of `drive-env serve`: channel socket://HOST:PORT, interface slcan or none, and no "
+            "other option but bitrate"
+        )
     if interface is None:
         if not over_tcp:
             raise OpenError(
@@ -77,8 +90,9 @@ class Port:
         self._bus = bus
         self._owned = owned
         self._handlers: dict[int, Handler] = {}
-        self._sending = threading.Lock()  # the lifeline's thread sends, too
+        self._sending = threading.Lock()  # the supervisor's thread sends, too
         self._receiving = threading.Lock()
+        self._is_receiving = False
         self._file = _file_number(bus)
 
     def subscribe(self, can_id: int, handler: Handler | None) -> None:
@@ -110,23 +124,32 @@ class Port:
                 "bit rate, termination), and that the adapter or the emulator is still there"
             ) from error
 
-    def receive(self, timeout: float = 0.0) -> bool:
+    def receive(self, timeout: float = 0.0, done: Callable[[], bool] | None = None) -> bool:
         """Wait up to `timeout` [s] for a frame and hand it to its handler; False if none came.
+
+        While another thread receives, its frames count: `done` tells whether what is waited for has come by it.
 
         Raises:
             BusError: If the bus is gone.
         """
+        if not self._take_turn(timeout, done):
+            return done is not None and done()
+        self._is_receiving = True
         try:
-            with self._receiving:
-                message = self._next(timeout)
+            if done is not None and done():
+                return True
+            message = self._next(timeout)
+            if message is None:
+                return False
+            if not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
+                handler = self._handlers.get(message.arbitration_id)
+                if handler is not None:
+                    handler(bytes(message.data))
         except (can.CanError, OSError, ValueError) as error:
             raise BusError(f"the bus is gone: {error}; open it again") from error
-        if message is None:
-            return False
-        if not (message.is_extended_id or message.is_error_frame or message.is_remote_frame):
-            handler = self._handlers.get(message.arbitration_id)
-            if handler is not None:
-                handler(bytes(message.data))
+        finally:
+            self._is_receiving = False
+            self._receiving.release()
         return True
 
     def drain(self) -> None:
@@ -143,13 +166,29 @@ class Port:
             if left <= 0.0:
                 self.drain()
                 return done()
-            self.receive(left)
+            self.receive(left, done)
         return True
 
     def close(self) -> None:
         """Close the bus if it is ours."""
         if self._owned:
             self._bus.shutdown()
+
+    def _take_turn(self, timeout: float, done: Callable[[], bool] | None) -> bool:
+        """Become the thread that receives, within `timeout` [s]; False if another one is, or if `done`."""
+        if self._receiving.acquire(blocking=False):
+            return True
+        begun = time.monotonic()
+        deadline, idle_since = begun + timeout, begun
+        while not self._receiving.acquire(timeout=_TURN):
+            if self._is_receiving:
+                idle_since = time.monotonic()
+            elif time.monotonic() - idle_since > _ORPHANED and self._receiving.locked():
+                # Ctrl-C came to the other thread between its turn and its first instruction: nobody would receive.
+                self._receiving.release()
+            if (done is not None and done()) or time.monotonic() >= deadline:
+                return False
+        return True
 
     def _next(self, timeout: float) -> can.Message | None:
         if self._file is None:

@@ -79,6 +79,10 @@ class ProcessData:
         """Return the TPDOs that are mapped, node by node."""
         return [pdo for of_node in self._mapped.get(OUT_OF_DRIVE.name, ((), []))[1] for pdo in of_node]
 
+    def sampled_entries(self) -> tuple[Entry, ...]:
+        """Return what the mapped TPDOs carry."""
+        return self._mapped.get(OUT_OF_DRIVE.name, ((), []))[0]
+
     def encode(self, played: Mapping[Entry, Integers]) -> list[tuple[int, Bytes]]:
         """Return identifier and rows of bytes of each mapped RPDO, of integers of shape (cycles, num_axes)."""
         rows = []

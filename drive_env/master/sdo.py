@@ -7,6 +7,7 @@ transfer are passed over; an abort names its object.
 from __future__ import annotations
 
 import struct
+import threading
 import time
 from collections.abc import Callable
 
@@ -14,7 +15,8 @@ import canopen
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 from canopen.sdo.client import SdoClient as CanopenClient
 
-from drive_env.canopen.frames import NMT, SDO_REQUEST, SDO_RESPONSE
+from drive_env.canopen.frames import ERROR_CONTROL, NMT, SDO_REQUEST, SDO_RESPONSE
+from drive_env.dictionary.access import ObjectAccessError
 from drive_env.master.errors import BusError, NoAnswerError, refused
 from drive_env.master.port import Port
 
@@ -42,6 +44,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._answers: list[bytes] = []
         self._object = (0, 0)
         self._timeout = 0.5
+        self._turn = threading.RLock()  # one transfer at a time: the supervisor's thread looks at the drive, too
         port.subscribe(SDO_RESPONSE + node, self._answers.append)
 
     def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
@@ -81,7 +84,35 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             self._port.send(NMT, bytes((PRE_OPERATIONAL, self._node)))
             self.write(index, sub, data, label, PATIENT * timeout)
 
+    def ask(self, index: int, sub: int, timeout: float) -> bytes | None:
+        """Return the bytes of a short object if they come within `timeout` [s], the wait for one's turn included."""
+        deadline = time.monotonic() + timeout
+        if not self._turn.acquire(timeout=timeout):
+            return None
+        try:
+            return self._transfer(index, sub, None, "a look", max(deadline - time.monotonic(), 1e-3))
+        except (BusError, ObjectAccessError):
+            return None
+        finally:
+            self._turn.release()
+
+    def command(self, index: int, sub: int, data: bytes) -> None:
+        """Send a short write without waiting: neither for an answer nor for a transfer that is under way.
+
+        Raises:
+            BusError: If the bus does not take the frame.
+        """
+        self.send_request(struct.pack("<BHB", 0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0"))
+
+    def guard(self) -> None:
+        """Ask the node for its life (node guarding, CiA 301)."""
+        self._port.send(ERROR_CONTROL + self._node, remote=True, length=1)
+
     def _transfer(self, index: int, sub: int, data: bytes | None, what: str, timeout: float) -> bytes:
+        with self._turn:
+            return self._transfer_alone(index, sub, data, what, timeout)
+
+    def _transfer_alone(self, index: int, sub: int, data: bytes | None, what: str, timeout: float) -> bytes:
         self._object = (index, sub)
         self._timeout = timeout
         where = f"node {self._node}"
@@ -128,11 +159,14 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
                         raise SdoAbortedError(struct.unpack_from("<L", answer, 4)[0])
                     return answer
             left = deadline - time.monotonic()
-            if left <= 0.0 and not self._port.receive():
+            if left <= 0.0 and not self._port.receive(done=self._answered):
                 raise SdoCommunicationError("No SDO response received")
             if left > 0.0:
-                self._port.receive(min(left, 0.05))
+                self._port.receive(min(left, 0.05), self._answered)
             self._alive()
+
+    def _answered(self) -> bool:
+        return bool(self._answers)
 
     def abort(self, abort_code: int = 0x08000000) -> None:
         """Abort the transfer."""

@@ -14,6 +14,7 @@ from contextlib import suppress
 
 import can
 
+from drive_env.bus.slcan import TOKEN_WANTED, check_token
 from drive_env.master.errors import OpenError
 
 CONNECT_TIMEOUT = 3.0  # [s]
@@ -26,15 +27,19 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
     Args:
         channel: The address.
         bitrate: Bit rate to set [bit/s]; by default the adapter's.
+        token: What a hub that is open to the network asks for. One that asks for none is joined all the same.
 
     Raises:
-        OpenError: For an address or a bit rate that is none, or nobody there.
+        OpenError: For an address, a bit rate or a token that is none, the wrong token, or nobody there; in receiving,
+            if the hub asks for a token and none was given.
     """
 
-    def __init__(self, channel: str, bitrate: int | None = None) -> None:
+    def __init__(self, channel: str, bitrate: int | None = None, token: str | None = None) -> None:
         if bitrate is not None and bitrate not in _BIT_RATES:
             raise OpenError(f"bit rate {bitrate} bit/s is none of slcan's: {', '.join(map(str, _BIT_RATES))}")
         self._socket = _connect(channel)
+        if token is not None:
+            _present(token, self._socket, channel)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setblocking(False)
         self._frames: deque[can.Message] = deque()
@@ -85,6 +90,11 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
         *lines, self._rest = (self._rest + data).split(b"\r")
         now = time.time()
         for line in lines:
+            if line + b"\r" == TOKEN_WANTED:
+                raise OpenError(
+                    f"{self.channel_info} asks for a token; set DRIVE_ENV_TOKEN to the one that `drive-env serve` "
+                    "printed (in Python: token=...)"
+                )
             message = _parse(line.strip(b"\a"), now)
             if message is not None:
                 self._frames.append(message)
@@ -120,6 +130,34 @@ def _connect(channel: str) -> socket.socket:
         raise OpenError(
             f"nobody answers at {channel}: {error}; start `drive-env serve`, or correct --channel"
         ) from error
+
+
+def _present(token: str, connection: socket.socket, channel: str) -> None:
+    """Show a token before anything else, and wait for the answer; the connection is closed if it is not taken."""
+    try:
+        check_token(token)
+        connection.sendall(b"K" + token.encode() + b"\r")
+        answer = b""
+        while answer in (b"", TOKEN_WANTED[:1], TOKEN_WANTED):  # what else comes is "yes", or of who asks for none
+            data = connection.recv(_CHUNK)
+            if not data:
+                raise ConnectionResetError
+            answer += data
+    except ValueError as error:
+        connection.close()
+        raise OpenError(f"{error}; take the one that `drive-env serve` printed") from None
+    except TimeoutError:
+        connection.close()
+        raise OpenError(
+            f"{channel} does not answer to the token within {CONNECT_TIMEOUT:g} s; if it is no hub of `drive-env "
+            "serve`, unset DRIVE_ENV_TOKEN"
+        ) from None
+    except OSError:
+        connection.close()
+        raise OpenError(
+            f"{channel} refuses the token; take the one that `drive-env serve` printed, and wait a second after a "
+            "wrong one"
+        ) from None
 
 
 def _parse(line: bytes, now: float) -> can.Message | None:

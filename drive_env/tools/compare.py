@@ -59,10 +59,7 @@ def compare(
             check_free(out, "choose another --out")
         from drive_env.replay import read_log
 
-        try:
-            recorded = read_log(log)
-        except UnicodeDecodeError:
-            raise ValueError(f"{log} is no text; give the CSV that drive-env scope writes") from None
+        recorded = read_log(log)
         # The compiler is imported from here on: a mistake above is told at once.
         from drive_env.drives import EmulatedDrives
         from drive_env.envs.randomisation import Distributions
@@ -70,6 +67,7 @@ def compare(
         from drive_env.replay import fit as fitted
         from drive_env.replay import replay
         from drive_env.tools.parameters import load_parameters
+        from drive_env.whole_file import write_whole
 
         laws = Distributions.load(distributions or load) if fit else None
         with EmulatedDrives(device, load, motor, machines if fit else 1, seed) as drives:
@@ -80,7 +78,7 @@ def compare(
             if laws is not None and fit:
                 found = fitted(drives, recorded, laws, fit, settings=given, rounds=rounds, seed=seed)
         if found is not None and out is not None:
-            out.write_text(found.to_toml(), encoding="utf-8")
+            write_whole(out, found.to_toml())
         if json:
             print_json(_as_json(report, dictionary, found, out))
         else:

@@ -17,6 +17,8 @@ from drive_env.tools.options import (
     Json,
     Nodes,
     Timeout,
+    Yes,
+    ask,
     axis_name,
     axis_place,
     connect,
@@ -27,6 +29,7 @@ from drive_env.tools.options import (
     print_json,
 )
 
+CONTROLWORD, STATUSWORD = 0x6040, 0x6041
 Raw = Annotated[bool, typer.Option("--raw", help="Integers as the wire carries them, without units.")]
 
 
@@ -71,30 +74,36 @@ def set_object(
     bitrate: Bitrate = None,
     timeout: Timeout = None,
     raw: Raw = False,
+    yes: Yes = False,
     json: Json = False,
     dry_run: DryRun = False,
 ) -> None:
     """Write an object over SDO, read it back and show what it is now.
 
-    Put -- before a negative value: drive-env set 60FF -- -1000.
+    Put -- before a negative value: drive-env set 60FF -- -1000. Where an axis is live it asks first. A controlword that
+    enables is refused, since nobody would watch the motor; one that stops (0, 2, 6, 7) always goes through.
     """
     from drive_env.master import quantities
-    from drive_env.master.parameters import COMMANDS
+    from drive_env.master.parameters import command, of_first_axis
 
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "dry_run": dry_run, "safety": False}
     with errors_as_exit_codes(), connect(interface, channel, node, device, eds, **options) as drives:
         entry = drives.description.dictionary.find(object_name(name))
-        rows = []
-        increments = [None] * drives.num_axes if raw else increments_per_revolution(drives)
-        if not drives.description.is_number(entry):
-            drives.write((entry.index, entry.sub), value)
-            wanted: list[Any] = [value] * drives.num_axes
-        else:
+        is_controlword = of_first_axis(entry.index) == CONTROLWORD
+        # A controlword has no unit, and one that stops is not kept waiting for what one would need.
+        increments = [None] * drives.num_axes if raw or is_controlword else increments_per_revolution(drives)
+        wanted: list[Any] = [value] * drives.num_axes
+        if drives.description.is_number(entry):
             wanted = [
                 quantities.parse_raw(value, entry) if raw else quantities.parse(value, entry, scale)
                 for scale in increments
             ]
-            drives.write((entry.index, entry.sub), wanted)
+        if is_controlword:
+            _refuse_to_enable(entry, wanted[0])
+        elif not dry_run:
+            _ask_where_live(drives, f"{entry.label} = {value}", yes)
+        drives.write((entry.index, entry.sub), wanted if drives.description.is_number(entry) else value)
+        rows = []
         readable = entry.access != "wo"
         found = drives.read((entry.index, entry.sub)) if readable else wanted
         for axis in range(drives.num_axes):
@@ -106,8 +115,30 @@ def set_object(
                 print(f"{axis_name(drives, axis)}  {entry.label} = {_text(now, entry, scale, raw)}")
         differs = readable and not dry_run and any(a != b for a, b in zip(found, wanted, strict=True))
         # Stores and the like take a signature and read something else.
-        if differs and not COMMANDS.get(entry.index, "").endswith("a service"):
+        if differs and not command(entry.index).endswith("a service"):
             fail(f"{entry.label} does not read back as it was written ({wanted[0]})", REFUSED)
+
+
+def _refuse_to_enable(entry: Any, controlword: int) -> None:
+    """Raise ValueError for a controlword that would enable: this command ends, and nothing watches then."""
+    from drive_env import motion
+
+    if motion.is_enabling(controlword):
+        raise ValueError(
+            f"{entry.label} = {controlword} would enable the axis, and this command ends right after: nobody would "
+            "watch the motor. Turn it with `drive-env jog`, or from Python with CanDrives; to stop it, set 2 or 0"
+        )
+
+
+def _ask_where_live(drives: Any, what: str, yes: bool) -> None:
+    """Have the user agree to a write where a drive may turn its motor; `ask` raises otherwise."""
+    from drive_env import motion
+
+    status = [int(word) for word in drives.read(STATUSWORD)]
+    live = [f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if motion.is_live(word)]
+    if live:
+        who = ", ".join(live)
+        ask(f"{who} is live by its statusword, and obeys at once (to stop it, set 6040 to 2). Write {what}?", yes)
 
 
 def _row(entry: Any, value: Any, increments: float | None) -> dict[str, Any]:

@@ -38,7 +38,7 @@ def jog(
     bitrate: Bitrate = None,
     timeout: Timeout = None,
     max_current: Annotated[
-        str | None, typer.Option(help="Quick-stop above this current; by default the drive's.")
+        str | None, typer.Option(help="Limit of the current, which the drive holds; by default the drive's own.")
     ] = None,
     json: Json = False,
     dry_run: DryRun = False,
@@ -52,8 +52,8 @@ def jog(
         from drive_env import motion
         from drive_env.dictionary.access import check_limits
         from drive_env.master import quantities
-        from drive_env.master.bounds import Limits
         from drive_env.master.description import describe
+        from drive_env.safety.limits import Limits
 
         known = describe(device, eds).dictionary
         current = None if max_current is None else quantities.parse(max_current, known.find(0x6077), None)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+
+from drive_env.commands import CLOSED, output_is_closed
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -34,7 +35,7 @@ Channel = Annotated[
         "--channel",
         "-c",
         envvar="DRIVE_ENV_CHANNEL",
-        help="Channel: can0, or socket://127.0.0.1:PORT of `drive-env serve`.",
+        help="Channel: can0, or socket://127.0.0.1:PORT of `drive-env serve` (its token, if any, in DRIVE_ENV_TOKEN).",
     ),
 ]
 Bitrate = Annotated[int | None, typer.Option(help="Bit rate [bit/s], where the interface sets it.")]
@@ -77,11 +78,37 @@ def connect(
     return CanDrives(device, eds=eds, interface=interface, channel=channel, nodes=nodes or (1,), **others)
 
 
+def look_first(
+    interface: str | None,
+    channel: str | None,
+    nodes: Iterable[int],
+    bitrate: int | None,
+    device: str,
+    eds: Path | None = None,
+    timeout: float | None = None,
+) -> None:
+    """Raise NoAnswerError for a node that is silent: to open it as drives would send it an NMT command."""
+    from drive_env.master.description import describe
+    from drive_env.master.errors import NoAnswerError
+    from drive_env.master.port import Port, open_bus
+    from drive_env.master.sdo import SdoClient
+
+    patience = describe(device, eds).answer_timeout if timeout is None else timeout
+    port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
+    try:
+        for node in nodes:
+            SdoClient(port, node).read(0x1000, 0, "1000h:00 Device type", patience)
+    except NoAnswerError as error:
+        raise NoAnswerError(f"{error}; if it is stopped (NMT), a run would take it to pre-operational") from None
+    finally:
+        port.close()
+
+
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one red line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
     from drive_env.master.errors import BusError, RefusedError
-    from drive_env.safety import SafetyError
+    from drive_env.safety.envelope import SafetyError
 
     with ending_by(fail, refused=(RefusedError, SafetyError, BusError, TimeoutError)):
         yield
@@ -118,7 +145,11 @@ def ending_by(
             raise
         fail(error, REFUSED)
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and output_is_closed():
+            raise typer.Exit(CLOSED) from None  # `| head -1` has seen enough: no mistake, and nobody to tell
         fail(f"{error.filename}: {error.strerror}" if error.filename else error, USER_ERROR)
+    except MemoryError as error:
+        fail(f"there is not enough memory{f' ({error})' if str(error) else ''}; ask for less at a time", USER_ERROR)
     except KeyboardInterrupt:
         fail("interrupted", INTERRUPTED)
 
@@ -150,9 +181,11 @@ def print_json(value: Any) -> None:
 
 
 def check_time(option: str, value: float | None) -> None:
-    """Raise ValueError for a time [s] that is not above 0, or not a number; None is any."""
-    if value is not None and not 0.0 < value < math.inf:
-        raise ValueError(f"{option} {value:g} s must be above 0 s")
+    """Raise ValueError for a time [s] that is not above 0, endless, or not a number; None is any."""
+    from drive_env.arguments import LONGEST
+
+    if value is not None and not 0.0 < value <= LONGEST:
+        raise ValueError(f"{option} {value:g} s must be above 0 s, and {LONGEST:g} s at most")
 
 
 def check_free(file: Path, remedy: str = "choose another file") -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -15,7 +16,6 @@ from drive_env.tools.options import (
     Bitrate,
     Channel,
     DeviceName,
-    DryRun,
     Eds,
     Interface,
     Json,
@@ -25,14 +25,27 @@ from drive_env.tools.options import (
     check_free,
     connect,
     errors_as_exit_codes,
+    fail,
     increments_per_revolution,
+    look_first,
     print_json,
 )
+from mechanics.untrusted import read_toml
+
+if TYPE_CHECKING:
+    from drive_env.master.identity import Identity
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 Axis = Annotated[int, typer.Option(help="Axis of a node with several, from 0.")]
 File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `backup` writes them.")]
 Store = Annotated[bool, typer.Option("--store", help="Have the drive keep them over a power cycle (1010h:01, 'save').")]
+OtherDrive = Annotated[
+    bool, typer.Option("--other-drive", help="Write it also to another drive than the one it was read from.")
+]
+Unchecked = Annotated[
+    bool, typer.Option("--unchecked", help="Take a file that was changed, or that has no check sum: you have read it.")
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Read the drive and say what would be written; write nothing.")]
 SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 
 
@@ -50,6 +63,7 @@ def backup(
 ) -> None:
     """Read all parameters of a drive into a file; commands and services are none."""
     from drive_env.master.parameters import read_parameters
+    from drive_env.whole_file import sealed, write_whole
 
     with errors_as_exit_codes():
         if str(file) != "-":
@@ -57,11 +71,11 @@ def backup(
         with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
             _check_axis(drives, axis)
             values = read_parameters(drives, axis)
-            text = _toml(drives, values)
+            text = sealed(_toml(drives, axis, values))
         if str(file) == "-":
             print(text, end="")
             return
-        file.write_text(text, encoding="utf-8")
+        write_whole(file, text)
         if json:
             print_json({"file": str(file), "parameters": len(values)})
         else:
@@ -89,6 +103,8 @@ def diff(
         if other is not None:
             dictionary = describe(device, eds).dictionary
             wanted, found = load_parameters(file, dictionary), load_parameters(other, dictionary)
+            _tell_of_changes(file)
+            _tell_of_changes(other)
             differences = [
                 Difference(dictionary.find(key), wanted.get(key, 0), found.get(key))
                 for key in {**wanted, **found}
@@ -99,6 +115,7 @@ def diff(
             with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
                 _check_axis(drives, axis)
                 differences = compare(drives, load_parameters(file, drives.description.dictionary), axis)
+                _tell_of_changes(file)
                 scale = increments_per_revolution(drives)[axis]
         _print(differences, "drive" if other is None else other.name, file.name, scale, json)
         if differences:
@@ -116,18 +133,36 @@ def restore(
     bitrate: Bitrate = None,
     timeout: Timeout = None,
     store: Store = False,
+    other_drive: OtherDrive = False,
+    unchecked: Unchecked = False,
     yes: Yes = False,
     json: Json = False,
     dry_run: DryRun = False,
 ) -> None:
     """Write a file's parameters to a drive, all or none: what was written is read back, or else taken back.
 
-    Bit rate and node-ID are left alone. The axis must not be enabled.
+    The file must be as `backup` wrote it, and of this drive. Bit rate and node-ID are left alone; commands and services
+    are refused. The axis must not be enabled.
     """
-    with errors_as_exit_codes(), _connected(interface, channel, node, device, eds, bitrate, timeout, dry_run) as drives:
-        _check_axis(drives, axis)
-        wanted = load_parameters(file, drives.description.dictionary)
-        _exchange(drives, wanted, axis, file.name, store=store, yes=yes or dry_run, json=json)
+    from drive_env.master.description import describe
+    from drive_env.master.identity import check_same_drive, read_identity
+    from drive_env.master.parameters import check_no_commands
+
+    with errors_as_exit_codes():
+        wanted = load_parameters(file, describe(device, eds).dictionary)
+        written, axis_then = _check_file(file, unchecked=unchecked)
+        check_no_commands(wanted, file)
+        bus = _Bus(interface, channel, node, device, eds, bitrate, timeout)
+
+        def check(drives: Any) -> None:
+            check_same_drive(file, written, read_identity(drives), other_drive=other_drive)
+            if axis_then not in (None, axis) and not other_drive:
+                raise ValueError(
+                    f"{file} was read from axis {axis_then}, and --axis says {axis}; nothing was written. If it is "
+                    "meant for this axis all the same, say --other-drive"
+                )
+
+        _exchange(bus, wanted, axis, file.name, check, store=store, yes=yes, json=json, dry_run=dry_run)
 
 
 def commission(
@@ -156,34 +191,120 @@ def commission(
             print("\n".join(sorted(path.stem for path in known.presets.glob("*.toml"))))
             return
         preset = known.preset(motor)
-        with _connected(interface, channel, node, device, None, bitrate, timeout, dry_run) as drives:
-            _check_axis(drives, axis)
-            dictionary = drives.description.dictionary
-            wanted = {(e.index, e.sub): value for e, value in ((dictionary.find(n), v) for n, v in preset.items())}
-            _exchange(drives, wanted, axis, f"preset {motor}", store=store, yes=yes or dry_run, json=json)
+        dictionary = known.new_dictionary()
+        wanted = {(e.index, e.sub): value for e, value in ((dictionary.find(n), v) for n, v in preset.items())}
+        bus = _Bus(interface, channel, node, device, None, bitrate, timeout)
+        name = f"preset {motor}"
+        _exchange(bus, wanted, axis, name, lambda drives: None, store=store, yes=yes, json=json, dry_run=dry_run)
+
+
+class _Bus(NamedTuple):
+    """A node, as the options name it."""
+
+    interface: str | None
+    channel: str | None
+    node: int
+    device: str
+    eds: Path | None
+    bitrate: int | None
+    timeout: float | None
 
 
 def _exchange(
-    drives: Any, wanted: dict[tuple[int, int], int], axis: int, name: str, *, store: bool, yes: bool, json: bool
+    bus: _Bus,
+    wanted: dict[tuple[int, int], int],
+    axis: int,
+    name: str,
+    check: Callable[[Any], None],
+    *,
+    store: bool,
+    yes: bool,
+    json: bool,
+    dry_run: bool,
 ) -> None:
-    from drive_env.master.parameters import IDENTITY_OF_THE_NODE, compare, write_all_or_none
+    """Write parameters and say what the drive holds then, as another connection reads it.
 
-    wanted = {key: value for key, value in wanted.items() if key[0] not in IDENTITY_OF_THE_NODE}
-    differences = compare(drives, wanted, axis)
-    scale = increments_per_revolution(drives)[axis]
-    if not json:
-        _print(differences, "drive", name, scale, json)
-    if differences:
-        ask(f"Write {len(differences)} parameters to node {drives.nodes[axis // drives.description.num_axes]}?", yes)
-    changes = write_all_or_none(drives, wanted, axis)
-    if store:
-        drives.write((0x1010, 1), SAVE)
+    Args:
+        bus: The node.
+        wanted: The parameters.
+        axis: Of the node.
+        name: What they are from.
+        check: Raises for a drive that they are not meant for.
+        store: Have the drive keep them.
+        yes: Do not ask.
+        json: Print JSON.
+        dry_run: Say what would be written, and write nothing.
+    """
+    from drive_env.master.parameters import check_at_rest, compare, list_differences, restorable, write_all_or_none
+
+    wanted = restorable(wanted)
+    if dry_run:  # to open a node that is stopped would send it an NMT command
+        look_first(bus.interface, bus.channel, [bus.node], bus.bitrate, bus.device, bus.eds, bus.timeout)
+    with _connected(*bus) as drives:
+        _check_axis(drives, axis)
+        check(drives)
+        differences = compare(drives, wanted, axis)
+        scale = increments_per_revolution(drives)[axis]
+        if not json:
+            _print(differences, "drive", name, scale, json)
+        if dry_run:
+            check_at_rest(drives, wanted, axis)
+            _tell_plan(differences, scale, bus.node, store=store, json=json)
+            return
+        if differences:
+            ask(f"Write {len(differences)} parameters to node {bus.node}?", yes)
+        changes = write_all_or_none(drives, wanted, axis)
+        if store:
+            drives.write((0x1010, 1), SAVE)
+    # What was just written is not believed to whom wrote it: another connection reads it anew.
+    with _connected(*bus) as drives:
+        left = compare(drives, wanted, axis)
+    if left:
+        fail(
+            f"node {bus.node} does not hold what was written, as a second reading shows: {list_differences(left)}; "
+            "is another master writing to it? Look with `drive-env diff`, then restore again",
+            REFUSED,
+        )
     if json:
         rows = [_row(change, scale) for change in changes]
         print_json({"changed": rows, "verified": len(wanted), "stored": store})
     else:
         kept = "; the drive keeps them" if store else "" if not changes else "; they last until a reset (--store)"
-        print(f"{len(changes)} written, {len(wanted)} verified{kept}")
+        print(f"{len(changes)} written, {len(wanted)} verified by a second reading{kept}")
+
+
+def _tell_plan(differences: list[Any], scale: float | None, node: int, *, store: bool, json: bool) -> None:
+    """Say what would be written."""
+    if json:
+        rows = [_row(difference, scale) for difference in differences]
+        print_json({"would change": rows, "would store": store, "written": 0})
+        return
+    kept = ", and kept over a power cycle" if store else ""
+    print(f"{len(differences)} parameters would be written to node {node}{kept}; nothing was written")
+
+
+def _check_file(file: Path, *, unchecked: bool) -> tuple[Identity | None, int | None]:
+    """Return from which drive and axis a file was read, None where it does not say; raise if it is not as written."""
+    from drive_env.master.identity import load_identity
+    from drive_env.whole_file import check_seal
+
+    table = _read_toml(file)
+    check_seal(file, table, unchecked=unchecked)
+    identity = table.get("identity")
+    if not isinstance(identity, dict):
+        return None, None
+    axis = identity.get("axis")
+    return load_identity(identity), axis if type(axis) is int else None
+
+
+def _tell_of_changes(file: Path) -> None:
+    """Say on stderr that a file is not as it was written: to compare with it, it need not be."""
+    from drive_env.whole_file import FileChangedError
+
+    try:
+        _check_file(file, unchecked=False)
+    except FileChangedError as error:
+        print(f"drive-env: note: {error}", file=sys.stderr)
 
 
 def _connected(
@@ -194,9 +315,8 @@ def _connected(
     eds: Path | None,
     bitrate: int | None,
     timeout: float | None,
-    dry_run: bool = False,
 ) -> Any:
-    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "dry_run": dry_run, "safety": False}
+    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     return connect(interface, channel, [node], device, eds, **options)
 
 
@@ -205,18 +325,21 @@ def _check_axis(drives: Any, axis: int) -> None:
         raise ValueError(f"--axis {axis}: the node has {drives.num_axes} axes, from 0")
 
 
-def _toml(drives: Any, values: dict[tuple[int, int], int]) -> str:
+def _toml(drives: Any, axis: int, values: Mapping[tuple[int, int], int]) -> str:
     """Return parameters as TOML; the objects' names are comments, their index is what counts."""
+    from drive_env.master.identity import read_identity
+    from drive_env.whole_file import FORMAT
+
     known = drives.description
     lines = [
-        f"# Parameters of node {drives.nodes[0]}, read {datetime.now(UTC):%Y-%m-%d %H:%M} UTC.",
+        f"# Parameters of node {drives.nodes[0]}. The check sum at the end shows a change: restore refuses it.",
+        f"format = {FORMAT}",
+        f'read = "{datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC"',
         "",
         "[identity]",
-        f'device = "{known.name}"',
+        *read_identity(drives).to_toml(),
+        f"axis = {axis}",
     ]
-    for index, name in ((0x1008, "name"), (0x1009, "hardware"), (0x100A, "software")):
-        if known.has(index):
-            lines.append(f'{name} = "{drives.read(index)[0]}"')
     lines += ["", "[parameters]  # index:sub-index, both hexadecimal"]
     for (index, sub), value in values.items():
         entry = known.dictionary.find((index, sub))
@@ -229,13 +352,7 @@ def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
     """Return the parameters of a file; ValueError for what is none."""
     from drive_env.dictionary.access import check_in_range, check_writable
 
-    if not path.is_file():
-        raise ValueError(f"there is no file {path}; write one with `drive-env backup {path}`")
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no TOML: {error}") from error
-    rows = table.get("parameters")
+    rows = _read_toml(path).get("parameters")
     if not isinstance(rows, dict) or not rows:
         raise ValueError(f"{path} has no table [parameters]; `drive-env backup` writes one")
     import numpy as np
@@ -252,6 +369,16 @@ def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
         check_in_range(entry, np.asarray(value))
         values[key] = int(value)
     return values
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    """Return what a file holds; ValueError if it is no TOML."""
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}; write one with `drive-env backup {path}`")
+    try:
+        return read_toml(path)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no TOML, or is torn: {error}; take another copy") from error
 
 
 def _print(differences: Iterable[Any], found: str, wanted: str, scale: float | None, json: bool) -> None:

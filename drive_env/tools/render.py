@@ -10,7 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
+from drive_env.commands import CLOSED, output_is_closed
 from drive_env.tools.options import USER_ERROR, fail, progress_on
+from mechanics.untrusted import read_text
 
 # Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported when it is needed.
 
@@ -64,6 +66,8 @@ def render(
     except (DemonstrationError, OpenGLError, PictureFileError) as error:
         fail(error, USER_ERROR)
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and output_is_closed():
+            raise typer.Exit(CLOSED) from None
         fail(f"{error.filename or out}: {error.strerror or error}; choose another --out", USER_ERROR)
 
 
@@ -92,7 +96,7 @@ def _render(row: Any, film: Path | None, view: bool) -> None:
 
 def _with_overrides(config: Path, **overrides: str | int | None) -> str:
     """Return the run's TOML with its comments, the overridden values in their place."""
-    text = config.read_text(encoding="utf-8")
+    text = read_text(config)
     for key, value in overrides.items():
         if value is not None:
             line = f"{key} = {json.dumps(value)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import secrets
 import signal
 import sys
 import threading
@@ -19,10 +20,13 @@ from drive_env.tools.options import REFUSED, USER_ERROR, fail
 if TYPE_CHECKING:
     from drive_env.bus.config import Bus
     from drive_env.bus.server import Server
+    from drive_env.faults.control import Control
 
 PORT = 29636  # no service is registered there, and no system gives it to others
 LOOPBACK = "127.0.0.1"
 PATIENCE = 8.0  # s after which a user wants to know what takes so long
+AUTO = "auto"  # as --token
+TOKEN_BYTES = 12  # of chance: 16 characters
 COMPILING = "drive-env: compiling the kernels, once; about 30 seconds"
 # SDO of any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1 synchronous.
 WARM_UP_REQUESTS = tuple(
@@ -43,9 +47,13 @@ def serve(
     ] = None,
     config: Annotated[Path | None, typer.Option(help="Several drives on one bus (TOML), as examples/bus.toml.")] = None,
     port: Annotated[int, typer.Option(help="TCP port of the hub; 0 for a free one.")] = PORT,
-    host: Annotated[
-        str, typer.Option(help="Address of the hub; anything but loopback lets the network in.")
+    listen: Annotated[
+        str, typer.Option(help="Address of the hub; anything but loopback lets the network in and needs --token.")
     ] = LOOPBACK,
+    token: Annotated[
+        str | None,
+        typer.Option(help="What clients of the hub must present: 8 to 48 letters, digits, - and _; auto: makes one."),
+    ] = None,
     interface: Annotated[
         str | None, typer.Option("--interface", "-i", help="python-can interface instead of the hub, e.g. socketcan.")
     ] = None,
@@ -64,6 +72,13 @@ def serve(
         bool, typer.Option("--stats", help="Say at the end how late cycles were and how full the bus.")
     ] = False,
     duration: Annotated[float | None, typer.Option(help="End after this time [s]; else by Ctrl-C.")] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(help="Let something fail: 'encoder_stuck at=2 duration=0.1 node=1'; may be repeated."),
+    ] = None,
+    control: Annotated[
+        int | None, typer.Option(help="Port on loopback at which `drive-env fault` reaches it; 0 for a free one.")
+    ] = None,
 ) -> None:
     """Put emulated drives on a CAN bus that python-can, python-canopen and drive-env itself can join."""
     server: list[Server] = []
@@ -73,14 +88,19 @@ def serve(
         bus = _bus(device, load, motor, node, config, bitrate, store, seed)
         if duration is not None and not duration > 0.0:
             _fail(f"--duration {duration:g} s must be above 0 s")
-        made = _server(bus, real_time, port, host, interface, channel)
+        if token == AUTO:
+            token = secrets.token_urlsafe(TOKEN_BYTES)
+        made = _server(bus, real_time, port, listen, token, interface, channel)
         server.append(made)
-        _announce(made, bus, real_time, interface, channel)
+        controls = _faults(made, fault or [], control)
+        _announce(made, bus, real_time, token, interface, channel)
         try:
             made.run(duration)
         except _can_error() as error:
             _fail(f"the interface {interface} failed: {error}", REFUSED)
         finally:
+            for one in controls:
+                one.close()
             made.close()
             made.world.close()
         if stats:
@@ -120,7 +140,15 @@ def _bus(
         _fail(str(error))
 
 
-def _server(bus: Bus, real_time: bool, port: int, host: str, interface: str | None, channel: str | None) -> Server:
+def _server(
+    bus: Bus,
+    real_time: bool,
+    port: int,
+    listen: str,
+    token: str | None,
+    interface: str | None,
+    channel: str | None,
+) -> Server:
     """Return the server of a bus, its transport open."""
     from drive_env.bus.config import BusConfigError, build_world
     from drive_env.bus.hub import Hub
@@ -129,8 +157,10 @@ def _server(bus: Bus, real_time: bool, port: int, host: str, interface: str | No
 
     if interface is None and channel is not None:
         _fail(f"--channel {channel} needs --interface, e.g. --interface socketcan")
-    if not host:  # the system would take it for every address
-        _fail(f"--host must be an address, e.g. {LOOPBACK}; 0.0.0.0 lets the whole network in")
+    if interface is not None and token is not None:
+        _fail(f"--token is for the hub; --interface {interface} cannot ask for one")
+    if not listen:  # the system would take it for every address
+        _fail(f"--listen must be an address, e.g. {LOOPBACK}; 0.0.0.0 lets the whole network in")
     if not 0 <= port <= 65_535:
         _fail(f"--port {port} must be 0 to 65535")
     try:
@@ -140,9 +170,12 @@ def _server(bus: Bus, real_time: bool, port: int, host: str, interface: str | No
     transport: Transport
     if interface is None:
         try:
-            transport = Hub(port, host, bus.bit_rate)
-        except OSError as error:
-            _fail(f"cannot listen on {host}:{port}: {error.strerror or error}; choose another --port (0: a free one)")
+            transport = Hub(port, listen, bus.bit_rate, token=token)
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            _fail(f"cannot listen on {listen}:{port}: {reason}; choose another --port (0: a free one) or --listen")
+        except ValueError as error:
+            _fail(f"{error}; say --token auto, --token TEXT of 8 characters or more, or --listen {LOOPBACK}")
     else:
         transport = _can_port(interface, channel, bus.bit_rate)
     waiting = threading.Timer(PATIENCE, lambda: print(COMPILING, file=sys.stderr, flush=True))
@@ -151,6 +184,34 @@ def _server(bus: Bus, real_time: bool, port: int, host: str, interface: str | No
     _warm_up(bus)
     waiting.cancel()
     return Server(world, transport)
+
+
+def _faults(server: Server, orders: list[str], port: int | None) -> list[Control]:
+    """Schedule faults, and return the control socket if one is asked for."""
+    from drive_env.faults.bus_faults import BusFaults
+    from drive_env.faults.control import Control
+    from drive_env.faults.schedule import parse_order
+
+    if not orders and port is None:
+        return []
+    faults = BusFaults(server.world)
+    try:
+        for order in orders:
+            faults.add(parse_order(order))
+        if port is None:
+            return []
+        if not 0 <= port <= 65_535:
+            raise ValueError(f"--control {port} must be 0 to 65535")
+        control = Control(faults, port)
+    except (ValueError, OSError) as error:
+        server.close()
+        server.world.close()
+        if isinstance(error, OSError):
+            why = os.strerror(error.errno or 0)
+            _fail(f"cannot listen on {LOOPBACK}:{port}: {why}; choose another --control (0: a free one)")
+        _fail(f"--fault: {error}" if orders else str(error))
+    print(f"drive-env: drive-env fault NAME --control {control.port} lets something fail")
+    return [control]
 
 
 def _can_port(interface: str, channel: str | None, bit_rate: int) -> Any:
@@ -180,16 +241,29 @@ def _warm_up(bus: Bus) -> None:
     world.close()
 
 
-def _announce(server: Server, bus: Bus, real_time: bool, interface: str | None, channel: str | None) -> None:
+def _announce(
+    server: Server, bus: Bus, real_time: bool, token: str | None, interface: str | None, channel: str | None
+) -> None:
+    from drive_env.bus.hub import Hub
+
     nodes = ", ".join(
         f"node {', '.join(map(str, row.nodes))} ({row.device}, {row.motor}, {row.load})" for row in bus.machines
     )
     pace = "in real time" if real_time else "in lockstep: each SYNC is 1 ms"
     print(f"drive-env: {nodes}, {bus.bit_rate / 1e3:g} kbit/s, {pace}; Ctrl-C ends it")
-    if interface is None:
+    hub = server.transport
+    if isinstance(hub, Hub):
+        if hub.is_public:
+            print(
+                f"drive-env: {hub.host}:{hub.port} is open to the network: whoever reaches it and has the token may "
+                "read and move these drives. Token and frames travel as plain text; where others listen, serve on "
+                f"{LOOPBACK} and use an SSH tunnel."
+            )
         print("import can")
-        place = server.transport.channel  # type: ignore[attr-defined]
-        print(f'bus = can.Bus(interface="slcan", channel="{place}", sleep_after_open=0)')
+        print(f'bus = can.Bus(interface="slcan", channel="{hub.channel}", sleep_after_open=0)')
+        if token is not None:
+            print(f'bus.serialPortOrig.write(b"K{token}\\r"); bus.open()')
+            print(f"drive-env: programs of drive-env take the token from the environment: DRIVE_ENV_TOKEN={token}")
     else:
         print(f"on {interface} {channel or ''}".rstrip())
     sys.stdout.flush()

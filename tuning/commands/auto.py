@@ -48,18 +48,22 @@ def auto(
         provenance.check_folder(folder)
         with drive.open() as target:
             result = _run(target, folder, drive.seed, store)
-            _report(target, result, folder, drive.seed, json)
+            _report(target, result, folder, json)
         if not result.accepted.all():
             raise typer.Exit(REFUSED)
 
 
 def _run(target: Target, folder: Path, seed: int, store: bool) -> Result:
     from tuning.auto import auto as tune
+    from tuning.auto_certificate import certificate
 
     file = folder / "before.toml"
     try:
         with progress_bar("tuning") as show:
-            return tune(target, file, seed=seed, keep=store, progress=lambda what, share: show(share))
+            return tune(
+                target, file, seed=seed, keep=store, progress=lambda what, share: show(share),
+                files=lambda result: certificate(target, result, seed).files(folder),
+            )  # fmt: skip
     except KeyboardInterrupt:
         fail(f"interrupted; {_left_behind(target, file)}", INTERRUPTED)
 
@@ -82,10 +86,7 @@ def _left_behind(target: Target, file: Path) -> str:
     return f"the drives are disabled and have the new gains: drive-tune restore {file} brings back what was"
 
 
-def _report(target: Target, result: Result, folder: Path, seed: int, json: bool) -> None:
-    from tuning.auto_certificate import certificate
-
-    written = certificate(target, result, seed).save(folder)
+def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
     if json:
         rows = [
             {
@@ -100,7 +101,8 @@ def _report(target: Target, result: Result, folder: Path, seed: int, json: bool)
             for k, axis in enumerate(result.axes)
         ]
         summary = {"drive seconds": result.drive_seconds.tolist(), "stored": result.kept}
-        files = {"snapshot": str(result.file), "certificate": str(written[0]), "report": str(written[1])}
+        names = {"certificate": "certificate.json", "report": "report.html"}
+        files = {"snapshot": str(result.file)} | {what: str(folder / name) for what, name in names.items()}
         print_json({"axes": rows} | summary | files)
         return
     from rich import box

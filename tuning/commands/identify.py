@@ -60,13 +60,14 @@ def identify(
         if out is not None and out.is_dir():
             raise ValueError(f"{out} is a folder; give a file for --out, e.g. {out / 'identified.json'}")
         file = way_back(drive, "identify", None if out is None else out.with_suffix(""))
+        from drive_env.whole_file import write_whole
         from tuning.identification import identify as run
 
         with drive.open() as target, unchanged(target, file), progress_bar("identifying") as show:
             found = run(target, progress=lambda what, share: show(share))
         rows = [row(one) for one in found]
         if out is not None:
-            out.write_text(json_.dumps(rows, indent=1) + "\n", encoding="utf-8")
+            write_whole(out, json_.dumps(rows, indent=1) + "\n")
         if json:
             print_json([one | before_as_json(file) for one in rows])
         else:

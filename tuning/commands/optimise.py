@@ -15,6 +15,7 @@ from tuning.commands.options import (
     Json,
     Resume,
     Workers,
+    check_machines,
     check_seed,
     errors_as_exit_codes,
     fail,
@@ -24,6 +25,7 @@ from tuning.commands.options import (
     what_an_interrupt_leaves,
 )
 
+MOST_SEARCHES = 10_000
 STALL = 60.0  # s: so long a sampler may think while an axis stands still, enabled
 
 
@@ -104,8 +106,9 @@ def optimise(
     """
     with errors_as_exit_codes():
         check_seed(drive.seed)
-        if lanes < 1:
-            raise ValueError(f"--lanes must be 1 or more, not {lanes}")
+        check_machines("--lanes", lanes)
+        if not 1 <= searches <= MOST_SEARCHES:
+            raise ValueError(f"--searches must be 1 or more, and {MOST_SEARCHES} at most, not {searches}")
         if resume and out is None:
             raise ValueError("--resume needs --out: the folder into which the search was to write")
         if drive.bus and (searches != 1 or workers is not None or cluster is not None or resume):
@@ -142,18 +145,20 @@ def optimise(
             except KeyboardInterrupt:
                 fail(what_an_interrupt_leaves(folder) if journal is None else _kept_in(journal), INTERRUPTED)
             emulated = common | {"load": drive.load, "lanes": lanes, "searches": searches}
+            _save(found, settings, folder, emulated)
             _report(found, settings, folder, None, where, emulated, json)
             unfinished.discard(folder)
             return
         before = file_before("optimise", folder)
         with drive.open() as target:
+            given = {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
+            on_bus = common | given | dict(target.bus)
             try:
-                found = _search_bus(target, settings, before)
+                found = _search_bus(target, settings, before, folder, on_bus)
             except KeyboardInterrupt:
                 lost = "interrupted; the trials made are lost: on a bus they are kept only with --journal FILE"
                 fail(lost if journal is None else _kept_in(journal), INTERRUPTED)
-        on_bus = common | {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
-        _report(found, settings, folder, before, where, on_bus | dict(target.bus), json)
+        _report(found, settings, folder, before, where, on_bus, json)
 
 
 def _search_machine(
@@ -203,8 +208,11 @@ def _kept_in(journal: Path) -> str:
     return f"interrupted; the trials made are in {journal}: the same command goes on from there"
 
 
-def _search_bus(target: Any, settings: Any, before: Path) -> Any:
-    """Search on a bus, the state before being in a file; what is no success is undone, and says where that file is."""
+def _search_bus(target: Any, settings: Any, before: Path, folder: Path, options: dict[str, Any]) -> Any:
+    """Search on a bus, the state before being in a file; what is no success is undone, and says where that file is.
+
+    Results that cannot be written down are none.
+    """
     from tuning.optimise import optimise as search
     from tuning.snapshot import put_back
 
@@ -213,7 +221,13 @@ def _search_bus(target: Any, settings: Any, before: Path) -> Any:
         put_back(target, before, "drive-tune") as transaction,
         progress_bar(f"{settings.trials} trials by {settings.sampler}") as show,
     ):
-        found = search(target, settings, progress=show)
+        try:
+            found = search(target, settings, progress=show)
+        except OSError as error:
+            if error.errno is None or settings.journal is None:  # a drive's, or a file of which it says the name
+                raise
+            raise OSError(error.errno, error.strerror, str(settings.journal)) from error
+        _save(found, settings, folder, options)
         transaction.commit()
     return found
 
@@ -222,10 +236,16 @@ def leave_oscillations_to_trials(drives: Any) -> None:
     """Have the envelope not end a search for what a trial stops itself, nor for a sampler that thinks."""
     from dataclasses import replace
 
-    from drive_env.safety import Envelope
-
     if drives.safety is not None:
-        drives.safety = Envelope(replace(drives.safety.limits, oscillation=False, stall=STALL), drives)
+        drives.safety.change(replace(drives.safety.limits, oscillation=False, stall=STALL))
+
+
+def _save(found: Any, settings: Any, folder: Path, options: dict[str, Any]) -> None:
+    from tuning import provenance
+    from tuning.trials_files import save
+
+    with provenance.new_folder(folder) as partial:
+        save(found, settings, partial, options, provenance.versions())
 
 
 def _report(
@@ -239,11 +259,6 @@ def _report(
 ) -> None:
     from dataclasses import asdict
 
-    from tuning import provenance
-    from tuning.trials_files import save
-
-    with provenance.new_folder(folder) as partial:
-        save(found, settings, partial, options, provenance.versions())
     if json:
         print_json(
             {

@@ -178,6 +178,16 @@ def check_seed(seed: int) -> None:
         raise ValueError(f"--seed must be 0 or more, not {seed}")
 
 
+def check_machines(option: str, machines: int) -> None:
+    """Raise ValueError for a number of emulated machines that cannot be."""
+    from drive_env.drives import MOST_MACHINES
+
+    if not 1 <= machines <= MOST_MACHINES:
+        raise ValueError(
+            f"{option} must be {'1 or more' if machines < 1 else f'{MOST_MACHINES} at most'}, not {machines}"
+        )
+
+
 def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool, axes: str = APART) -> None:
     """Raise ValueError for options of a bus where --bus was not said.
 
@@ -220,8 +230,7 @@ def open_target(
     from tuning.target import LOCKSTEP_PATIENCE, emulated, on_bus
 
     check_seed(seed)
-    if machines < 1:
-        raise ValueError(f"--machines must be 1 or more, not {machines}")
+    check_machines("--machines", machines)
     if not bus:
         check_no_bus(nodes, bitrate, lockstep, axes)
         ends = None if travel is None else parse_travels(travel)
@@ -284,7 +293,7 @@ def tell_before(file: Path | None) -> None:
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
     from drive_env.master.errors import BusError, RefusedError
-    from drive_env.safety import SafetyError
+    from drive_env.safety.envelope import SafetyError
     from tuning.pools import PoolError
 
     with ending_by(fail, refused=(SafetyError, BusError, RefusedError, PoolError, TimeoutError)):

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tuning.commands.options import Channel, Interface, Json, Yes, ask, errors_as_exit_codes, fail, print_json
+from drive_env.tools.parameters import OtherDrive, Unchecked
+from tuning.commands.options import (
+    REFUSED,
+    Channel,
+    Interface,
+    Json,
+    Yes,
+    ask,
+    errors_as_exit_codes,
+    fail,
+    print_json,
+)
+
+if TYPE_CHECKING:
+    from tuning.snapshot import Snapshot
 
 
 def restore(
@@ -22,42 +36,62 @@ def restore(
             show_default="as they were told to keep the change",
         ),
     ] = None,
+    other_drive: OtherDrive = False,
+    unchecked: Unchecked = False,
     yes: Yes = False,
     json: Json = False,
 ) -> None:
     """Bring drives back to the parameters that they had before a change.
 
-    The file says which drives, on which bus; --interface and --channel say otherwise. Each axis is written all or none,
-    and read back; it must not be enabled.
+    The file says which drives, on which bus; --interface and --channel say otherwise. It must be as it was written, and
+    of these drives. Each axis is written all or none, and read back; it must not be enabled.
     """
     with errors_as_exit_codes():
         from tuning.snapshot import load_snapshot
 
-        snapshot = load_snapshot(file)
+        snapshot = load_snapshot(file, unchecked=unchecked)
         if not snapshot.bus:
             fail(f"{file} was taken from emulated drives, which ended with their program; nothing is left to restore")
         given = {"interface": interface, "channel": channel}
         address = {**snapshot.bus, **{name: value for name, value in given.items() if value is not None}}
         nodes = ", ".join(map(str, address.get("nodes", [])))
         ask(f"Restore node {nodes} on {address.get('channel')}?", yes)
-        changed, kept = _restore(snapshot, address, snapshot.stored if store is None else store)
+        keep = snapshot.stored if store is None else store
+        changed, verified = _restore(file, snapshot, address, keep, other_drive=other_drive)
     if json:
         rows = [{"axis": k, "object": c.entry.label, "found": c.found, "restored": c.wanted} for k, c in changed]
-        print_json({"changed": rows, "stored": kept})
+        print_json({"changed": rows, "verified": verified, "stored": keep})
         return
     for axis, change in changed:
         print(f"axis {axis}: {change.entry.label}: {change.found} -> {change.wanted}")
-    print(f"{len(changed)} parameter{'s' * (len(changed) != 1)} restored" + ("; the drives keep them" if kept else ""))
+    kept = "; the drives keep them" if keep else ""
+    count = f"{len(changed)} parameter{'s' * (len(changed) != 1)}"
+    print(f"{count} restored, {verified} verified by a second reading{kept}")
 
 
-def _restore(snapshot: Any, address: dict[str, Any], store: bool) -> tuple[list[tuple[int, Any]], bool]:
-    """Return what was changed as (axis, difference), and whether the drives keep it."""
+def _restore(
+    file: Path, snapshot: Snapshot, address: dict[str, Any], store: bool, *, other_drive: bool
+) -> tuple[list[tuple[int, Any]], int]:
+    """Return what was changed as (axis, difference), and how many parameters another connection has read anew."""
     from drive_env import CanDrives
+    from drive_env.master.parameters import compare, list_differences, restorable
     from tuning import snapshot as snapshots
 
     # Nothing turns: the envelope would only add its own limits.
     with CanDrives(snapshot.device, safety=False, **address) as drives:
+        snapshots.check_same_drives(file, snapshot, drives, other_drive=other_drive)
         changed = snapshots.restore(drives, snapshot)
         if store:
             snapshots.store(drives)
-    return [(axis, change) for axis, changes in enumerate(changed) for change in changes], store
+    verified = 0
+    with CanDrives(snapshot.device, safety=False, **address) as drives:
+        for axis, values in enumerate(snapshot.axes):
+            wanted = restorable(values)
+            verified += len(wanted)
+            if left := compare(drives, wanted, axis):
+                fail(
+                    f"axis {axis} does not hold what was written, as a second reading shows: {list_differences(left)}; "
+                    f"is another master writing to it? End it, then restore {file} again",
+                    REFUSED,
+                )
+    return [(axis, change) for axis, changes in enumerate(changed) for change in changes], verified

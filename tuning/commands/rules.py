@@ -113,7 +113,7 @@ class _Axis:
 
 def _identified(target: Target) -> list[Plant | str]:
     """Return what the axes are, or why no rule can say anything of one: its inertia was not found."""
-    from drive_env.safety import swinging_allowed
+    from drive_env.safety.envelope import swinging_allowed
     from tuning.identification import identify
     from tuning.linear_model import Plant
 

@@ -86,7 +86,8 @@ def brake(drive, lane, rate, dt):
 def change_mode(drive, lane):
     """Make the requested mode the present one, without a jump: demands start from the motion there is."""
     before = drive.loop_level[lane]
-    if before == 0:
+    if before == 0 or drive.mode_display[lane] == CSP:
+        # A set-point of csp may have jumped: its speed for a period is none that the axis has, or could be braked from.
         drive.velocity_demand[lane] = drive.omega_meas[lane]
     if before != 2:
         drive.position_demand[lane] = drive.theta_meas[lane]

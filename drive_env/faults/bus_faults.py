@@ -1,0 +1,255 @@
+"""Faults of a bus: of its wire and its nodes, and of the machines behind them."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from drive_env.arguments import whole_cycles
+from drive_env.bus.faults import Faults
+from drive_env.bus.world import CYCLE, World
+from drive_env.canopen.frames import NMT, Frame
+from drive_env.canopen.node import Node
+from drive_env.drives import EmulatedDrives
+from drive_env.faults.machine_faults import axes_that_fulfil
+from drive_env.faults.schedule import NEVER, Condition, Order, cycles_of
+from drive_env.faults.table import Row, checked_parameters, find_fault
+
+logger = logging.getLogger(__name__)
+
+# What disturbs the wire itself: the wire's own words.
+DISTURBANCES: dict[str, Callable[[Mapping[str, float]], Faults]] = {
+    "bus_loss": lambda given: Faults(drop=given["share"]),
+    "bus_delay": lambda given: Faults(delay=given["share"], delay_max=given["longest"]),
+    "bus_doubling": lambda given: Faults(duplicate=given["share"]),
+    "bus_reorder": lambda given: Faults(reorder=given["share"]),
+    "bus_bit_errors": lambda given: Faults(corrupt=given["share"]),
+}
+OF_ONE_NODE = ("bus_off", "second_master", "node_reset", "store_interrupted")
+MOST_BABBLE = 16  # frames of a babbler that wait for the bus: it never stops, and need not remember
+BABBLE = bytes(8)
+
+
+class BusFault(NamedTuple):
+    """A fault that is still to come or is there: its number, what was asked for, its node, and whether it is there."""
+
+    number: int
+    order: Order
+    node: int | None
+    is_active: bool
+
+
+@dataclass(eq=False)
+class _Scheduled:
+    """A fault and where it stands: cycles at which it begins and ends, None while its condition is waited for.
+
+    `inner` is the number that the machine gave to a fault of its own.
+    """
+
+    number: int
+    order: Order
+    row: Row
+    given: Mapping[str, float]
+    condition: Condition
+    node: int | None
+    delay: int
+    length: int
+    begins: int | None = None
+    ends: int | None = None
+    disturbance: Faults | None = None
+    inner: int | None = None
+
+
+class BusFaults:
+    """All faults of a world, which may be given from any thread; they act as a communication cycle begins.
+
+    Args:
+        world: The world.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._lock = threading.RLock()
+        self._faults: list[_Scheduled] = []
+        self._ended: list[_Scheduled] = []  # called off, to be ended by the world's own thread
+        self._next_number = 0
+        world.before_cycle.append(self._act)
+
+    def add(self, order: Order) -> int:
+        """Schedule a fault of the bus, or of a node and its machine; return its number.
+
+        Args:
+            order: What is asked for; `node` is needed where there are several and the fault is of one.
+
+        Raises:
+            ValueError: For a fault, parameter, time, condition or node that is none, or that this machine cannot have.
+        """
+        row = find_fault(order.name)
+        given = checked_parameters(row, order.parameters)
+        condition = Condition.parse(order.when)
+        delay, length = cycles_of(order, row, partial(whole_cycles, cycle=CYCLE))
+        is_of_wire = row.group == "bus" and row.name not in OF_ONE_NODE
+        node = order.node if is_of_wire and order.node is None else self._node_of(order)
+        with self._lock:
+            if not is_of_wire and row.name not in OF_ONE_NODE:
+                assert node is not None
+                # Refused here if the machine refuses it; the world's own thread gives it to the machine.
+                self._drives_of(node)._faults.check(order)
+            self._next_number += 1
+            fault = _Scheduled(self._next_number, order, row, given, condition, node, delay, length)
+            self._faults.append(fault)
+            if order.when == "" or self._is_of_machine(row):
+                fault.begins = self._world.cycles + (0 if self._is_of_machine(row) else delay)
+            return fault.number
+
+    def listing(self) -> list[BusFault]:
+        """Return the faults that are still to come or are there."""
+        with self._lock:
+            return [BusFault(fault.number, fault.order, fault.node, self._is_active(fault)) for fault in self._faults]
+
+    def clear(self, number: int | None = None) -> None:
+        """End a fault or call it off, None all of them; ValueError if there is none of that number."""
+        with self._lock:
+            known = [fault.number for fault in self._faults]
+            if number is not None and number not in known:
+                raise ValueError(f"there is no fault {number}; there are {', '.join(map(str, known)) or 'none'}")
+            chosen = [fault for fault in self._faults if number in (None, fault.number)]
+            self._faults = [fault for fault in self._faults if fault not in chosen]
+            self._ended += chosen
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    @staticmethod
+    def _is_of_machine(row: Row) -> bool:
+        return row.group not in ("bus", "node")
+
+    def _node_of(self, order: Order) -> int:
+        nodes = self._world.nodes
+        known = ", ".join(map(str, nodes))
+        if order.node is None and len(nodes) > 1:
+            raise ValueError(f"fault {order.name} is of one node; say which: node={next(iter(nodes))}, of {known}")
+        node = next(iter(nodes)) if order.node is None else order.node
+        if node not in nodes:
+            raise ValueError(f"fault {order.name}: there is no node {node} on the bus; there are {known}")
+        return node
+
+    def _emulated(self, node: int) -> Node:
+        found = self._world.nodes[node]
+        assert isinstance(found, Node), "faults are of emulated nodes"
+        return found
+
+    def _drives_of(self, node: int) -> EmulatedDrives:
+        return self._emulated(node).drives
+
+    def _is_active(self, fault: _Scheduled) -> bool:
+        if fault.inner is not None and fault.node is not None:
+            found = [one for one in self._drives_of(fault.node)._faults.listing() if one.number == fault.inner]
+            return bool(found) and bool(found[0].active.any())
+        return fault.ends is not None
+
+    def _act(self) -> None:
+        """Begin, go on with and end what is due; the world calls it as a communication cycle begins."""
+        if not self._faults and not self._ended:
+            return
+        now = self._world.cycles
+        with self._lock:
+            for fault in self._ended:
+                self._end(fault)
+            self._ended.clear()
+            for fault in list(self._faults):
+                if fault.begins is None and self._holds(fault):
+                    fault.begins = now + fault.delay
+                if fault.ends is None and fault.begins is not None and fault.begins <= now:
+                    fault.ends = now + fault.length if fault.length < NEVER else NEVER
+                    try:
+                        self._begin(fault)
+                    except ValueError as error:  # a load that cannot be stepped so: the bus goes on
+                        logger.warning("fault %d is called off: %s", fault.number, error)
+                        self._faults.remove(fault)
+                        continue
+                if fault.ends is not None and self._is_over(fault, now):
+                    self._end(fault)
+                    self._faults.remove(fault)
+                elif fault.ends is not None:
+                    self._go_on(fault, now)
+
+    def _holds(self, fault: _Scheduled) -> bool:
+        """Return whether an axis of the fault's node, or any on the bus, fulfils its condition."""
+        if fault.node is None:
+            return any(bool(axes_that_fulfil(fault.condition, drives).any()) for drives in self._world.drives)
+        node = self._emulated(fault.node)
+        met = axes_that_fulfil(fault.condition, node.drives)
+        return bool(met[node.first_axis : node.first_axis + node.drives.device.num_axes].any())
+
+    def _is_over(self, fault: _Scheduled, now: int) -> bool:
+        if fault.row.once:
+            return True
+        if fault.inner is not None and fault.node is not None:
+            return not any(one.number == fault.inner for one in self._drives_of(fault.node)._faults.listing())
+        return fault.ends is not None and fault.ends <= now
+
+    def _begin(self, fault: _Scheduled) -> None:
+        world, name, node = self._world, fault.row.name, fault.node
+        if name in DISTURBANCES:
+            fault.disturbance = DISTURBANCES[name](fault.given)
+            world.wire.injected.append(fault.disturbance)
+        if node is None or name == "babbling_node":
+            return
+        if name == "bus_off":
+            # Without a duration the controller is back as soon as it can be.
+            held = 0.0 if fault.order.duration is None else fault.order.duration
+            world.take_off_bus(node, world.time + held)
+            if fault.order.duration is None:
+                fault.ends = world.cycles + 1
+        elif name == "node_reset":
+            world.nodes[node].power_on(world.time)
+        elif name == "store_interrupted":
+            self._emulated(node).saves_lose_power = True
+        elif self._is_of_machine(fault.row):
+            fault.inner = self._give_to_machine(fault, node)
+
+    def _give_to_machine(self, fault: _Scheduled, number: int) -> int:
+        """Let the machine of a node have a fault; of sensors, motor and supply it is of the node's own axis."""
+        node = self._emulated(number)
+        drives, order = node.drives, fault.order
+        machine, axis = divmod(node.first_axis, drives.load.num_axes)
+        where = np.arange(drives.num_machines) == machine
+        of_axis = fault.row.group in ("sensor", "motor", "supply")
+        return drives.machine.fault(
+            order.name, at=order.at, when=order.when, duration=order.duration, where=where,
+            axis=axis if of_axis else None, **order.parameters,
+        )  # fmt: skip
+
+    def _go_on(self, fault: _Scheduled, now: int) -> None:
+        wire, name, given = self._world.wire, fault.row.name, fault.given
+        assert fault.begins is not None
+        sender = (name, fault.number)
+        if name == "babbling_node":
+            # Whole frames: as many as the rate has made since it began.
+            passed = now - fault.begins
+            due = int((passed + 1) * given["rate"] * CYCLE) - int(passed * given["rate"] * CYCLE)
+            for _ in range(min(due, MOST_BABBLE - wire.waiting(sender))):
+                wire.send(Frame(int(given["identifier"]), BABBLE), sender, self._world.time)
+        elif name == "second_master" and (now - fault.begins) % max(round(given["period"] / CYCLE), 1) == 0:
+            wire.send(Frame(NMT, bytes((int(given["command"]), fault.node or 0))), sender, self._world.time)
+
+    def _end(self, fault: _Scheduled) -> None:
+        if fault.disturbance is not None:
+            # By identity: two faults of the same numbers are two.
+            injected = self._world.wire.injected
+            injected[:] = [one for one in injected if one is not fault.disturbance]
+        if fault.node is None or fault.ends is None:
+            return
+        if fault.row.name == "bus_off" and fault.order.duration is not None:
+            self._world.let_recover(fault.node)
+        elif fault.row.name == "store_interrupted":
+            self._emulated(fault.node).saves_lose_power = False
+        elif fault.inner is not None:
+            faults = self._drives_of(fault.node)._faults
+            if any(one.number == fault.inner for one in faults.listing()):
+                faults.clear(fault.inner, np.ones(self._drives_of(fault.node).num_machines, bool))

@@ -1,0 +1,110 @@
+"""What the faults of machines change: rows of quantities, each with its value under the fault by its value without."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Given = Mapping[str, float]
+
+
+class Quantity(NamedTuple):
+    """What a fault changes.
+
+    kind: "record", a field of the drives' records, one per axis; "load", a parameter of the load, one per machine;
+        "jam", what holds the load [N*m at the rotor], one per axis.
+    name: Of the field or parameter.
+    part: In a deep field.
+    """
+
+    kind: str
+    name: str = ""
+    part: int = 0
+
+
+class Change(NamedTuple):
+    """A quantity, and its value under the fault: (value without, parameters of the fault, rated torque [N*m])."""
+
+    quantity: Quantity
+    value: Callable[[Floats, Given, float], Floats]
+
+
+def _record(name: str, value: Callable[[Floats, Given, float], Floats], part: int = 0) -> Change:
+    return Change(Quantity("record", name, part), value)
+
+
+def _broken(sound: Floats, given: Given, rated: float) -> Floats:
+    return np.ones_like(sound)
+
+
+def _vanished(sound: Floats, given: Given, rated: float) -> Floats:
+    return np.zeros_like(sound)
+
+
+def _phase(number: int) -> Callable[[Floats, Given, float], Floats]:
+    return lambda sound, given, rated: np.ones_like(sound) if given["phase"] == number else sound
+
+
+def _left(sound: Floats, given: Given, rated: float) -> Floats:
+    return sound * given["left"]
+
+
+def _multiplied(sound: Floats, given: Given, rated: float) -> Floats:
+    return sound * given["factor"]
+
+
+ENCODER_GAIN = Quantity("record", "encoder_gain")
+ENCODER_NOISE = Quantity("record", "encoder_noise")
+
+# Temperatures act on R_s and psi_m each millisecond, so what is changed is their value at 25 degC.
+CHANGES: dict[str, tuple[Change, ...]] = {
+    "encoder_lost_counts": (Change(ENCODER_GAIN, lambda sound, given, rated: sound * (1.0 - given["share"])),),
+    "encoder_stuck": (Change(ENCODER_GAIN, _vanished),),
+    "encoder_reversed": (Change(ENCODER_GAIN, lambda sound, given, rated: -sound),),
+    "encoder_noise": (Change(ENCODER_NOISE, lambda sound, given, rated: np.hypot(sound, given["angle"])),),
+    "halls_lost": (_record("hall_broken", _broken),),
+    "current_offset": (_record("adc_offset_error", lambda sound, given, rated: sound + given["current"]),),
+    "open_phase": tuple(_record(f"open_{letter}", _phase(number)) for number, letter in enumerate("abc")),
+    "demagnetised": (_record("psi_nominal", lambda sound, given, rated: sound * (1.0 - given["share"])),),
+    "winding_short": tuple(_record(name, _left) for name in ("R_nominal", "L_d", "L_q")),
+    "stage_short": (_record("short_conductance", lambda sound, given, rated: sound + given["conductance"]),),
+    "supply_dip": (_record("supply_voltage", lambda sound, given, rated: np.minimum(sound, given["voltage"])),),
+    "supply_surge": (_record("supply_voltage", lambda sound, given, rated: np.maximum(sound, given["voltage"])),),
+    "enable_lost": (_record("enable_input", _vanished),),
+    "jam": (Change(Quantity("jam"), lambda sound, given, rated: sound + given["torque"] * rated),),
+    "broken_coupling": tuple(Change(Quantity("load", name), _vanished) for name in ("stiffness", "damping")),
+    # Of the first that the load has (payload_of).
+    "payload_jump": tuple(Change(Quantity("load", name), _multiplied) for name in ("payload", "mass", "inertia")),
+}
+# A moment, not a state: what MachineFaults does at once.
+MOMENTS = ("encoder_jump", "node_reset")
+
+
+def changes_of(name: str, load_parameters: tuple[str, ...], load: str, num_axes: int) -> tuple[Change, ...]:
+    """Return what a fault changes on a machine.
+
+    Args:
+        name: The fault.
+        load_parameters: Names of the load's parameters.
+        load: Name of the load, for messages.
+        num_axes: Axes of a machine.
+
+    Raises:
+        ValueError: If the load does not have what the fault changes.
+    """
+    changes = CHANGES[name]
+    if name == "broken_coupling" and (num_axes > 1 or "stiffness" not in load_parameters):
+        raise ValueError(
+            f"fault broken_coupling: load {load!r} has no coupling between one rotor and its load that could break; "
+            "take one that has: two_mass, three_mass, belt, ball_screw, vertical_screw, geared_joint"
+        )
+    if name == "payload_jump":
+        found = [change for change in changes if change.quantity.name in load_parameters]
+        if not found:
+            raise ValueError(f"fault payload_jump: load {load!r} has no parameter payload, mass or inertia to change")
+        return (found[0],)
+    return changes

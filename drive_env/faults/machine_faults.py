@@ -1,0 +1,349 @@
+"""Faults of emulated machines: begun and ended by their schedule, on top of the machines as they were built."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.faults.effects import ENCODER_GAIN, ENCODER_NOISE, MOMENTS, Change, Quantity, changes_of
+from drive_env.faults.schedule import ENABLED, NEVER, NO_CONDITION, Condition, Order, cycles_of
+from drive_env.faults.table import Row, checked_parameters, find_fault
+from drive_env.firmware.record import get_lanes, set_lanes
+
+if TYPE_CHECKING:
+    from drive_env.drives import EmulatedDrives
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+ABSENT, WAITING, DUE, ON, OVER = range(5)  # a machine: not concerned, waits for the condition, for the time, ...
+OPERATION_ENABLED = (0x6F, 0x27)
+TWO_PI = 2.0 * math.pi
+SEED_STEP = 2_654_435_761  # golden ratio of 2^32: neighbouring seeds give noises apart
+
+
+class InjectedFault(NamedTuple):
+    """A fault that is still to come or is there.
+
+    number: What `machine.fault` returned.
+    order: What was asked for.
+    parameters: All numbers of the fault.
+    waiting, active: Which machines wait for it and have it, shape (num_machines,).
+    """
+
+    number: int
+    order: Order
+    parameters: Mapping[str, float]
+    waiting: Mask
+    active: Mask
+
+
+@dataclass(eq=False)
+class _Scheduled:
+    """A fault with its state in each machine.
+
+    `delay` and `length` are its times in cycles; `axes` those that it is of, (num_axes,). Of each machine, shape
+    (num_machines,): `state`, and the cycles at which it begins and ends.
+    """
+
+    number: int
+    order: Order
+    row: Row
+    given: Mapping[str, float]
+    condition: Condition
+    changes: tuple[Change, ...]
+    delay: int
+    length: int
+    axes: Mask
+    state: NDArray[np.int64]
+    begins: NDArray[np.int64]
+    ends: NDArray[np.int64]
+
+    def changes_some(self, quantity: Quantity) -> bool:
+        """Return whether it is there on some machine, and changes a quantity."""
+        return bool(np.any(self.state == ON)) and any(change.quantity == quantity for change in self.changes)
+
+    def is_over(self) -> bool:
+        return not bool(np.any((self.state != ABSENT) & (self.state != OVER)))
+
+
+def axes_that_fulfil(condition: Condition, drives: EmulatedDrives) -> Mask:
+    """Return which axes fulfil a condition now, shape (num_axes,)."""
+    records, count = drives._records, drives.num_axes
+    if condition.quantity == NO_CONDITION:
+        return np.ones(count, bool)
+    if condition.quantity == ENABLED:
+        words = get_lanes(records, "statusword", count).astype(np.int64)
+        return np.asarray(words & OPERATION_ENABLED[0] == OPERATION_ENABLED[1])
+    value = get_lanes(records, "theta_m" if condition.quantity == "position" else "omega_m", count).astype(float)
+    value = np.abs(value) if condition.quantity == "speed" else value
+    return np.asarray(value > condition.limit if condition.above else value < condition.limit)
+
+
+class MachineFaults:
+    """All faults of a set of emulated machines. Nothing is looked at while there are none.
+
+    A fault's change is on top of the machine as it was built: `base` keeps what a quantity is without any, and several
+    faults of one quantity act in the order in which they were given.
+    """
+
+    def __init__(self, drives: EmulatedDrives) -> None:
+        self._drives = drives
+        self._axes_per_machine = drives.load.num_axes
+        self._faults: list[_Scheduled] = []
+        self._next_number = 0
+        self._base: dict[Quantity, Floats] = {}
+        self._held: dict[Quantity, Mask] = {}
+        self._jam = np.zeros(drives.num_axes)
+
+    # --- giving, listing, taking back -----------------------------------------------------------------------------
+    def add(self, order: Order, machines: Mask) -> int:
+        """Schedule a fault and return its number; `Machines.fault` says what an order holds."""
+        drives, axis = self._drives, order.axis
+        row, changes = self.check(order)
+        given = checked_parameters(row, order.parameters)
+        delay, length = cycles_of(order, row, drives._cycles)
+        condition = Condition.parse(order.when)
+        axes = np.repeat(machines, self._axes_per_machine)
+        if axis is not None:
+            axes &= np.arange(drives.num_axes) % self._axes_per_machine == axis
+        self._rehearse(changes, given, axes)
+        self._next_number += 1
+        begins = np.full(drives.num_machines, drives._now + delay)
+        state = np.where(machines, DUE if condition.quantity == NO_CONDITION else WAITING, ABSENT)
+        self._faults.append(
+            _Scheduled(
+                self._next_number, order, row, given, condition, changes, delay, length, axes, state, begins,
+                np.full(drives.num_machines, NEVER),
+            )
+        )  # fmt: skip
+        return self._next_number
+
+    def check(self, order: Order) -> tuple[Row, tuple[Change, ...]]:
+        """Return the row of a fault and what it changes.
+
+        Raises:
+            ValueError: For a fault that these machines cannot have, or an order that is none.
+        """
+        name, axis = order.name, order.axis
+        row = find_fault(name)
+        if row.group == "bus" or name == "store_interrupted":
+            raise ValueError(
+                f"fault {name} is of a bus and its nodes, which machines in process do not have; give it to a bus that "
+                f"is served: drive-env serve --fault {name!r}"
+            )
+        if axis is not None and not 0 <= axis < self._axes_per_machine:
+            raise ValueError(f"fault {name}: axis={axis} must be 0 to {self._axes_per_machine - 1} of a machine")
+        return row, () if name in MOMENTS else self._changes(name)
+
+    def listing(self) -> list[InjectedFault]:
+        """Return the faults that are still to come or are there."""
+        return [
+            InjectedFault(
+                fault.number, fault.order, dict(fault.given), (fault.state == WAITING) | (fault.state == DUE),
+                fault.state == ON,
+            )
+            for fault in self._faults
+        ]  # fmt: skip
+
+    def clear(self, number: int | None, machines: Mask) -> None:
+        """End a fault, or all, on some machines; ValueError if there is none of that number."""
+        known = [fault.number for fault in self._faults]
+        if number is not None and number not in known:
+            raise ValueError(f"there is no fault {number}; there are {', '.join(map(str, known)) or 'none'}")
+        for fault in list(self._faults):
+            if number is None or fault.number == number:
+                self._end(fault, machines & (fault.state == ON))
+                fault.state[machines & (fault.state != ABSENT)] = OVER
+        self._forget()
+
+    @property
+    def some(self) -> bool:
+        """Whether there is any fault to look after."""
+        return bool(self._faults)
+
+    # --- time -----------------------------------------------------------------------------------------------------
+    def act(self, now: int) -> int:
+        """Begin and end what is due at cycle `now`; return the cycle by which to call again."""
+        following = NEVER
+        for fault in list(self._faults):
+            waiting = fault.state == WAITING
+            if waiting.any():
+                met = waiting & self._holds(fault)
+                fault.state[met] = DUE
+                fault.begins[met] = now + fault.delay
+            due = (fault.state == DUE) & (fault.begins <= now)
+            if due.any():
+                self._begin(fault, due, now)
+            over = (fault.state == ON) & (fault.ends <= now)
+            if over.any():
+                self._end(fault, over)
+            if np.any(fault.state == WAITING):
+                following = now + 1
+            for state, times in ((DUE, fault.begins), (ON, fault.ends)):
+                those = times[fault.state == state]
+                following = min(following, int(those.min()) if those.size else NEVER)
+        self._forget()
+        return max(following, now + 1)
+
+    @contextmanager
+    def suspended(self) -> Iterator[None]:
+        """Take all changes back while the machines as they were built are changed; then they are on top again."""
+        active = [(fault, fault.state == ON) for fault in self._faults if np.any(fault.state == ON)]
+        for fault, machines in active:
+            fault.state[machines] = OVER
+        for fault, _ in active:
+            self._refresh(fault)
+        try:
+            yield
+        finally:
+            for fault, machines in active:
+                fault.state[machines] = ON
+            for fault, _ in active:
+                self._refresh(fault)
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _changes(self, name: str) -> tuple[Change, ...]:
+        load = self._drives.load
+        names = tuple(parameter.name for parameter in load.parameters)
+        return changes_of(name, names, str(load.name), self._axes_per_machine)
+
+    def _rehearse(self, changes: tuple[Change, ...], given: Mapping[str, float], axes: Mask) -> None:
+        """Refuse a change of the load that cannot be stepped now rather than in the middle of a run."""
+        for change in changes:
+            if change.quantity.kind == "load":
+                sound = self._get(change.quantity)
+                self._set(change.quantity, change.value(sound, given, self._drives.motor.rated_torque), axes)
+                self._set(change.quantity, sound, axes)
+
+    def _begin(self, fault: _Scheduled, machines: Mask, now: int) -> None:
+        axes = fault.axes & np.repeat(machines, self._axes_per_machine)
+        if fault.row.name in MOMENTS:
+            fault.state[machines] = OVER
+            if fault.row.name == "node_reset":
+                self._drives.reset_node(axes)
+            else:
+                self._jump(fault.given["angle"], axes)
+            return
+        fault.state[machines] = ON
+        fault.ends[machines] = now + fault.length if fault.length < NEVER else NEVER
+        if any(change.quantity == ENCODER_NOISE for change in fault.changes):
+            seeds = np.mod(self._drives._noise_seeds * SEED_STEP + fault.number, 2.0**32 - 1.0) + 1.0
+            set_lanes(self._drives._records, "encoder_random", np.floor(seeds), axes)
+        self._refresh(fault)
+
+    def _end(self, fault: _Scheduled, machines: Mask) -> None:
+        if not machines.any():
+            return
+        fault.state[machines] = OVER
+        self._refresh(fault)
+        if fault.row.name == "broken_coupling":
+            for group in self._drives._groups:
+                group.load.mend("stiffness", machines[group.machines])
+
+    def _forget(self) -> None:
+        self._faults = [fault for fault in self._faults if not fault.is_over()]
+
+    def _holds(self, fault: _Scheduled) -> Mask:
+        """Return which machines fulfil a fault's condition, on any of its axes."""
+        return self._machines(axes_that_fulfil(fault.condition, self._drives) & fault.axes)
+
+    def _machines(self, axes: Mask) -> Mask:
+        """Return the machines of which an axis is meant."""
+        found: Mask = np.logical_or.reduce(axes.reshape(-1, self._axes_per_machine), axis=1)
+        return found
+
+    def _refresh(self, fault: _Scheduled) -> None:
+        """Bring the quantities that a fault changes to what all faults that are there make of them."""
+        for quantity in {change.quantity for change in fault.changes}:
+            while not self._refresh_quantity(quantity):
+                # Several faults together have made a load that cannot be stepped, the latest of them too much.
+                latest = [one for one in self._faults if one.changes_some(quantity)][-1]
+                latest.state[latest.state == ON] = OVER
+                warnings.warn(
+                    f"fault {latest.number} ({latest.row.name}) is called off: together with the others it makes a "
+                    "load that cannot be stepped; give it other numbers",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+
+    def _refresh_quantity(self, quantity: Quantity) -> bool:
+        """Bring one quantity to what its faults make of it; return whether the machines can have it."""
+        axes = self._drives.num_axes
+        held = self._held.setdefault(quantity, np.zeros(axes, bool))
+        present = self._get(quantity)
+        base = self._base.setdefault(quantity, present.copy())
+        base[~held] = present[~held]
+        wanted, some = base.copy(), np.zeros(axes, bool)
+        for one in self._faults:
+            if not one.changes_some(quantity):
+                continue
+            mask = one.axes & np.repeat(one.state == ON, self._axes_per_machine)
+            for change in one.changes:
+                if change.quantity == quantity:
+                    changed = change.value(wanted, one.given, self._drives.motor.rated_torque)
+                    wanted = np.where(mask, changed, wanted)
+                    some |= mask
+        touched = held | some
+        if np.any(wanted[touched] != present[touched]):
+            try:
+                self._set(quantity, wanted, touched)
+            except ValueError:
+                if not some.any():
+                    raise
+                return False
+        self._held[quantity] = some
+        return True
+
+    def _get(self, quantity: Quantity) -> Floats:
+        drives = self._drives
+        if quantity.kind == "jam":
+            return self._jam.copy()
+        if quantity.kind == "load":
+            values = np.concatenate([group.load.get(quantity.name) for group in drives._groups])
+            return np.repeat(values, self._axes_per_machine)
+        return get_lanes(drives._records, quantity.name, drives.num_axes, quantity.part).astype(float)
+
+    def _set(self, quantity: Quantity, values: Floats, axes: Mask) -> None:
+        drives = self._drives
+        if quantity.kind == "jam":
+            self._jam = np.where(axes, values, self._jam)
+            for group in drives._groups:
+                group.load.jam(self._jam[group.axes].reshape(-1, self._axes_per_machine))
+        elif quantity.kind == "load":
+            machines = self._machines(axes)
+            per_machine = values[:: self._axes_per_machine]
+            for group in drives._groups:
+                group.load.set(quantity.name, per_machine[group.machines], machines[group.machines])
+            drives._refresh_inertia()
+        elif quantity == ENCODER_GAIN:
+            self._set_encoder_gain(values, axes)
+        else:
+            set_lanes(drives._records, quantity.name, values, axes, quantity.part)
+
+    def _set_encoder_gain(self, gain: Floats, axes: Mask) -> None:
+        """Let encoders count otherwise from here on: an incremental encoder keeps what it has counted."""
+        records, count = self._drives._records, self._drives.num_axes
+
+        def lanes(name: str) -> Floats:
+            return get_lanes(records, name, count).astype(float)
+
+        edges = (lanes("theta_m") + lanes("encoder_error")) * lanes("encoder_counts") / TWO_PI
+        now, then = np.floor(edges * lanes("encoder_gain")), np.floor(edges * gain)
+        set_lanes(records, "encoder_gain", gain, axes)
+        for name in ("count", "count_zero"):
+            set_lanes(records, name, lanes(name) + then - now, axes)
+
+    def _jump(self, angle: float, axes: Mask) -> None:
+        """Put the counters off by an angle [rad], as if so many edges came within one sample."""
+        records, count = self._drives._records, self._drives.num_axes
+        counts = np.rint(angle * get_lanes(records, "encoder_counts", count).astype(float) / TWO_PI)
+        for name in ("count", "count_zero"):
+            set_lanes(records, name, get_lanes(records, name, count).astype(float) - counts, axes)

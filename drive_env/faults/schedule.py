@@ -1,0 +1,112 @@
+"""When a fault begins and ends: after a time or a condition, for a duration or for ever; also as one line of text."""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from drive_env.faults.table import Row
+
+QUANTITIES = {"position": "rad", "speed": "rad/s"}
+NO_CONDITION, ENABLED = "", "enabled"
+_COMPARISON = re.compile(r"\s*(position|speed)\s*([<>])\s*(\S+)\s*")
+_WORDS = ("at", "when", "duration", "node")
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What a fault waits for, of the axes that it is of; any of them will do.
+
+    quantity: "enabled": operation enabled. "position": true rotor angle [rad]; "speed": its rate without its sign
+        [rad/s]; these are compared with `limit`. "" is no condition.
+    above: Whether it has to be above the limit, or below.
+    """
+
+    quantity: str = NO_CONDITION
+    above: bool = True
+    limit: float = 0.0
+
+    @classmethod
+    def parse(cls, text: str) -> Condition:
+        """Return what `when` says: "enabled", or as "speed > 100" or "position < -3.5".
+
+        Raises:
+            ValueError: If it says neither.
+        """
+        if text.strip() in (NO_CONDITION, ENABLED):
+            return cls(text.strip())
+        match = _COMPARISON.fullmatch(text)
+        try:
+            limit = float(match[3]) if match else math.nan
+        except ValueError:
+            limit = math.nan
+        if match is None or not math.isfinite(limit):
+            raise ValueError(
+                f"when={text!r} is no condition; use 'enabled', or compare position [rad] or speed [rad/s] of the "
+                "rotor with a number, as 'speed > 100'"
+            )
+        return cls(match[1], match[2] == ">", limit)
+
+
+NEVER = 2**62  # a cycle that does not come
+
+
+@dataclass(frozen=True)
+class Order:
+    """One fault that is asked for, as `machine.fault` takes it; on a bus `node` says whose it is, not `axis`."""
+
+    name: str
+    at: float = 0.0
+    when: str = NO_CONDITION
+    duration: float | None = None
+    node: int | None = None
+    axis: int | None = None
+    parameters: dict[str, float] = field(default_factory=dict)
+
+
+def cycles_of(order: Order, row: Row, cycles: Callable[[float], int]) -> tuple[int, int]:
+    """Return delay and length of a fault in communication cycles; `cycles` counts them in a time [s].
+
+    Raises:
+        ValueError: For times that are no whole cycles, or a duration of what is a moment.
+    """
+    if order.duration is not None and row.once:
+        raise ValueError(f"fault {row.name} is a moment and has no duration; leave duration out")
+    length = NEVER if order.duration is None else cycles(order.duration)
+    if length < 1:
+        raise ValueError(f"fault {row.name}: duration=0 s must be 0.001 s or more")
+    return cycles(order.at), length
+
+
+def parse_order(text: str) -> Order:
+    """Return what one line asks for: a name, then as at=2 duration=0.1 when="speed > 100" node=1 share=0.2.
+
+    Raises:
+        ValueError: For a line that cannot be understood; the values are checked by whoever takes the order.
+    """
+    try:
+        words = shlex.split(text)
+    except ValueError as error:
+        raise ValueError(f"fault {text!r}: {error}") from None
+    if not words or "=" in words[0]:
+        raise ValueError(f"fault {text!r} must begin with its name, as 'encoder_stuck at=2 duration=0.1'")
+    when, numbers = NO_CONDITION, {}
+    for word in words[1:]:
+        key, equals, value = word.partition("=")
+        if not equals:
+            raise ValueError(f"fault {text!r}: {word!r} must be as at=2; keys are {', '.join(_WORDS)} and parameters")
+        if key == "when":
+            when = value
+            continue
+        try:
+            numbers[key] = float(value)
+        except ValueError:
+            raise ValueError(f"fault {text!r}: {key} must be a number, not {value!r}") from None
+    node = numbers.pop("node", None)
+    if node is not None and not node.is_integer():
+        raise ValueError(f"fault {text!r}: node must be a whole number, not {node:g}")
+    at, duration = numbers.pop("at", 0.0), numbers.pop("duration", None)
+    return Order(words[0], at, when, duration, None if node is None else int(node), parameters=numbers)

@@ -1,0 +1,106 @@
+"""The table of faults: what can fail, with which parameters, and what drive and master make of it."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from drive_env.devices import find_device
+
+GROUPS = ("sensor", "motor", "supply", "load", "bus", "node")
+DRIVE = "tmcm1636"  # whose reactions the table has
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a fault: default, lowest and highest value, unit, and what it means."""
+
+    default: float
+    low: float
+    high: float
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """A fault; table.toml says what each entry holds. `emergency` is None where nothing in the drive sees it."""
+
+    name: str
+    group: str
+    title: str
+    physics: str
+    drive: str
+    master: str
+    recovery: str
+    test: str
+    emergency: int | None = None
+    detection: float | None = None
+    once: bool = False
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+
+
+def _rows() -> dict[str, Row]:
+    tables = tomllib.loads((Path(__file__).parent / "table.toml").read_text(encoding="utf-8"))
+    return {
+        name: Row(name, **{**table, "parameters": {k: Parameter(**p) for k, p in table.get("parameters", {}).items()}})
+        for name, table in tables.items()
+    }
+
+
+FAULTS = _rows()
+
+
+def find_fault(name: str) -> Row:
+    """Return the row of a fault.
+
+    Raises:
+        ValueError: If there is none of that name, with those that are.
+    """
+    if name not in FAULTS:
+        raise ValueError(f"no fault is named {name!r}; there are {', '.join(FAULTS)}")
+    return FAULTS[name]
+
+
+def names_of(chosen: str) -> tuple[str, ...]:
+    """Return the faults of a group, or the one of that name.
+
+    Raises:
+        ValueError: If it is neither.
+    """
+    if chosen in GROUPS:
+        return tuple(row.name for row in FAULTS.values() if row.group == chosen)
+    if chosen not in FAULTS:
+        raise ValueError(f"no fault or group is named {chosen!r}; there are {', '.join((*GROUPS, *FAULTS))}")
+    return (chosen,)
+
+
+def checked_parameters(row: Row, given: Mapping[str, float]) -> dict[str, float]:
+    """Return all parameters of a fault, those that are not given at their defaults.
+
+    Raises:
+        ValueError: For one that the fault does not have, or a value out of its range.
+    """
+    for name, value in given.items():
+        if name not in row.parameters:
+            known = ", ".join(row.parameters) or "none"
+            raise ValueError(f"fault {row.name} has no parameter {name!r}; it has {known}")
+        limits = row.parameters[name]
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise ValueError(f"fault {row.name}: {name} must be a finite number, not {value!r}")
+        if not limits.low <= value <= limits.high:
+            raise ValueError(
+                f"fault {row.name}: {name}={value:g} must lie in {limits.low:g}...{limits.high:g} {limits.unit}"
+            )
+        if isinstance(limits.default, int) and value != int(value):
+            raise ValueError(f"fault {row.name}: {name}={value:g} must be a whole number")
+    return {name: float(given.get(name, limits.default)) for name, limits in row.parameters.items()}
+
+
+def emergency_name(code: int) -> str:
+    """Return the drive's name of an emergency code."""
+    found = [name for name, emergency in find_device(DRIVE).emergencies.items() if emergency.code == code]
+    return found[0]

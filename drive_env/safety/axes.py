@@ -1,0 +1,204 @@
+"""What is known of the axes: whether they are live, where they are, how fast, and since when."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.master.description import Key
+from drive_env.safety.bounds import COUNTED
+from drive_env.safety.objects import CURRENT, HM, POSITION, STATUSWORD, VELOCITY
+from drive_env.safety.rotor import RotorAngle, wrapped
+from drive_env.safety.states import is_live
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BASELINE = 0.008  # s at least between two positions that tell a speed
+JUMP_TURNS, JUMP_SHARE = 0.003, 2.0  # rev, and of the way that the speed explains: more is a new zero, not a movement
+CURRENT_MEMORY = 0.03  # s
+
+
+class Axes:
+    """What is known of every axis; arrays have shape (num_axes,).
+
+    Args:
+        drives: The drives.
+
+    Attributes:
+        lock: Held by whoever changes what is known, or begins or steps a stop.
+        epoch: Grows with every controlword: samples from before tell nothing of what it did.
+        is_armed: Whether everything is ready for motion: watchdogs on, limits lent, every axis seen.
+        live: Whether an axis may turn, by its statusword, or by a frame that could have enabled it.
+        assumed: Live, until a sample of this epoch shows otherwise.
+        in_flight: An enabling frame is out, and nobody has said that it came.
+        lost: Axes that could not be proved off.
+        outside: How far outside its limits an axis was when it became live, or since [inc]; -1: not seen yet.
+        aim: Axis to the target of pp before, from which relative moves go on [inc].
+        velocity: As the drive says [inc/s].
+        speed: From positions [inc/s].
+        mean_current: Over the last 30 ms [unit of 6077h].
+        seen: When the statusword came last [s].
+        clock: The time of lockstep [s].
+        is_counted: Whether 606Ch counts what 6064h counts, per second.
+    """
+
+    def __init__(self, drives: CanDrives) -> None:
+        self._drives = drives
+        known = drives.description
+        self.is_counted = known.has(VELOCITY) and known.dictionary.find(VELOCITY).unit == COUNTED
+        count = drives.num_axes
+        self.lock = threading.RLock()
+        self.everywhere = np.ones(count, bool)
+        self.epoch = 0
+        self.is_armed = False
+        self.live = np.zeros(count, bool)
+        self.assumed = np.zeros(count, bool)
+        self.in_flight = np.zeros(count, bool)
+        self.lost: set[int] = set()
+        self.status = np.zeros(count, np.int64)
+        self.mode = np.zeros(count, np.int64)
+        self.outside = np.full(count, -1, np.int64)
+        self.aim: dict[int, int] = {}
+        self.position = np.zeros(count, np.int64)
+        self.velocity = np.zeros(count)
+        self.speed = np.zeros(count)
+        self.mean_current = np.zeros(count)
+        self.seen = np.full(count, -math.inf)
+        self.clock = 0.0
+        self.rotor = RotorAngle(count)
+        self._placed = np.zeros(count, bool)  # whether a position was seen
+        self._position_time = np.full(count, -math.inf)  # when it was there [s]
+        self._current_time = np.zeros(count)  # [s]
+        # The position and its time from which the speed is reckoned.
+        self._base = np.zeros(count, np.int64)
+        self._base_time = np.full(count, -math.inf)
+
+    def now(self) -> float:
+        """Return the time by which the axes are seen [s]: that of lockstep where time waits."""
+        return self.clock if self._drives.time_waits else time.monotonic()
+
+    @property
+    def may_turn(self) -> Mask:
+        """Which axes count as live."""
+        return self.live | self.assumed
+
+    def of_nodes(self, nodes: Sequence[int]) -> Mask:
+        """Return which axes belong to nodes, by position."""
+        per_node = self._drives.description.num_axes
+        axes = np.zeros(self._drives.num_axes, bool)
+        for k in nodes:
+            axes[k * per_node : (k + 1) * per_node] = True
+        return axes
+
+    def assume(self, axes: Mask) -> None:
+        """Count axes as live from now on: a frame that could enable them is about to be sent."""
+        with self.lock:
+            self.epoch += 1
+            begins = axes & ~self.live
+            self.outside = np.where(begins, -1, self.outside)
+            self.assumed |= axes
+            self.in_flight |= axes
+            self.live |= axes
+
+    def take_for_off(self, axes: Mask) -> None:
+        """Count axes as off: they were proved to be."""
+        with self.lock:
+            for mask in (self.live, self.assumed, self.in_flight):
+                mask &= ~axes
+
+    def place(self, position: Integers, scale: Floats) -> None:
+        """Take positions [inc] and scales [inc/rev] that were read: what moved scale or zero has not moved the rotors.
+
+        Args:
+            position: What 6064h shows now.
+            scale: Increments of a revolution; nan where the drive does not say.
+        """
+        turns = self.rotor.turns(self.position) if self.rotor.is_placed and self._placed.any() else None
+        if turns is not None:
+            turns = np.where(self._placed, turns, 0.0)
+        self.rotor.place(position, np.where(np.isnan(scale), 1.0, scale), turns)
+        self.position = position.copy()
+        self._base_time[:] = -math.inf
+        self._placed[:] = True
+
+    def take(self, rows: Mapping[Key, Integers], epoch: int, where: Mask) -> bool:
+        """Keep what the newest samples say.
+
+        Args:
+            rows: The samples, each object of shape (rows, num_axes).
+            epoch: That of the moment when they were asked for.
+            where: Axes that they are of.
+
+        Returns:
+            Whether homing has set a new zero, so that limits count from there.
+        """
+        now = self.now()
+        has_new_zero = False
+        if STATUSWORD in rows:
+            self.status = np.where(where, rows[STATUSWORD][-1], self.status)
+            shown = is_live(self.status)
+            current = where & (epoch >= self.epoch) & ~self.in_flight
+            was = self.live
+            self.assumed &= ~current
+            self.live = np.where(where, shown | self.assumed, self.live)
+            self.outside = np.where(self.live & ~was, -1, self.outside)
+            for axis in np.flatnonzero(was & ~self.live):
+                self.aim.pop(int(axis), None)
+            self.seen = np.where(where, now, self.seen)
+        if CURRENT in rows:
+            # By the time since the axes were seen last: a run has a row for each cycle, a look one now and then.
+            span = np.clip(now - self._current_time, self._drives.description.cycle, CURRENT_MEMORY)
+            share = np.where(where, span / CURRENT_MEMORY, 0.0)
+            self.mean_current += share * (rows[CURRENT].mean(axis=0) - self.mean_current)
+            self._current_time = np.where(where, now, self._current_time)
+        if VELOCITY in rows and self.is_counted:
+            self.velocity = np.where(where, rows[VELOCITY][-1], self.velocity).astype(float)
+        if POSITION in rows:
+            has_new_zero = self._take_position(rows[POSITION], now, where)
+        if POSITION in rows and not (VELOCITY in rows and self.is_counted):
+            self.velocity = np.where(where, self.speed, self.velocity)
+        return has_new_zero
+
+    def _take_position(self, rows: Integers, now: float, where: Mask) -> bool:
+        before = self.position
+        self.position = np.where(where, rows[-1], self.position)
+        has_new_zero = self._find_jumps(before, rows, now, where)
+        self._position_time = np.where(where, now, self._position_time)
+        old = where & (now - self._base_time >= BASELINE)
+        span = np.maximum(now - self._base_time, BASELINE)
+        speed = wrapped(self.position - self._base) / span
+        known = old & np.isfinite(self._base_time) & (now - self._base_time < 10 * BASELINE)
+        self.speed = np.where(known, speed, np.where(old, self.velocity, self.speed))
+        self._base = np.where(old, self.position, self._base)
+        self._base_time = np.where(old, now, self._base_time)
+        self._placed |= where
+        return has_new_zero
+
+    def _find_jumps(self, before: Integers, rows: Integers, now: float, where: Mask) -> bool:
+        """Return whether homing has set a new zero: the rotor has not moved, and its limits neither."""
+        homing = where & self._placed & (self.mode == HM)
+        if not homing.any():
+            return False
+        path = np.vstack([before, rows])
+        steps = wrapped(np.diff(path, axis=0))
+        elapsed = np.clip((now - self._position_time) / len(rows), self._drives.description.cycle, 1.0)
+        explained = JUMP_TURNS * np.maximum(self.rotor.scale, 1.0) + JUMP_SHARE * np.abs(self.velocity) * elapsed
+        jumps = np.where(homing & (np.abs(steps) > explained), steps, 0).sum(axis=0)
+        if not jumps.any() or not self.rotor.is_placed:
+            return False
+        turns = self.rotor.turns(self.position) - jumps / self.rotor.scale
+        turns = np.where(jumps != 0, turns, self.rotor.turns(self.position))
+        self.rotor.place(self.position, self.rotor.scale, turns)
+        self._base_time = np.where(jumps != 0, -math.inf, self._base_time)
+        return True

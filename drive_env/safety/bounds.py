@@ -1,0 +1,156 @@
+"""The limits of every axis as integers of its drive, at the scale and zero that it has now."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.master.description import Key
+from drive_env.master.errors import RefusedError
+from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
+from drive_env.safety.objects import VELOCITY
+from drive_env.safety.rotor import HOME_OFFSET, RotorAngle
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+POSITION_LOW, POSITION_HIGH, FOLLOWING_WINDOW = (0x607D, 1), (0x607D, 2), (0x6065, 0)
+MAX_PROFILE_VELOCITY, MAX_MOTOR_SPEED = (0x607F, 0), (0x6080, 0)
+ACCELERATION, DECELERATION, QUICK_STOP_DECELERATION = (0x6083, 0), (0x6084, 0), (0x6085, 0)
+COUNTED = "pps"  # speeds in increments per second; other units are not set off against positions
+# A settled axis swings by some counts around its target [inc], though by no more than so much of a turn [rev].
+SETTLED, SETTLED_TURNS = 200.0, 0.02
+SLACK_TURNS = 0.02  # besides, of a move that is meant to end at a limit: noise and overshoot may take it past [rev]
+
+
+@dataclass
+class Bounds:
+    """Limits of every axis, shape (num_axes,) each.
+
+    Attributes:
+        low: Lowest position [inc]; -NO_LIMIT for none.
+        high: Highest position [inc].
+        given: Whether the user gave the position limits, which then hold in homing, too.
+        settled: How far a settled axis swings around its place [inc].
+        slack: How far beyond them is no leaving [inc].
+        velocity: Highest speed [unit of 606Ch].
+        current: Highest current [unit of 6077h].
+        following: Largest following error [inc].
+        braking: Deceleration of a quick stop [inc/s^2]; 0 where it is not known.
+        profile: Highest deceleration of a profile [inc/s^2], or `braking`.
+        rest: Speed below which an axis is at rest [inc/s].
+        default_speed: Whether the speed limit is ours, for want of another.
+        speed: Highest speed by positions [inc/s], where the unit of 606Ch is not known; else infinite.
+    """
+
+    low: Integers
+    high: Integers
+    given: Mask
+    settled: Floats
+    slack: Floats
+    velocity: Integers
+    current: Integers
+    following: Integers
+    braking: Floats
+    profile: Floats
+    rest: Floats
+    default_speed: Mask
+    speed: Floats
+    has_position: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.has_position = bool(np.any((self.low > -NO_LIMIT) | (self.high < NO_LIMIT)))
+
+
+def read_bounds(limits: Limits, drives: CanDrives, rotor: RotorAngle, ends: tuple[Floats, Floats]) -> Bounds:
+    """Return the limits of every axis; those that the user left open are read from the drives.
+
+    Args:
+        limits: The user's.
+        drives: The drives.
+        rotor: Where their rotors are.
+        ends: The user's limits of position [rev], nan where there are none.
+    """
+    low, high = _own_range(drives)
+    is_given = ~(np.isnan(ends[0]) & np.isnan(ends[1]))
+    # Only the user's: a drive's own range is widened by who homes it, and the user's place is not.
+    bottom, top = (np.nan_to_num(rotor.increments(end), nan=0.0, posinf=2.0**61, neginf=-(2.0**61)) for end in ends)
+    low = np.where(np.isnan(ends[0]), np.where(is_given, -NO_LIMIT, low), np.floor(bottom)).astype(np.int64)
+    high = np.where(np.isnan(ends[1]), np.where(is_given, NO_LIMIT, high), np.ceil(top)).astype(np.int64)
+    low = np.where(low <= -(2**60), -NO_LIMIT, low)
+    high = np.where(high >= 2**60, NO_LIMIT, high)
+
+    known_scale = rotor.scale > 1.0
+    counted = drives.description.has(VELOCITY) and drives.description.dictionary.find(VELOCITY).unit == COUNTED
+    velocity = _magnitude(drives, given(limits.velocity, drives.num_axes), MAX_PROFILE_VELOCITY)
+    ours = (velocity >= NO_LIMIT) & known_scale & counted
+    velocity = np.where(ours, np.rint(DEFAULT_SPEED * rotor.scale), velocity).astype(np.int64)
+    braking = _rate(drives, QUICK_STOP_DECELERATION)
+    settled = np.where(known_scale, np.minimum(SETTLED, SETTLED_TURNS * rotor.scale), SETTLED)
+    return Bounds(
+        low,
+        high,
+        is_given,
+        settled,
+        settled + np.where(known_scale, SLACK_TURNS * rotor.scale, 0.0),
+        velocity,
+        _magnitude(drives, given(limits.current, drives.num_axes), drives.description.hints.current_limit),
+        _magnitude(drives, given(limits.following_error, drives.num_axes), FOLLOWING_WINDOW),
+        braking,
+        np.maximum.reduce([braking, _rate(drives, ACCELERATION), _rate(drives, DECELERATION)]),
+        np.where(known_scale, REST_TURNS * rotor.scale, REST_INCREMENTS),
+        ours,
+        np.where(known_scale & (not counted), DEFAULT_SPEED * rotor.scale, np.inf),
+    )
+
+
+REST_TURNS, REST_INCREMENTS = 0.15, 2000.0  # rev/s, inc/s: what a velocity filter may show of a rotor at rest
+
+
+def _own_range(drives: CanDrives) -> tuple[Integers, Integers]:
+    """Return 607Dh, corrected by the home offset (CiA 402); what is no range is none."""
+    low, high = read_own(drives, POSITION_LOW, -NO_LIMIT), read_own(drives, POSITION_HIGH, NO_LIMIT)
+    # The ends of the type, which are the factory's, are no limits; neither is an empty range.
+    empty = low >= high
+    offset = read_own(drives, HOME_OFFSET, 0)
+    return (
+        np.where(empty | (low <= -(2**31)), -NO_LIMIT, low - offset),
+        np.where(empty | (high >= 2**31 - 1), NO_LIMIT, high - offset),
+    )
+
+
+def read_own(drives: CanDrives, key: Key, absent: int) -> Integers:
+    """Return an object of every axis, or what stands for it where the drive does not have it, whatever its EDS says."""
+    if drives.description.has(key):
+        with contextlib.suppress(RefusedError):
+            found: Integers = drives.read_entry(drives.description.dictionary.find(key))
+            return found
+    return np.full(drives.num_axes, absent, np.int64)
+
+
+def _magnitude(drives: CanDrives, user: Floats, key: Key) -> Integers:
+    """Return the user's limit, or the drive's; 0 and the end of the type switch the drive's off."""
+    if np.isnan(user).any():
+        found = read_own(drives, key, NO_LIMIT)
+        own = np.where((found <= 0) | (found >= 2**31 - 1), NO_LIMIT, found)
+    else:
+        own = np.full(len(user), NO_LIMIT, np.int64)
+    chosen = np.where(np.isnan(user) | np.isinf(user), 0.0, user).astype(np.int64)
+    result: Integers = np.where(np.isnan(user), own, np.where(np.isinf(user), NO_LIMIT, chosen))
+    return result
+
+
+def _rate(drives: CanDrives, key: Key) -> Floats:
+    """Return a deceleration [inc/s^2]; 0 where the drive has none, or counts it in units that we do not know."""
+    known = drives.description
+    if not known.has(key) or known.dictionary.find(key).unit != f"{COUNTED}^2":
+        return np.zeros(drives.num_axes)
+    return read_own(drives, key, 0).astype(float)

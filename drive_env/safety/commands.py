@@ -1,0 +1,371 @@
+"""What a program is about to write or play, held against the limits before it is sent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.dictionary.entries import Entry
+from drive_env.master.description import Key
+from drive_env.safety.axes import Axes
+from drive_env.safety.bounds import COUNTED, QUICK_STOP_DECELERATION, read_own
+from drive_env.safety.errors import SafetyError
+from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, given
+from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
+from drive_env.safety.objects import (
+    CONTROLWORD,
+    CSP,
+    DEMAND,
+    HOMING_SPEED_TO_SWITCH,
+    HOMING_SPEED_TO_ZERO,
+    MODE,
+    MOVING_SPEEDS,
+    NEW_SET_POINT,
+    POSITION,
+    POSITION_OFFSET,
+    POSITIONING_OPTIONS,
+    PP,
+    PROFILE_VELOCITY,
+    RELATIVE,
+    RUNNING_SPEEDS,
+    TARGET_POSITION,
+    TARGET_TORQUE,
+    TARGET_VELOCITY,
+    TORQUE_OFFSET,
+    UNRAMPED_MODES,
+    VELOCITY_OFFSET,
+)
+from drive_env.safety.rotor import scale_objects
+from drive_env.safety.states import may_enable
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+# Objects whose magnitude is a command, and which limit holds it.
+_MAGNITUDES = {
+    TARGET_VELOCITY: "velocity",
+    PROFILE_VELOCITY: "velocity",
+    HOMING_SPEED_TO_SWITCH: "velocity",
+    HOMING_SPEED_TO_ZERO: "velocity",
+    VELOCITY_OFFSET: "velocity",
+    TARGET_TORQUE: "current",
+    TORQUE_OFFSET: "current",
+}
+# Set-points that add up.
+_PARTNERS = {
+    TARGET_VELOCITY: VELOCITY_OFFSET,
+    VELOCITY_OFFSET: TARGET_VELOCITY,
+    TARGET_TORQUE: TORQUE_OFFSET,
+    TORQUE_OFFSET: TARGET_TORQUE,
+}
+
+
+class Commands:
+    """The set-points of some drives, and whether what is commanded next would lead beyond a limit.
+
+    Args:
+        drives: The drives.
+        axes: What is known of them.
+        limits: Those that hold.
+        modes: Returns the mode of operation of every axis.
+    """
+
+    def __init__(self, drives: CanDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
+        self._drives = drives
+        self._known = drives.description.dictionary
+        self._current_limit = drives.description.hints.current_limit
+        self._axes = axes
+        self._limits = limits
+        self._modes = modes
+        self._set_points: dict[Key, Integers] = {}  # as they were written or read last
+
+    def check_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        """Raise SafetyError for a value that would pass a limit, or change what positions mean at the wrong time."""
+        self._check_value(entry, raw, where)
+        self._check_meaning(entry, where)
+
+    def check_play(self, played: Mapping[Entry, Integers], words: Integers | None) -> None:
+        """Raise SafetyError for rows that would pass a limit; `words` are those of the controlword among them."""
+        relative = words is not None and bool(np.any(words & RELATIVE))
+        for entry, rows in played.items():
+            key = (entry.index, entry.sub)
+            if rows.shape[0] == 0:
+                continue
+            if key in (TARGET_POSITION, POSITION_OFFSET):
+                if not relative:
+                    self._check_sum(entry, rows, played)
+            elif key == MODE:
+                self.check_modes(self._axes.everywhere, rows, played)  # other rows may enable
+            elif key != CONTROLWORD:
+                self._check_value(entry, rows, self._axes.everywhere, played)
+        if relative:
+            assert words is not None
+            self._check_played_moves(words, played)
+
+    def note(self, key: Key, raw: Integers, where: Mask) -> None:
+        """Take note of a set-point that was written."""
+        self._set_points[key] = np.where(where, raw, self._set_points.get(key, 0))
+
+    def forget(self) -> None:
+        """Forget all set-points: a node was reset."""
+        self._set_points.clear()
+
+    def note_start(self, words: Integers, where: Mask) -> None:
+        """Take note of where moves in pp lead that a controlword has started."""
+        starts = where & may_enable(words) & (words & NEW_SET_POINT != 0) & (self._axes.mode == PP)
+        target = self._set_points.get(TARGET_POSITION)
+        for axis in np.flatnonzero(starts).tolist() if target is not None else ():
+            base = self._axes.aim.get(axis, int(self._axes.position[axis])) if words[axis] & RELATIVE else 0
+            self._axes.aim[axis] = base + int(target[axis])  # type: ignore[index]
+
+    def check_start(self, words: Integers, where: Mask) -> None:
+        """Check a move when it is started: only then is it known whether it is relative, and how fast it will be."""
+        starts = where & may_enable(words) & (words & NEW_SET_POINT != 0)
+        bounds = self._limits.bounds()
+        if not starts.any():
+            return
+        self._check_speeds(starts, self._modes(), MOVING_SPEEDS, bounds.velocity)
+        if not bounds.has_position:
+            return
+        starts &= self._modes() == PP
+        if not starts.any():
+            return
+        target = self._known.find(TARGET_POSITION)
+        distance = self._drives.read_entry(target)
+        self._set_points[TARGET_POSITION] = distance
+        relative = words & RELATIVE != 0
+        self._check_position(target, distance, starts & ~relative, (PP,))
+        if np.any(starts & relative):
+            for base in self._bases():
+                self._check_position(target, base + distance, starts & relative, (PP,))
+
+    def check_played_starts(self, words: Integers, played: Mapping[Entry, Integers]) -> None:
+        """Raise SafetyError for moves that rows start at a speed, which the drive has already, beyond the limit."""
+        starts = (may_enable(words) & (words & NEW_SET_POINT != 0)).any(axis=0)
+        if starts.any():
+            self._check_speeds(starts, self._modes(), MOVING_SPEEDS, self._limits.bounds().velocity, played)
+
+    def _bases(self) -> list[Integers]:
+        """Return from where relative moves may go on: the target before, the demand or the actual position (60F2h)."""
+        options = read_own(self._drives, POSITIONING_OPTIONS, 0) & 3
+        demand = read_own(self._drives, DEMAND, 0)
+        aims = np.array(
+            [self._axes.aim.get(axis, int(demand[axis])) for axis in range(self._drives.num_axes)], np.int64
+        )
+        if not options.any():
+            return [demand, aims]
+        return [demand, aims, read_own(self._drives, POSITION, 0)]
+
+    def _check_played_moves(self, words: Integers, played: Mapping[Entry, Integers]) -> None:
+        """Check moves that rows start, each relative to the ones before."""
+        bounds = self._limits.bounds()
+        if not bounds.has_position:
+            return
+        target = self._known.find(TARGET_POSITION)
+        now = self._drives.read_entry(target)
+        rows = next((r for e, r in played.items() if e is target), np.broadcast_to(now, words.shape))
+        rises = (words & NEW_SET_POINT != 0) & np.vstack(
+            [np.ones((1, words.shape[1]), bool), words[:-1] & NEW_SET_POINT == 0]
+        )
+        relative = words & RELATIVE != 0
+        absolute = np.where(rises & ~relative, rows, self._axes.position)
+        self._check_position(target, absolute, self._axes.everywhere, (PP,))
+        steps = np.where(rises & relative, rows, 0)
+        for base in self._bases():
+            self._check_position(target, base + np.cumsum(steps, axis=0), (rises & relative).any(axis=0), (PP,))
+
+    def _check_sum(self, entry: Entry, rows: Integers, played: Mapping[Entry, Integers]) -> None:
+        """Check target and offset of csp as what they add up to; of a target in pp it is the target alone."""
+        by_key = {(other.index, other.sub): values for other, values in played.items()}
+        if (entry.index, entry.sub) == POSITION_OFFSET and TARGET_POSITION in by_key:
+            return  # with the target
+        target = by_key.get(TARGET_POSITION, self._last(TARGET_POSITION))
+        offset = by_key.get(POSITION_OFFSET, self._last(POSITION_OFFSET))
+        self._check_position(entry, np.broadcast_to(target + offset, rows.shape), self._axes.everywhere, (CSP,))
+        if (entry.index, entry.sub) == TARGET_POSITION:
+            self._check_position(entry, rows, self._axes.everywhere, (PP,))
+
+    def _check_value(
+        self, entry: Entry, raw: Integers, where: Mask, played: Mapping[Entry, Integers] | None = None
+    ) -> None:
+        key = (entry.index, entry.sub)
+        if key in (TARGET_POSITION, POSITION_OFFSET):
+            other = self._last(POSITION_OFFSET if key == TARGET_POSITION else TARGET_POSITION)
+            if key == TARGET_POSITION or np.any(self._modes() == CSP):
+                self._check_position(entry, raw + other, where, (CSP,))
+        elif key == QUICK_STOP_DECELERATION:
+            self._check_braking(entry, raw, where)
+        elif key == MODE:
+            self.check_modes(where & self._axes.may_turn, raw)
+        else:
+            self._check_magnitude(entry, raw, where, played or {})
+
+    def _check_meaning(self, entry: Entry, where: Mask) -> None:
+        """Raise SafetyError for what would change the meaning of positions at the wrong time."""
+        key = (entry.index, entry.sub)
+        moves_scale = key in scale_objects(self._drives.description)
+        if moves_scale and np.any(where & self._axes.may_turn):
+            raise SafetyError(
+                f"{entry.label} changes the scale of positions, and the axis is enabled; nothing was sent. Disable "
+                "it first"
+            )
+        if key in self._drives.description.hints.turns_positions_round and self._limits.user.position is not None:
+            raise SafetyError(
+                f"{entry.label} turns positions round, and Limits(position=...) hold for the present direction; "
+                "nothing was sent. Write it without them, then open the drives with limits"
+            )
+
+    def _check_position(self, entry: Entry, aim: Integers, axes: Mask, modes: tuple[int, ...]) -> None:
+        """Raise SafetyError for an aim, or rows of aims, beyond the limits of an axis in one of the modes."""
+        bounds = self._limits.bounds()
+        if not bounds.has_position:
+            return
+        outside = (aim < bounds.low) | (aim > bounds.high)
+        if not outside.any():
+            return
+        # The mode is an SDO transfer away, half a millisecond of a policy's cycle: asked for only where it matters.
+        rows, outside = np.atleast_2d(aim), np.atleast_2d(outside)
+        if (wrong := np.flatnonzero(axes & outside.any(axis=0) & np.isin(self._modes(), modes))).size:
+            axis = int(wrong[0])
+            farthest = rows[outside[:, axis], axis][0]
+            origin = self._limits.origin(self._limits.user.position, "position", "607Dh")
+            raise SafetyError(
+                f"axis {axis}: {entry.label} would lead to {farthest}, beyond the limits "
+                f"{bound_text(bounds.low[axis])} to {bound_text(bounds.high[axis])}; nothing was sent. Choose a target "
+                f"inside, or widen {origin}"
+            )
+
+    def _check_magnitude(self, entry: Entry, raw: Integers, where: Mask, played: Mapping[Entry, Integers]) -> None:
+        key = (entry.index, entry.sub)
+        if key == self._current_limit:
+            limit = self._own_current_limit()
+        elif key in _MAGNITUDES:
+            limit = getattr(self._limits.bounds(), _MAGNITUDES[key])
+        else:
+            return
+        name = _MAGNITUDES.get(key, "current")
+        partner = _PARTNERS.get(key)
+        value = raw
+        if partner is not None:
+            added = next((rows for e, rows in played.items() if (e.index, e.sub) == partner), self._last(partner))
+            value = raw + added
+        above = np.maximum(np.abs(raw), np.abs(value)) > limit
+        if not above.any():
+            return
+        rows, above = np.atleast_2d(np.broadcast_to(value, above.shape)), np.atleast_2d(above)
+        wrong = np.flatnonzero(where & above.any(axis=0))
+        if wrong.size:
+            axis = int(wrong[0])
+            largest = rows[above[:, axis], axis][0]
+            remedy = self._velocity_origin(axis) if name == "velocity" else self._current_origin(key)
+            raise SafetyError(
+                f"axis {axis}: {entry.label} = {largest} is beyond the limit {limit[axis]}; nothing was sent. Choose "
+                f"less, or raise {remedy}"
+            )
+
+    def _own_current_limit(self) -> Integers:
+        """Return how high the drive's own current limit may be set: to the user's, or to anything."""
+        user = given(self._limits.user.current, self._drives.num_axes)
+        return np.where(np.isnan(user) | np.isinf(user), NO_LIMIT, np.nan_to_num(user, posinf=0.0)).astype(np.int64)
+
+    def _check_braking(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        """Raise SafetyError for a ramp that would let an axis that is turning run on."""
+        if entry.unit != f"{COUNTED}^2":
+            return
+        raw = np.atleast_2d(raw).min(axis=0)
+        wrong = np.flatnonzero(where & self._axes.live & (raw * STOP_WITHIN < np.abs(self._axes.velocity)))
+        if wrong.size:
+            axis = int(wrong[0])
+            raise SafetyError(
+                f"axis {axis}: {entry.label} = {raw[axis]} would not stop it within {STOP_WITHIN:g} s from its "
+                f"{abs(self._axes.velocity[axis]):.0f} pps; nothing was sent. Choose more, or stop it first"
+            )
+        axes = where & self._axes.may_turn
+        if np.any(slow := axes & (raw < self._unramped_ramp())):
+            self._refuse_mode(slow & np.isin(self._modes(), UNRAMPED_MODES), raw)
+        self._check_speeds(axes, self._modes(), {**RUNNING_SPEEDS, **MOVING_SPEEDS}, raw * STOP_WITHIN)
+
+    def check_modes(
+        self, axes: Mask, modes: Integers | None = None, played: Mapping[Entry, Integers] | None = None
+    ) -> None:
+        """Raise SafetyError for axes that would be too fast in their mode as soon as they are enabled.
+
+        The speed that a drive has from before is held against the limit. What torques or set-points of csp make of an
+        axis has no speed that could be: until it is seen, it is as fast as its inertia lets it become, and only a quick
+        stop's ramp of that order brings it to rest.
+
+        Args:
+            axes: Those that may be enabled.
+            modes: What they will be in, by default the modes that they have.
+            played: Rows that are played at once, and are checked by themselves.
+        """
+        bounds = self._limits.bounds()
+        if not axes.any():
+            return
+        now = np.atleast_2d(self._modes() if modes is None else modes)
+        known, key = self._drives.description, QUICK_STOP_DECELERATION
+        if known.has(key) and known.dictionary.find(key).unit == f"{COUNTED}^2":
+            slow = axes & (bounds.braking < self._unramped_ramp())
+            self._refuse_mode(slow & np.isin(now, UNRAMPED_MODES).any(axis=0), bounds.braking)
+        for row in np.unique(now, axis=0):
+            self._check_speeds(axes, row, RUNNING_SPEEDS, bounds.velocity, played)
+
+    def _check_speeds(
+        self,
+        axes: Mask,
+        modes: Integers,
+        speeds: Mapping[int, tuple[tuple[Key, ...], ...]],
+        limit: NDArray[Any],
+        played: Mapping[Entry, Integers] | None = None,
+    ) -> None:
+        """Raise SafetyError for axes whose drives have a speed for their mode that is beyond the limit."""
+        played_keys = {(entry.index, entry.sub) for entry in played or {}}
+        for mode, sums in speeds.items():
+            if not np.any(chosen := axes & (modes == mode)):
+                continue
+            for keys in sums:
+                if played_keys & set(keys):
+                    continue
+                value = sum((read_own(self._drives, key, 0) for key in keys), np.zeros(len(axes), np.int64))
+                for axis in np.flatnonzero(chosen & (np.abs(value) > limit)).tolist():
+                    names = " + ".join(self._known.find(key).label for key in keys if self._drives.description.has(key))
+                    raise SafetyError(
+                        f"axis {axis}: its drive has {names} = {value[axis]}, beyond the limit {int(limit[axis])}; "
+                        f"nothing was sent. Write less there first, or raise {self._velocity_origin(axis)}"
+                    )
+
+    def _unramped_ramp(self) -> NDArray[np.float64]:
+        """Return the slowest ramp of a quick stop that modes without a limit of speed may have [inc/s^2]."""
+        scale = self._axes.rotor.scale
+        return np.where(scale > 1.0, DEFAULT_SPEED * scale / STOP_WITHIN, 0.0)
+
+    def _refuse_mode(self, wrong: Mask, ramp: Integers | NDArray[np.float64]) -> None:
+        for axis in np.flatnonzero(wrong).tolist():
+            raise SafetyError(
+                f"axis {axis}: nothing limits the speed in csp, tq or cst, and a quick stop's ramp of 6085h = "
+                f"{ramp[axis]:.0f} is too slow for it; nothing was sent. Have 6085h at "
+                f"{self._unramped_ramp()[axis]:.0f} or more, or choose another mode"
+            )
+
+    def _current_origin(self, key: Key) -> str:
+        own = "the drive's" if key == self._current_limit else f"{self._current_limit[0]:04X}h"
+        return self._limits.origin(self._limits.user.current, "current", own)
+
+    def _velocity_origin(self, axis: int) -> str:
+        bounds = self._limits.bounds()
+        if 0.0 < bounds.braking[axis] * STOP_WITHIN <= bounds.velocity[axis]:
+            return f"the quick stop's ramp, 6085h: no axis may be faster than it stops within {STOP_WITHIN:g} s"
+        if bounds.default_speed[axis]:
+            return "Limits(velocity=...): this drive has no limit of its own, and 6,000 rpm are taken"
+        return self._limits.origin(self._limits.user.velocity, "velocity", "607Fh")
+
+    def _last(self, key: Key) -> Integers:
+        if key not in self._set_points:
+            self._set_points[key] = read_own(self._drives, key, 0)
+        return self._set_points[key]

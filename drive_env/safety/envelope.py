@@ -1,0 +1,443 @@
+"""The envelope around whatever acts on drives of a bus: limits, an oscillation detector, stops.
+
+Four lines of defence, each for the failure of the one before:
+- what the program commands is refused before it is sent (`before_write`, `before_play`; `commands.py`);
+- what the drives do is watched, by the samples of every communication cycle and otherwise by a thread of its own
+  (`watch.py`, `judging.py`), and they are stopped by grades (`stop_runner.py`, `stopping.py`);
+- limits that are tighter than the drives' own are lent to them (`limits_in_force.py`, `lending.py`);
+- a process that dies is noticed by the drives themselves (`watchdogs.py`, `error_control.py`).
+
+Whether an axis is live is what its statusword says, and it counts as live from before a frame that could enable it is
+sent. A watchdog is given up only where the statusword, read back, shows every axis of its node off.
+
+A program that touches no limit sees the same integers with the envelope and without.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.dictionary.entries import Entry
+from drive_env.master.description import Key
+from drive_env.safety import signals
+from drive_env.safety.axes import Axes
+from drive_env.safety.bounds import (
+    ACCELERATION,
+    DECELERATION,
+    FOLLOWING_WINDOW,
+    MAX_PROFILE_VELOCITY,
+    POSITION_HIGH,
+    POSITION_LOW,
+    QUICK_STOP_DECELERATION,
+)
+from drive_env.safety.commands import Commands
+from drive_env.safety.errors import SafetyError as SafetyError
+from drive_env.safety.lending import Lending
+from drive_env.safety.limits import Limits
+from drive_env.safety.limits_in_force import LimitsInForce
+from drive_env.safety.objects import (
+    CONTROLWORD,
+    MODE,
+    SET_POINTS,
+    STATUSWORD,
+    STORE,
+)
+from drive_env.safety.rotor import HOME_OFFSET, scale_objects
+from drive_env.safety.states import (
+    DISABLE_VOLTAGE,
+    cuts_voltage,
+    is_live,
+    leads_on,
+    may_enable,
+)
+from drive_env.safety.stop_runner import StopRunner
+from drive_env.safety.stopping import Stop
+from drive_env.safety.watch import Watch
+from drive_env.safety.watchdogs import Watchdogs
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+logger = logging.getLogger(__name__)
+
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+DEVICE_OBJECTS = 0x2000  # below are those of communication
+# Limits of the drives themselves, and what tells their stopping distance.
+_BOUNDS = (
+    POSITION_LOW, POSITION_HIGH, FOLLOWING_WINDOW, MAX_PROFILE_VELOCITY, QUICK_STOP_DECELERATION, ACCELERATION,
+    DECELERATION, HOME_OFFSET,
+)  # fmt: skip
+
+
+class Envelope:
+    """The limits at work on some drives.
+
+    Args:
+        limits: What the program may do.
+        drives: The drives.
+
+    Raises:
+        ValueError: For limits that do not fit the number of axes.
+    """
+
+    def __init__(self, limits: Limits, drives: CanDrives) -> None:
+        limits.check_axes(drives.num_axes)
+        self._drives = drives
+        self._known = drives.description.dictionary
+        self._axes = Axes(drives)
+        self._lending = Lending(drives)
+        self._limits = LimitsInForce(limits, drives, self._axes, self._lending)
+        self._watchdogs = Watchdogs(drives, self._axes, self._limits, self._lending)
+        self._stops = StopRunner(drives, self._axes, self._limits, self._lending, self._watchdogs.cease)
+        self._watch = Watch(
+            drives, self._axes, self._limits, self._stops, self._watchdogs,
+            prepare=lambda: drives.prepare_watch(self), poll=lambda: drives.poll(self),
+        )  # fmt: skip
+        self._commands = Commands(drives, self._axes, self._limits, self._watch.modes)
+        self._checked_stop: Stop | None = None  # when the controlword that is being written was checked
+        self._is_closing = False
+
+    @property
+    def limits(self) -> Limits:
+        """What the program may do."""
+        return self._limits.user
+
+    @limits.setter
+    def limits(self, limits: Limits) -> None:
+        self._limits.user = limits
+
+    @property
+    def epoch(self) -> int:
+        """What samples are asked for in: it grows with every controlword."""
+        return self._axes.epoch
+
+    # --- what CanDrives calls -------------------------------------------------------------------------------------
+    def change(self, limits: Limits) -> None:
+        """Take other limits; those of position are places of the rotors as 6064h shows them now."""
+        limits.check_axes(self._drives.num_axes)
+        self._limits.change(limits)
+
+    def enter(self) -> None:
+        """Take note that the program does something; raise once what the supervisor had to do meanwhile."""
+        self.alive()
+        if self._watch.booted:
+            self._after_restart()
+        self._watch.raise_pending()
+
+    def alive(self) -> None:
+        """Take note that the program waits for an answer."""
+        self._watch.alive()
+
+    def before_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        """Raise SafetyError for a value that would pass a limit; make ready for motion before it is commanded."""
+        key = (entry.index, entry.sub)
+        self._watch.await_stop()
+        if key == CONTROLWORD:
+            self._before_controlword(raw, where)
+            return
+        if entry.index >= DEVICE_OBJECTS and not self._axes.is_armed and self._finds_live(where):
+            self._arm()
+        self._commands.check_write(entry, raw, where)
+        if key in SET_POINTS:
+            self._arm()
+        if entry.index == STORE and self._axes.is_armed:
+            self._lending.give_back(set(range(self._drives.num_axes)))
+
+    def after_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        """Take note of what was written."""
+        key = (entry.index, entry.sub)
+        if key == CONTROLWORD:
+            self._after_controlword(raw, where)
+        elif key == MODE:
+            self._axes.mode = np.where(where, raw, self._axes.mode)
+        elif key in SET_POINTS:
+            self._commands.note(key, raw, where)
+        elif key in scale_objects(self._drives.description):
+            self._limits.place()
+        elif key in _BOUNDS or key == self._drives.description.hints.current_limit:
+            self._limits.forget()
+            if key == HOME_OFFSET and self._axes.is_armed:
+                self._limits.lend()  # it corrects software limits
+        elif entry.index == STORE and self._axes.is_armed:
+            self._limits.lend()
+
+    def write_lent(self, entry: Entry, axis: int, value: int) -> bool:
+        """Take a value for an object that has another one meanwhile; False if it has not."""
+        key = (entry.index, entry.sub)
+        if not self._lending.is_lent(key, axis):
+            return False
+        self._lending.settle(key, axis, value)
+        self._limits.forget()
+        self._limits.lend()
+        return True
+
+    def own(self, entry: Entry, axis: int, found: int) -> int:
+        """Return what the program sees of an object that has `found`: its own value where another is lent."""
+        return self._lending.own((entry.index, entry.sub), axis, found)
+
+    def before_play(self, played: Mapping[Entry, Integers]) -> None:
+        """Raise SafetyError for rows that would pass a limit; make ready for motion if they command any."""
+        self._watch.await_stop()
+        if not played:
+            return
+        words = next((rows for entry, rows in played.items() if (entry.index, entry.sub) == CONTROLWORD), None)
+        self._commands.check_play(played, words)
+        enables = self._axes.everywhere if words is None else may_enable(words).any(axis=0)
+        if words is not None and cuts_voltage(words).any():
+            self._check_cuts(words)
+            self._brake(cuts_voltage(words).any(axis=0))
+        if words is not None or any((entry.index, entry.sub) in SET_POINTS for entry in played):
+            self._arm()
+        if words is not None and enables.any():
+            self._commands.check_modes(enables, played=played)
+            self._commands.check_played_starts(words, played)
+            self._prove_watchdogs(enables)
+            self._axes.assume(enables)
+        self._checked_stop = self._stops.current
+
+    def _check_cuts(self, words: Integers) -> None:
+        """Raise SafetyError for rows that take the voltage from an axis which an earlier row lets turn."""
+        after = np.cumsum(may_enable(words), axis=0) > 0
+        if (wrong := np.flatnonzero((after & cuts_voltage(words)).any(axis=0))).size:
+            raise SafetyError(
+                f"axis {int(wrong[0])}: these rows take the voltage away after they have enabled it, and it may turn "
+                "by then; nothing was sent. Play a quick stop (6040h = 2), and write 0 afterwards"
+            )
+
+    def after_play(self, played: Mapping[Entry, Integers]) -> None:
+        """Take note of what was played."""
+        for entry, rows in played.items():
+            if len(rows):
+                self.after_write(entry, rows[-1], self._axes.everywhere)
+
+    def before_reset(self, nodes: Sequence[int]) -> None:
+        """Bring axes of nodes, by position, to rest and switch them off: a reset takes their voltage away."""
+        self._watch.await_stop()
+        axes = self._axes.of_nodes(nodes)
+        self._brake(axes)
+        for axis in np.flatnonzero(axes & self._axes.live):
+            self._drives.write_raw(self._known.find(CONTROLWORD), int(axis), DISABLE_VOLTAGE)
+        self._axes.take_for_off(axes)
+
+    def after_reset(self, nodes: Sequence[int]) -> None:
+        """Take note that nodes, by position, were reset: their error control is their own again."""
+        for k in nodes:
+            self._watchdogs.forget(k)
+            self._watch.booted.discard(k)
+        self._lending.forget(set(np.flatnonzero(self._axes.of_nodes(nodes)).tolist()))
+        self._commands.forget()
+        self._axes.aim.clear()
+        self._axes.epoch += 1
+        self._axes.is_armed = False  # the next command arms anew; what still runs is watched on
+        self._limits.forget()
+        if self._axes.rotor.is_placed:
+            self._limits.place()
+
+    def restarted(self, node: int) -> None:
+        """Take note that a node, by position, has booted though nobody here has reset it."""
+        if self._is_ours():
+            self._watch.note_restart(node)
+
+    def _after_restart(self) -> None:
+        """Take down what was known of nodes that restarted, and have the program told."""
+        nodes = sorted(self._watch.booted)
+        self._drives.forget(nodes)
+        self.after_reset(nodes)  # a boot-up says nothing of the axes: reset communication leaves them running
+        numbers = ", ".join(str(self._drives.nodes[k]) for k in nodes)
+        self._stops.stop_for(
+            f"node {numbers} has restarted by itself", "check its power; what was set since its boot is lost"
+        )
+
+    def has_lost(self, node: int) -> bool:
+        """Return whether an axis of a node, by position, could not be proved to be off."""
+        return bool(self._axes.lost & set(np.flatnonzero(self._axes.of_nodes([node])).tolist()))
+
+    def watched(self) -> list[Entry]:
+        """Return what is to be sampled at every SYNC, the most important first: the same list while limits are."""
+        return self._watch.looks.watched()
+
+    def sampled(self, chosen: Sequence[Entry]) -> None:
+        """Take note of what comes with every SYNC; the rest of what is watched is asked for."""
+        self._watch.looks.sampled(chosen)
+
+    def observe(self, rows: Mapping[Key, Integers], epoch: int, where: Mask | None = None) -> None:
+        """Look at samples, each object of shape (rows, num_axes); stop and raise SafetyError beyond a limit.
+
+        Args:
+            rows: The samples, one communication cycle apart.
+            epoch: The envelope's when they were asked for.
+            where: Axes that they are of, all by default.
+        """
+        self._watch.observe(rows, epoch, where)
+
+    def stop(self, reason: str) -> None:
+        """Bring what is live to rest by grades and switch it off; what fails is logged.
+
+        Axes that nobody has armed were neither enabled nor commanded by this program, and are left alone. Neither
+        Ctrl-C nor SIGTERM cuts the stop short.
+        """
+        if not self._is_ours():
+            return
+        with self._uninterrupted():
+            if not self._watch.look_for_live():
+                return
+            logger.warning("stopping the drives: %s", reason)
+            with self._axes.lock:
+                self._stops.begin(self._axes.may_turn, holds=False)
+            self._watch.await_stop(ends=True)
+
+    def close(self) -> None:
+        """Stop what is live; give the drives back what they had, and their watchdogs, once they are proved off."""
+        if self._is_ours():
+            with self._uninterrupted():
+                self.stop("the drives are closed while enabled")
+                self._watchdogs.give_up()
+        self._end_watching()
+
+    def _is_ours(self) -> bool:
+        """Return whether this program has enabled or commanded anything, or made ready to."""
+        return self._axes.is_armed or self._watch.is_supervised or bool(self._axes.may_turn.any())
+
+    # --- signals --------------------------------------------------------------------------------------------------
+    def interrupt(self) -> bool:
+        """Begin to stop, since the program is told to end; return whether that is under way already.
+
+        Called from a signal handler, between any two instructions of the program: it only asks the supervisor.
+        """
+        if self._is_closing or self._watch.is_told_to_end:
+            return True
+        if not self._axes.may_turn.any():
+            return False
+        self._watch.tell_to_end()
+        return False
+
+    def carry_on(self) -> None:
+        """Have the program told that it was stopped, since it goes on."""
+        self._watch.carry_on()
+
+    @contextlib.contextmanager
+    def _uninterrupted(self) -> Iterator[None]:
+        """Let no signal that the library hears end a block."""
+        before, self._is_closing = self._is_closing, True
+        try:
+            yield
+        finally:
+            self._is_closing = before
+
+    # --- commands -------------------------------------------------------------------------------------------------
+    def _before_controlword(self, words: Integers, where: Mask) -> None:
+        enables = where & may_enable(words)
+        if enables.any() or np.any(where & leads_on(words)):
+            self._arm()
+            self._commands.check_start(words, where)
+            self._commands.check_modes(enables)
+            self._prove_watchdogs(enables)
+            self._axes.assume(enables)
+        if np.any(cuts := where & cuts_voltage(words)):
+            self._brake(cuts)
+        self._checked_stop = self._stops.current
+
+    def _after_controlword(self, words: Integers, where: Mask) -> None:
+        with self._axes.lock:
+            self._axes.epoch += 1
+            self._axes.in_flight &= ~where
+        self._commands.note_start(words, where)
+        if np.any(where & may_enable(words)):
+            self._watch.forget_signal()
+        if np.any(enabled := where & may_enable(words)):
+            with self._axes.lock:
+                if self._stops.current is not self._checked_stop:
+                    # It was stopped between the check and the frame, which may have undone that.
+                    self._stops.current = None
+                    self._stops.begin(enabled, holds=True)
+                    return
+                self._stops.current = None
+            for axis in np.flatnonzero(enabled).tolist():
+                self._stops.end_hold(axis)
+
+    def _prove_watchdogs(self, enables: Mask) -> None:
+        """See to it that the watchdogs are still there before axes are enabled: a node may have restarted."""
+        if not np.any(enables & ~self._axes.live):
+            return
+        self._watchdogs.check()
+        if not self._axes.is_armed:
+            self._drives.must_start()
+            self._arm()
+
+    def _finds_live(self, where: Mask) -> bool:
+        """Return whether an axis that is about to be changed is live: somebody else has enabled it."""
+        status = self._known.find(STATUSWORD)
+        return any(is_live(self._drives.read_raw(status, int(axis))) for axis in np.flatnonzero(where))
+
+    # --- arming ---------------------------------------------------------------------------------------------------
+    def _arm(self) -> None:
+        """Make ready for motion: nodes operational, limits known and lent, watchdogs on, every axis seen.
+
+        Raises:
+            SafetyError: If an axis cannot be watched; BusError or ObjectAccessError if a node does not answer.
+        """
+        if self._axes.lost:
+            raise SafetyError(
+                f"axis {min(self._axes.lost)} could not be proved to be off, and is left to its watchdog; look at it, "
+                "and open the drives again"
+            )
+        self._drives.start()
+        if self._axes.is_armed:
+            return
+        self._limits.bounds()
+        self._axes.mode = self._watch.modes().copy()
+        try:
+            if not self._drives.is_dry:
+                self._watchdogs.set()
+            self._limits.lend()
+            self._stops.make_sure_of_a_ramp()
+            self._watch.first_look()
+        except BaseException:
+            with self._uninterrupted():
+                self.stop("the drives cannot be watched")
+                self._watchdogs.give_up()
+            self._end_watching()
+            raise
+        self._axes.is_armed = True
+        self._watch.begin()
+        signals.guard(self)
+
+    def _end_watching(self) -> None:
+        self._watch.end()
+        signals.release(self)
+
+    def _brake(self, axes: Mask) -> None:
+        """Bring axes that turn to rest before their voltage is taken away; then it is."""
+        if self._drives.is_dry or not self._watch.look_for_live():
+            return
+        rest = self._limits.bounds().rest
+        turning = axes & self._axes.live & (np.maximum(np.abs(self._axes.speed), np.abs(self._axes.velocity)) > rest)
+        if turning.any():
+            self._arm()  # also what somebody else has enabled, once it is ours to stop
+            with self._axes.lock:
+                self._stops.begin(turning, holds=False)
+            self._watch.await_stop()
+
+
+@contextlib.contextmanager
+def swinging_allowed(drives: Any) -> Iterator[None]:
+    """Have the envelope of drives, if they have one, take current that swings for intended; its other limits stay."""
+    envelope = getattr(drives, "safety", None)
+    if envelope is None:
+        yield
+        return
+    limits = envelope.limits
+    envelope.limits = replace(limits, oscillation=False)
+    try:
+        yield
+    finally:
+        envelope.limits = limits

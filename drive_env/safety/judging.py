@@ -1,0 +1,182 @@
+"""What the drives do, held against the limits: speed, position, following error, current and its swings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.dictionary.entries import ObjectDictionary
+from drive_env.master.description import Key
+from drive_env.safety.axes import Axes
+from drive_env.safety.bounds import Bounds
+from drive_env.safety.limits import NO_LIMIT
+from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
+from drive_env.safety.objects import CSP, CURRENT, DEMAND, HM, POSITION, PP, VELOCITY
+from drive_env.safety.oscillation import SWING, SWING_WINDOW, SWINGS, Swings
+from drive_env.safety.rotor import wrapped
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A current above its limit is no accident until it lasts: noise and overshoot are within this.
+CURRENT_MARGIN, CURRENT_CYCLES = 1.25, 10
+LATENCY = 0.010  # s from a sample to the drive's ramp
+
+
+class Judging:
+    """Whether samples are within the limits.
+
+    Args:
+        known: The drives' objects.
+        axes: What is known of the axes.
+        limits: Those that hold.
+        modes: Returns the mode of operation of every axis.
+        stop_for: Stops the drives for what is wrong, and raises SafetyError with that and a remedy.
+    """
+
+    def __init__(
+        self,
+        known: ObjectDictionary,
+        axes: Axes,
+        limits: LimitsInForce,
+        modes: Callable[[], Integers],
+        stop_for: Callable[[str, str], NoReturn],
+    ) -> None:
+        self._known = known
+        self._axes = axes
+        self._limits = limits
+        self._modes = modes
+        self._stop_for = stop_for
+        count = len(axes.everywhere)
+        self._over_current = np.zeros(count, np.int64)
+        self._swings = [Swings() for _ in range(count)]
+
+    def judge(self, rows: Mapping[Key, Integers], judged: Mask) -> None:
+        """Compare samples, each object of shape (rows, num_axes), with the limits of some axes."""
+        if not judged.any():
+            return
+        bounds = self._limits.bounds()
+        if VELOCITY in rows:
+            fastest = np.abs(rows[VELOCITY]).max(axis=0)
+            self._trip(judged, fastest, bounds.velocity, VELOCITY, "lower the profile velocity or the target")
+        if POSITION in rows:
+            self._judge_speed(judged, bounds)
+        if POSITION in rows and bounds.has_position:
+            self._judge_position(judged, rows[POSITION], bounds)
+        if POSITION in rows and DEMAND in rows:
+            self._judge_following(judged, rows[DEMAND] - rows[POSITION], bounds)
+        if CURRENT in rows:
+            self._judge_current(judged, rows[CURRENT], bounds)
+
+    def _judge_speed(self, judged: Mask, bounds: Bounds) -> None:
+        """Hold speeds by positions against the limit of drives whose own unit of speed is not known."""
+        if (wrong := np.flatnonzero(judged & (np.abs(self._axes.speed) > bounds.speed))).size:
+            axis = int(wrong[0])
+            self._stop_for(
+                f"axis {axis} turns by {abs(self._axes.speed[axis]):.0f} increments a second, and its limit is "
+                f"{bounds.speed[axis]:.0f} (6,000 rpm of the rotor, or what its travel allows)",
+                "lower the profile velocity or the target",
+            )
+
+    def _judge_position(self, judged: Mask, position: Integers, bounds: Bounds) -> None:
+        ahead = self._stopping_distance(bounds)
+        end = position[-1] + ahead
+        low, high = np.minimum(position.min(axis=0), end), np.maximum(position.max(axis=0), end)
+        if ((low >= bounds.low) & (high <= bounds.high)).all():
+            self._axes.outside[:] = 0
+            return
+        below = np.where(bounds.low > -NO_LIMIT, bounds.low - position, 0)
+        above = np.where(bounds.high < NO_LIMIT, position - bounds.high, 0)
+        outside = np.maximum(np.maximum(below, above), 0)
+        will_be = np.maximum(
+            np.where(bounds.low > -NO_LIMIT, bounds.low - low, 0),
+            np.where(bounds.high < NO_LIMIT, high - bounds.high, 0),
+        )
+        # An axis that was enabled outside may come back, though not go further out.
+        self._axes.outside = np.where(self._axes.outside < 0, outside[0], self._axes.outside)
+        slack = np.where(will_be > outside.max(axis=0), bounds.slack, bounds.settled)
+        allowed = np.maximum(self._axes.outside, 0) + slack
+        farthest = np.maximum(outside.max(axis=0), will_be)
+        self._axes.outside = np.minimum(self._axes.outside, outside[-1])
+        wrong = (farthest > allowed) & judged
+        if wrong.any() and np.any(wrong & (bounds.given | (self._modes() != HM))):
+            axis = int(np.flatnonzero(wrong & (bounds.given | (self._axes.mode != HM)))[0])
+            there = outside.max(axis=0)[axis] > bounds.settled[axis] + max(self._axes.outside[axis], 0)
+            what = "the position is" if there else "the axis could not stop before it is"
+            by = outside.max(axis=0)[axis] if there else farthest[axis]
+            self._stop_for(
+                f"axis {axis}: {what} {int(by)} beyond the limits {bound_text(bounds.low[axis])} to "
+                f"{bound_text(bounds.high[axis])}",
+                f"move it back, or widen {self._limits.origin(self._limits.user.position, 'position', '607Dh')}",
+            )
+
+    def _stopping_distance(self, bounds: Bounds) -> Floats:
+        """Return how far the axes go on, if they are stopped now [inc]."""
+        speed = self._axes.velocity
+        planned = np.isin(self._axes.mode, (PP, CSP))  # ends by itself, at a target that was checked
+        braking = np.where(planned, bounds.profile, bounds.braking)
+        # Where the ramp is not known, as long a way as a stop may take at most.
+        unknown = np.where(planned, 0.0, np.abs(speed) * STOP_WITHIN / 2.0)
+        ramp = np.where(braking > 0.0, speed**2 / (2.0 * np.where(braking > 0.0, braking, 1.0)), unknown)
+        way = ramp + np.where(planned, 0.0, np.abs(speed) * LATENCY)
+        return np.asarray(np.sign(speed) * way)
+
+    def _judge_following(self, judged: Mask, error: Integers, bounds: Bounds) -> None:
+        largest: Integers = np.abs(wrapped(error)).max(axis=0)
+        # The mode is an SDO transfer away: asked for only where it matters.
+        if not np.any(judged & (largest > bounds.following)):
+            return
+        follows = np.isin(self._modes(), (PP, CSP))
+        self._trip(
+            judged,
+            np.where(follows, largest, 0),
+            bounds.following,
+            DEMAND,
+            "move more gently, or tune the loops, or raise "
+            + self._limits.origin(self._limits.user.following_error, "following_error", "6065h"),
+            "the following error",
+        )
+
+    def _judge_current(self, judged: Mask, current: Integers, bounds: Bounds) -> None:
+        above = np.abs(current) > CURRENT_MARGIN * bounds.current
+        if above.any():
+            self._count_over_current(judged, current, above, bounds)
+        else:
+            self._over_current[judged] = 0
+        if not self._limits.user.oscillation:
+            return
+        for axis in map(int, np.flatnonzero(judged & (bounds.current < NO_LIMIT))):
+            swings, threshold = self._swings[axis], SWING * float(bounds.current[axis])
+            for value in current[:, axis].tolist():
+                if swings.count(value, threshold) >= SWINGS:
+                    self._swings[axis] = Swings()
+                    self._stop_for(
+                        f"axis {axis} oscillates: its current swung {SWINGS} times past plus and minus "
+                        f"{threshold:.0f} within {SWING_WINDOW} cycles",
+                        "lower the velocity loop's gains, or set Limits(oscillation=False) for an excitation",
+                    )
+
+    def _count_over_current(self, judged: Mask, current: Integers, above: Mask, bounds: Bounds) -> None:
+        for row, too_high in zip(current, above, strict=True):
+            self._over_current = np.where(judged, np.where(too_high, self._over_current + 1, 0), self._over_current)
+            late = np.flatnonzero(judged & (self._over_current >= CURRENT_CYCLES))
+            if late.size:
+                axis = int(late[0])
+                self._stop_for(
+                    f"axis {axis}: the current is {row[axis]} for {CURRENT_CYCLES} cycles, and its limit is "
+                    f"{bounds.current[axis]}",
+                    "check the current loop's gains 2041h and the motor's wiring",
+                )
+
+    def _trip(
+        self, judged: Mask, value: Integers, limit: Integers, key: Key, remedy: str, what: str | None = None
+    ) -> None:
+        wrong = np.flatnonzero(judged & (value > limit))
+        if wrong.size:
+            axis = int(wrong[0])
+            name = what or self._known.find(key).label
+            self._stop_for(f"axis {axis}: {name} is {value[axis]}, and its limit is {limit[axis]}", remedy)

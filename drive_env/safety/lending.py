@@ -1,0 +1,108 @@
+"""Limits that the drives hold themselves while they are moved, and get back what they had.
+
+A limit that lives in this process alone dies with it. What is tighter here than in a drive is lent to it: the drive
+holds it, and the program goes on reading and writing its own value, which the drive has again afterwards.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, NamedTuple
+
+from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.entries import Entry
+from drive_env.master.description import Key
+from drive_env.master.errors import BusError
+from drive_env.master.tidying import Tidying
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+logger = logging.getLogger(__name__)
+
+
+class Loan(NamedTuple):
+    """What an object had, and what it has meanwhile."""
+
+    own: int
+    lent: int
+
+
+class Lending:
+    """Objects that have another value for a while.
+
+    Args:
+        drives: The drives.
+    """
+
+    def __init__(self, drives: CanDrives) -> None:
+        self._drives = drives
+        self._loans: dict[tuple[Key, int], Loan] = {}
+
+    def lend(self, key: Key, axis: int, value: int) -> bool:
+        """Give an object of an axis a value for a while; return whether the drive, read back, has it."""
+        entry = self._drives.description.dictionary.find(key)
+        try:
+            loan = self._loans.get((key, axis))
+            own = int(self._drives.read_raw(entry, axis)) if loan is None else loan.own
+            self._loans[key, axis] = Loan(own, value)
+            self._drives.write_raw(entry, axis, value)
+            if int(self._drives.read_raw(entry, axis)) == value:
+                return True
+            logger.warning("axis %d does not take %s = %d; it is watched from here alone", axis, entry.label, value)
+        except ObjectAccessError as error:
+            logger.warning("axis %d: %s; this limit is watched from here alone", axis, error)
+            self._loans.pop((key, axis), None)
+        return False
+
+    def own(self, key: Key, axis: int, found: int) -> int:
+        """Return what the program sees of an object that has `found`."""
+        loan = self._loans.get((key, axis))
+        return loan.own if loan is not None and loan.lent == found else found
+
+    def owned(self, key: Key, axis: int) -> int:
+        """Return what an object had that has another value meanwhile."""
+        return self._loans[key, axis].own
+
+    def is_lent(self, key: Key, axis: int) -> bool:
+        """Return whether an object has another value meanwhile."""
+        return (key, axis) in self._loans
+
+    def settle(self, key: Key, axis: int, value: int) -> None:
+        """Take note of what the program wants an object to have afterwards."""
+        self._loans[key, axis] = self._loans[key, axis]._replace(own=value)
+
+    def give_back(self, axes: set[int]) -> None:
+        """Give axes what they had.
+
+        Raises:
+            BusError: If not all of it could be.
+        """
+        tidying = Tidying()
+        for (key, axis), loan in list(self._loans.items()):
+            if axis in axes:
+                entry = self._drives.description.dictionary.find(key)
+                tidying.step(lambda entry=entry, axis=axis, loan=loan: self._return(entry, axis, loan))  # type: ignore[misc]
+        tidying.end()
+
+    def give_back_one(self, key: Key, axis: int) -> None:
+        """Give an object of an axis what it had."""
+        self._return(self._drives.description.dictionary.find(key), axis, self._loans[key, axis])
+
+    def has_lent(self, axes: set[int]) -> bool:
+        """Return whether any object of axes has another value meanwhile."""
+        return any(axis in axes for _, axis in self._loans)
+
+    def forget(self, axes: set[int]) -> None:
+        """Forget what axes had: their node was reset."""
+        for key, axis in list(self._loans):
+            if axis in axes:
+                del self._loans[key, axis]
+
+    def _return(self, entry: Entry, axis: int, loan: Loan) -> None:
+        # Who else has changed it meanwhile had a reason.
+        if int(self._drives.read_raw(entry, axis)) == loan.lent:
+            self._drives.write_raw(entry, axis, loan.own)
+            if (found := int(self._drives.read_raw(entry, axis))) != loan.own:
+                raise BusError(f"axis {axis}: {entry.label} should have {loan.own} again, and has {found}")
+        self._loans.pop(((entry.index, entry.sub), axis), None)

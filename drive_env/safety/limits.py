@@ -1,0 +1,86 @@
+"""Limits of what a program may do to drives of a bus, as the user states them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Integers = NDArray[np.int64]
+PerAxis = float | Sequence[float | None]
+
+NO_LIMIT = 2**62  # beyond what any object holds
+LEAST_SILENCE, MOST_SILENCE = 0.02, 65.535  # s; 1016h counts whole milliseconds in 16 bits
+DEFAULT_SPEED = 100.0  # rev/s of the rotor (6,000 rpm), of a drive that has no limit of its own
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a program may do to drives, in the drive's units; None takes the drive's own limit.
+
+    Each limit is one number for all axes, or a sequence with one per axis, of which None takes the drive's own.
+
+    Attributes:
+        position: Lowest and highest position [unit of 6064h]; infinite for none. What is given is taken as a place of
+            the rotor when the drives are opened, and stays there whatever moves the scale or the zero (2058h, 608Fh,
+            homing); homing keeps to it, too. The drive's own are 607Dh, from which homing is exempt.
+        velocity: Highest speed either way [unit of 606Ch]; the drive's is 607Fh, if it has one, else 6,000 rpm of the
+            rotor. No axis may be faster than its quick stop (6085h) brings to rest within a second.
+        current: Highest current or torque either way [unit of 6077h]; the drive's is its current limit.
+        following_error: Largest distance of demand and position in pp and csp; the drive's is 6065h.
+        oscillation: Quick-stop an axis whose current oscillates.
+        stall: Longest pause between two calls while an axis is enabled [s]; None for any.
+        silence: Silence of this process after which the drive stops by itself [s]. None switches nothing on in a drive:
+            it is for drives without a heartbeat consumer (1016h) and life guarding (100Ch), and for you at the
+            emergency stop.
+    """
+
+    position: tuple[PerAxis | None, PerAxis | None] | None = None
+    velocity: PerAxis | None = None
+    current: PerAxis | None = None
+    following_error: PerAxis | None = None
+    oscillation: bool = True
+    stall: float | None = 1.0
+    silence: float | None = 0.5
+
+    def __post_init__(self) -> None:
+        if self.position is not None:
+            if len(self.position) != 2:
+                raise ValueError(f"position limits are lowest and highest, not {self.position}")
+            low, high = np.broadcast_arrays(_values(self.position[0], -math.inf), _values(self.position[1], math.inf))
+            if np.isnan(low).any() or np.isnan(high).any() or not np.all(low < high):
+                raise ValueError(f"position limits are lowest and highest, not {self.position}")
+        for name in ("velocity", "current", "following_error"):
+            if not np.all(_values(getattr(self, name), 1.0) > 0):
+                raise ValueError(f"{name} must be above 0, not {getattr(self, name)}; None takes the drive's own limit")
+        if self.stall is not None and not 0.0 < self.stall < math.inf:
+            raise ValueError(f"stall must be above 0 s, not {self.stall}; None is for any")
+        if self.silence is not None and not LEAST_SILENCE <= self.silence <= MOST_SILENCE:
+            raise ValueError(
+                f"silence = {self.silence} s cannot be: a drive counts it in milliseconds, and this computer keeps "
+                f"{LEAST_SILENCE:g} s at best; choose {LEAST_SILENCE:g} to {MOST_SILENCE:g} s"
+            )
+
+    def check_axes(self, num_axes: int) -> None:
+        """Raise ValueError for a sequence that is not one value per axis."""
+        low, high = (None, None) if self.position is None else self.position
+        given = {"position": low, "position's upper end": high}
+        for name, value in (given | {n: getattr(self, n) for n in ("velocity", "current", "following_error")}).items():
+            if np.ndim(_values(value, 0.0)) and len(_values(value, 0.0)) not in (1, num_axes):
+                raise ValueError(
+                    f"{name} has {len(_values(value, 0.0))} values for {num_axes} axes; give one for all, or one each"
+                )
+
+
+def given(value: PerAxis | None, num_axes: int) -> NDArray[np.float64]:
+    """Return what the user gave for each axis, nan where the drive's own limit counts, shape (num_axes,)."""
+    return np.broadcast_to(_values(value, math.nan), (num_axes,)).astype(float)
+
+
+def _values(value: PerAxis | None, absent: float) -> NDArray[np.float64]:
+    if value is None or np.ndim(value) == 0:  # type: ignore[arg-type]
+        return np.asarray(absent if value is None else value, float)
+    return np.array([absent if one is None else one for one in value], np.float64)  # type: ignore[union-attr]

@@ -1,0 +1,159 @@
+"""The limits that hold now: the user's as places of the rotors, the drives' own besides, and lent where tighter."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.master.description import Key
+from drive_env.safety.axes import Axes
+from drive_env.safety.bounds import (
+    FOLLOWING_WINDOW,
+    MAX_MOTOR_SPEED,
+    MAX_PROFILE_VELOCITY,
+    POSITION_HIGH,
+    POSITION_LOW,
+    Bounds,
+    read_bounds,
+    read_own,
+)
+from drive_env.safety.lending import Lending
+from drive_env.safety.limits import NO_LIMIT, Limits, given
+from drive_env.safety.objects import POSITION
+from drive_env.safety.rotor import HOME_OFFSET, read_scale
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+STOP_WITHIN = 1.0  # s from the highest speed allowed by the quick stop's ramp; what ramps slower may turn no faster
+
+
+def bound_text(bound: np.int64) -> str:
+    """Return an end of a range for a message."""
+    return "(none)" if abs(int(bound)) >= NO_LIMIT else str(int(bound))
+
+
+class LimitsInForce:
+    """The limits of the axes at the scale and zero that they have now.
+
+    Args:
+        user: What the user allows.
+        drives: The drives.
+        axes: What is known of them.
+        lending: What holds the limits that are tighter than the drives' own.
+
+    Attributes:
+        user: What the user allows.
+        latest: The limits as they were read last; None since something changed that they depend on.
+    """
+
+    def __init__(self, user: Limits, drives: CanDrives, axes: Axes, lending: Lending) -> None:
+        self.user = user
+        self.latest: Bounds | None = None
+        self._generation = 0
+        self._drives = drives
+        self._axes = axes
+        self._lending = lending
+        self._ends = self._capture()
+
+    def change(self, user: Limits) -> None:
+        """Take other limits; those of position are places of the rotors as 6064h shows them now."""
+        self.user = user
+        self._ends = self._capture()
+        self.forget()
+        if self._axes.is_armed:
+            self.lend()
+
+    def forget(self) -> None:
+        """Read anew what the limits depend on before they are used again."""
+        self._generation += 1
+        self.latest = None
+
+    def _capture(self) -> tuple[Floats, Floats]:
+        """Return the user's limits of position as places of the rotors [rev]; nan where there are none."""
+        count = self._drives.num_axes
+        if self.user.position is None:
+            return np.full(count, math.nan), np.full(count, math.nan)
+        self.place()
+        low, high = (given(end, count) for end in self.user.position)
+        here = self._axes.position.astype(float)
+        turns = self._axes.rotor.turns(self._axes.position)
+        return tuple(turns + (end - here) / self._axes.rotor.scale for end in (low, high))  # type: ignore[return-value]
+
+    def place(self) -> None:
+        """Read where the rotors are and what a revolution counts; what moved scale or zero has not moved them."""
+        position = read_own(self._drives, POSITION, 0)
+        scale = read_scale(self._drives)
+        with self._axes.lock:
+            self._axes.place(position, scale)
+            self.forget()
+        if self._axes.is_armed:
+            self.lend()
+
+    def bounds(self) -> Bounds:
+        """Return the limits of every axis as integers of its drive; what the user left open is read from the drives."""
+        bounds, generation = self.latest, self._generation
+        if bounds is None:
+            if not self._axes.rotor.is_placed:
+                self.place()
+            bounds = read_bounds(self.user, self._drives, self._axes.rotor, self._ends)
+            ramp = np.where(bounds.braking > 0.0, bounds.braking * STOP_WITHIN, float(NO_LIMIT))
+            bounds.velocity = np.minimum(bounds.velocity, np.minimum(ramp, float(NO_LIMIT)).astype(np.int64))
+            if generation == self._generation:  # else something changed while another thread's answers were read
+                self.latest = bounds
+        return bounds
+
+    def lend(self) -> None:
+        """Lend the drives the limits that are tighter than their own."""
+        bounds = self.bounds()
+        offset = self._last_offset()
+        wanted: dict[Key, tuple[Floats, bool]] = {}
+        if self.user.position is not None:
+            wanted[POSITION_LOW] = (
+                np.where(bounds.low > -NO_LIMIT, bounds.low - bounds.slack + offset, -math.inf),
+                False,
+            )
+            wanted[POSITION_HIGH] = (
+                np.where(bounds.high < NO_LIMIT, bounds.high + bounds.slack + offset, math.inf),
+                True,
+            )
+        for key, limit, highest in (
+            (self._drives.description.hints.current_limit, self.user.current, bounds.current),
+            (FOLLOWING_WINDOW, self.user.following_error, bounds.following),
+            (MAX_PROFILE_VELOCITY, self.user.velocity, bounds.velocity),
+        ):
+            if limit is not None:
+                wanted[key] = (np.where(highest < NO_LIMIT, highest, math.inf), True)
+        if self.user.velocity is not None and self._axes.is_counted and np.all(self._axes.rotor.scale > 1.0):
+            wanted[MAX_MOTOR_SPEED] = (np.ceil(60.0 * bounds.velocity / self._axes.rotor.scale), True)
+        for key, (value, is_upper) in wanted.items():
+            if self._drives.description.has(key):
+                for axis in range(self._drives.num_axes):
+                    self._lend_one(key, axis, float(value[axis]), is_upper)
+
+    def _lend_one(self, key: Key, axis: int, limit: float, is_upper: bool) -> None:
+        entry = self._drives.description.dictionary.find(key)
+        assert entry.low is not None and entry.high is not None, "a limit is a number"
+        own = int(self._drives.read_axis(entry, axis))
+        switched_off = own == 0 and key in (FOLLOWING_WINDOW, MAX_PROFILE_VELOCITY, MAX_MOTOR_SPEED)
+        value = max(min(limit, float(entry.high)), float(entry.low))
+        tighter = switched_off or (value < own if is_upper else value > own)
+        if tighter and math.isfinite(limit):
+            self._lending.lend(key, axis, round(value))
+        elif self._lending.is_lent(key, axis):
+            self._lending.lend(key, axis, own)
+
+    def _last_offset(self) -> Integers:
+        if self.user.position is None:
+            return np.zeros(self._drives.num_axes, np.int64)
+        return read_own(self._drives, HOME_OFFSET, 0)
+
+    def origin(self, value: object, name: str, own: str) -> str:
+        """Return what sets a limit, for a message: the user's `value` by `name`, or the object of the drive."""
+        return f"Limits({name}=...)" if value is not None else f"the drive's own limit, {own}"

@@ -1,0 +1,127 @@
+"""What is watched: sampled with every SYNC as far as it fits, and otherwise asked for."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.dictionary.entries import Entry
+from drive_env.master.description import Key
+from drive_env.safety.axes import Axes
+from drive_env.safety.bounds import Bounds
+from drive_env.safety.limits import NO_LIMIT
+from drive_env.safety.limits_in_force import LimitsInForce
+from drive_env.safety.objects import CURRENT, DEMAND, POSITION, STATUSWORD, VELOCITY
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+UNSAMPLED = 0.010  # s between two looks at what no PDO carries
+ASK = 0.015  # s for an answer to a look
+SILENT = 0.05  # s for which one that did not answer is not asked again: it must not hold up the others
+
+
+class Looks:
+    """What comes with every SYNC, and what is asked for besides.
+
+    Args:
+        drives: The drives.
+        axes: What is known of them.
+        limits: Those that hold.
+        observe: Takes what an axis answered: rows, the epoch when it was asked, which axis.
+    """
+
+    def __init__(
+        self,
+        drives: CanDrives,
+        axes: Axes,
+        limits: LimitsInForce,
+        observe: Callable[[Mapping[Key, Integers], int, Mask], None],
+    ) -> None:
+        self._drives = drives
+        self._known = drives.description.dictionary
+        self._axes = axes
+        self._limits = limits
+        self._observe = observe
+        self._watched: tuple[Bounds, list[Entry]] | None = None
+        self._unsampled: list[Entry] = []
+        self._unsampled_at = 0.0
+        self._silent: dict[int, float] = {}  # node, by position -> until when nobody asks it again
+
+    @property
+    def is_short(self) -> bool:
+        """Whether some of what is watched does not come with SYNC."""
+        return bool(self._unsampled)
+
+    def ask_unsampled(self) -> None:
+        """Ask for what no PDO carries, when it is due."""
+        now = time.monotonic()
+        if self._unsampled and now >= self._unsampled_at:
+            self._unsampled_at = now + UNSAMPLED
+            self.ask(self._unsampled)
+
+    def watched(self) -> list[Entry]:
+        """Return what is to be sampled at every SYNC, the most important first: the same list while limits are."""
+        bounds = self._limits.bounds()
+        if self._watched is not None and self._watched[0] is bounds:
+            return self._watched[1]
+        keys = [STATUSWORD, POSITION, VELOCITY]
+        if np.any(bounds.current < NO_LIMIT):
+            keys.insert(2, CURRENT)
+        if np.any(bounds.following < NO_LIMIT):
+            keys.append(DEMAND)
+        entries = [self._known.find(key) for key in keys if self._drives.description.has(key)]
+        self._watched = (bounds, entries)
+        return entries
+
+    def sampled(self, chosen: Sequence[Entry]) -> None:
+        """Take note of what comes with every SYNC; the rest of what is watched is asked for."""
+        self._unsampled = [entry for entry in self.watched() if entry not in chosen]
+        keys = [(entry.index, entry.sub) for entry in self._unsampled]
+        if DEMAND in keys and POSITION not in keys:  # a following error is told by both of a moment
+            self._unsampled.insert(0, self._known.find(POSITION))
+
+    def with_unsampled(self, rows: Mapping[Key, Integers]) -> Mapping[Key, Integers]:
+        """Return samples and what no PDO carries, which is asked for now and then: no time passes in lockstep."""
+        count = len(next(iter(rows.values()))) if rows else 1
+        if self._axes.clock + count * self._drives.description.cycle < self._unsampled_at:
+            return rows
+        self._unsampled_at = self._axes.clock + UNSAMPLED
+        asked = {}
+        for entry in self._unsampled:
+            value = self._drives.read_entry(entry)
+            asked[entry.index, entry.sub] = np.tile(value, (count, 1))
+        return {**asked, **rows}
+
+    def ask(self, entries: Sequence[Entry]) -> bool:
+        """Read objects of every axis; return whether all came. Beyond a limit the drives are stopped."""
+        epoch, per_node = self._axes.epoch, self._drives.description.num_axes
+        complete = True
+        for axis in range(self._drives.num_axes):
+            node, part = divmod(axis, per_node)
+            if node in self._silent and self._axes.now() < self._silent[node]:
+                complete = False
+                continue
+            rows = {}
+            for entry in entries:
+                index, sub = self._drives.description.key(entry, part)
+                data = self._drives.sdo(node).ask(index, sub, ASK)
+                if data is None:
+                    complete = False
+                    self._silent[node] = self._axes.now() + SILENT
+                    break
+                row = np.zeros((1, self._drives.num_axes), np.int64)
+                row[0, axis] = self._drives.description.decode(entry, data)
+                rows[entry.index, entry.sub] = row
+            where = np.zeros(self._drives.num_axes, bool)
+            where[axis] = True
+            if rows:
+                self._observe(rows, epoch, where)
+        return complete

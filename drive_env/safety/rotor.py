@@ -1,0 +1,90 @@
+"""Where the rotors are, in revolutions since the drives were opened: what scale and zero of 6064h do not move."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.master.description import Description, Key
+from drive_env.master.errors import RefusedError
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+ENCODER_RESOLUTION, GEAR_RATIO, FEED = 0x608F, 0x6091, 0x6092
+HOME_OFFSET = (0x607C, 0)
+
+
+def wrapped(difference: Integers) -> Integers:
+    """Return differences of positions that count on past the end of 32 bits."""
+    result: Integers = (difference + 2**31) % 2**32 - 2**31
+    return result
+
+
+class RotorAngle:
+    """The way between increments of 6064h and revolutions of the rotors.
+
+    Positions are those of a moment (`place`) and the increments since; whoever moves scale or zero takes another.
+
+    Args:
+        num_axes: How many.
+    """
+
+    def __init__(self, num_axes: int) -> None:
+        self._increments = np.zeros(num_axes, np.int64)
+        self._turns = np.zeros(num_axes)
+        self.scale = np.ones(num_axes)  # increments per revolution; 1 where the drive does not say
+        self.is_placed = False
+
+    def place(self, increments: Integers, scale: Floats, turns: Floats | None = None) -> None:
+        """Take note that rotors are at `turns` where 6064h shows `increments`; where they were believed by default."""
+        if turns is None:
+            turns = self.turns(increments) if self.is_placed else np.zeros(len(increments))
+        self._increments, self._turns, self.scale = increments.copy(), turns.copy(), scale.copy()
+        self.is_placed = True
+
+    def turns(self, increments: Integers) -> Floats:
+        """Return the angles [rev] at increments."""
+        result: Floats = self._turns + wrapped(increments - self._increments) / self.scale
+        return result
+
+    def increments(self, turns: Floats) -> Floats:
+        """Return the increments at angles [rev]; infinite ones stay so."""
+        result: Floats = self._increments + (turns - self._turns) * self.scale
+        return result
+
+
+def scale_objects(description: Description) -> tuple[Key, ...]:
+    """Return the objects that say how many increments a revolution has."""
+    own = description.hints.position_scale
+    if own is not None and description.has(own):
+        return (own,)
+    if all(description.has((index, sub)) for index in (GEAR_RATIO, FEED) for sub in (1, 2)):
+        return ((GEAR_RATIO, 1), (GEAR_RATIO, 2), (FEED, 1), (FEED, 2))
+    return tuple(key for key in ((ENCODER_RESOLUTION, 1), (ENCODER_RESOLUTION, 2)) if description.has(key))
+
+
+def read_scale(drives: CanDrives) -> Floats:
+    """Return the increments of a revolution of every axis; nan where the drive does not say."""
+    keys = scale_objects(drives.description)
+    known = drives.description.dictionary
+    try:
+        values = [drives.read_entry(known.find(key)).astype(float) for key in keys]
+    except RefusedError:  # the EDS has what the drive has not
+        values = []
+    if len(values) == 4:  # feed per revolution of the driving shaft, and revolutions of the motor for one of the shaft
+        motor, shaft, feed, shafts = values
+        scale = feed / np.where(shafts > 0, shafts, np.nan) * shaft / np.where(motor > 0, motor, np.nan)
+    elif len(values) == 2:
+        scale = values[0] / np.where(values[1] > 0, values[1], np.nan)
+    elif values:
+        scale = values[0]
+    else:
+        scale = np.full(drives.num_axes, np.nan)
+    result: Floats = np.where(scale > 0, scale, np.nan)
+    return result

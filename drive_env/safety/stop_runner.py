@@ -1,0 +1,199 @@
+"""Stops of some drives: which axes, what their drives must be told meanwhile, and what is left to the watchdogs."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.safety.axes import Axes
+from drive_env.safety.bounds import read_own
+from drive_env.safety.errors import SafetyError, logged
+from drive_env.safety.lending import Lending
+from drive_env.safety.limits import NO_LIMIT
+from drive_env.safety.limits_in_force import LimitsInForce
+from drive_env.safety.looks import ASK
+from drive_env.safety.objects import CONTROLWORD, QUICK_STOP_OPTION
+from drive_env.safety.states import OPERATION_ENABLED, matches
+from drive_env.safety.stopping import AxisStop, Phase, Sample, Stop
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+logger = logging.getLogger(__name__)
+
+Mask = NDArray[np.bool_]
+
+WEIGHT_LOOK, WEIGHT_SHARE = 0.06, 0.03  # s at rest; of the current limit, above which it may be a weight
+WAKE_PERIOD = 0.2  # s
+COASTS, RAMPS = 0, 2  # option codes of 605Ah
+# Option codes of 605Ah that end in switch on disabled, and those with the same ramp that end in quick stop active.
+_ENDS_HELD = {1: 5, 2: 6}
+
+
+class StopRunner:
+    """The stop that is under way, if one is.
+
+    Args:
+        drives: The drives.
+        axes: What is known of them; its lock is held by whoever begins or steps a stop.
+        limits: Those that hold.
+        lending: Lends the drives another quick stop option.
+        cease: Ends the heartbeats, so that what is lost stops by itself.
+
+    Attributes:
+        current: The stop; None when nothing is held.
+    """
+
+    def __init__(
+        self, drives: CanDrives, axes: Axes, limits: LimitsInForce, lending: Lending, cease: Callable[[], None]
+    ) -> None:
+        self.current: Stop | None = None
+        self._drives = drives
+        self._known = drives.description.dictionary
+        self._axes = axes
+        self._limits = limits
+        self._lending = lending
+        self._cease = cease
+        self._woken_at = 0.0
+        self._told_of: set[int] = set()  # axes that are held under a weight
+        self._held: set[int] = set()  # axes whose quick stop option was looked at in this stop
+
+    def make_sure_of_a_ramp(self) -> None:
+        """Have quick stops ramp: 605Ah = 0 would let an axis coast.
+
+        Raises:
+            SafetyError: If a drive does not take another option.
+        """
+        if not self._drives.description.has(QUICK_STOP_OPTION):
+            return
+        for axis, option in enumerate(read_own(self._drives, QUICK_STOP_OPTION, RAMPS).tolist()):
+            if option == COASTS and not self._lending.lend(QUICK_STOP_OPTION, axis, RAMPS):
+                raise SafetyError(
+                    f"axis {axis}: its quick stop lets it coast (605Ah = 0), and it takes no other option; write 605Ah "
+                    "= 2 where the drive allows it"
+                )
+
+    def end_hold(self, axis: int) -> None:
+        """Give an axis that is enabled anew its quick stop option again, if that is a ramp."""
+        if not self._lending.is_lent(QUICK_STOP_OPTION, axis):
+            return
+        with logged():
+            if self._lending.owned(QUICK_STOP_OPTION, axis) == COASTS:
+                self._lending.lend(QUICK_STOP_OPTION, axis, RAMPS)
+            else:
+                self._lending.give_back_one(QUICK_STOP_OPTION, axis)
+
+    def stop_for(self, what: str, remedy: str) -> NoReturn:
+        """Stop all axes that count as live, and raise SafetyError with what is wrong and what to do."""
+        with self._axes.lock:
+            self.begin(self._axes.may_turn, holds=True)
+        raise SafetyError(f"{what}: the drives were quick-stopped; {remedy}")
+
+    def begin(self, axes: Mask, *, holds: bool) -> None:
+        """Begin to stop axes, or go on with it; one that need not hold its place any more is switched off."""
+        now = self._axes.now()
+        stop = self.current
+        if stop is None:
+            stop = self.current = Stop({}, self._send, self._sample)
+        bounds = self._limits.latest
+        for axis in map(int, np.flatnonzero(axes)):
+            self._held.discard(axis)
+            self._told_of.discard(axis)
+            known = stop.axes.get(axis)
+            if known is not None and known.phase not in (Phase.OFF, Phase.LOST):
+                if known.phase is Phase.REST and holds:
+                    del stop.axes[axis]  # it moved again
+                else:
+                    if not holds:
+                        known.release(now)
+                    continue
+            speed = max(abs(self._axes.speed[axis]), abs(self._axes.velocity[axis]))
+            braking = 0.0 if bounds is None else float(bounds.braking[axis])
+            rest = 0.0 if bounds is None else float(bounds.rest[axis])
+            stop.axes[axis] = AxisStop(now, speed, braking, rest, holds)
+        stop.step(now)
+
+    def hold(self) -> None:
+        """Have axes that are stopping stay in quick stop active at first: a weight would pull them on."""
+        stop = self.current
+        if stop is None or not self._drives.description.has(QUICK_STOP_OPTION):
+            return
+        entry, per_node = self._known.find(QUICK_STOP_OPTION), self._drives.description.num_axes
+        for axis, one in list(stop.axes.items()):
+            if not one.holds or one.phase is not Phase.RAMP or axis in self._held:
+                continue
+            node, part = divmod(axis, per_node)
+            data = self._drives.sdo(node).ask(*self._drives.description.key(entry, part), ASK)
+            if data is None:
+                continue
+            self._held.add(axis)
+            option = int(self._drives.description.decode(entry, data))
+            if option in _ENDS_HELD:
+                with logged():
+                    self._lending.lend(QUICK_STOP_OPTION, axis, _ENDS_HELD[option])
+
+    def _release_what_no_weight_pulls(self, stop: Stop) -> None:
+        """Switch off axes that stand without current: a drive that is held may not watch over its master."""
+        now, bounds = self._axes.now(), self._limits.latest
+        for axis, one in stop.axes.items():
+            if one.phase is not Phase.REST or not one.holds or one.rests_for(now) < WEIGHT_LOOK:
+                continue
+            limit = NO_LIMIT if bounds is None else int(bounds.current[axis])
+            if limit >= NO_LIMIT or abs(self._axes.mean_current[axis]) <= WEIGHT_SHARE * limit:
+                one.release(now)
+            elif axis not in self._told_of:
+                self._told_of.add(axis)
+                logger.warning(
+                    "axis %d is held in quick stop active: it takes a current of %d at rest, as under a weight; it "
+                    "falls when its voltage goes, unless a brake holds it", axis, int(self._axes.mean_current[axis]),
+                )  # fmt: skip
+
+    def _send(self, axis: int, word: int) -> None:
+        """Send a controlword without waiting for an answer."""
+        node, part = divmod(axis, self._drives.description.num_axes)
+        index, sub = self._drives.description.key(self._known.find(CONTROLWORD), part)
+        with logged():
+            self._drives.sdo(node).command(index, sub, word.to_bytes(2, "little"))
+
+    def _sample(self, axis: int) -> Sample:
+        return Sample(float(self._axes.seen[axis]), int(self._axes.status[axis]), float(self._axes.speed[axis]))
+
+    def step(self) -> None:
+        """Take the stop that is under way a step on."""
+        stop = self.current
+        assert stop is not None
+        now = self._axes.now()
+        before = {axis: one.phase for axis, one in stop.axes.items()}
+        stop.step(now)
+        self._release_what_no_weight_pulls(stop)
+        if now >= self._woken_at and any(one.is_unseen(now) for one in stop.axes.values()):
+            # A node that has missed its master is stopped and answers nothing. Operational, not pre-operational, where
+            # some drives do not watch their master.
+            self._woken_at = now + WAKE_PERIOD
+            self._drives.must_start()
+            with logged():
+                self._drives.start()
+        for axis, one in stop.axes.items():
+            if one.phase is before[axis]:
+                continue
+            if one.phase is Phase.CUT and one.why:
+                logger.error("axis %d: %s; its voltage is switched off", axis, one.why)
+            elif one.phase is Phase.LOST:
+                logger.error("axis %d does not answer, and is left to its watchdog", axis)
+                self._axes.lost.add(axis)
+                self._cease()
+
+    def judged(self) -> Mask:
+        """Return which axes the limits are held against: those that are live and not stopping."""
+        judged = self._axes.live.copy()
+        judged[list(self._axes.lost)] = False
+        if self.current is not None:
+            for axis, stop in self.current.axes.items():
+                # What somebody else has enabled since is no longer ours to hold.
+                is_enabled = stop.is_over and matches(int(self._axes.status[axis]), OPERATION_ENABLED)
+                judged[axis] &= is_enabled
+        return judged

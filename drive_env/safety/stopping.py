@@ -1,0 +1,195 @@
+"""A stop by grades: the ramp of a quick stop; is the axis slowing down as the ramp says; if not, the voltage goes.
+
+A stop knows no bus: it is given samples and time, and says which controlword each axis needs next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+from typing import NamedTuple
+
+from drive_env.safety.states import DISABLE_VOLTAGE, QUICK_STOP, QUICK_STOP_ACTIVE, is_live, matches
+
+REPEAT = 0.02  # s after which a command that shows no effect is sent again
+ANSWER = 0.1  # s within which a drive must have begun its ramp
+GRACE = 0.02  # s from the command to a slower axis: the bus, the drive's cycle, the loops
+SHARE = 0.5  # of the ramp's deceleration that counts as slowing down as it says
+LONGEST = 1.0  # s; whoever would stand by then at the present deceleration is slowing down well, too
+RAMP_TIMEOUT = 2.0  # s for the whole ramp
+SETTLED = 0.02  # s for which samples must show an axis at rest
+BLIND = 0.4  # s without a sample, after which the ramp is taken to be over
+BREAKS_LOOSE = 10.0  # times the speed of rest, at which an axis that is held shakes or slips
+LOST = 0.6  # s for which the voltage-off is repeated before an axis is given up
+
+
+class Phase(Enum):
+    """Where the stop of an axis is."""
+
+    RAMP = "ramp"
+    REST = "at rest, held"
+    CUT = "voltage off"
+    OFF = "off"
+    LOST = "lost"
+
+
+class Sample(NamedTuple):
+    """What is known of an axis: when it was seen [s], statusword, speed [inc/s]."""
+
+    time: float
+    status: int
+    speed: float
+
+
+class AxisStop:
+    """The stop of one axis.
+
+    Args:
+        now: The present [s].
+        speed: Its speed as far as it is known [inc/s].
+        deceleration: Of its quick stop ramp [inc/s^2]; 0 where it is not known.
+        rest: Speed below which it is at rest [inc/s].
+        holds: Let it stay in quick stop active, which holds its place, instead of switching it off.
+    """
+
+    def __init__(self, now: float, speed: float, deceleration: float, rest: float, holds: bool) -> None:
+        self.phase = Phase.RAMP
+        self.why = ""  # the voltage had to go
+        self._begun = self._since = now
+        self._first = abs(speed)
+        self._deceleration = deceleration
+        self._rest = rest
+        self._settled: float | None = None  # since when it is at rest [s]
+        self._sent: float | None = None
+        self._seen = now
+        self._check: Sample | None = None
+        self.holds = holds
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more is to be done."""
+        return self.phase in (Phase.OFF, Phase.LOST) or (self.phase is Phase.REST and self.holds)
+
+    def step(self, now: float, sample: Sample) -> int | None:
+        """Take what is known now; return the controlword to send, None for none."""
+        fresh = sample.time > self._seen
+        if fresh:
+            self._seen = sample.time
+        if fresh and sample.time > self._begun and not is_live(sample.status) and self._sent is not None:
+            self.phase = Phase.OFF
+            return None
+        if self.phase is Phase.RAMP:
+            self._watch_ramp(now, sample, fresh)
+        elif self.phase is Phase.CUT and now - self._since > LOST:
+            self.phase = Phase.LOST
+        elif self.phase is Phase.REST and fresh and abs(sample.speed) > BREAKS_LOOSE * self._rest:
+            self.why = "it moves though it is held"
+            self._enter(Phase.CUT, now)
+        if self.phase is Phase.REST and not self.holds:
+            self._enter(Phase.CUT, now)
+        return self._command(now, sample)
+
+    def rests_for(self, now: float) -> float:
+        """Return how long it has been at rest and held [s]."""
+        return now - self._since if self.phase is Phase.REST else 0.0
+
+    def is_unseen(self, now: float) -> bool:
+        """Return whether the voltage should go, and nobody answers."""
+        return self.phase is Phase.CUT and now - self._seen > ANSWER
+
+    def release(self, now: float) -> None:
+        """Hold it no longer."""
+        self.holds = False
+        if self.phase is Phase.REST:
+            self._enter(Phase.CUT, now)
+
+    def _watch_ramp(self, now: float, sample: Sample, fresh: bool) -> None:
+        if not fresh:
+            if now - self._seen > BLIND:
+                self.why = f"it was not seen for {now - self._seen:.1f} s"
+                self._enter(Phase.CUT, now)
+            return
+        self._first = max(self._first, abs(sample.speed)) if sample.time < self._begun + GRACE else self._first
+        begun = matches(sample.status, QUICK_STOP_ACTIVE) or not matches(sample.status, (0x6F, 0x27))
+        if not begun:
+            if now - self._begun > ANSWER:
+                self.why = "it does not obey the quick stop"
+                self._enter(Phase.CUT, now)
+            return
+        if abs(sample.speed) > self._rest:
+            self._settled = None
+        elif self._settled is None:
+            self._settled = sample.time
+        if self._settled is not None and sample.time - self._settled >= SETTLED:
+            self._enter(Phase.REST, now)
+        elif now - self._begun > RAMP_TIMEOUT:
+            self.why = f"it is still turning after {RAMP_TIMEOUT:g} s"
+            self._enter(Phase.CUT, now)
+        elif not self._slows_down(now, sample):
+            self.why = "it does not slow down as its ramp says"
+            self._enter(Phase.CUT, now)
+
+    def _slows_down(self, now: float, sample: Sample) -> bool:
+        """Return whether the speed is where the ramp has it, or falls fast enough to be 0 within LONGEST."""
+        elapsed = max(now - self._begun - GRACE, 0.0)
+        # Of a ramp that is not known only how fast the speed falls tells anything.
+        expected = self._first - SHARE * self._deceleration * elapsed if self._deceleration > 0.0 else 0.0
+        if self._check is None:
+            self._check = sample
+        if abs(sample.speed) <= max(expected, 0.0) + 3.0 * self._rest:
+            self._check = sample
+            return True
+        span = sample.time - self._check.time
+        if span < GRACE:
+            return True
+        rate = (abs(self._check.speed) - abs(sample.speed)) / span
+        self._check = sample
+        return rate * LONGEST >= abs(sample.speed)
+
+    def _enter(self, phase: Phase, now: float) -> None:
+        self.phase, self._since, self._sent = phase, now, None if phase is Phase.CUT else self._sent
+
+    def _command(self, now: float, sample: Sample) -> int | None:
+        if self.phase is Phase.RAMP:
+            word, wanted = QUICK_STOP, matches(sample.status, QUICK_STOP_ACTIVE) and sample.time > self._begun
+        elif self.phase is Phase.CUT:
+            word, wanted = DISABLE_VOLTAGE, False
+        else:
+            return None
+        if self._sent is not None and (wanted or now - self._sent < REPEAT):
+            return None
+        self._sent = now
+        return word
+
+
+class Stop:
+    """The stop of some axes.
+
+    Args:
+        axes: Their stops, by number.
+        send: Sends a controlword to an axis, without waiting for an answer.
+        sample: Returns what is known of an axis.
+    """
+
+    def __init__(
+        self, axes: dict[int, AxisStop], send: Callable[[int, int], None], sample: Callable[[int], Sample]
+    ) -> None:
+        self.axes = axes
+        self._send = send
+        self._sample = sample
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more is to be done."""
+        return all(axis.is_over for axis in self.axes.values())
+
+    def step(self, now: float) -> None:
+        """Send what each axis needs at `now` [s]."""
+        for number, axis in self.axes.items():
+            if axis.phase not in (Phase.OFF, Phase.LOST) and (word := axis.step(now, self._sample(number))) is not None:
+                self._send(number, word)
+
+    def release(self, now: float) -> None:
+        """Switch off what is held, once it is at rest."""
+        for axis in self.axes.values():
+            axis.release(now)

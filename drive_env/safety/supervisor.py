@@ -1,0 +1,79 @@
+"""The thread that watches drives whatever the program does: it looks, stops, and keeps the drives' watchdogs quiet.
+
+While the program runs communication cycles, their samples are what is watched, and this thread only looks at the
+clock. While it computes, sleeps, reads or writes, this thread asks the drives itself. A program that takes the
+interpreter from it takes the heartbeats away, too, and the drives stop by themselves.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+from drive_env.master.errors import BusError
+
+logger = logging.getLogger(__name__)
+
+PERIOD = 0.004  # s between two turns
+SWITCH_INTERVAL = 0.0005  # s; a program that computes gives the interpreter up that soon, instead of after 5 ms
+
+
+class Supervisor:
+    """Runs a turn every few milliseconds.
+
+    Args:
+        turn: What to do; a BusError is told once, anything else ends the heartbeats.
+        fail: Called when a turn failed for good.
+    """
+
+    def __init__(self, turn: Callable[[], None], fail: Callable[[], None]) -> None:
+        self._turn = turn
+        self._fail = fail
+        self._wake = threading.Event()
+        self._ended = threading.Event()
+        self._interval = sys.getswitchinterval()
+        self._thread = threading.Thread(target=self._run, name="drive supervisor", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._interval = sys.getswitchinterval()
+        sys.setswitchinterval(min(self._interval, SWITCH_INTERVAL))
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Take the next turn now; callable from a signal handler."""
+        self._wake.set()
+
+    def is_this_thread(self) -> bool:
+        """Return whether whoever asks is the thread itself."""
+        return threading.get_ident() == self._thread.ident
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ended.set()
+        self._wake.set()
+        if self._thread.is_alive() and self._thread is not threading.current_thread():
+            self._thread.join(2.0)
+        sys.setswitchinterval(self._interval)
+
+    def _run(self) -> None:
+        told = ""  # a bus that is gone is told once, not with every turn
+        while not self._ended.is_set():
+            begun = time.monotonic()
+            try:
+                self._turn()
+                told = ""
+            except BusError as error:
+                # Heartbeats that do not get out are what the drives wait for to stop by themselves.
+                if str(error) != told:
+                    told = str(error)
+                    logger.error("%s", told)
+            except Exception:
+                logger.exception("the drives cannot be watched any more; they stop by themselves")
+                self._fail()
+                return
+            self._wake.wait(max(PERIOD - (time.monotonic() - begun), 0.0005))
+            self._wake.clear()

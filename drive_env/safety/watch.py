@@ -1,0 +1,381 @@
+"""Watching over the drives: by every sample that comes, and by a thread of its own when the program does nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.master.description import Key
+from drive_env.master.errors import BusError
+from drive_env.safety.axes import Axes
+from drive_env.safety.errors import SafetyError, logged
+from drive_env.safety.judging import Judging
+from drive_env.safety.limits_in_force import LimitsInForce
+from drive_env.safety.looks import Looks
+from drive_env.safety.objects import CONTROLWORD, CURRENT, MODE_DISPLAY, POSITION, STATUSWORD, VELOCITY
+from drive_env.safety.states import DISABLE_VOLTAGE
+from drive_env.safety.stop_runner import StopRunner
+from drive_env.safety.stopping import BLIND as BLIND_TIMEOUT
+from drive_env.safety.stopping import LOST, RAMP_TIMEOUT
+from drive_env.safety.supervisor import Supervisor
+from drive_env.safety.watchdogs import Watchdogs
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+
+logger = logging.getLogger(__name__)
+
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+STALE, STALE_OFF = 0.008, 0.015  # s after which drives that are live, or off, are looked at
+BLIND = 0.2  # s for which a live axis cannot be seen, however it is asked, until it is stopped
+MISSED = 3  # SYNCs in a row to which a node that answers otherwise sends no TPDO: it is not operational
+MOST_STOP_CYCLES = 5000  # in lockstep
+SILENT_CYCLE = 0.1  # s of lockstep that count as passed where nobody answers
+LONGEST_STOP = RAMP_TIMEOUT + BLIND_TIMEOUT + LOST + 2.0  # s, all grades together
+AT_ONCE = 0.1  # s after a signal within which another one means the same
+
+
+class Watch:
+    """Sees what the drives do, and what the program fails to do.
+
+    Args:
+        drives: The drives.
+        axes: What is known of them.
+        limits: Those that hold.
+        stops: The stop that is under way.
+        watchdogs: What the drives do by themselves.
+        prepare: Has mapped what is watched.
+        poll: Has a SYNC answered and its samples observed; False if a node sent none, None if cycles are under way.
+
+    Attributes:
+        looks: What comes with every SYNC, and what is asked for.
+        booted: Nodes that have restarted by themselves, by position.
+    """
+
+    def __init__(
+        self,
+        drives: CanDrives,
+        axes: Axes,
+        limits: LimitsInForce,
+        stops: StopRunner,
+        watchdogs: Watchdogs,
+        prepare: Callable[[], None],
+        poll: Callable[[], bool | None],
+    ) -> None:
+        self._drives = drives
+        self._known = drives.description.dictionary
+        self._axes = axes
+        self._limits = limits
+        self._stops = stops
+        self._watchdogs = watchdogs
+        self._prepare = prepare
+        self._poll = poll
+        self._judging = Judging(self._known, axes, limits, self.modes, stops.stop_for)
+        self.looks = Looks(drives, axes, limits, self._observe_axis)
+        self._supervisor: Supervisor | None = None
+        self._missed = 0
+        self._alive = time.monotonic()
+        self._pending: SafetyError | None = None  # to be raised in the program's thread
+        self._told_at = -math.inf  # when a signal told the program to end [s]
+        self.booted: set[int] = set()
+        self._is_restart_told = False
+
+    @property
+    def is_supervised(self) -> bool:
+        """Whether the thread runs."""
+        return self._supervisor is not None
+
+    def begin(self) -> None:
+        """Start the thread, unless it runs, or time waits for the program."""
+        if not self._drives.time_waits and self._supervisor is None:
+            self._missed = 0
+            self.alive()
+            self._supervisor = Supervisor(self._turn, self._fail)
+            self._supervisor.start()
+
+    def end(self) -> None:
+        """End the thread, and whatever was under way: nobody watches any more."""
+        if self._supervisor is not None:
+            self._supervisor.close()
+            self._supervisor = None
+        self._axes.is_armed = False
+        self._stops.current = None
+        self._watchdogs.end()
+        self._told_at = -math.inf
+
+    def raise_pending(self) -> None:
+        """Raise once what the supervisor had to do meanwhile."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            raise pending
+
+    def note_restart(self, node: int) -> None:
+        """Take note that a node, by position, has booted though nobody here has reset it."""
+        self._is_restart_told = False
+        self.booted.add(node)
+
+    def tell_to_end(self) -> None:
+        """Begin to stop, at the supervisor's next turn; callable from a signal handler."""
+        self._told_at = time.monotonic()
+        if self._supervisor is not None:
+            self._supervisor.wake()
+
+    def carry_on(self) -> None:
+        """Have the program told that a signal has stopped it, since it goes on."""
+        if self.is_told_to_end:
+            self._pending = SafetyError("the drives were stopped, since the program was told to end (a signal)")
+
+    def forget_signal(self) -> None:
+        """Take note that the program goes on after a signal: it enables an axis."""
+        self._told_at = -math.inf
+
+    @property
+    def is_told_to_end(self) -> bool:
+        """Whether a signal has begun a stop that is not over."""
+        if time.monotonic() - self._told_at < AT_ONCE:
+            return True
+        return math.isfinite(self._told_at) and self._stops.current is not None and not self._stops.current.is_over
+
+    def alive(self) -> None:
+        """Take note that the program waits for an answer."""
+        if not self._is_supervisor():
+            self._alive = time.monotonic()
+
+    def _is_supervisor(self) -> bool:
+        return self._supervisor is not None and self._supervisor.is_this_thread()
+
+    def modes(self) -> Integers:
+        """Return the mode of operation of every axis, asked for unless this is the supervisor's thread."""
+        if self._drives.description.has(MODE_DISPLAY) and not self._is_supervisor():
+            self._axes.mode = self._drives.read_entry(self._known.find(MODE_DISPLAY))
+        return self._axes.mode
+
+    def first_look(self) -> None:
+        """See every axis once, or raise SafetyError: what cannot be seen is not moved."""
+        if self._drives.is_dry:
+            return
+        missing = [
+            label
+            for key, label in ((POSITION, "6064h"), (STATUSWORD, "6041h"))
+            if not self._drives.description.has(key)
+        ]
+        if missing:
+            raise SafetyError(f"the EDS has no {', '.join(missing)}: the drives cannot be watched; complete the EDS")
+        if not self._drives.time_waits:
+            self._prepare()
+            self._prove_operational()
+        self.looks.sampled(self._drives.sampled_entries())
+        for entry in self.looks.watched():
+            values = self._drives.read_entry(entry)
+            self._take({(entry.index, entry.sub): values[None, :]}, self._axes.epoch, self._axes.everywhere)
+
+    def _prove_operational(self) -> None:
+        """Raise SafetyError if a node that was started sends no process data."""
+        deadline = time.monotonic() + self._drives.description.answer_timeout
+        while self._poll() is False:
+            if time.monotonic() > deadline:
+                break
+            self._drives.must_start()
+            self._drives.start()
+        else:
+            return
+        raise SafetyError(
+            "a node sends no process data at SYNC, though it was started: it cannot be watched; check 1005h and 18xxh, "
+            "and whether another master is on the bus"
+        )
+
+    def observe(self, rows: Mapping[Key, Integers], epoch: int, where: Mask | None = None) -> None:
+        """Look at samples, each object of shape (rows, num_axes); stop and raise SafetyError beyond a limit.
+
+        Args:
+            rows: The samples, one communication cycle apart.
+            epoch: The envelope's when they were asked for.
+            where: Axes that they are of, all by default.
+        """
+        self.alive()
+        with self._axes.lock:
+            if self._drives.time_waits and (where is None) and self.looks.is_short:
+                rows = self.looks.with_unsampled(rows)
+            if self._drives.time_waits:
+                self._axes.clock += len(next(iter(rows.values()))) * self._drives.description.cycle if rows else 0.0
+            self._take(rows, epoch, self._axes.everywhere if where is None else where)
+            if self._drives.time_waits and self._stops.current is not None:
+                self._stops.hold()
+                self._stops.step()
+            if (pending := self._pending) is not None and not self._is_supervisor():
+                self._pending = None
+                raise pending
+            self._judging.judge(rows, self._stops.judged())
+
+    def _take(self, rows: Mapping[Key, Integers], epoch: int, where: Mask) -> None:
+        if self._axes.take(rows, epoch, where):
+            self._limits.forget()
+
+    def _observe_axis(self, rows: Mapping[Key, Integers], epoch: int, where: Mask) -> None:
+        with self._axes.lock:
+            self._take(rows, epoch, where)
+            known = {POSITION: self._axes.position, STATUSWORD: self._axes.status}
+            seen = {key: np.where(where, row, known.get(key, 0)) for key, row in rows.items()}
+            self._judging.judge(seen, self._stops.judged() & where)
+
+    def look_for_live(self) -> bool:
+        """Return whether an axis is live, by what the drives say now; one that says nothing is what it was."""
+        entries = (
+            self._known.find(key) for key in (STATUSWORD, POSITION, VELOCITY) if self._drives.description.has(key)
+        )
+        with contextlib.suppress(SafetyError):  # whoever asks is about to stop; beyond a limit that has begun
+            self.looks.ask(list(entries))
+        return bool(self._axes.may_turn.any())
+
+    def await_stop(self, *, ends: bool = False) -> None:
+        """Return when a stop that is under way is over: what the program does next must not cut it short."""
+        stop = self._stops.current
+        if stop is None:
+            return
+        cycles, deadline = 0, time.monotonic() + LONGEST_STOP
+        while not stop.is_over and self._stops.current is stop:
+            cycles += 1
+            if not self._drives.time_waits and time.monotonic() > deadline:
+                logger.error("a stop is not over after %g s", LONGEST_STOP)
+                break
+            if self._drives.time_waits:
+                if cycles > MOST_STOP_CYCLES:
+                    break
+                self._stops.hold()
+                self._pass_cycle()
+            elif self._supervisor is None:
+                break
+            else:
+                self.alive()
+                time.sleep(0.002)
+        if ends:
+            for axis in sorted(stop.axes.keys() - self._axes.lost):
+                with logged():
+                    self._drives.write_raw(self._known.find(CONTROLWORD), axis, DISABLE_VOLTAGE)
+                    self._axes.in_flight[axis] = False
+            self._axes.epoch += 1
+            self._stops.current = None
+
+    def _pass_cycle(self) -> None:
+        """Let a cycle of lockstep pass, and look at the axes that answer."""
+        try:
+            self._drives.pass_cycle()
+        except BusError as error:
+            logger.error("%s", error)
+            self._axes.clock += SILENT_CYCLE
+        entries = [self._known.find(key) for key in (STATUSWORD, POSITION, CURRENT)]
+        self.looks.ask([entry for entry in entries if self._drives.description.has((entry.index, entry.sub))])
+        self._axes.clock += self._drives.description.cycle
+        with self._axes.lock:
+            if self._stops.current is not None:
+                self._stops.step()
+
+    # --- the supervisor's thread -------------------------------------------------------------------------------------
+    def _turn(self) -> None:
+        """Do what is due: heartbeats, a look at the drives, a step of a stop, the program's pulse.
+
+        Raises:
+            BusError: If the bus failed in one of them; the others are done all the same.
+        """
+        failure: BusError | None = None
+        for act in (
+            self._watchdogs.keep,
+            self._obey_signal,
+            self._stops.hold,
+            self._look,
+            self._go_on_stopping,
+            self._look_after,
+        ):
+            try:
+                act()
+            except SafetyError as error:
+                logger.error("%s", error)
+                self._pending = error
+            except BusError as error:
+                failure = error
+        if failure is not None:
+            raise failure
+
+    def _obey_signal(self) -> None:
+        if self.is_told_to_end and self._axes.may_turn.any():
+            with self._axes.lock:
+                self._stops.begin(self._axes.may_turn, holds=False)
+
+    def _go_on_stopping(self) -> None:
+        with self._axes.lock:
+            if self._stops.current is not None:
+                self._stops.step()
+
+    def _fail(self) -> None:
+        """Send a last quick stop, and leave the drives to their watchdogs."""
+        with self._axes.lock, logged():
+            self._stops.begin(self._axes.may_turn, holds=False)
+            self._axes.lost.update(np.flatnonzero(self._axes.may_turn).tolist())
+        self._watchdogs.cease()
+        self._pending = SafetyError("the drives cannot be watched any more, and stop by themselves; see the log")
+
+    def _look(self) -> None:
+        """See to it that the newest sample is young."""
+        now = time.monotonic()
+        live = bool(self._axes.may_turn.any())
+        if live:
+            self.looks.ask_unsampled()
+        if now - float(self._axes.seen.min()) < (STALE if live else STALE_OFF):
+            return
+        came = self._poll()
+        if came:
+            self._missed = 0
+        elif came is None and now - float(self._axes.seen.min()) < 2 * STALE:
+            return  # the program's own cycles are under way
+        elif self.looks.ask(self.looks.watched()) and came is False:
+            self._missed += 1
+
+    def _look_after(self) -> None:
+        """Stop what cannot be seen, what lost its state, and what a program that stalls has left."""
+        now = time.monotonic()
+        live = self._stops.judged()
+        if not live.any():
+            return
+        if self.booted and not self._is_restart_told:
+            self._is_restart_told = True
+            numbers = ", ".join(str(self._drives.nodes[k]) for k in sorted(self.booted))
+            self._stops.stop_for(f"node {numbers} has restarted by itself", "check its power, and for another master")
+        blind = live & (now - self._axes.seen > BLIND)
+        if blind.any():
+            axis = int(np.flatnonzero(blind)[0])
+            self._stops.stop_for(
+                f"axis {axis} could not be seen for {now - float(self._axes.seen[axis]):.2f} s",
+                "check the node's power and wiring, and the bus load",
+            )
+        if self._missed >= MISSED:
+            self._missed = 0
+            self._drives.must_start()
+            self._stops.stop_for(
+                "a node sends no process data any more: it left NMT operational", "is another master there?"
+            )
+        if (node := self._watchdogs.take_shared_id()) is not None:
+            self._axes.is_armed = False  # under another node-ID, once the program enables anew
+            self._stops.stop_for(
+                f"another program sends heartbeats as node-ID {node}, too, so that the drives would not notice the "
+                "death of either",
+                "end one of them",
+            )
+        pause = now - self._alive
+        stall = self._limits.user.stall
+        if stall is not None and pause > stall:
+            logger.error("the program did nothing for %.2f s: quick stop", pause)
+            with self._axes.lock:
+                self._stops.begin(self._axes.may_turn, holds=True)
+            self._pending = SafetyError(
+                f"the drives were quick-stopped: the program made no call for {pause:.2f} s with an axis enabled; "
+                f"the limit is {stall:g} s; disable the drives before long work, or set Limits(stall=...)"
+            )

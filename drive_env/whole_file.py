@@ -1,0 +1,134 @@
+"""Files that are whole or absent, also after a full disk or a power cut, and TOML that shows whether it was changed.
+
+A sealed file ends with a check sum over its content, not over its text: comments and white space may change. One that
+is torn has none at its end. It tells of accidents and of a change in passing; it is no signature.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+FORMAT = 2  # of sealed files; those before had neither check sum nor identity
+_CHECK, _SUM = "check", "sha256"
+
+
+class FileChangedError(ValueError):
+    """A file that is torn, that was changed since it was written, or of which nobody can say so."""
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file under another name, have the disk keep it, and give it its name; make its folder if needed.
+
+    What is no file (/dev/null, a pipe) is written as it is.
+
+    Raises:
+        OSError: If it cannot be written, with the file and the reason; what was there before is there still.
+    """
+    if path.exists() and not path.is_file():  # another file in its place would be the end of it
+        with _naming(path), path.open("wb") as device:
+            device.write(_bytes(content))
+        return
+    with files_to_be({path: content}):
+        pass
+
+
+def _bytes(content: str | bytes) -> bytes:
+    return content.encode() if isinstance(content, str) else content
+
+
+@contextmanager
+def files_to_be(contents: Mapping[Path, str | bytes]) -> Iterator[None]:
+    """Have files written and kept by the disk while a block runs; they get their names at its end, or vanish.
+
+    Raises:
+        OSError: If one cannot be written, with the file and the reason.
+    """
+    named: list[Path] = []
+    partial = {path: path.with_name(f".{path.name}.partial") for path in contents}
+    try:
+        for path, content in contents.items():
+            with _naming(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with partial[path].open("wb") as file:
+                    file.write(_bytes(content))
+                    file.flush()
+                    os.fsync(file.fileno())
+        yield
+        for path in contents:
+            with _naming(path):
+                partial[path].replace(path)
+                named.append(path)
+                keep_names(path.parent)
+    except BaseException:
+        # What took another file's place is that file's successor: alone, it is the one there is.
+        for path in (*partial.values(), *(named if len(contents) > 1 else ())):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Have an error name the file, which it does not where the disk is full."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
+
+
+def keep_names(folder: Path) -> None:
+    """Have the disk keep which files a folder has."""
+    if os.name != "posix":  # Windows knows no such thing
+        return
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # nor do some file systems
+            os.fsync(number)
+    finally:
+        os.close(number)
+
+
+def sealed(text: str) -> str:
+    """Return a TOML text with the check sum over its content as its last lines."""
+    return f'{text.rstrip()}\n\n[{_CHECK}]\n{_SUM} = "{content_hash(tomllib.loads(text))}"\n'
+
+
+def check_seal(path: Path, table: Mapping[str, Any], *, unchecked: bool = False) -> None:
+    """Raise FileChangedError unless a TOML file is as it was written.
+
+    Args:
+        path: For the message.
+        table: What the file holds.
+        unchecked: Let pass what was changed, and what has no check sum; what is torn never.
+    """
+    check = table.get(_CHECK)
+    stated = check.get(_SUM) if isinstance(check, dict) else None
+    if stated is None and "format" in table:
+        raise FileChangedError(
+            f"{path} is torn: it ends before its check sum, and what is missing nobody knows; take another copy"
+        )
+    if unchecked:
+        return
+    if stated is None:
+        raise FileChangedError(
+            f"{path} has no check sum: it was written by hand, or by a version that knew none, so that neither whether "
+            "it is whole nor of which drive it is can be checked. Look through it, then say --unchecked"
+        )
+    if content_hash({name: value for name, value in table.items() if name != _CHECK}) != stated:
+        raise FileChangedError(
+            f"{path} was changed since it was written: its content does not match its check sum. If you changed it, "
+            "look through it, then say --unchecked; else take another copy"
+        )
+
+
+def content_hash(content: Mapping[str, Any]) -> str:
+    """Return the SHA-256 over a content: over its JSON with sorted keys and no white space."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()

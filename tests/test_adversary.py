@@ -1,0 +1,168 @@
+"""Random and designed scripts against the envelope: a sample in every run (tests/adversary.py has the verdict)."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import random
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from adversary import (
+    ACTIONS,
+    END_STOP_SPEED,
+    MACHINES,
+    WRITABLE,
+    Bench,
+    Tally,
+    attack_machines,
+    build_bench,
+    judge,
+    kind_of,
+    quiet,
+    run_episode,
+    runs,
+)
+from fault_injection import eds_read_once
+
+from drive_env import Limits
+
+SAMPLE, MANY = 40, 600
+ON, OFF = 4, 1  # of the automaton
+
+
+def test_the_envelope_withstands_a_sample():
+    tally = attack_machines(range(SAMPLE))
+    assert tally.text() == ""
+    assert tally.refused > SAMPLE // 3  # it was needed
+    assert tally.outside > 0  # it does reach the ends of travel
+
+
+@pytest.mark.slow
+def test_the_envelope_withstands_many():
+    cores = os.cpu_count() or 1
+    tally = Tally()
+    with ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
+        for part in pool.map(attack_machines, [range(SAMPLE + k, SAMPLE + MANY, cores) for k in range(cores)]):
+            tally.merge(part)
+    assert tally.text() == ""
+    assert tally.episodes == MANY
+
+
+# --- the adversary is one -------------------------------------------------------------------------------------------
+def test_without_the_envelope_it_wins():
+    problems = []
+    with eds_read_once(), quiet():
+        benches = [build_bench(machine) for machine in (0, 1, 3)]
+        for number in range(75):
+            problems += run_episode(benches[number % 3], number, envelope=False).problems
+        for bench in benches:
+            bench.drives.close()
+    found = Counter(map(kind_of, problems))
+    assert found["left enabled"] >= 10
+    assert found["beyond the travel"] >= 5
+    assert found["above the limit"] >= 3
+    assert found["mistake of ours"] == 0
+
+
+def test_an_episode_is_the_same_again():
+    with eds_read_once(), quiet():
+        bench = build_bench(2)
+        first, other, again = (run_episode(bench, number) for number in (2, 22, 2))
+        bench.drives.close()
+    assert first == again
+    assert other.diary != first.diary
+
+
+def test_every_action_is_taken_and_every_kind_of_object_written():
+    taken = set()
+    with eds_read_once(), quiet():
+        bench = build_bench(0)
+        for number in range(40):
+            taken |= {line for line in run_episode(bench, number).diary if not line.startswith(" ")}
+        bench.drives.close()
+    assert taken == {action.__name__ for action in ACTIONS}
+    indices = {entry.index for entry in WRITABLE}
+    assert {0x1016, 0x1029, 0x1600, 0x2003, 0x2058, 0x2080, 0x6040, 0x6060, 0x607A, 0x6085, 0x60B0} <= indices
+
+
+def test_machines_differ_and_have_end_stops_among_them():
+    benches = [build_bench(number) for number in range(MACHINES)]
+    assert len({bench.limits for bench in benches}) == MACHINES
+    assert len({round(bench.deceleration) for bench in benches}) == MACHINES
+    assert sum(bench.stops is not None for bench in benches) >= 4
+    assert all(300.0 < bench.deceleration < 10_000.0 for bench in benches)
+    for bench in benches:
+        bench.drives.close()
+
+
+# --- the verdict -----------------------------------------------------------------------------------------------------
+def verdict(theta, omega, fsa=ON, current=0.0, load=0.0, intact=True, stops=None):
+    """Judge an axis with travel of 10 rad either way, a ramp of 500 rad/s^2 at half of 1000, and 2 A."""
+    column = [
+        np.broadcast_to(np.asarray(one, float), theta.shape)[:, None] for one in (theta, omega, fsa, current, load)
+    ]
+    names = ("theta", "omega", "fsa", "current", "load")
+    truth = SimpleNamespace(**{name: lambda one=one: one for name, one in zip(names, column, strict=True)})
+    bench = Bench(0, None, Limits(current=2000), (-10.0, 10.0), 1000.0, stops)
+    return judge(bench, SimpleNamespace(truth=truth), intact, len(theta))
+
+
+def drive_out(distance, speed=100.0):
+    """Pass the end of the travel at a speed and stop `distance` beyond it; return angle and speed."""
+    theta = np.minimum(np.arange(400) * speed * 1e-3, 10.0 + distance)
+    return theta, np.where(theta < 10.0 + distance, speed, 0.0)
+
+
+def test_the_verdict_takes_power_at_the_end_for_left_enabled():
+    still = np.zeros(200)
+    assert verdict(still, still, ON) == ["left enabled"]
+    assert verdict(still, still, OFF) == []
+    assert verdict(still, still, np.repeat([ON, OFF], 100)) == []
+
+
+@pytest.mark.parametrize(("distance", "wrong"), [(12.5, False), (14.0, True)])  # 2.5 + 10 + 0.63 rad at 100 rad/s
+@pytest.mark.parametrize("way", [1, -1])
+def test_the_verdict_knows_the_stopping_distance(distance, wrong, way):
+    theta, omega = drive_out(distance)
+    fsa = np.where(np.arange(400) < 399, ON, OFF)
+    found = verdict(way * theta, way * omega, fsa)
+    assert [("turns beyond the travel" in one) for one in found] == [True] * wrong
+
+
+def test_momentum_counts_where_the_axis_could_have_been_stopped():
+    theta, omega = drive_out(14.0)
+    late, early = np.where(theta < 11.0, ON, OFF), np.where(theta < 9.0, ON, OFF)
+    assert verdict(theta, omega, late) != []  # it passed the end with power, and was cut
+    assert verdict(theta, omega, early) == []  # its program had switched it off inside
+    assert verdict(theta, omega, late, intact=False) == []  # no loop to stop it with
+
+
+@pytest.mark.parametrize(("milliseconds", "wrong"), [(30, False), (31, True)])
+def test_the_verdict_counts_current_above_its_limit(milliseconds, wrong):
+    current = np.zeros(200)
+    current[50 : 50 + milliseconds] = 2.6
+    current[150:190] = 2.4  # within the margin
+    still = np.zeros(200)
+    assert len(verdict(still, still, OFF, current)) == wrong
+
+
+@pytest.mark.parametrize(("speed", "wrong"), [(END_STOP_SPEED - 1, False), (END_STOP_SPEED + 1, True)])
+def test_the_verdict_sees_end_stops(speed, wrong):
+    load = np.where(np.arange(200) < 150, 0.0, 0.26)
+    fsa = np.repeat([ON, OFF], [190, 10])
+    assert len(verdict(np.zeros(200), np.full(200, speed), fsa, load=load, stops=(-0.25, 0.25))) == wrong
+
+
+def test_runs_of_true_values():
+    assert runs(np.array([True, True, False, False, True])) == [(0, 2), (4, 5)]
+    assert runs(np.zeros(3, bool)) == []
+    rng = random.Random(1)
+    values = np.array([rng.random() < 0.5 for _ in range(100)])
+    again = np.zeros(100, bool)
+    for first, last in runs(values):
+        again[first:last] = True
+    assert (again == values).all()

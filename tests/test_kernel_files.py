@@ -1,0 +1,154 @@
+"""The cache of compiled kernels: whatever its files hold, a program runs, and says in one line what it rebuilds."""
+
+import errno
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drive_env import EmulatedDrives
+from drive_env.firmware import cycle
+from drive_env.process_image import from_od
+from mechanics import kernel_files
+from mechanics.compiled import user_cache_folder
+from mechanics.kernel_files import KernelFiles
+
+# What a program does with two small kernels, and how many it compiled.
+SMALL = """
+import logging, numpy as np
+logging.basicConfig(format="%(message)s")
+from drive_env.firmware import cycle
+from drive_env.process_image import from_od
+values = np.empty((2, 1, 1))
+assert from_od(np.array([[3], [4]]), np.array([0.5]), -10, 10, values, 0) and values.ravel().tolist() == [1.5, 2.0]
+print("compiled", sum(from_od.stats.cache_misses.values()), "kept", sum(from_od.stats.cache_hits.values()))
+"""
+WHOLE = """
+import logging
+logging.basicConfig(format="%(message)s")
+from drive_env import EmulatedDrives, motion
+with EmulatedDrives() as drives:
+    motion.enable(drives, "csv")
+    print(drives.record(["Statusword"], 0.01)["Statusword"][-1, 0])
+"""
+DAMAGES = {
+    "empty": lambda content: b"",
+    "cut": lambda content: content[: len(content) // 2],
+    "cut by one": lambda content: content[:-1],
+    "another byte": lambda content: content[:-100] + bytes([content[-100] ^ 1]) + content[-99:],
+    "noise": lambda content: os.urandom(len(content)),
+    "zeros": lambda content: bytes(len(content)),  # what some file systems leave after a power cut
+}
+
+
+def run(program: str, cache: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", program], env={**os.environ, "DRIVE_ENV_CACHE": str(cache)}, capture_output=True,
+        text=True, timeout=300,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory) -> Path:
+    """A copy of the real cache, with all kernels that these programs use."""
+    values = np.empty((2, 1, 1))
+    from_od(np.array([[3], [4]]), np.array([0.5]), -10, 10, values, 0)
+    with EmulatedDrives() as drives:
+        drives.advance(0.001)
+    copy = tmp_path_factory.mktemp("cache")
+    for kernel in (from_od, cycle.run):
+        folder = Path(kernel._cache.cache_path).relative_to(user_cache_folder()).parts[0]
+        shutil.copytree(user_cache_folder() / folder, copy / folder, dirs_exist_ok=True)
+    return copy
+
+
+def kernels(cache: Path) -> list[Path]:
+    return sorted(cache.rglob("*.kernel"))
+
+
+def test_another_program_finds_the_kernels_of_this_one(cache):
+    found = run(SMALL, cache)
+    assert (found.stdout, found.stderr) == ("compiled 0 kept 1\n", "")
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_is_told_removed_and_written_anew(cache, tmp_path, damage):
+    copy = Path(shutil.copytree(cache, tmp_path / "cache"))
+    assert len(kernels(copy)) > 1
+    for path in kernels(copy):
+        path.write_bytes(DAMAGES[damage](path.read_bytes()))
+    first = run(SMALL, copy)
+    assert first.returncode == 0, first.stderr
+    assert first.stdout == "compiled 1 kept 0\n"
+    assert "is damaged or of another version; it is compiled anew" in first.stderr
+    assert first.stderr.count("\n") == 1
+    second = run(SMALL, copy)
+    assert (second.stdout, second.stderr) == ("compiled 0 kept 1\n", "")
+
+
+@pytest.mark.slow
+def test_drives_run_though_every_kernel_is_damaged(cache, tmp_path):
+    copy = Path(shutil.copytree(cache, tmp_path / "cache"))
+    whole = run(WHOLE, copy)
+    for k, path in enumerate(kernels(copy)):
+        path.write_bytes(list(DAMAGES.values())[k % len(DAMAGES)](path.read_bytes()))
+    rebuilt = run(WHOLE, copy)
+    assert rebuilt.returncode == 0, rebuilt.stderr
+    assert rebuilt.stdout == whole.stdout
+
+
+def test_files_of_another_kind_do_not_matter(cache, tmp_path):
+    """A folder in the place of a file, what an older version left, half a file of a program that was killed."""
+    copy = Path(shutil.copytree(cache, tmp_path / "cache"))
+    path = next(one for one in kernels(copy) if "from_od" in one.name)
+    path.with_suffix(".nbi").write_bytes(b"torn")
+    path.with_name(path.name + ".0123456789abcdef").write_bytes(b"half")
+    path.unlink()
+    path.mkdir()
+    found = run(SMALL, copy)
+    assert found.returncode == 0, found.stderr
+    assert found.stdout == "compiled 1 kept 0\n"
+
+
+def test_two_programs_at_once_share_what_they_compile(tmp_path):
+    """Both begin with an empty cache; each file that they leave is whole."""
+    both = [
+        subprocess.Popen([sys.executable, "-c", SMALL], env={**os.environ, "DRIVE_ENV_CACHE": str(tmp_path)})
+        for _ in range(2)
+    ]
+    assert [one.wait(300) for one in both] == [0, 0]
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == kernels(tmp_path)
+    assert run(SMALL, tmp_path).stdout == "compiled 0 kept 1\n"
+
+
+def test_two_signatures_never_share_a_file(tmp_path):
+    """Numba's index gives both the number 1 if two processes save at once; the second would run the first's code."""
+    mine, other = KernelFiles(tmp_path, "f-1.py311", 0), KernelFiles(tmp_path, "f-1.py311", 0)
+    mine.save(("int64",), "code of int64")
+    other.save(("float64",), "code of float64")
+    assert (other.load(("int64",)), mine.load(("float64",))) == ("code of int64", "code of float64")
+    assert KernelFiles(tmp_path, "f-1.py311", 1).load(("int64",)) is None, "of an edited source"
+    mine.flush()
+    assert mine.load(("int64",)) is None
+
+
+def test_a_full_disk_costs_the_cache_alone(tmp_path, monkeypatch, caplog):
+    def full(self, data):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    kernel_files._tell_not_kept.cache_clear()
+    monkeypatch.setattr(Path, "write_bytes", full)
+    files = KernelFiles(tmp_path, "f-1.py311", 0)
+    with caplog.at_level(logging.WARNING):
+        files.save("key", "kernel")
+        files.save("other", "kernel")
+    assert [record.getMessage() for record in caplog.records] == [
+        f"compiled kernels cannot be kept in {tmp_path}: No space left on device; every program compiles them anew. "
+        "Make room, or name another folder in DRIVE_ENV_CACHE"
+    ]
+    assert list(tmp_path.iterdir()) == []

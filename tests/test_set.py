@@ -1,0 +1,111 @@
+"""`drive-env set` where a motor may turn: what enables is refused, what stops goes through, the rest asks."""
+
+from __future__ import annotations
+
+import pytest
+from scripted_drive import ScriptedBus, ScriptedDrive
+from typer.testing import CliRunner
+
+from drive_env.cli import app
+
+DONE, REFUSED, USER_ERROR = 0, 1, 2
+OFF, ENABLED, QUICK_STOP, FAULT_REACTION, FAULT = 0x0240, 0x0637, 0x0607, 0x060F, 0x0608
+
+
+@pytest.fixture
+def drive(monkeypatch):
+    made = ScriptedDrive(values={(0x2058, 0): (65536, 4), (0x2042, 1): (445, 2)})
+    made.buses = []
+
+    def opened(*_, **__):
+        made.buses.append(ScriptedBus(made))
+        return made.buses[-1]
+
+    monkeypatch.setattr("drive_env.can_drives.open_bus", opened)
+    return made
+
+
+def put(*arguments, answer=None):
+    result = CliRunner().invoke(app, ["set", *map(str, arguments)], input=answer)
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def requests(drive):
+    """Return what the command asked: "r6041" for a read, "w6040" for a write."""
+    kinds = {0x40: "r", 0x20: "w"}
+    return [
+        f"{kinds[data[0] & 0xE0]}{int.from_bytes(data[1:3], 'little'):04X}"
+        for bus in drive.buses
+        for data in bus.sent(0x601)
+        if data[0] & 0xE0 in kinds
+    ]
+
+
+@pytest.mark.parametrize("status", [OFF, ENABLED])
+@pytest.mark.parametrize(
+    "word", ["15", "0x0F", "0x1F", "0x10F", "0x8F", "79"], ids=["on", "hex", "start", "halt", "with reset", "relative"]
+)
+@pytest.mark.parametrize("options", [(), ("--yes",), ("--raw",), ("--dry-run",)], ids=str)
+def test_a_controlword_that_enables_is_refused_with_the_remedy(drive, status, word, options):
+    drive.set(0x6041, status)
+    code, out, error = put("6040", word, *options)
+    assert (code, "w6040" in requests(drive), drive.get(0x6041), "=" in out) == (USER_ERROR, False, status, False)
+    assert "would enable the axis, and this command ends right after: nobody would watch the motor" in error
+    assert "`drive-env jog`" in error and "CanDrives" in error
+
+
+def test_by_its_name_and_of_a_second_axis_it_is_the_same(drive, tmp_path):
+    from drive_env.devices import find_device
+
+    assert put("Controlword", 15)[0] == USER_ERROR
+    # The EDS of a drive with two axes lists the objects of the second one, too.
+    text = find_device("tmcm1636").eds.read_text(encoding="cp1252").replace("=0x6040\n", "=0x6040\n900=0x6840\n")
+    section = text[text.index("[6040]") : text.index("[", text.index("[6040]") + 1)]
+    (tmp_path / "two.eds").write_text(text + "\n" + section.replace("6040", "6840"), "cp1252")
+    code, _, error = put("6840", 15, "--eds", tmp_path / "two.eds")
+    assert (code, "6840h:00 Controlword = 15 would enable" in error) == (USER_ERROR, True), error
+
+
+@pytest.mark.parametrize("word", [0, 2, 6, 7])
+@pytest.mark.parametrize("status", [ENABLED, QUICK_STOP, FAULT_REACTION, FAULT])
+def test_a_controlword_that_stops_goes_through_without_a_question_and_first(drive, word, status):
+    drive.set(0x6041, status)
+    code, out, error = put("6040", word)
+    assert (code, drive.get(0x6040)) == (DONE, word), error
+    assert out == f"node 1  6040h:00 Controlword = {word} ({word:X}h)\n"
+    asked = requests(drive)
+    assert not {"r6041", "r2058"} & set(asked[: asked.index("w6040")])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("60FF", 1000), ("607A", 1000), ("6071", 10), ("6060", 3), ("2003", 5000), ("2042:1", 500), ("1016:1", 0)],
+)
+@pytest.mark.parametrize("status", [ENABLED, QUICK_STOP, FAULT_REACTION])
+def test_any_other_write_to_a_live_axis_asks_first_and_says_why(drive, name, value, status):
+    drive.set(0x6041, status)
+    key = int(name[:4], 16), int(name[5:] or 0)
+    before = drive.get(*key)
+    code, _, error = put(name, value)
+    assert (code, drive.get(*key)) == (USER_ERROR, before)
+    assert f"node 1 ({status:04X}h) is live by its statusword, and obeys at once (to stop it, set 6040 to 2). " in error
+    assert f" Write {name[:4]}h:0" in error
+    assert error.endswith(f" = {value}? Nobody is there to ask; say --yes\n")
+    assert put(name, value, "--yes")[0] == DONE
+    assert drive.get(*key) == value
+
+
+def test_a_user_who_says_no_has_changed_nothing(drive, monkeypatch):
+    monkeypatch.setattr("typer.testing._NamedTextIOWrapper.isatty", lambda self: True, raising=False)
+    monkeypatch.setattr("drive_env.tools.options.typer.confirm", lambda question: False)
+    drive.set(0x6041, ENABLED)
+    code, _, error = put("60FF", 1000)
+    assert (code, error, drive.get(0x60FF)) == (REFUSED, "drive-env: nothing was changed\n", 0)
+
+
+@pytest.mark.parametrize("status", [OFF, 0x0221, 0x0233, FAULT])
+def test_an_axis_that_cannot_turn_is_no_question(drive, status):
+    drive.set(0x6041, status)
+    assert put("60FF", 1000)[0] == DONE
+    assert drive.get(0x60FF) == 1000
