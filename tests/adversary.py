@@ -452,12 +452,15 @@ class Tally:
         """Return the episodes that went wrong, empty if none did."""
         if not self.bad:
             return ""
-        kinds = Counter(kind_of(problem) for one in self.bad for problem in one.problems)
         shown = [
             "\n".join([f"episode {one.number}: {'; '.join(one.problems)}", *(f"    {line}" for line in one.diary)])
             for one in sorted(self.bad, key=lambda one: len(one.diary))[:most]
         ]
-        return "\n".join([f"{len(self.bad)} of {self.episodes} episodes: {dict(kinds)}", *shown])
+        return "\n".join([f"{len(self.bad)} of {self.episodes} episodes: {self.kinds()}", *shown])
+
+    def kinds(self) -> dict[str, int]:
+        """Return how many problems of each kind there were."""
+        return dict(Counter(kind_of(problem) for one in self.bad for problem in one.problems))
 
 
 def kind_of(problem: str) -> str:
@@ -513,10 +516,14 @@ def main() -> None:
             part = job.result()
             tally.merge(part)
             progress.update(task, advance=part.episodes, bad=len(tally.bad))
+            if part.bad:  # at once: a long run may be ended before its end
+                print(part.text(), flush=True)
+            if not progress.console.is_terminal:
+                print(f"{tally.episodes} of {given.episodes} episodes, {len(tally.bad)} wrong", flush=True)
     seconds = time.perf_counter() - begin
     print(f"{tally.episodes} episodes in {seconds:.0f} s, {tally.episodes / seconds:.0f}/s; in {tally.refused} the "
           f"envelope refused or stopped something, in {tally.outside} the axis left its travel")  # fmt: skip
-    print(tally.text() or "nothing went wrong")
+    print(f"{len(tally.bad)} went wrong: {tally.kinds()}" if tally.bad else "nothing went wrong")
     raise SystemExit(bool(tally.bad))
 
 

@@ -208,7 +208,7 @@ def soak(load, seconds, seed):
     np.testing.assert_array_equal(run.lanes("psi_nominal"), psi)  # nothing is left of any fault
     run.drives.close()
     assert grown < 8.0, f"{grown:.1f} MB more than at the beginning"
-    assert threads() == threads_before
+    assert threads() <= threads_before  # one that another test left may have ended meanwhile
     assert len(files()) <= len(files_before)
     assert run.energy[0] < 2e-3 * run.energy[1], "the energies do not balance"
     return run
@@ -276,7 +276,7 @@ def bus_soak(seconds, seed):
     assert world.wire.statistics.most_waiting < 5000 + MOST_BABBLE
     world.close()
     assert grown < 8.0
-    assert threads() == threads_before
+    assert threads() <= threads_before  # one that another test left may have ended meanwhile
     assert len(files()) <= len(files_before)
     assert enabled > 0.02 * seconds * 1000 * len(nodes)
     return given
