@@ -396,3 +396,19 @@ def test_the_end_of_the_travel_is_kept_by_the_way_that_a_stop_takes(bus, drive, 
         else:
             drives.advance(0.005)
         drive.set(0x606C, 0)
+
+
+@pytest.mark.parametrize("scale", [256, 1024, TURN])
+@pytest.mark.parametrize(("turns", "stops"), [(0.002, False), (0.03, True), (0.5, True)])
+def test_a_coarse_scale_of_positions_gives_an_axis_no_more_room_beyond_its_end(bus, drive, scale, turns, stops):
+    """Overshoot and noise of an axis at its limit are within 0.02 turns, whatever an increment is."""
+    drive.set(0x2058, scale)
+    with CanDrives(bus=bus, pace="lockstep", safety=Limits(position=(-3 * scale, 3 * scale))) as drives:
+        motion.enable(drives, mode="csv")
+        drives.advance(0.005)
+        drive.set(0x6064, round((3.0 + turns) * scale))
+        if stops:
+            with pytest.raises(SafetyError, match="beyond the limits"):
+                drives.advance(0.005)
+        else:
+            drives.advance(0.005)
