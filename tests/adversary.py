@@ -7,7 +7,8 @@ policy, a careless script or another master might do, and closes it. The verdict
 
 - no axis has current available beyond its travel plus the stopping distance of its machine, measured beforehand, at
   the speed at which it passed the end of its travel, or that it had when it was enabled out there; an axis whose loops
-  were changed brakes as well as these let it, and may have current as long as that brings it to rest within a second;
+  were changed brakes as well as these let it, and may have current as long as that brings it to rest within a second
+  (seen over SLOWING cycles; the voltage goes NOTICED cycles after that ends), and for a stop of LONGEST_STOP at most;
 - no axis whose loops, sensors and limits of current are as commissioned gets there at all, by power or by momentum, if
   its power was on when it passed the end;
 - no end stop is met at more than END_STOP_SPEED by such an axis;
@@ -53,6 +54,8 @@ SLOW_OUTSIDE = 2.0 * np.pi  # a rotor that creeps back or settles out there [rad
 END_STOP_SPEED = 10.0  # of the rotor [rad/s]
 CURRENT_MARGIN, CURRENT_TIME = 1.25, 0.030  # of the limit; 10 ms, and the 20 ms in which an envelope acts [s]
 SLOWING, LONGEST = 20, 1.0  # cycles over which an axis is seen to slow down; [s] in which it must stand then
+NOTICED = 65  # cycles: two measurements of 20 ms that do not meet, the filter of 606Ch, the command
+LONGEST_STOP = 2.1  # [s]
 KINDS = ("left enabled", "beyond the travel", "an end stop", "above the limit")
 AFTERWARDS = 1500  # cycles after the program's end for the drive's own reaction to a fault, a ramp and a second at most
 
@@ -377,10 +380,7 @@ def judge(bench: Bench, world: ObservedWorld, intact: bool, end: int) -> list[st
     truth = world.truth
     theta, omega = truth.theta()[:, 0], truth.omega()[:, 0]
     on, current = np.isin(truth.fsa()[:, 0], ON), truth.current()[:, 0]
-    # Slowing down, over the last so many cycles, fast enough to stand within a second.
-    before = np.abs(np.concatenate([omega[:1].repeat(SLOWING), omega])[: len(omega)])
-    rate = (before - np.abs(omega)) / (SLOWING * 0.001)
-    brakes = (truth.fsa()[:, 0] == State.QUICK_STOP_ACTIVE) & (rate * LONGEST >= np.abs(omega))
+    brakes = braking(omega, truth.fsa()[:, 0] == State.QUICK_STOP_ACTIVE)
     found = []
     if on[-1]:
         found.append("left enabled")
@@ -408,6 +408,16 @@ def judge(bench: Bench, world: ObservedWorld, intact: bool, end: int) -> list[st
     if longest > CURRENT_TIME * 1000:
         found.append(f"{current.max():.1f} A, above the limit of {limit:.1f} A for {longest} ms")
     return found
+
+
+def braking(omega: np.ndarray, stopping: np.ndarray) -> np.ndarray:
+    """Return the cycles in which an axis in a quick stop [rad/s] is slowing down, or was so a moment ago."""
+    before = np.abs(np.concatenate([omega[:1].repeat(SLOWING), omega])[: len(omega)])
+    rate = (before - np.abs(omega)) / (SLOWING * 0.001)
+    cycle = np.arange(len(omega))
+    begun = np.maximum.accumulate(np.where(stopping, -1, cycle))  # the last cycle before the stop
+    slowed = np.maximum.accumulate(np.where(~stopping | (rate * LONGEST >= np.abs(omega)), cycle, -1))
+    return stopping & (cycle - slowed <= NOTICED) & (cycle - begun <= LONGEST_STOP * 1000)
 
 
 def excursions(outside: np.ndarray, enabled: np.ndarray) -> list[tuple[int, int]]:

@@ -29,6 +29,7 @@ from adversary import (
 from fault_injection import eds_read_once
 
 from drive_env import Limits
+from drive_env.firmware.fsa import State
 
 SAMPLE, MANY = 40, 600
 ON, OFF = 4, 1  # of the automaton
@@ -139,6 +140,32 @@ def test_momentum_counts_where_the_axis_could_have_been_stopped():
     assert verdict(theta, omega, late) != []  # it passed the end with power, and was cut
     assert verdict(theta, omega, early) == []  # its program had switched it off inside
     assert verdict(theta, omega, late, intact=False) == []  # no loop to stop it with
+
+
+@pytest.mark.parametrize(
+    ("rates", "wrong"),
+    [
+        ([(500, 110.0)], False),  # it would stand within a second, all the way
+        ([(500, 40.0)], True),  # it would not, from the beginning
+        ([(150, 110.0), (40, 0.0), (310, 110.0)], False),  # the voltage goes after this if it lasts
+        ([(150, 110.0), (100, 0.0), (250, 110.0)], True),
+        ([(150, 110.0), (350, -20.0)], True),  # faster again
+    ],
+)
+def test_an_axis_whose_loops_were_changed_may_have_current_while_it_slows_down(rates, wrong):
+    omega = 100.0 - np.cumsum(np.concatenate([np.full(count, rate) for count, rate in rates])) * 1e-3
+    theta = 10.0 + np.cumsum(omega) * 1e-3
+    fsa = np.where(np.arange(500) < 499, State.QUICK_STOP_ACTIVE, OFF)
+    assert bool(verdict(theta, omega, fsa, intact=False)) == wrong
+    assert verdict(theta, omega, fsa) != []  # with loops as commissioned it would have stopped long before
+
+
+def test_no_stop_has_current_for_longer_than_two_seconds():
+    omega = 100.0 * np.exp(-1.1 * np.arange(2500) * 1e-3)
+    theta = 10.0 + np.cumsum(omega) * 1e-3
+    for cycles, wrong in ((2000, False), (2400, True)):
+        fsa = np.where(np.arange(2500) < cycles, State.QUICK_STOP_ACTIVE, OFF)
+        assert bool(verdict(theta, omega, fsa, intact=False)) == wrong
 
 
 @pytest.mark.parametrize(("milliseconds", "wrong"), [(30, False), (31, True)])
