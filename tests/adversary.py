@@ -12,7 +12,7 @@ policy, a careless script or another master might do, and closes it. The verdict
 - no axis whose loops, sensors and limits of current are as commissioned gets there at all, by power or by momentum, if
   its power was on when it passed the end;
 - no end stop is met at more than END_STOP_SPEED by such an axis;
-- no current stays above its limit;
+- no current stays above its limit, as long as the drive's current sensors are adjusted as they were;
 - no axis is left enabled.
 """
 
@@ -54,7 +54,7 @@ SLOW_OUTSIDE = 2.0 * np.pi  # a rotor that creeps back or settles out there [rad
 END_STOP_SPEED = 10.0  # of the rotor [rad/s]
 CURRENT_MARGIN, CURRENT_TIME = 1.25, 0.030  # of the limit; 10 ms, and the 20 ms in which an envelope acts [s]
 SLOWING, LONGEST = 20, 1.0  # cycles over which an axis is seen to slow down; [s] in which it must stand then
-NOTICED = 65  # cycles: two measurements of 20 ms that do not meet, the filter of 606Ch, the command
+NOTICED = 85  # cycles: two measurements of 20 ms, a third that lies across, the baseline of the speed, the command
 LONGEST_STOP = 2.1  # [s]
 KINDS = ("left enabled", "beyond the travel", "an end stop", "above the limit")
 AFTERWARDS = 1500  # cycles after the program's end for the drive's own reaction to a fault, a ramp and a second at most
@@ -66,6 +66,7 @@ PRESET_SPEED = 20 * TURN  # at which the stopping distance is measured [pps]
 # Sensors, commutation and loops; what shortens the current that brakes. Whoever writes them may find no brake left.
 COMMISSIONING = range(0x2000, 0x3000)
 SCALE = 0x2058  # which is no such thing: it moves limits, not loops
+CURRENT_SENSORS = 0x2060  # offsets: neither the drive nor whoever reads it can see a current that they hide
 UNWRITTEN = (0x1010, 0x1011, 0x2706)  # stores and restores: they outlive the episode, and take seconds
 
 
@@ -122,6 +123,7 @@ class Attack:
         self.drives, self.world, self.bench, self.rng = drives, world, bench, rng
         self.diary: list[str] = []
         self.intact = True  # loops, sensors and limits of current are as commissioned
+        self.measured = True  # the sensors of the current are
         self.refusals = 0
 
     def act(self) -> None:
@@ -142,6 +144,7 @@ class Attack:
         self.diary.append(f"  write {index:04X}h {'' if isinstance(name, int) else name[1]} = {value}")
         if index in COMMISSIONING and index != SCALE:
             self.intact = False
+            self.measured &= index != CURRENT_SENSORS
         with suppress(*(error for error in EXPECTED if error is not KeyboardInterrupt)):
             self.drives.write(name, value)
 
@@ -367,16 +370,24 @@ def run_episode(bench: Bench, number: int, seed: int = 0, *, envelope: bool = Tr
     while world.cycles == end or (world.truth.is_on()[0] and world.cycles < end + AFTERWARDS):
         world.cycle()
     bus.shutdown()
-    diary, intact = (attack.diary, attack.intact) if attack else ([], True)
-    episode = Episode(number, crash + judge(bench, world, intact, end), diary, cycles=world.cycles)
+    diary = attack.diary if attack else []
+    found = judge(bench, world, attack is None or attack.intact, attack is None or attack.measured)
+    episode = Episode(number, crash + found, diary, cycles=world.cycles)
     theta = world.truth.theta()[:, 0]
     episode.refused = attack is not None and attack.refusals > 0
     episode.outside = bool(((theta < bench.travel[0]) | (theta > bench.travel[1])).any())
     return episode
 
 
-def judge(bench: Bench, world: ObservedWorld, intact: bool, end: int) -> list[str]:
-    """Return what is wrong with what a machine did in an episode whose program ended at cycle `end`."""
+def judge(bench: Bench, world: ObservedWorld, intact: bool, measured: bool = True) -> list[str]:
+    """Return what is wrong with what a machine did in an episode.
+
+    Args:
+        bench: The machine.
+        world: What it did.
+        intact: Loops, sensors and limits of current were as commissioned.
+        measured: The sensors of the current were.
+    """
     truth = world.truth
     theta, omega = truth.theta()[:, 0], truth.omega()[:, 0]
     on, current = np.isin(truth.fsa()[:, 0], ON), truth.current()[:, 0]
@@ -405,7 +416,7 @@ def judge(bench: Bench, world: ObservedWorld, intact: bool, end: int) -> list[st
                 found.append(f"an end stop met at {abs(omega[first]):.0f} rad/s")
     limit = (bench.limits.current or 0) * 1e-3
     longest = max((last - first for first, last in runs(current > CURRENT_MARGIN * limit)), default=0)
-    if longest > CURRENT_TIME * 1000:
+    if measured and longest > CURRENT_TIME * 1000:
         found.append(f"{current.max():.1f} A, above the limit of {limit:.1f} A for {longest} ms")
     return found
 

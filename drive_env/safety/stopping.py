@@ -5,6 +5,7 @@ A stop knows no bus: it is given samples and time, and says which controlword ea
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from enum import Enum
 from typing import NamedTuple
@@ -16,6 +17,11 @@ ANSWER = 0.1  # s within which a drive must have begun its ramp
 GRACE = 0.02  # s from the command to a slower axis: the bus, the drive's cycle, the loops
 SHARE = 0.5  # of the ramp's deceleration that counts as slowing down as it says
 LONGEST = 1.0  # s; whoever would stand by then at the present deceleration is slowing down well, too
+# Measurements of the deceleration, one after the other, that must be too low: a loop that was at its limit of current
+# goes on as before until the ramp has come down to the speed that there is.
+MEASUREMENTS = 2
+# A loop whose integral has wound up takes an axis past rest and brings it back: so much of its speed, for so long [s].
+SWING_SHARE, SWING_TIME = 0.25, 0.25
 RAMP_TIMEOUT = 2.0  # s for the whole ramp
 SETTLED = 0.02  # s for which samples must show an axis at rest
 BLIND = 0.4  # s without a sample, after which the ramp is taken to be over
@@ -57,12 +63,15 @@ class AxisStop:
         self.why = ""  # the voltage had to go
         self._begun = self._since = now
         self._first = abs(speed)
+        self._way = 0.0  # sign of the speed with which it began
+        self._swung: float | None = None  # when it passed rest [s]
         self._deceleration = deceleration
         self._rest = rest
         self._settled: float | None = None  # since when it is at rest [s]
         self._sent: float | None = None
         self._seen = now
         self._check: Sample | None = None
+        self._too_low = 0  # measurements of the deceleration in a row
         self.holds = holds
 
     @property
@@ -110,6 +119,8 @@ class AxisStop:
                 self._enter(Phase.CUT, now)
             return
         self._first = max(self._first, abs(sample.speed)) if sample.time < self._begun + GRACE else self._first
+        if self._way == 0.0 and abs(sample.speed) > self._rest:
+            self._way = math.copysign(1.0, sample.speed)
         begun = matches(sample.status, QUICK_STOP_ACTIVE) or not matches(sample.status, (0x6F, 0x27))
         if not begun:
             if now - self._begun > ANSWER:
@@ -130,21 +141,25 @@ class AxisStop:
             self._enter(Phase.CUT, now)
 
     def _slows_down(self, now: float, sample: Sample) -> bool:
-        """Return whether the speed is where the ramp has it, or falls fast enough to be 0 within LONGEST."""
+        """Return whether the speed is where the ramp has it, swings past rest, or will be 0 within LONGEST."""
         elapsed = max(now - self._begun - GRACE, 0.0)
         # Of a ramp that is not known only how fast the speed falls tells anything.
         expected = self._first - SHARE * self._deceleration * elapsed if self._deceleration > 0.0 else 0.0
         if self._check is None:
             self._check = sample
-        if abs(sample.speed) <= max(expected, 0.0) + 3.0 * self._rest:
-            self._check = sample
+        if sample.speed * self._way < 0.0 and self._swung is None:
+            self._swung = sample.time
+        swings = self._swung is not None and sample.time - self._swung <= SWING_TIME
+        if abs(sample.speed) <= max(expected, SWING_SHARE * self._first * swings) + 3.0 * self._rest:
+            self._check, self._too_low = sample, 0
             return True
         span = sample.time - self._check.time
         if span < GRACE:
             return True
         rate = (abs(self._check.speed) - abs(sample.speed)) / span
         self._check = sample
-        return rate * LONGEST >= abs(sample.speed)
+        self._too_low = 0 if rate * LONGEST >= abs(sample.speed) else self._too_low + 1
+        return self._too_low < MEASUREMENTS
 
     def _enter(self, phase: Phase, now: float) -> None:
         self.phase, self._since, self._sent = phase, now, None if phase is Phase.CUT else self._sent
