@@ -9,6 +9,7 @@ policy, a careless script or another master might do, and closes it. The verdict
   the speed at which it passed the end of its travel, or that it had when it was enabled out there; an axis whose loops
   were changed brakes as well as these let it, and may have current as long as that brings it to rest within a second
   (seen over SLOWING cycles; the voltage goes NOTICED cycles after that ends), and for a stop of LONGEST_STOP at most;
+  nobody but the drive itself ends its fault reaction (CiA 402), which has as long;
 - no axis whose loops, sensors and limits of current are as commissioned gets there at all, by power or by momentum, if
   its power was on when it passed the end;
 - no end stop is met at more than END_STOP_SPEED by such an axis;
@@ -392,6 +393,7 @@ def judge(bench: Bench, world: ObservedWorld, intact: bool, measured: bool = Tru
     theta, omega = truth.theta()[:, 0], truth.omega()[:, 0]
     on, current = np.isin(truth.fsa()[:, 0], ON), truth.current()[:, 0]
     brakes = braking(omega, truth.fsa()[:, 0] == State.QUICK_STOP_ACTIVE)
+    brakes |= reacting(truth.fsa()[:, 0] == State.FAULT_REACTION_ACTIVE)
     found = []
     if on[-1]:
         found.append("left enabled")
@@ -429,6 +431,12 @@ def braking(omega: np.ndarray, stopping: np.ndarray) -> np.ndarray:
     begun = np.maximum.accumulate(np.where(stopping, -1, cycle))  # the last cycle before the stop
     slowed = np.maximum.accumulate(np.where(~stopping | (rate * LONGEST >= np.abs(omega)), cycle, -1))
     return stopping & (cycle - slowed <= NOTICED) & (cycle - begun <= LONGEST_STOP * 1000)
+
+
+def reacting(reaction: np.ndarray) -> np.ndarray:
+    """Return the cycles of fault reactions that the drive has not ended too late."""
+    cycle = np.arange(len(reaction))
+    return reaction & (cycle - np.maximum.accumulate(np.where(reaction, -1, cycle)) <= LONGEST_STOP * 1000)
 
 
 def excursions(outside: np.ndarray, enabled: np.ndarray) -> list[tuple[int, int]]:

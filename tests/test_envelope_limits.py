@@ -412,3 +412,17 @@ def test_a_coarse_scale_of_positions_gives_an_axis_no_more_room_beyond_its_end(b
                 drives.advance(0.005)
         else:
             drives.advance(0.005)
+
+
+@pytest.mark.parametrize(("scale", "refused"), [(1, True), (49, True), (50, False)])
+def test_positions_too_coarse_for_a_travel_to_be_watched_are_refused(bus, drive, scale, refused):
+    drive.set(0x2058, scale)
+    with CanDrives(bus=bus, pace="lockstep", safety=Limits(position=(-3 * scale, 3 * scale))) as drives:
+        if refused:
+            with pytest.raises(SafetyError, match=rf"a revolution has {scale} increments \(2058h\), too few .* Set 50"):
+                motion.enable(drives, mode="csv")
+            assert drive.get(0x6041) & 0x6F != 0x27
+        else:
+            motion.enable(drives, mode="csv")
+    with CanDrives(bus=bus, pace="lockstep", safety=Limits(velocity=3 * scale)) as drives:
+        motion.enable(drives, mode="csv")  # no travel to watch

@@ -47,6 +47,7 @@ class Axes:
         aim: Axis to the target of pp before, from which relative moves go on [inc].
         velocity: As the drive says [inc/s].
         speed: From positions [inc/s].
+        has_scale: Whether the drive says how many increments a revolution has.
         mean_current: Over the last 30 ms [unit of 6077h].
         seen: When the statusword came last [s].
         clock: The time of lockstep [s].
@@ -78,6 +79,7 @@ class Axes:
         self.clock = 0.0
         self.rotor = RotorAngle(count)
         self._placed = np.zeros(count, bool)  # whether a position was seen
+        self.has_scale = np.zeros(count, bool)
         self._position_time = np.full(count, -math.inf)  # when it was there [s]
         self._current_time = np.zeros(count)  # [s]
         # The position and its time from which the speed is reckoned.
@@ -127,7 +129,8 @@ class Axes:
         turns = self.rotor.turns(self.position) if self.rotor.is_placed and self._placed.any() else None
         if turns is not None:
             turns = np.where(self._placed, turns, 0.0)
-        self.rotor.place(position, np.where(np.isnan(scale), 1.0, scale), turns)
+        self.has_scale = ~np.isnan(scale)
+        self.rotor.place(position, np.where(self.has_scale, scale, 1.0), turns)
         self.position = position.copy()
         self._base_time[:] = -math.inf
         self._placed[:] = True

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drive_env.dictionary.entries import Entry
 from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
-from drive_env.safety.bounds import COUNTED, QUICK_STOP_DECELERATION, read_own
+from drive_env.safety.bounds import COUNTED, QUICK_STOP_DECELERATION, SLACK_TURNS, read_own
 from drive_env.safety.errors import SafetyError
 from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, given
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
@@ -308,6 +308,7 @@ class Commands:
         bounds = self._limits.bounds()
         if not axes.any():
             return
+        self._check_resolution(axes)
         now = np.atleast_2d(self._modes() if modes is None else modes)
         known, key = self._drives.description, QUICK_STOP_DECELERATION
         if known.has(key) and known.dictionary.find(key).unit == f"{COUNTED}^2":
@@ -315,6 +316,18 @@ class Commands:
             self._refuse_mode(slow & np.isin(now, UNRAMPED_MODES).any(axis=0), bounds.braking)
         for row in np.unique(now, axis=0):
             self._check_speeds(axes, row, RUNNING_SPEEDS, bounds.velocity, played)
+
+    def _check_resolution(self, axes: Mask) -> None:
+        """Raise SafetyError for axes whose positions are too coarse for their travel to be watched."""
+        scale = self._axes.rotor.scale
+        coarse = axes & self._limits.bounds().given & self._axes.has_scale & (scale * SLACK_TURNS < 1.0)
+        for axis in np.flatnonzero(coarse).tolist():
+            keys = scale_objects(self._drives.description)
+            names = ", ".join(f"{index:04X}h" for index in dict.fromkeys(index for index, _ in keys))
+            raise SafetyError(
+                f"axis {axis}: a revolution has {scale[axis]:g} increments ({names}), too few to watch its travel; "
+                f"nothing was sent. Set {1.0 / SLACK_TURNS:.0f} or more, or open the drives without limits of position"
+            )
 
     def _check_speeds(
         self,
