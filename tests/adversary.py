@@ -80,6 +80,7 @@ class Bench:
     limits: Limits
     travel: tuple[float, float]  # of the rotor [rad]
     deceleration: float  # of the rotor [rad/s^2]
+    kick: float  # what a quick stop adds to its way, if it begins at full torque, which its velocity loop starts with [rad]
     stops: tuple[float, float] | None  # end stops, as `Truth.load` [rad or m]
 
 
@@ -93,12 +94,14 @@ def build_bench(number: int, seed: int = 0) -> Bench:
     position = (round(turns[0] * TURN), round(turns[1] * TURN))
     velocity, current = round(rng.uniform(8.0, 25.0) * TURN), rng.randrange(2000, 6500)
     travel = drives.load.travel[0] if drives.load.travel else None
+    deceleration = measure_deceleration(drives, velocity, current)
     return Bench(
         number,
         drives,
         Limits(position=position, velocity=velocity, current=current),
         (position[0] * RADIANS, position[1] * RADIANS),
-        measure_deceleration(drives, velocity, current),
+        deceleration,
+        measure_kick(drives, current),
         travel,
     )
 
@@ -114,6 +117,22 @@ def measure_deceleration(drives: EmulatedDrives, speed: int, current: int) -> fl
     motion.quick_stop(drives)
     drives.advance(0.5)
     return float(omega**2 / (2.0 * abs(drives.machine.rotor_angle[0] - start)))
+
+
+def measure_kick(drives: EmulatedDrives, current: int) -> float:
+    """Return the way of a quick stop that begins at a torque [mA], a few milliseconds after standstill [rad]."""
+    drives.machine.reset()
+    drives.write(0x2003, current)
+    motion.enable(drives, mode="cst")
+    drives.write(0x6071, current)
+    drives.advance(0.005)
+    start = drives.machine.rotor_angle[0]
+    motion.quick_stop(drives)
+    way = 0.0
+    for _ in range(100):
+        drives.advance(0.005)
+        way = max(way, abs(drives.machine.rotor_angle[0] - start))
+    return way
 
 
 # --- what is done -------------------------------------------------------------------------------------------------
@@ -400,7 +419,7 @@ def judge(bench: Bench, world: ObservedWorld, intact: bool, measured: bool = Tru
     for outside in (bench.travel[0] - theta, theta - bench.travel[1]):
         for first, last in excursions(outside > 0.0, truth.fsa()[:, 0] == State.OPERATION_ENABLED):
             speed = np.abs(omega[first : first + round(REACTION * 1000) + 1]).max()
-            predicted = speed * REACTION + speed**2 / (2.0 * RAMP_SHARE * bench.deceleration) + SLACK
+            predicted = speed * REACTION + speed**2 / (2.0 * RAMP_SHARE * bench.deceleration) + bench.kick + SLACK
             # Power, or the momentum of an axis that could have been stopped.
             counts = (on[first:last] | on[first]) if intact else (on & ~brakes)[first:last]
             way = outside[first:last] - max(outside[first - 1] if first else 0.0, 0.0)

@@ -108,7 +108,7 @@ def verdict(theta, omega, fsa=ON, current=0.0, load=0.0, intact=True, stops=None
     ]
     names = ("theta", "omega", "fsa", "current", "load")
     truth = SimpleNamespace(**{name: lambda one=one: one for name, one in zip(names, column, strict=True)})
-    bench = Bench(0, None, Limits(current=2000), (-10.0, 10.0), 1000.0, stops)
+    bench = Bench(0, None, Limits(current=2000), (-10.0, 10.0), 1000.0, 0.0, stops)
     return judge(bench, SimpleNamespace(truth=truth), intact)
 
 
