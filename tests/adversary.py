@@ -80,7 +80,7 @@ class Bench:
     limits: Limits
     travel: tuple[float, float]  # of the rotor [rad]
     deceleration: float  # of the rotor [rad/s^2]
-    kick: float  # what a quick stop adds to its way, if it begins at full torque, which its velocity loop starts with [rad]
+    kick: float  # what a quick stop from full torque, with which the velocity loop then begins, adds to its way [rad]
     stops: tuple[float, float] | None  # end stops, as `Truth.load` [rad or m]
 
 

@@ -8,6 +8,7 @@ import pytest
 from canopen_wire import Wire
 
 from drive_env import EmulatedDrives
+from drive_env.canopen.error_control import consumers
 from drive_env.canopen.nmt import State
 from drive_env.firmware import fsa
 
@@ -133,6 +134,16 @@ def test_an_entry_that_watches_nobody(wire, entry):
         rx 780  05
         wait 100 ms
     """)
+
+
+@pytest.mark.parametrize("entries", [[0x00070000, 0x00070032], [0x00070032, 0x00070000]])
+def test_of_two_entries_for_one_node_the_one_with_a_time_watches_it(entries):
+    """The other is switched off, as a master leaves it that takes another one for itself."""
+    [one] = consumers(entries)
+    assert one.node_id == 7
+    one.receive(1.0)
+    assert not one.is_lost(1.049)
+    assert one.is_lost(1.050)
 
 
 def test_the_master_s_own_number_may_be_watched_and_switched_off_again(wire):

@@ -352,6 +352,18 @@ PDOMapping=0
 """
 
 
+MAX_PROFILE_VELOCITY = """
+[607F]
+ParameterName=Max profile velocity
+ObjectType=0x7
+DataType=0x0007
+AccessType=rw
+DefaultValue=0
+PDOMapping=0
+;Unit=pps
+"""
+
+
 def test_a_drive_that_would_do_nothing_without_its_master_is_told_to_stop(tmp_path, bus, drive):
     drive.values[0x6007, 0] = (0, 2)
     with CanDrives(eds=foreign(tmp_path, ABORT_CONNECTION), bus=bus) as drives:
@@ -426,3 +438,32 @@ def test_positions_too_coarse_for_a_travel_to_be_watched_are_refused(bus, drive,
             motion.enable(drives, mode="csv")
     with CanDrives(bus=bus, pace="lockstep", safety=Limits(velocity=3 * scale)) as drives:
         motion.enable(drives, mode="csv")  # no travel to watch
+
+
+# --- zero and "off" --------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("window", "stops"), [(0, False), (2**31 - 1, False), (5000, True), (20_000, False)])
+def test_a_following_error_window_of_0_is_no_limit(bus, drive, window, stops):
+    """As every drive has it from its factory that checks none (6065h, CiA 402)."""
+    drive.set(0x6065, window)
+    with CanDrives(bus=bus, pace="lockstep") as drives:
+        motion.enable(drives, mode="csp")
+        drives.advance(0.005)
+        drive.set(0x6062, 10_000)
+        if stops:
+            with pytest.raises(SafetyError, match="the following error is 10000, and its limit is 5000"):
+                drives.advance(0.005)
+        else:
+            drives.advance(0.005)
+
+
+@pytest.mark.parametrize(("own", "limit"), [(0, 100 * TURN), (2**31 - 1, 100 * TURN), (2000, 2000)])
+def test_a_maximum_profile_velocity_of_0_is_no_limit(tmp_path, bus, drive, own, limit):
+    """607Fh at its factory value; 6,000 rpm are taken then."""
+    path = tmp_path / "with 607Fh.eds"
+    text = find_device("tmcm1636").eds.read_text(encoding="utf-8")
+    path.write_text(text + MAX_PROFILE_VELOCITY + ENCODER_RESOLUTION, encoding="utf-8")
+    drive.values |= {(0x607F, 0): (own, 4), (0x608F, 1): (TURN, 4), (0x608F, 2): (1, 4)}
+    with CanDrives(eds=path, bus=bus, pace="lockstep") as drives:
+        drives.write(0x60FF, limit)
+        with pytest.raises(SafetyError, match=f"60FFh.* = {limit + 1} is beyond the limit {limit}"):
+            drives.write(0x60FF, limit + 1)

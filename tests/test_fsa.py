@@ -293,6 +293,7 @@ def test_bits_14_and_15_tell_motion_and_direction(drives):
 SPEED = 600_000  # pps
 SLOW_DOWN, QUICK = 3_000_000, 12_000_000  # pps^2: 200 and 50 ms
 CST_TORQUE = 300  # mA
+LONGEST_STOP = 1.0  # s after the end of the ramp: longer than that no stop holds the power
 STANDS = 65_536  # pps: 60 rpm, one encoder count per window is 73
 
 
@@ -575,3 +576,37 @@ def test_a_wrong_supply_during_a_fault_reaction_cuts_it(drives):
     assert states(drives) == [FAULT, FAULT]
     assert [e.code for e in drives.emergencies()] == [0x8611, 0x3210] * 2
     assert drives.read(0x1001).tolist() == [0x25, 0x25]
+
+
+# --- a stop that never comes to rest --------------------------------------------------------------------------------
+@pytest.mark.parametrize("option", [1, 2, 5, 6])
+def test_a_quick_stop_that_does_not_come_to_rest_is_cut_a_second_after_its_ramp(drives, option):
+    """Without gains nothing brakes: 605Ah = 1 and 2 end without power; 5 and 6 stay, as they are told to."""
+    drives.write(0x605A, option)
+    drives.write(0x6065, 2**31 - 1)
+    run(drives, "pv")
+    for sub in (1, 2):
+        drives.write((0x2042, sub), 0)
+    drives.write(0x6040, 0x02)
+    trace = drives.record(RECORDED, duration=SPEED / RAMPS[option] + LONGEST_STOP + 0.1)
+    seen = [state_of(word) for word in trace[0x6041][:, 0]]
+    if option in STAY_IN_QUICK_STOP:
+        assert set(seen) == {QSA}
+        return
+    end = seen.index(SOD)
+    assert seen == [QSA] * end + [SOD] * (len(seen) - end)
+    assert end * 1e-3 == pytest.approx(SPEED / RAMPS[option] + LONGEST_STOP, abs=0.05)
+    assert abs(int(trace[0x606C][end, 0])) > STANDS
+
+
+def test_a_fault_reaction_that_does_not_come_to_rest_is_cut_a_second_after_its_ramp(drives):
+    drives.machine.set("stage.dc_capacitance", 0.1)
+    run(drives, "pp")
+    drives.write(0x6065, 200)
+    drives.machine.load_torque = -0.30
+    trace = drives.record(RECORDED, duration=SPEED / QUICK + LONGEST_STOP + 0.1)
+    drives.machine.load_torque = 0.0
+    seen = [state_of(word) for word in trace[0x6041][:, 0]]
+    first, end = seen.index(FRA), seen.index(FAULT)
+    assert (end - first) * 1e-3 == pytest.approx(SPEED / QUICK + LONGEST_STOP, abs=0.05)
+    assert abs(int(trace[0x606C][end, 0])) > STANDS
