@@ -48,7 +48,12 @@ def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
         (("rules", "--bus", "--travel", "-1:1"), "will turn. Is its way clear? Nobody is there to ask; say --yes"),
         (("rules", "--load", "brick"), "no load is named 'brick'"),
         (("auto", "--motor", "brick"), "brick"),
-        (("auto", "--node", "1"), "add --bus"),
+        (("auto", "--node", "1"), "--travel is missing"),
+        (("auto", "--channel", "can0"), "--travel is missing"),
+        (("auto", "--interface", "pcan", "--yes"), "--travel is missing"),
+        (("identify", "-c", "can0", "--travel", "-1:1"), "will turn. Is its way clear? Nobody is there to ask"),
+        (("response", "--lockstep"), "--travel is missing"),
+        (("auto", "--axes", "linked"), "add --bus"),
         (("auto", "--bus", "--yes"), "--travel is missing"),
     ],
 )

@@ -101,7 +101,7 @@ def swing(share, lasting):
         (swing(0.12, 0.2), RAMP, "", 0.3, 0.4),
         (swing(-0.4, 0.2), RAMP, "it does not slow down as its ramp says", 0.1, 0.25),  # on again, not back
         (swing(0.4, 0.2), RAMP, "it does not slow down as its ramp says", 0.1, 0.22),
-        (down(RAMP, to=-0.15 * SPEED), RAMP, "it does not slow down as its ramp says", 0.37, 0.42),  # it stays there
+        (down(RAMP, to=-0.1 * SPEED), RAMP, "it does not slow down as its ramp says", 0.22, 0.28),  # it stays there
     ],
 )
 def test_an_axis_keeps_its_voltage_while_it_slows_down(speed, ramp, why, earliest, latest):

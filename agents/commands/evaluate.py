@@ -25,7 +25,7 @@ from agents.commands.options import (
     print_json,
     progress_bar,
 )
-from drive_env.tools.options import Yes
+from drive_env.tools.options import Yes, was_typed
 from tuning.commands.options import ask_to_turn
 
 EMULATOR = "emulator"
@@ -124,10 +124,10 @@ def evaluate(
         if card:
             _tell_card(policy, json)
             return
-        on_bus = any(_was_typed(context, one) for one in BUS_OPTIONS)
+        on_bus = any(was_typed(context, one) for one in BUS_OPTIONS)
         if lockstep and not on_bus and gap is None:
             raise ValueError("--lockstep is of a bus; give its --channel, or --gap")
-        if gap is not None and (extra := [one for one in NOT_OF_A_GAP if _was_typed(context, one)]):
+        if gap is not None and (extra := [one for one in NOT_OF_A_GAP if was_typed(context, one)]):
             raise ValueError(f"--gap serves machines of its own, an episode each; leave --{extra[0]} out")
         recording = None if replay is None or replay.suffix.lower() == ".csv" else _recording(replay)
         recorded = None if recording is None else recording.environment
@@ -369,12 +369,6 @@ def _guard(environment: str, stall: float | None, saturation: float | None) -> A
 
     given = {"stall": stall, "saturation": saturation}
     return replace(LIMITS[environment], **{name: value or None for name, value in given.items() if value is not None})
-
-
-def _was_typed(context: typer.Context, name: str) -> bool:
-    """Return whether an option stands on the command line: one in the environment must turn no motor by surprise."""
-    source = context.get_parameter_source(name)
-    return source is not None and source.name == "COMMANDLINE"
 
 
 def _tell(

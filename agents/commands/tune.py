@@ -24,7 +24,7 @@ from agents.commands.options import (
     new_folder,
     print_json,
 )
-from drive_env.tools.options import DeviceName, Yes, look_first
+from drive_env.tools.options import DeviceName, Yes, look_first, names_a_bus
 from tuning.commands.options import MotorName, Supply, TravelRange, ask_to_turn
 
 MOST_TRIALS = 10_000
@@ -75,7 +75,7 @@ def tune(
         from agents.policy import load_policy
         from agents.shipped import find_agent
 
-        bus = _is_of_a_bus(context)
+        bus = names_a_bus(context)
         if bus and seed is not None:
             raise ValueError("--seed draws an emulated machine; leave it out on a bus")
         if trials is not None and not 1 <= trials <= MOST_TRIALS:
@@ -104,12 +104,6 @@ def tune(
                 ask_to_turn(node, yes)
             result = _run(target, policy, folder, agent, store, json)
         _report(result, folder, json, bus)
-
-
-def _is_of_a_bus(context: typer.Context) -> bool:
-    """Return whether the command line says anything of a bus; variables of the environment alone do not."""
-    given = (context.get_parameter_source(name) for name in ("interface", "channel", "node", "bitrate", "lockstep"))
-    return any(source is not None and source.name == "COMMANDLINE" for source in given)
 
 
 @contextmanager

@@ -17,11 +17,11 @@ ANSWER = 0.1  # s within which a drive must have begun its ramp
 GRACE = 0.02  # s from the command to a slower axis: the bus, the drive's cycle, the loops
 SHARE = 0.5  # of the ramp's deceleration that counts as slowing down as it says
 LONGEST = 1.0  # s; whoever would stand by then at the present deceleration is slowing down well, too
-# Measurements of the deceleration, one after the other, that must be too low: a loop that was at its limit of current
-# goes on as before until the ramp has come down to the speed that there is.
+# Measurements of the deceleration, one after the other, that must be too low before one was enough: a loop that was at
+# its limit of current goes on as before until the ramp has come down to the speed that there is.
 MEASUREMENTS = 2
 # A loop whose integral has wound up takes an axis past rest and brings it back: so much of its speed, for so long [s].
-SWING_SHARE, SWING_TIME = 0.25, 0.25
+SWING_SHARE, SWING_TIME = 0.15, 0.1
 RAMP_TIMEOUT = 2.0  # s for the whole ramp
 SETTLED = 0.02  # s for which samples must show an axis at rest
 BLIND = 0.4  # s without a sample, after which the ramp is taken to be over
@@ -71,7 +71,7 @@ class AxisStop:
         self._sent: float | None = None
         self._seen = now
         self._check: Sample | None = None
-        self._too_low = 0  # measurements of the deceleration in a row
+        self._too_low, self._most = 0, MEASUREMENTS  # measurements of the deceleration in a row; once it brakes, one
         self.holds = holds
 
     @property
@@ -158,8 +158,11 @@ class AxisStop:
             return True
         rate = (abs(self._check.speed) - abs(sample.speed)) / span
         self._check = sample
-        self._too_low = 0 if rate * LONGEST >= abs(sample.speed) else self._too_low + 1
-        return self._too_low < MEASUREMENTS
+        if rate * LONGEST >= abs(sample.speed):
+            self._too_low, self._most = 0, 1
+            return True
+        self._too_low += 1
+        return self._too_low < self._most
 
     def _enter(self, phase: Phase, now: float) -> None:
         self.phase, self._since, self._sent = phase, now, None if phase is Phase.CUT else self._sent

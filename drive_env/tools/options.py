@@ -53,6 +53,21 @@ Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 _INDEX = re.compile(r"^(?:0x)?([0-9a-f]{4})h?(?:[:.]([0-9a-f]{1,2})h?)?$", re.IGNORECASE)
 
 
+# Whoever types one of these means drives on a bus.
+OF_A_BUS = ("interface", "channel", "node", "nodes", "bitrate", "lockstep")
+
+
+def was_typed(context: typer.Context, name: str) -> bool:
+    """Return whether an option stands on the command line: one in the environment must turn no motor by surprise."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def names_a_bus(context: typer.Context) -> bool:
+    """Return whether the command line names a bus or a node of it."""
+    return any(was_typed(context, name) for name in OF_A_BUS)
+
+
 def object_name(text: str) -> ObjectName:
     """Return how the dictionary is asked for an object written as 6041, 0x6041, 607D:1 (hexadecimal) or name."""
     found = _INDEX.match(text.strip())

@@ -24,7 +24,7 @@ from drive_env.tools.options import Json as Json
 from drive_env.tools.options import Nodes as Nodes
 from drive_env.tools.options import Yes as Yes
 from drive_env.tools.options import ask as ask
-from drive_env.tools.options import ending_by
+from drive_env.tools.options import ending_by, names_a_bus
 from drive_env.tools.options import print_json as print_json
 from drive_env.tools.options import progress_on as progress_on
 
@@ -40,7 +40,14 @@ MotorName = Annotated[str, typer.Option("--motor", help="Motor by name; its data
 LoadName = Annotated[str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF.")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random, 0 or more.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results, new or empty.")]
-Bus = Annotated[bool, typer.Option("--bus", help="Use the drives on a bus, inside the safety envelope.")]
+Bus = Annotated[
+    bool,
+    typer.Option(
+        "--bus",
+        help="Use the drives on a bus, inside the safety envelope; --interface, --channel, --node, --bitrate and "
+        "--lockstep say so, too. What stands in the environment does not.",
+    ),
+]
 Lockstep = Annotated[bool, typer.Option("--lockstep", help="Let time pass by SYNC, for an emulator that is served so.")]
 Supply = Annotated[
     float | None,
@@ -119,7 +126,10 @@ class TargetOptions(DriveOptions):
 
 
 def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command these options beside its own; it gets them together, as its argument `drive`."""
+    """Give a command these options beside its own; it gets them together, as its argument `drive`.
+
+    Whoever types an option of a bus means the bus.
+    """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(options, include_extras=True)
@@ -131,12 +141,15 @@ def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callab
         mine = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for name, p in own.items() if name != "drive"]
 
         @wraps(command)
-        def run(**given: Any) -> None:
+        def run(context: typer.Context, **given: Any) -> None:
+            given["bus"] |= names_a_bus(context)
             chosen = options(**{p.name: given.pop(p.name) for p in shared})
             command(drive=chosen, **given)
 
-        run.__signature__ = inspect.Signature([*mine, *shared])  # type: ignore[attr-defined]  # what typer reads
-        run.__annotations__ = {p.name: p.annotation for p in (*mine, *shared)}
+        context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+        taken = [context, *mine, *shared]
+        run.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]  # what typer reads
+        run.__annotations__ = {p.name: p.annotation for p in taken}
         return run
 
     return decorate
