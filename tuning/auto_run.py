@@ -15,6 +15,7 @@ from drive_env.gains import GAIN_OBJECTS, Gains
 from drive_env.positioning import POSITION, wrapped
 from tuning.auto_result import AxisRun, Result
 from tuning.ladder import OTHERS
+from tuning.stop_causes import stop_causes
 
 if TYPE_CHECKING:
     from tuning.measured_loop import MeasuredLoop
@@ -135,14 +136,8 @@ class Run:
         drives = self.target.drives
         mask, value = motion.FAULT_BIT
         faulted = self.going & (drives.read(0x6041) & mask == value)
-        names: dict[int, list[str]] = {}
-        for message in drives.emergencies():
-            if message.code:
-                names.setdefault(message.axis, []).append(message.name)
-        return {
-            axis: ", ".join(dict.fromkeys(names.get(axis, []))) or "no emergency told why"
-            for axis in map(int, np.flatnonzero(faulted))
-        }
+        causes = stop_causes(drives)
+        return {axis: causes[axis] for axis in map(int, np.flatnonzero(faulted))}
 
     def drop_faults(self, meanwhile: str) -> None:
         """Take out axes that went into fault, and say which."""

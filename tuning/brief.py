@@ -23,6 +23,7 @@ from tuning.experiments import MECHANICS, PULSED, RESPONSE, UNITS, WORST_MISFIT,
 from tuning.frequency_response import measure
 from tuning.identification import NAMES, Estimate, Identification, Progress, refused
 from tuning.oscillation_watch import shaken
+from tuning.stop_causes import stop_causes
 from tuning.target import Target
 from tuning.winding import BRIEFLY, identify_winding, pulse, to_torque_mode
 from tuning.working_state import GUESS, STATUS, Working, cautious_gains, enable, switch_off
@@ -122,8 +123,9 @@ class _Brief(Experiments):
         target, drives = working.target, working.target.drives
         fault = drives.read(STATUS) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1]
         able = working.where & ~fault
+        causes = stop_causes(drives) if fault.any() else []
         for k in map(int, np.flatnonzero(working.where & fault)):
-            self._no_response(k, "the drive is in fault; see its emergencies")
+            self._no_response(k, f"the drive is in fault: {causes[k]}")
         if not able.any():
             return
         write_gains(drives, self.response_gains(working, inertia), able)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.identification import Estimate, refused
+from tuning.stop_causes import stop_causes
 from tuning.working_state import (
     BY_FIELD,
     COMMUTATION,
@@ -89,13 +90,14 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
     # Counting up is the field's direction unless 2057h turns the sign of positions around.
     shaft = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
     found = []
+    causes = [] if alive.all() else stop_causes(drives)
     for k in range(count):
         if not where[k] or reasons[k]:
             found.append(EncoderCheck(refused("1", reasons[k]), refused("1", reasons[k])))
         elif not alive[k]:
             reason = (
-                "the axis was switched off while the field turned: it left its travel, or the drive did it itself; "
-                "see its emergencies"
+                "the axis was switched off while the field turned: it left its travel, or the drive did it itself "
+                f"({causes[k]})"
             )
             found.append(EncoderCheck(refused("1", reason), refused("1", reason)))
         else:

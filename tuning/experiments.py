@@ -16,6 +16,7 @@ from tuning.identification import NAMES, Estimate, Identification, Progress, ref
 from tuning.inertia import Mechanics, identify_mechanics
 from tuning.oscillation_watch import OscillationError, WatchedDrives, shaken
 from tuning.standstill import standstill_resistances
+from tuning.stop_causes import stop_causes
 from tuning.target import Target, timed
 from tuning.winding import Winding, identify_winding, pulse, to_torque_mode
 from tuning.working_state import (
@@ -176,8 +177,9 @@ class Experiments:
         drives = working.target.drives
         trace = drives.record([CURRENT], HOLD * CYCLE)
         alive = still_enabled(working, drives.read(STATUS))
+        causes = [] if alive.all() else stop_causes(drives)
         for k in np.flatnonzero(working.where & ~alive):
-            self.refuse(int(k), NAMES[4:], "the drive switched off while it held the axis; see its emergencies")
+            self.refuse(int(k), NAMES[4:], f"the drive switched off while it held the axis: {causes[k]}")
         return np.asarray(trace[CURRENT][-STEADY:].mean(axis=0) * 1e-3)
 
     def take_windings(self, working: Working, windings: list[Winding]) -> None:
@@ -205,9 +207,10 @@ class Experiments:
         go_back(working, "csv")
         able = working.where & still_enabled(working, drives.read(STATUS))
         down, up = working.room()
+        causes = [] if able.all() else stop_causes(drives)
         for k in np.flatnonzero(working.where):
             if not able[k]:
-                self.refuse(int(k), RESPONSE, "the drive switched off; see its emergencies")
+                self.refuse(int(k), RESPONSE, f"the drive switched off: {causes[k]}")
             elif max(up[k], -down[k]) < LEAST_ROOM:
                 able[k] = False
                 self.refuse(int(k), RESPONSE, (

@@ -26,6 +26,7 @@ from tuning.measured_loop import COHERENT, GOOD_MISFIT, MeasuredLoop, merged
 from tuning.oscillation_watch import OscillationError, shaken
 from tuning.plant_fit import PlantFit, Seen, fit_plant
 from tuning.shaking import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
+from tuning.stop_causes import stop_causes
 from tuning.target import timed
 from tuning.transfer import directions, transfer
 
@@ -56,6 +57,7 @@ CONFIRMING, LESS = 6, 0.5  # passes of one that is confirmed, and the share of i
 TRIAL_SPEED, TRIAL_CURRENT = 0.1, 0.4
 SPEED, CURRENT = 0.45, 0.9
 TRIAL_SWING, SWING = 0.42, 0.65  # RMS over 25 ms, beyond which it is not the shaking but an oscillation
+RETURN_SHARE = 0.5  # of the speed from which the DC link holds what a stop gives back
 IN_RAMP = 0.5  # of what the shaking takes, for changing the speed
 TRAVEL = 0.85
 OVER_NOISE = 5.0  # least RMS of the shaken velocity over the encoder's noise, also where the motion then reverses
@@ -162,6 +164,7 @@ class _Measurement:
         self._device: Device = target.device
         self._notes: list[list[str]] = [[] for _ in range(target.num_axes)]
         self._where = where
+        self._stoppable: Floats = np.full(target.num_axes, np.inf)  # speed from which the DC link bears a stop [rad/s]
 
     def run(self, progress: Callable[[float], object]) -> MeasuredLoop:
         target = self._target
@@ -179,6 +182,7 @@ class _Measurement:
                 rough = transfer(trial.set_point, trial.answer, self._lines)[0]
                 room = np.abs(room) - speed * _duration(1, self._lines)
                 amplitude, speed = self._amplitude(rough, trial, room, limit)
+                shaker.fastest = np.minimum(shaker.fastest, RETURN_SHARE * self._stoppable)
                 less = None
                 with shaken(counted.drives, SWING * limit):
                     seen = shaker.run(amplitude, sign * speed, self._passes, PERIODS, traced=self._traced)
@@ -186,8 +190,10 @@ class _Measurement:
                     if self._confirmed:
                         less = shaker.run(LESS * amplitude, sign * speed, self._passes, PERIODS)
         self._drive_time = clock.seconds + shaker.traced_time
-        for axis in np.flatnonzero(where & ~seen.enabled):
-            self._notes[axis].append("the drive stopped while it was shaken; see its emergencies")
+        stopped = where & ~seen.enabled
+        causes = stop_causes(target.drives) if stopped.any() else []
+        for axis in np.flatnonzero(stopped):
+            self._notes[axis].append(f"the drive stopped while it was shaken: {causes[axis]}")
         self._note_limits(seen.peak_current, where)
         result = self._evaluate(seen, less, where & seen.enabled)
         progress(1.0)
@@ -249,7 +255,13 @@ class _Measurement:
         way = peak(self._kind, lines, amplitude, gain / omega)
         flowing, shaken = (peak(self._kind, lines, amplitude, answer) for answer in (current, gain))
         tiny = np.finfo(float).tiny
-        shares = [available / (flowing + tiny), largest / (shaken + tiny), 0.5 * np.maximum(room, 1e-9) / (way + tiny)]
+        # A stop gives back J w^2 / 2, and a swing 2 J w dw, which the DC link must hold; losses come on top.
+        energy = self._link_energy() / (self._target.motor.torque_constant / mobility)
+        self._stoppable, returned = np.sqrt(2.0 * energy), np.sqrt(energy / (2.0 * 1.1))
+        shares = [
+            available / (flowing + tiny), largest / (shaken + tiny), 0.5 * np.maximum(room, 1e-9) / (way + tiny),
+            returned / (shaken + tiny),
+        ]  # fmt: skip
         fits = np.min(shares, axis=0)
         amplitude, shaken = amplitude * fits, shaken * fits
         speed = np.minimum(1.1 * shaken, fastest)
@@ -257,6 +269,11 @@ class _Measurement:
             why = "its way is too short" if by_way[axis] <= fastest[axis] else "its loop or its limits are too tight"
             self._notes[axis].append(f"{why} for a steady speed: the motion reversed, friction is part of the response")
         return amplitude, speed
+
+    def _link_energy(self) -> Floats:
+        """Return what the DC link takes until the drive cuts its stage [J], by the least capacitance of its class."""
+        device = self._device
+        return np.asarray(0.5 * device.stage["dc_capacitance"].low * (device.overvoltage**2 - self._target.supply**2))
 
     def _current_gain(self) -> Complex:
         """Return demanded current per velocity of the set-point, the loop being open, complex (n, axes)."""

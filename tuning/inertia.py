@@ -24,6 +24,7 @@ from drive_env.parameters import velocity_filter
 from tuning.confidence import gain_error, interval, t_quantile
 from tuning.identification import Estimate, refused
 from tuning.oscillation_watch import SOFTER, VELOCITY_I, VELOCITY_P, OscillationError
+from tuning.stop_causes import stop_causes
 from tuning.target import Target
 from tuning.working_state import (
     CURRENT,
@@ -254,9 +255,10 @@ def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked:
 
         moves, angle, current, alive, gains = _moved(working, plan, cautious_gains(target, inertia), softness)
         results = []
+        causes = [] if alive.all() else stop_causes(target.drives)
         for k in range(target.num_axes):
             if not alive[k]:
-                results.append(_none("the drive switched off during the moves; see its emergencies"))
+                results.append(_none(f"the drive switched off during the moves: {causes[k]}"))
                 continue
             found, rough = _balance(working, k, angle[:, k], current[:, k], moves, gains[k])
             results.append(found)

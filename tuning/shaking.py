@@ -77,6 +77,7 @@ class Shaker:
         self._lines, self._kind = lines, kind
         self.radians = 2.0 * math.pi / np.maximum(np.asarray(self._drives.read(POSITION_SCALER), float), 1.0)
         self.traced_time = 0.0  # s that passed in traces, which a target's clock does not see
+        self.fastest = np.full(target.num_axes, 0.4 * target.speed)  # on the way back [rad/s]
 
     def __enter__(self) -> Shaker:
         drives, where = self._drives, self._where
@@ -206,8 +207,7 @@ class Shaker:
         off = wrapped(drives.read(POSITION) - self._origin) * self.radians * where * BACK
         if np.abs(off).max() < NEAR:
             return
-        fastest = 0.4 * self._target.speed
-        cycles = max(RETURN, math.ceil(float(np.abs(off).max()) * 2.0 / fastest / CYCLE))
+        cycles = max(RETURN, math.ceil(float((np.abs(off) / self.fastest).max()) * 2.0 / CYCLE))
         t = (np.arange(cycles) + 0.5) / cycles
         shape = (1.0 - np.cos(2.0 * math.pi * t))[:, None]
         velocity = -off / (cycles * CYCLE) * shape

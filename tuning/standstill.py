@@ -17,6 +17,7 @@ from tuning.confidence import gain_error, interval, t_quantile
 from tuning.dead_time import dead_time
 from tuning.encoder_check import FIELD_ANGLE, able, stay_inside
 from tuning.identification import Estimate, refused
+from tuning.stop_causes import stop_causes
 from tuning.winding import SUPPLY_IDLE, WIDEST
 from tuning.working_state import (
     BY_FIELD,
@@ -79,10 +80,11 @@ def standstill_resistances(working: Working) -> list[Estimate]:
         drives.write(OPEN_LOOP_CURRENT, 0, where=where)
         drives.write(COMMUTATION, commutation, where=where)
     found = []
+    causes = [] if alive.all() else stop_causes(drives)
     for k in range(target.num_axes):
         reason = reasons[k]
         if where[k] and not alive[k]:
-            reason = "the drive switched off while its current stood; see its emergencies"
+            reason = f"the drive switched off while its current stood: {causes[k]}"
         elif where[k] and np.ptp(angles[:, k]) * target.motor.n_p > MOST_TURN:
             reason = "the rotor did not stay where its current holds it: it slipped from the field"
         elif where[k] and np.any(np.abs(errors[:, k]) > MOST_ERROR * currents[:, k]):

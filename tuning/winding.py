@@ -24,6 +24,7 @@ from drive_env import motion
 from tuning.confidence import gain_error, interval, t_quantile
 from tuning.dead_time import dead_time
 from tuning.identification import Estimate, refused
+from tuning.stop_causes import stop_causes
 from tuning.working_state import (
     CURRENT,
     CYCLE,
@@ -152,10 +153,12 @@ def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats,
             f"ms instead of {1e3 * CYCLE:g}: in real time they are not in step with the current; the inductance "
             "needs an emulator in lockstep (--lockstep) or a faster bus, or take the data sheet's"
         )] * working.target.num_axes  # fmt: skip
+    able = working.where & pulses.alive
+    causes = [] if able.all() else stop_causes(working.target.drives)
     return [
         _winding(working, _of_axis(pulses, k), k, float(electrical_angle[k]), pole_pairs)
-        if working.where[k] and pulses.alive[k]
-        else _none("the drive switched off during the current pulses; see its emergencies")
+        if able[k]
+        else _none(f"the drive switched off during the current pulses: {causes[k]}")
         for k in range(working.target.num_axes)
     ]
 

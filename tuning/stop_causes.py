@@ -1,0 +1,18 @@
+"""Why drives switched themselves off: what their emergencies say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def stop_causes(drives: Any) -> list[str]:
+    """Return what each axis of the drives has told since its emergencies were read last, most important for a message.
+
+    Returns:
+        A text for each axis: "undervoltage (3220h), ..." in the order of the emergencies, or that there was none.
+    """
+    told: list[dict[str, None]] = [{} for _ in range(drives.num_axes)]
+    for message in drives.emergencies():
+        if message.code:
+            told[message.axis][f"{message.name} ({message.code:04X}h)"] = None
+    return [", ".join(axis) or "no emergency told why" for axis in told]
