@@ -178,11 +178,22 @@ def test_a_service_takes_its_signature(run):
     assert (code, "node 1 refused the write of 5 to 1010h:03" in error) == (REFUSED, True), error
 
 
-def test_a_dry_run_shows_the_frames_and_changes_nothing(run, shared):
+def test_a_dry_run_reads_what_is_says_what_would_be_and_changes_nothing(run, shared):
+    machine = shared[1][0]
+    before = {name: machine.read(name).tolist() for name in (0x6040, 0x6060, 0x6064, 0x6081, 0x60FF)}
     code, out, _ = run("set", "6081", "4660", "--dry-run")
     assert code == DONE
-    assert "601   [8]  23 81 60 00 34 12 00 00" in out
-    assert shared[1][0].read(0x6081) == [2_184_533]
+    assert "6081h:00 Profile velocity is 2184533 pps" in out
+    assert "4660 pps" in out and "would be written; nothing was" in out
+    assert run("set", "6081", "-1", "--dry-run")[0] == USER_ERROR
+    assert json.loads(run("set", "6081", "4660", "--dry-run", "--json")[1])[0] | {"node": 0} == {
+        "node": 0, "object": "6081h:00", "is": 2_184_533, "would be": 4660,
+    }  # fmt: skip
+    code, out, _ = run("jog", "60 rpm", "--for", "2", "--dry-run")
+    assert code == DONE
+    assert "would be enabled, turn at 60 rpm for 2 s, and be switched off again; nothing was done" in out
+    assert "moved" not in out
+    assert {name: machine.read(name).tolist() for name in before} == before
 
 
 @pytest.mark.parametrize(

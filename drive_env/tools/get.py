@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,12 +12,12 @@ from drive_env.tools.options import (
     Bitrate,
     Channel,
     DeviceName,
-    DryRun,
     Eds,
     Interface,
     Json,
     Nodes,
     Timeout,
+    WouldDo,
     Yes,
     ask,
     axis_name,
@@ -25,9 +26,14 @@ from drive_env.tools.options import (
     errors_as_exit_codes,
     fail,
     increments_per_revolution,
+    look_first,
     object_name,
     print_json,
 )
+
+if TYPE_CHECKING:
+    from drive_env.can_drives import CanDrives
+    from drive_env.dictionary.entries import Entry
 
 CONTROLWORD, STATUSWORD = 0x6040, 0x6041
 Raw = Annotated[bool, typer.Option("--raw", help="Integers as the wire carries them, without units.")]
@@ -76,7 +82,7 @@ def set_object(
     raw: Raw = False,
     yes: Yes = False,
     json: Json = False,
-    dry_run: DryRun = False,
+    dry_run: WouldDo = False,
 ) -> None:
     """Write an object over SDO, read it back and show what it is now.
 
@@ -86,8 +92,11 @@ def set_object(
     from drive_env.master import quantities
     from drive_env.master.parameters import command, of_first_axis
 
-    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "dry_run": dry_run, "safety": False}
-    with errors_as_exit_codes(), connect(interface, channel, node, device, eds, **options) as drives:
+    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
+    with errors_as_exit_codes(), ExitStack() as stack:
+        if dry_run:
+            look_first(interface, channel, node or [1], bitrate, device, eds, timeout)
+        drives = stack.enter_context(connect(interface, channel, node, device, eds, **options))
         entry = drives.description.dictionary.find(object_name(name))
         is_controlword = of_first_axis(entry.index) == CONTROLWORD
         # A controlword has no unit, and one that stops is not kept waiting for what one would need.
@@ -100,7 +109,10 @@ def set_object(
             ]
         if is_controlword:
             _refuse_to_enable(entry, wanted[0])
-        elif not dry_run:
+        if dry_run:
+            _tell_plan(drives, entry, wanted, increments, value, raw=raw, json=json)
+            return
+        if not is_controlword:
             _ask_where_live(drives, f"{entry.label} = {value}", yes)
         drives.write((entry.index, entry.sub), wanted if drives.description.is_number(entry) else value)
         rows = []
@@ -113,10 +125,35 @@ def set_object(
         else:
             for axis, _, now, scale in rows:
                 print(f"{axis_name(drives, axis)}  {entry.label} = {_text(now, entry, scale, raw)}")
-        differs = readable and not dry_run and any(a != b for a, b in zip(found, wanted, strict=True))
+        differs = readable and any(a != b for a, b in zip(found, wanted, strict=True))
         # Stores and the like take a signature and read something else.
         if differs and not command(entry.index).endswith("a service"):
             fail(f"{entry.label} does not read back as it was written ({wanted[0]})", REFUSED)
+
+
+def _tell_plan(
+    drives: CanDrives, entry: Entry, wanted: list[Any], increments: list[Any], text: str, *, raw: bool, json: bool
+) -> None:
+    """Say what the drive has, and what would be written; raises for a value that the object cannot take."""
+    from drive_env.dictionary.access import check_limits, check_writable
+
+    check_writable(entry)
+    is_number = drives.description.is_number(entry)
+    for one in wanted if is_number else []:
+        check_limits(entry, one)
+    found = drives.read((entry.index, entry.sub)) if entry.access != "wo" else [None] * drives.num_axes
+    if json:
+        rows = [
+            axis_place(drives, axis) | {"object": f"{entry.index:04X}h:{entry.sub:02X}", "is": found[axis],
+                                        "would be": wanted[axis]}
+            for axis in range(drives.num_axes)
+        ]  # fmt: skip
+        print_json(rows)
+        return
+    for axis, scale in enumerate(increments):
+        now = "" if found[axis] is None else f" is {_text(found[axis], entry, scale, raw)};"
+        then = _text(wanted[axis], entry, scale, raw) if is_number else text
+        print(f"{axis_name(drives, axis)}  {entry.label}{now} {then} would be written; nothing was")
 
 
 def _refuse_to_enable(entry: Any, controlword: int) -> None:

@@ -10,20 +10,21 @@ from drive_env.tools.options import (
     Bitrate,
     Channel,
     DeviceName,
-    DryRun,
     Eds,
     Interface,
     Json,
     Timeout,
+    WouldDo,
     connect,
     errors_as_exit_codes,
     increments_per_revolution,
+    look_first,
     print_json,
 )
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 TARGET_VELOCITY, PROFILE_VELOCITY, TARGET_POSITION, POSITION = 0x60FF, 0x6081, 0x607A, 0x6064
-ACCELERATION = 0x6083
+ACCELERATION, STATUSWORD = 0x6083, 0x6041
 
 
 def jog(
@@ -41,7 +42,7 @@ def jog(
         str | None, typer.Option(help="Limit of the current, which the drive holds; by default the drive's own.")
     ] = None,
     json: Json = False,
-    dry_run: DryRun = False,
+    dry_run: WouldDo = False,
 ) -> None:
     """Enable an axis, turn it for a while or by a distance, and switch it off again.
 
@@ -61,7 +62,9 @@ def jog(
             raise ValueError(f"--max-current {max_current} must be above 0 A; leave it out for the drive's own limit")
         if not 0.001 <= duration <= 3600.0:
             raise ValueError(f"--for {duration:g} s must be at least 0.001 s and at most an hour")
-        options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "dry_run": dry_run}
+        options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout}
+        if dry_run:
+            look_first(interface, channel, [node], bitrate, device, eds, timeout)
         with connect(interface, channel, [node], device, eds, safety=Limits(current=current), **options) as drives:
             scale = increments_per_revolution(drives)[0]
             velocity = quantities.parse(speed, known.find(TARGET_VELOCITY), scale)
@@ -71,12 +74,15 @@ def jog(
             # Told before the axis is enabled.
             check_limits(known.find(TARGET_VELOCITY), velocity)
             check_limits(known.find(TARGET_POSITION), distance or 0)
-            if drives.description.has(ACCELERATION) and not dry_run and int(drives.read(ACCELERATION)[0]) == 0:
+            if drives.description.has(ACCELERATION) and int(drives.read(ACCELERATION)[0]) == 0:
                 raise ValueError(
                     "the drive's profile acceleration 6083h is 0, so nothing would move; set it "
                     "(drive-env set 6083 '500 rev/s^2'), or commission the drive"
                 )
             start = int(drives.read(POSITION)[0])
+            if dry_run:
+                _tell_plan(motion, drives, speed, by, duration, start, scale, json=json)
+                return
             if distance is None:
                 _turn(motion, drives, velocity, round(duration, 3))
             else:
@@ -91,6 +97,35 @@ def jog(
             print(f"node {node} moved by {quantities.show(moved, known.find(POSITION), scale)}")
             for message in emergencies:
                 print(f"emergency {message['code']:04X}h {message['name']}")
+
+
+def _tell_plan(
+    motion: Any,
+    drives: Any,
+    speed: str,
+    by: str | None,
+    duration: float,
+    start: int,
+    scale: float | None,
+    *,
+    json: bool,
+) -> None:
+    """Say where the axis is and what would be done; raises for one in fault, which could not be enabled."""
+    from drive_env.master import quantities
+
+    status = int(drives.read(STATUSWORD)[0])
+    mask, fault = motion.FAULT_BIT
+    if status & mask == fault:
+        raise RuntimeError(f"the drive is in fault ({status:04X}h) and would not be enabled; reset it first")
+    what = f"turn at {speed} for {duration:g} s" if by is None else f"turn by {by} at {speed}"
+    if json:
+        print_json({"would": what, "start": start, "statusword": status, "moved": 0})
+        return
+    here = quantities.show(start, drives.description.dictionary.find(POSITION), scale)
+    print(
+        f"node {drives.nodes[0]} is at {here} ({status:04X}h) and would be enabled, {what}, and be switched off again; "
+        "nothing was done"
+    )
 
 
 def _turn(motion: Any, drives: Any, velocity: int, duration: float) -> None:

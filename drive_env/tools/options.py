@@ -44,6 +44,7 @@ DeviceName = Annotated[str, typer.Option("--device", help="Drive by name.")]
 Eds = Annotated[Path | None, typer.Option("--eds", help="EDS of any other CiA 402 drive, in place of --device.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the frames and send none.")]
+WouldDo = Annotated[bool, typer.Option("--dry-run", help="Read the drive and say what would be done; change nothing.")]
 Timeout = Annotated[
     float | None,
     typer.Option(envvar="DRIVE_ENV_TIMEOUT", help="Longest wait for an answer [s].", show_default="the device's, 0.5"),

@@ -20,6 +20,7 @@ from drive_env.tools.options import (
     Interface,
     Json,
     Timeout,
+    WouldDo,
     Yes,
     ask,
     check_free,
@@ -45,7 +46,6 @@ OtherDrive = Annotated[
 Unchecked = Annotated[
     bool, typer.Option("--unchecked", help="Take a file that was changed, or that has no check sum: you have read it.")
 ]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Read the drive and say what would be written; write nothing.")]
 SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 
 
@@ -137,7 +137,7 @@ def restore(
     unchecked: Unchecked = False,
     yes: Yes = False,
     json: Json = False,
-    dry_run: DryRun = False,
+    dry_run: WouldDo = False,
 ) -> None:
     """Write a file's parameters to a drive, all or none: what was written is read back, or else taken back.
 
@@ -177,7 +177,7 @@ def commission(
     store: Store = False,
     yes: Yes = False,
     json: Json = False,
-    dry_run: DryRun = False,
+    dry_run: WouldDo = False,
 ) -> None:
     """Write a motor's preset to a drive: motor, encoder, current limit, gains and profile; shows the difference first.
 
