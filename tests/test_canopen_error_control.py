@@ -246,6 +246,29 @@ def test_life_guarding(wire):
     assert wire.value(0x6041) & 0x4F == 0x08
 
 
+@pytest.mark.parametrize("between", ["2B 0C 10 00 00 00 00 00", "2B 0C 10 00 14 00 00 00"], ids=["off", "longer"])
+def test_life_guarding_configured_a_second_time_waits_for_its_first_request(wire, between):
+    assert wire.download(0x100D, 0, 3, 1) == 0
+    wire.play(f"""
+        rx 605  2B 0C 10 00 0A 00 00 00   # 10 ms, three times
+        tx 585  60 0C 10 00 00 00 00 00
+        rx 705  RTR
+        tx 705  7F
+        wait 20 ms
+        rx 605  {between}
+        tx 585  60 0C 10 00 00 00 00 00
+        wait 100 ms
+        rx 605  2B 0C 10 00 0A 00 00 00   # the second master
+        tx 585  60 0C 10 00 00 00 00 00
+        wait 100 ms                       # no 8130h: it has not asked yet
+        rx 705  RTR
+        tx 705  FF
+        wait 30 ms
+        wait 1 ms
+        tx 085  30 81 11 00 FF 00 00 00
+    """)
+
+
 @pytest.mark.parametrize(("time", "factor"), [(0, 3), (10, 0)])
 def test_no_life_guarding_without_time_or_factor(wire, time, factor):
     assert wire.download(0x100C, 0, time, 2) == 0

@@ -401,8 +401,18 @@ def test_bit_30_reads_1_whatever_is_written(wire):
 )
 @pytest.mark.parametrize("index", [0x1400, 0x1800])
 def test_restricted_identifiers_are_refused(wire, index, can_id):
+    assert wire.download(index, 1, can_id | 1 << 30, 4) == 0x0609_0030  # in use, and off
     configure(wire, index, 1, wire.value(index, 1) | 1 << 31, 4)
     assert wire.download(index, 1, can_id | 1 << 30, 4) == 0x0609_0030
+
+
+@pytest.mark.parametrize("can_id", [0x001, 0x180, 0x605, 0x701])
+def test_a_restricted_identifier_of_emergencies_is_refused(wire, can_id):
+    before = wire.value(0x1014)
+    assert wire.download(0x1014, 0, can_id, 4) == 0x0609_0030  # in use
+    assert wire.value(0x1014) == before
+    configure(wire, 0x1014, 0, before | 1 << 31, 4)
+    assert wire.download(0x1014, 0, can_id, 4) == 0x0609_0030  # off
 
 
 def test_two_rpdos_on_one_identifier(wire):
@@ -470,9 +480,10 @@ def test_a_mapping_of_nothing_sends_nothing_and_takes_an_empty_frame(wire):
     """)
 
 
-UNSUPPORTED, NO_OBJECT, NOT_MAPPABLE, TOO_MUCH, TOO_HIGH = (
+UNSUPPORTED, NO_OBJECT, NO_SUB_INDEX, NOT_MAPPABLE, TOO_MUCH, TOO_HIGH = (
     0x0601_0000,
     0x0602_0000,
+    0x0609_0011,
     0x0604_0041,
     0x0604_0042,
     0x0609_0031,
@@ -490,7 +501,9 @@ UNSUPPORTED, NO_OBJECT, NOT_MAPPABLE, TOO_MUCH, TOO_HIGH = (
         (0x1A01, True, 2, 3, 0x6064_0020, UNSUPPORTED),
         (0x1600, True, 0, 1, 0x9999_0010, NO_OBJECT),
         (0x1600, True, 0, 1, 0x0005_0008, NO_OBJECT),  # no dummy mapping
-        (0x1600, True, 0, 1, 0x6040_0110, NOT_MAPPABLE),  # no such sub-index
+        (0x1600, True, 0, 1, 0x6040_0110, NO_SUB_INDEX),
+        (0x1A00, True, 0, 1, 0x1001_0108, NO_SUB_INDEX),
+        (0x1600, True, 0, 1, 0x607D_0920, NO_SUB_INDEX),
         (0x1600, True, 0, 1, 0x6081_0020, NOT_MAPPABLE),  # not mappable
         (0x1600, True, 0, 1, 0x1017_0010, NOT_MAPPABLE),
         (0x1600, True, 0, 1, 0x6041_0010, NOT_MAPPABLE),  # read-only in an RPDO

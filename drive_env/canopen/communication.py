@@ -154,14 +154,15 @@ def _check_bits(entry: Entry, raw: int, allowed: int) -> None:
 
 def _check_identifier(objects: ModuleObjects, entry: Entry, raw: int) -> None:
     """Check an object of which bit 31 switches the service off (CiA 301: 1014h, 1400h, 1800h)."""
+    # First what is never possible: a master that set bit 31 and tried again would be refused then.
+    if raw & frames.INVALID == 0 and frames.is_restricted(raw & frames.IDENTIFIER):
+        raise ObjectAccessError(
+            VALUE_RANGE, f"{entry.label} cannot be {raw & frames.IDENTIFIER:03X}h, which CiA 301 reserves"
+        )
     before = objects.value(entry.index, entry.sub)
     if (before | raw) & frames.INVALID == 0 and (before ^ raw) & frames.IDENTIFIER:
         raise ObjectAccessError(
             WRONG_STATE, f"{entry.label} is in use with {before & frames.IDENTIFIER:03X}h; set its bit 31 before"
-        )
-    if raw & frames.INVALID == 0 and frames.is_restricted(raw & frames.IDENTIFIER):
-        raise ObjectAccessError(
-            VALUE_RANGE, f"{entry.label} cannot be {raw & frames.IDENTIFIER:03X}h, which CiA 301 reserves"
         )
 
 

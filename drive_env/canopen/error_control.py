@@ -68,8 +68,12 @@ class NodeGuarding:
         self._life_time = 0.0
 
     def configure(self, life_time: float) -> None:
-        """Take over guard time times life time factor [s]; 0 watches nobody."""
+        """Take over guard time times life time factor [s]; 0 watches nobody. Life begins with the next request.
+
+        A master that configures it anew has stopped asking meanwhile: the time since the master before it is no loss.
+        """
         self._life_time = life_time
+        self._last = None
 
     def reset(self) -> None:
         """Begin anew, as after reset communication: the next answer has toggle 0."""

@@ -2,7 +2,7 @@
 
 The rule is the manual's (sections 3.1.18 and 3.1.20): switch the PDO off (bit 31 of its COB-ID), set the number of
 entries to 0, write entries, set their number, switch the PDO on. What breaks it is refused with the codes that CiA 301
-has for mapping: 06010000h, 06020000h, 06040041h, 06040042h.
+has for mapping: 06010000h, 06020000h, 06090011h, 06040041h, 06040042h.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 
 from drive_env.dictionary.access import (
     CANNOT_BE_MAPPED,
-    NO_SUCH_OBJECT,
     PDO_LENGTH_EXCEEDED,
     UNSUPPORTED_ACCESS,
     ObjectAccessError,
@@ -44,14 +43,16 @@ def check_mappable(entry: Entry, raw: int, transmit: bool, find: Callable[[int, 
     """Return the object that a mapping entry names.
 
     Raises:
-        ObjectAccessError: 06020000h if there is no such object, 06040041h if a PDO of this direction cannot carry it.
+        ObjectAccessError: 06020000h if there is no such object, 06090011h if it has no such sub-index, 06040041h if a
+            PDO of this direction cannot carry it.
     """
     index, sub, bits = parse(raw)
     try:
         mapped = find(index, sub)
     except ObjectAccessError as error:
-        code = NO_SUCH_OBJECT if error.abort_code == NO_SUCH_OBJECT else CANNOT_BE_MAPPED
-        raise ObjectAccessError(code, f"{entry.label} cannot map {index:04X}h:{sub:02X}: {error}") from error
+        raise ObjectAccessError(
+            error.abort_code, f"{entry.label} cannot map {index:04X}h:{sub:02X}: {error}"
+        ) from error
     wrong_way = "wo" if transmit else "ro"
     if not mapped.pdo_mappable or mapped.access in (wrong_way, "const") or mapped.bits not in LAYOUT:
         raise ObjectAccessError(CANNOT_BE_MAPPED, f"{entry.label} cannot map {mapped.label}, {mapped.access}")
