@@ -163,6 +163,7 @@ def test_any_interface_serves(tmp_path):
     (["--duration", "0"], "drive-env: --duration 0 s must be above 0 s"),
     (["--duration", "soon"], "--duration"),
     (["--channel", "can0"], "drive-env: --channel can0 needs --interface"),
+    (["--interface", "socketcan"], "drive-env: --interface socketcan needs --channel, e.g. --channel vcan0; without"),
     (["--interface", "nonsense", "--channel", "x"], "drive-env: cannot open --interface nonsense --channel x: "),
     (["--config", "none.toml"], "drive-env: cannot read the bus none.toml: No such file"),
     (["--config", "two.toml", "--node", "3"], "drive-env: two.toml has 2 machines, so --node cannot say which"),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,11 +34,15 @@ from mechanics.untrusted import MOST_RECORDING, check_size
 MOST_CHANNELS = 0xFFFF
 SIGNAL_WAIT = 0.02  # s, the longest pause between two looks whether the user has pressed Ctrl-C
 FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc")
+WRITTEN = (*FORMATS, ".pcap")
 
 
 def log(
     file: Annotated[
-        Path, typer.Argument(help="New file; .log is candump's format, .blf Vector's, also .asc .csv .trc.")
+        Path,
+        typer.Argument(
+            help="New file; Wireshark opens .log (candump's) and .pcap, .blf is Vector's, also .asc .csv .trc."
+        ),
     ],
     interface: Interface = None,
     channel: Channel = None,
@@ -50,8 +56,9 @@ def log(
         from can.util import channel2int
 
         from drive_env.master.port import open_bus
+        from drive_env.tools.frame_files import FRAME_FILES, FrameFile
 
-        _check_format(file)
+        _check_format(file, WRITTEN)
         check_time("--duration", duration)
         if not file.parent.is_dir():
             raise ValueError(f"there is no folder {file.parent}; choose another file")
@@ -59,9 +66,10 @@ def log(
         bus = open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {}))
         count = 0
         lost: Exception | None = None
+        taken = _take_interrupts()
         end = time.monotonic() + (float("inf") if duration is None else duration)
         try:
-            with can.Logger(str(file)) as writer:
+            with FrameFile(file) if file.suffix.lower() in FRAME_FILES else can.Logger(str(file)) as writer:
                 try:
                     while (left := end - time.monotonic()) > 0.0:
                         try:
@@ -78,6 +86,8 @@ def log(
                 except KeyboardInterrupt:
                     pass  # the usual end: the file is complete
         finally:
+            if taken is not None:
+                signal.signal(signal.SIGINT, taken)
             bus.shutdown()
         if lost is not None:
             if json:
@@ -112,7 +122,7 @@ def replay(
         from drive_env.master.port import Port, open_bus
         from drive_env.tools.replayed_motors import ANSWER_TIMEOUT
 
-        _check_format(file)
+        _check_format(file, FORMATS)
         if not file.is_file():
             raise ValueError(f"there is no file {file}")
         if not 0.0 < speed < math.inf:
@@ -203,9 +213,19 @@ def _is_from_a_master(frame: Any) -> bool:
     return any(base < can_id < base + 0x80 for base in (*RPDO, SDO_REQUEST))
 
 
-def _check_format(file: Path) -> None:
-    if file.suffix.lower() not in FORMATS:
-        raise ValueError(f"{file}: the ending says the format, and {file.suffix!r} is none of {', '.join(FORMATS)}")
+def _take_interrupts() -> Any:
+    """Let SIGINT end a log also where it is ignored, and return the handler before, None where nothing was changed.
+
+    A script's shell starts what is in its background so (POSIX), and such a log would have no end.
+    """
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        return None
+    return signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _check_format(file: Path, formats: tuple[str, ...]) -> None:
+    if file.suffix.lower() not in formats:
+        raise ValueError(f"{file}: the ending says the format, and {file.suffix!r} is none of {', '.join(formats)}")
 
 
 def _say(text: str, value: dict[str, Any], json: bool) -> None:

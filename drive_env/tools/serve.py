@@ -26,6 +26,7 @@ PORT = 29636  # no service is registered there, and no system gives it to others
 LOOPBACK = "127.0.0.1"
 PATIENCE = 8.0  # s after which a user wants to know what takes so long
 AUTO = "auto"  # as --token
+NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then hears nobody
 TOKEN_BYTES = 12  # of chance: 16 characters
 COMPILING = "drive-env: compiling the kernels, once; about 30 seconds"
 # SDO of any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1 synchronous.
@@ -219,6 +220,8 @@ def _can_port(interface: str, channel: str | None, bit_rate: int) -> Any:
 
     from drive_env.bus.can_port import CanPort
 
+    if interface in NEEDS_CHANNEL and not (channel or can.util.load_config(config={"interface": interface})["channel"]):
+        _fail(f"--interface {interface} needs --channel, e.g. --channel vcan0; without one it would serve nobody")
     try:
         return CanPort(can.Bus(interface=interface, channel=channel, bitrate=bit_rate))
     except (can.CanError, OSError, ValueError, TypeError, NotImplementedError, ImportError) as error:

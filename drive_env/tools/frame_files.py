@@ -1,0 +1,80 @@
+"""Files of frames as Wireshark opens them: candump's lines, and pcap in Linux SocketCAN framing."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+# Beside an identifier, and of an error frame (linux/can.h, linux/can/error.h).
+EXTENDED, REMOTE, ERROR, BUS_ERROR = 1 << 31, 1 << 30, 1 << 29, 0x80
+BIT_RATE_SWITCH, ERROR_STATE, FD = 0x01, 0x02, 0x04  # of CAN FD
+ERROR_DATA = bytes(8)  # an error frame carries what was wrong, which python-can does not hand on
+
+# pcap (draft-ietf-opsawg-pcap): magic of microseconds, version 2.4, longest record, link type.
+LINKTYPE_CAN_SOCKETCAN = 227
+PCAP_HEADER = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65_535, LINKTYPE_CAN_SOCKETCAN)
+RECORD = struct.Struct("<IIII")  # seconds, microseconds, length kept, length of the frame
+FRAME = struct.Struct(">IBBBB")  # identifier with flags (big-endian whatever the rest is), length, FD flags, reserved
+
+
+def candump_line(message: Any) -> bytes:
+    """Return a line of `candump -L`: no R or T at its end, which Wireshark and older can-utils take for data."""
+    channel = "can0" if message.channel is None else str(message.channel)
+    channel = f"can{channel}" if channel.isdigit() else "".join(channel.split())  # blanks part the fields
+    if message.is_error_frame:
+        content = f"{ERROR | BUS_ERROR:08X}#{ERROR_DATA.hex()}"
+    else:
+        content = f"{message.arbitration_id:0{8 if message.is_extended_id else 3}X}#"
+        if message.is_remote_frame:
+            content += f"R{message.dlc or ''}"
+        else:
+            content += f"#{_fd_flags(message) & ~FD:X}" if message.is_fd else ""
+            content += message.data.hex().upper()
+    return f"({max(message.timestamp, 0.0):017.6f}) {channel} {content}\n".encode()
+
+
+def pcap_record(message: Any) -> bytes:
+    """Return a record of link type 227: where a frame came from, which pcap has no field for, is left out."""
+    if message.is_error_frame:
+        can_id, data, length = ERROR | BUS_ERROR, ERROR_DATA, len(ERROR_DATA)
+    else:
+        can_id = message.arbitration_id | message.is_extended_id * EXTENDED | message.is_remote_frame * REMOTE
+        data = b"" if message.is_remote_frame else bytes(message.data)
+        length = message.dlc if message.is_remote_frame else len(data)
+    packet = FRAME.pack(can_id, length, _fd_flags(message), 0, 0) + data
+    seconds, microseconds = divmod(round(max(message.timestamp, 0.0) * 1e6), 1_000_000)
+    return RECORD.pack(seconds, microseconds, len(packet), len(packet)) + packet
+
+
+def _fd_flags(message: Any) -> int:
+    if not message.is_fd:
+        return 0
+    return FD | message.bitrate_switch * BIT_RATE_SWITCH | message.error_state_indicator * ERROR_STATE
+
+
+# Ending -> what a file begins with, and what a frame becomes in it.
+FRAME_FILES = {".log": (b"", candump_line), ".pcap": (PCAP_HEADER, pcap_record)}
+
+
+class FrameFile:
+    """A new file of frames, by its ending one of FRAME_FILES.
+
+    Args:
+        path: Where.
+    """
+
+    def __init__(self, path: Path) -> None:
+        header, self._encode = FRAME_FILES[path.suffix.lower()]
+        self._file: Any = path.open("xb")
+        self._file.write(header)
+
+    def __enter__(self) -> FrameFile:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+
+    def __call__(self, message: Any) -> None:
+        """Write a frame."""
+        self._file.write(self._encode(message))

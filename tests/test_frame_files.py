@@ -1,0 +1,128 @@
+"""Files of frames for Wireshark, byte by byte: candump's lines, and pcap with link type 227 (SocketCAN)."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+
+import can
+import pytest
+from typer.testing import CliRunner
+
+from drive_env.cli import app
+from drive_env.tools.frame_files import FrameFile
+
+FRAMES = {
+    "data": can.Message(timestamp=1.5, arbitration_id=0x181, data=b"\x37\x02", is_extended_id=False),
+    "sent by this program": can.Message(
+        timestamp=1.5, arbitration_id=0x601, data=bytes(8), is_extended_id=False, is_rx=False, channel=0
+    ),
+    "empty": can.Message(timestamp=1_700_000_000.000001, arbitration_id=0x080, is_extended_id=False, channel="vcan0"),
+    "remote": can.Message(timestamp=2.9999999, arbitration_id=0x701, is_remote_frame=True, dlc=1, is_extended_id=False),
+    "extended": can.Message(timestamp=0, arbitration_id=0x123, data=b"\xff", is_extended_id=True),
+    "error": can.Message(timestamp=3, is_error_frame=True),
+    "FD": can.Message(
+        timestamp=3, arbitration_id=0x181, data=bytes(12), is_fd=True, bitrate_switch=True, is_extended_id=False
+    ),
+    "before the clock was set": can.Message(timestamp=-1, arbitration_id=0x181, data=b"\1", is_extended_id=False),
+}
+LINES = {
+    "data": "(0000000001.500000) can0 181#3702",
+    "sent by this program": "(0000000001.500000) can0 601#0000000000000000",
+    "empty": "(1700000000.000001) vcan0 080#",
+    "remote": "(0000000003.000000) can0 701#R1",
+    "extended": "(0000000000.000000) can0 00000123#FF",
+    "error": "(0000000003.000000) can0 20000080#0000000000000000",
+    "FD": "(0000000003.000000) can0 181##1" + 24 * "0",
+    "before the clock was set": "(0000000000.000000) can0 181#01",
+}
+# Seconds, microseconds; identifier with its flags, length, FD flags; data.
+PACKETS = {
+    "data": (1, 500_000, 0x181, 2, 0, "3702"),
+    "sent by this program": (1, 500_000, 0x601, 8, 0, 16 * "0"),
+    "empty": (1_700_000_000, 1, 0x080, 0, 0, ""),
+    "remote": (3, 0, 0x4000_0701, 1, 0, ""),
+    "extended": (0, 0, 0x8000_0123, 1, 0, "ff"),
+    "error": (3, 0, 0x2000_0080, 8, 0, 16 * "0"),
+    "FD": (3, 0, 0x181, 12, 0x05, 24 * "0"),
+    "before the clock was set": (0, 0, 0x181, 1, 0, "01"),
+}
+
+
+def packets(content):
+    """Read a pcap as its specification has it (draft-ietf-opsawg-pcap; tcpdump.org, LINKTYPE_CAN_SOCKETCAN)."""
+    magic, major, minor, _, _, longest, link = struct.unpack_from("<IHHiIII", content)
+    assert (magic, major, minor, link) == (0xA1B2C3D4, 2, 4, 227)
+    place, found = 24, []
+    while place < len(content):
+        seconds, microseconds, kept, length = struct.unpack_from("<IIII", content, place)
+        assert kept == length <= longest and microseconds < 1_000_000
+        packet = content[place + 16 : place + 16 + kept]
+        assert len(packet) == kept
+        can_id, size, flags, reserved, raw_dlc = struct.unpack_from(">IBBBB", packet)
+        assert (reserved, raw_dlc) == (0, 0)
+        found.append((seconds, microseconds, can_id, size, flags, packet[8:].hex()))
+        place += 16 + kept
+    return found
+
+
+def write(path, messages):
+    with FrameFile(path) as file:
+        for message in messages:
+            file(message)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_line_is_candump_s(tmp_path, name):
+    assert write(tmp_path / "a.log", [FRAMES[name]]).decode() == LINES[name] + "\n"
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_packet_is_socketcan_s(tmp_path, name):
+    assert packets(write(tmp_path / "a.pcap", [FRAMES[name]])) == [PACKETS[name]]
+
+
+def test_python_can_reads_the_lines(tmp_path):
+    write(tmp_path / "a.log", FRAMES.values())
+    with can.LogReader(str(tmp_path / "a.log")) as reader:
+        for wrote, read in zip(FRAMES.values(), reader, strict=True):
+            assert wrote.equals(read, timestamp_delta=1.1, check_channel=False, check_direction=False)
+
+
+def test_a_channel_has_no_blanks(tmp_path):
+    frame = can.Message(timestamp=1, arbitration_id=1, is_extended_id=False, channel="CAN 1")
+    assert write(tmp_path / "a.log", [frame]) == b"(0000000001.000000) CAN1 001#\n"
+
+
+def test_replay_names_the_formats_that_it_reads(tmp_path):
+    (tmp_path / "a.pcap").write_bytes(b"")
+    done = CliRunner().invoke(app, ["replay", str(tmp_path / "a.pcap")])
+    assert done.exit_code == 2 and "'.pcap' is none of .log, .blf, .asc" in done.stderr
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are otherwise there")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_log_in_the_background_of_a_script_ends_by_a_signal(tmp_path, number):
+    """Such a one begins with SIGINT ignored."""
+    program = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from drive_env import commands; "
+    file = tmp_path / "frames.pcap"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program + "commands.drive_env()", "log", file, "-i", "virtual", "-c", "nobody's"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        while not file.exists():
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.01)
+        process.send_signal(number)
+        out, error = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.wait()
+    assert (process.returncode, out, error) == (0, f"0 frames written to {file}\n", "")
+    assert packets(file.read_bytes()) == []
