@@ -20,7 +20,8 @@ from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.cli import PANELS, app
-from drive_env.master.errors import BusError
+from drive_env.dictionary.access import ObjectAccessError
+from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.tools import scan
 
 DONE, REFUSED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
@@ -90,6 +91,43 @@ def test_a_node_that_boots_while_it_is_scanned_is_found_and_said_to_be_in_no_sta
             pass
 
     assert scan._find(Port(), 1, 3, 0.1) == {(1, ""), (2, "operational")}
+
+
+class SilentPort:
+    """A port at which nothing is heard."""
+
+    def subscribe(self, can_id, handler):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("silent", "state", "line"),
+    [
+        ({0x1000}, "", "node 3  no answer to 1000h:00 within 0.3 s; try a longer --timeout"),
+        ({0x1000}, "operational", "node 3  no answer to 1000h:00 within 0.3 s; try a longer --timeout (operational)"),
+        ({0x1000}, "stopped", "node 3  no SDO answer (stopped)"),
+        (
+            {0x1008, 0x100A},
+            "operational",
+            "node 3  unknown device, give its --eds  CiA 402  operational  "
+            "no answer to 1008h:00, 100Ah:00 within 0.3 s; try a longer --timeout",
+        ),
+        (set(), "", "node 3  unknown device, give its --eds  CiA 402"),
+    ],
+)
+def test_scan_shows_a_time_out_as_a_time_out(monkeypatch, capsys, silent, state, line):
+    """An object that a node lacks is refused at once: silence is something else."""
+
+    def read(client, index, sub, what, timeout):
+        if index in silent:
+            raise NoAnswerError("node 3 did not answer")
+        if index != 0x1000:
+            raise ObjectAccessError(0x0602_0000, what)
+        return (402).to_bytes(4, "little")
+
+    monkeypatch.setattr("drive_env.master.sdo.SdoClient.read", read)
+    scan._print([scan._look(SilentPort(), 3, state, 0.3)], 0.3)
+    assert capsys.readouterr().out == line + "\n"
 
 
 def test_scan_of_an_empty_range_is_told(run):

@@ -50,7 +50,7 @@ def pcap_record(message: Any) -> bytes:
 def _fd_flags(message: Any) -> int:
     if not message.is_fd:
         return 0
-    return FD | message.bitrate_switch * BIT_RATE_SWITCH | message.error_state_indicator * ERROR_STATE
+    return FD | bool(message.bitrate_switch) * BIT_RATE_SWITCH | bool(message.error_state_indicator) * ERROR_STATE
 
 
 # Ending -> what a file begins with, and what a frame becomes in it.

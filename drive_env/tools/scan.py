@@ -49,7 +49,7 @@ def scan(
         if json:
             print_json(found)
         elif found:
-            _print(found)
+            _print(found, timeout)
         if not found:
             fail(
                 f"no node of {first} to {last} answered within {timeout:g} s; check power, bit rate, termination and "
@@ -84,17 +84,21 @@ def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, st
 
 def _look(port: Any, node: int, state: str, timeout: float) -> dict[str, Any]:
     from drive_env.dictionary.access import ObjectAccessError
-    from drive_env.master.errors import BusError
+    from drive_env.master.errors import BusError, NoAnswerError
     from drive_env.master.sdo import SdoClient
 
     sdo = SdoClient(port, node)
     row: dict[str, Any] = {"node": node, "state": state}
 
     def read(index: int, sub: int) -> bytes | None:
+        label = f"{index:04X}h:{sub:02X}"
         try:
-            return sdo.read(index, sub, f"{index:04X}h:{sub:02X}", timeout)
+            return sdo.read(index, sub, label, timeout)
+        except NoAnswerError:
+            row.setdefault("timed out", []).append(label)
         except (ObjectAccessError, BusError):
-            return None  # optional, or silent because it is stopped
+            pass  # optional
+        return None
 
     kind = read(0x1000, 0)
     if kind is None:
@@ -122,14 +126,17 @@ def _known_device(vendor: int | None, product: int | None) -> str | None:
     return None
 
 
-def _print(found: list[dict[str, Any]]) -> None:
+def _print(found: list[dict[str, Any]], timeout: float) -> None:
     for row in found:
+        late = ", ".join(row.get("timed out", ()))
+        late = f"no answer to {late} within {timeout:g} s; try a longer --timeout" if late else ""
         if "device type" not in row:
-            print(f"node {row['node']}  no SDO answer" + (f" ({row['state']})" if row["state"] else ""))
+            why = late if late and row["state"] != "stopped" else "no SDO answer"  # of a stopped node none comes
+            print(f"node {row['node']}  {why}" + (f" ({row['state']})" if row["state"] else ""))
             continue
         profile = row["device type"] & 0xFFFF
         facts = [row["device"] or "unknown device, give its --eds", row.get("name", "")]
         facts += [f"{name} {row[name]}" for name in ("hardware", "software") if name in row]
         facts += [f"{name} {row[name]:X}h" for name in ("vendor", "product", "revision", "serial") if name in row]
-        facts += [f"CiA {profile}" if profile else "no profile", row["state"]]
+        facts += [f"CiA {profile}" if profile else "no profile", row["state"], late]
         print(f"node {row['node']}  " + "  ".join(fact for fact in facts if fact))
