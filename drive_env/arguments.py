@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from drive_env.dictionary.entries import ObjectName
 
 Mask = NDArray[np.bool_]
 
@@ -40,3 +46,8 @@ def whole_cycles(duration: float, cycle: float) -> int:
             f"{duration:g} s is not a whole number of communication cycles of {cycle:g} s; use {cycles * cycle:g} s"
         )
     return cycles
+
+
+def object_names(objects: ObjectName | Sequence[ObjectName]) -> tuple[ObjectName, ...]:
+    """Return the objects that are meant: one by its name or index alone, or several; two integers are two indices."""
+    return (objects,) if isinstance(objects, (str, int, np.integer)) else tuple(objects)

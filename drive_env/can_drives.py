@@ -18,7 +18,7 @@ import can
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.arguments import checked_mask, whole_cycles
+from drive_env.arguments import checked_mask, object_names, whole_cycles
 from drive_env.dictionary.access import ObjectAccessError, check_readable, check_writable, checked_values
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.emergency import EmergencyMessage
@@ -185,7 +185,7 @@ class CanDrives:
 
     def record(
         self,
-        objects: Sequence[ObjectName],
+        objects: ObjectName | Sequence[ObjectName],
         duration: float,
         play: Mapping[ObjectName, ArrayLike] | None = None,
         period: float = 0.001,
@@ -197,7 +197,7 @@ class CanDrives:
         same ones costs no configuration, so a policy may record and play cycle by cycle.
 
         Args:
-            objects: What to record; objects that the drive can map to a TPDO.
+            objects: What to record: one object, or several; objects that the drive can map to a TPDO.
             duration: Whole communication cycles [s].
             play: Object -> integers to write, shape (cycles,) or (cycles, num_axes); objects for an RPDO.
             period: Time between samples [s], whole communication cycles.
@@ -213,7 +213,7 @@ class CanDrives:
         if every < 1:
             raise ValueError(f"period must be at least {self._description.cycle:g} s, not {period:g} s")
         given = play or {}
-        call = self._cycle_runner.call(objects, tuple(given))
+        call = self._cycle_runner.call(object_names(objects), tuple(given))
         played = self._cycle_runner.rows(call, tuple(given.values()), cycles)
         found = self._cycle_runner.record(call, played, cycles, self.safety)
         rows = -(-cycles // every)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.arguments import checked_mask, whole_cycles
+from drive_env.arguments import checked_mask, object_names, whole_cycles
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.entries import ObjectName
 from drive_env.emergency import EmergencyMessage
@@ -29,7 +29,7 @@ from drive_env.live_dictionary import NOTHING, LiveDictionary
 from drive_env.machine import Machines
 from drive_env.misfit import warn_of_misfits
 from drive_env.motors import find_motor
-from drive_env.parameters import apply_to_records, check_parameter, draw_parameters, parameter_table
+from drive_env.parameters import apply_to_records, check_known, check_parameter, draw_parameters, parameter_table
 from drive_env.process_image import ProcessImage
 from drive_env.trace import Trace
 from mechanics.load import Load
@@ -164,7 +164,7 @@ class EmulatedDrives:
 
     def record(
         self,
-        objects: Sequence[ObjectName],
+        objects: ObjectName | Sequence[ObjectName],
         duration: float,
         play: Mapping[ObjectName, ArrayLike] | None = None,
         period: float = 0.001,
@@ -175,7 +175,7 @@ class EmulatedDrives:
         csv every row is a set-point that arrives, also one that repeats the last.
 
         Args:
-            objects: What to record.
+            objects: What to record: one object, or several.
             duration: Whole communication cycles [s].
             play: Object -> integers to write, shape (cycles,) or (cycles, num_axes).
             period: Time between samples [s], whole communication cycles.
@@ -188,7 +188,7 @@ class EmulatedDrives:
         every = self._cycles(period)
         if every < 1:
             raise ValueError(f"period must be at least {self._cycle:g} s, not {period:g} s")
-        play = play or {}
+        objects, play = object_names(objects), play or {}
         names = (*objects, None, *play)
         image = self._images.get(names)
         if image is not None and image.scale_changes == self._objects.scale_changes:
@@ -268,8 +268,7 @@ class EmulatedDrives:
         seeds = np.repeat(noise, self.load.num_axes) + np.tile(np.arange(axes[1]), self.num_machines)
         self._noise_seeds = np.mod(seeds, 2.0**32 - 1.0) + 1.0  # xorshift stays at 0 for ever
         for name, value in given.items():
-            if name not in table:
-                raise ValueError(f"machines have no parameter {name!r}; they have {', '.join(table)}")
+            check_known(name, table)
             self._parameters[name] = np.broadcast_to(np.asarray(value, float), (self.num_machines,)).copy()
             check_parameter(name, self._parameters[name])
 

@@ -16,7 +16,7 @@ from drive_env.faults.machine_faults import InjectedFault
 from drive_env.faults.schedule import Order
 from drive_env.firmware.record import STATE, get_lanes, set_lanes
 from drive_env.lane_image import LaneImage
-from drive_env.parameters import check_parameter
+from drive_env.parameters import check_known, check_parameter
 
 if TYPE_CHECKING:
     from drive_env.drives import EmulatedDrives
@@ -105,8 +105,7 @@ class Machines:
             ValueError: As in `set`, at once, and for times that are past or no whole cycles.
         """
         drives = self._drives
-        if name not in drives._parameters:
-            raise ValueError(f"machines have no parameter {name!r}; they have {', '.join(drives._parameters)}")
+        check_known(name, drives._parameters)
         mask, rows = self._mask(where), np.asarray(values, float)
         cycles = [drives._cycles(float(time)) for time in np.atleast_1d(np.asarray(times, float))]
         if rows.shape not in ((len(cycles),), (len(cycles), drives.num_machines)):
@@ -223,8 +222,7 @@ class Machines:
             ValueError: If there is no such parameter, the value is not finite, or no machine can have it.
         """
         drives = self._drives
-        if name not in drives._parameters:
-            raise ValueError(f"machines have no parameter {name!r}; they have {', '.join(drives._parameters)}")
+        check_known(name, drives._parameters)
         mask = self._mask(where)
         check_parameter(name, self._per_machine(value, name)[mask])
         values = np.where(mask, self._per_machine(value, name), drives._parameters[name])
@@ -249,8 +247,7 @@ class Machines:
         mask = self._mask(where)
         new: dict[str, Floats] = {}
         for name, value in values.items():
-            if name not in drives._parameters:
-                raise ValueError(f"machines have no parameter {name!r}; they have {', '.join(drives._parameters)}")
+            check_known(name, drives._parameters)
             check_parameter(name, self._per_machine(value, name)[mask])
             new[name] = np.where(mask, self._per_machine(value, name), drives._parameters[name])
         before = {name: drives._parameters[name] for name in new}

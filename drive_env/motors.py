@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from mechanics.near_names import did_you_mean
+
 
 class Motor(NamedTuple):
     """A motor with its encoder: `kind` "pmsm", or "dc" with R_s, L and psi_m those of its one winding and n_p = 1."""
@@ -444,5 +446,7 @@ RANGES = {
 def find_motor(name: str) -> Motor:
     """Return the row of a motor; ValueError lists the names there are."""
     if name not in MOTORS:
-        raise ValueError(f"no motor is named {name!r}; there are {', '.join(sorted(MOTORS))}")
+        raise ValueError(
+            f"no motor is named {name!r}; there are {', '.join(sorted(MOTORS))}{did_you_mean(name, MOTORS)}"
+        )
     return MOTORS[name]

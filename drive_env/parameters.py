@@ -13,6 +13,7 @@ from drive_env.devices import Device
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import Motor
 from mechanics.load import Load
+from mechanics.near_names import did_you_mean
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -188,6 +189,14 @@ def check_parameter(name: str, values: Floats) -> None:
         raise ValueError(f"{name} must be above 0, not {values.min():g}")
 
 
+def check_known(name: str, known: Collection[str]) -> None:
+    """Raise ValueError, with those that there are, unless machines have a parameter of that name."""
+    if name not in known:
+        raise ValueError(
+            f"machines have no parameter {name!r}; they have {', '.join(known)}{did_you_mean(name, known)}"
+        )
+
+
 def _chosen(table: Mapping[str, MachineParameter], randomise: bool | Collection[str]) -> set[str]:
     if isinstance(randomise, bool):
         return set(table) if randomise else set()
@@ -197,7 +206,7 @@ def _chosen(table: Mapping[str, MachineParameter], randomise: bool | Collection[
         if wanted not in table and wanted not in groups:
             raise ValueError(
                 f"nothing to randomise is named {wanted!r}; there are {', '.join(sorted(groups))} and "
-                f"{', '.join(table)}"
+                f"{', '.join(table)}{did_you_mean(wanted, (*groups, *table))}"
             )
         chosen |= {name for name in table if name == wanted or name.split(".")[0] == wanted}
     return chosen

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mechanics.load import Combination, Contact, Friction, Load, Parameter, Roll, Switch
 from mechanics.model import resolve
+from mechanics.near_names import did_you_mean
 
 MODELS = Path(__file__).parent / "models"
 
@@ -324,6 +325,7 @@ def find_load(load: str | Path | Load) -> Load:
         return resolve(Load(Path(load)))
     raise ValueError(
         f"no load is named {load!r}; there are {', '.join(sorted(LOADS))}, or give the path of an MJCF (.xml)"
+        f"{did_you_mean(load, LOADS)}"
     )
 
 

@@ -641,6 +641,13 @@ def test_what_is_no_quantity_of_the_object_is_told(name, text, message):
         quantities.parse(text, KNOWN.find(name), 65536.0)
 
 
+@pytest.mark.parametrize("one", ["Statusword", 0x6041])
+def test_one_object_may_be_recorded_by_its_name_alone(drives, one):
+    trace = drives.record(one, 0.002)
+    assert trace["Statusword"].shape == (2, 1)
+    assert (trace[0x6041] == drives.read(0x6041)).all()
+
+
 def test_importing_the_package_imports_no_bus():
     code = "import sys, drive_env; sys.exit('can' in sys.modules or 'canopen' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -116,6 +116,29 @@ def test_unknown_names_list_what_there_is():
             EmulatedDrives(**options)
 
 
+@pytest.mark.parametrize(
+    ("options", "meant"),
+    [
+        ({"device": "tmcm1637"}, "did you mean 'tmcm1636'?"),
+        ({"load": "two_mas"}, "did you mean 'two_mass'"),
+        ({"motor": "qbl4207"}, "did you mean 'qbl4208'?"),
+        ({"randomise": ["loads"]}, "did you mean 'load'"),
+        ({"parameters": {"load.stifness": 1.0}}, "did you mean 'load.stiffness'"),
+    ],
+)
+def test_a_slip_of_the_pen_is_answered_with_the_nearest_name(options, meant):
+    with pytest.raises(ValueError) as refused:
+        EmulatedDrives(**options)
+    assert meant in str(refused.value)
+
+
+@pytest.mark.parametrize("one", ["Statusword", 0x6041, (0x6041, 0)])
+def test_one_object_may_be_recorded_by_its_name_alone(axis, one):
+    trace = axis.record([one] if isinstance(one, tuple) else one, 0.003)
+    assert trace["Statusword"].shape == (3, 1)
+    assert (trace[0x6041] == axis.read(0x6041)).all()
+
+
 def test_identical_machines_differ_in_nothing():
     drives = EmulatedDrives(num_machines=3, randomise=True, identical=True, first_machine=7, seed=3)
     alone = EmulatedDrives(num_machines=1, randomise=True, first_machine=7, seed=3)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import ObjectDictionary
+from mechanics.near_names import did_you_mean
 
 FOLDER = Path(__file__).parent
 
@@ -149,7 +150,8 @@ def find_device(name: str) -> Device:
     """Return a device by name; ValueError lists the names there are."""
     folder = FOLDER / name
     if name not in device_names():
-        raise ValueError(f"no device is named {name!r}; there are {', '.join(device_names())}")
+        near = did_you_mean(name, device_names())
+        raise ValueError(f"no device is named {name!r}; there are {', '.join(device_names())}{near}")
     data = tomllib.loads((folder / "device.toml").read_text(encoding="utf-8"))
     rows: tuple[Binding, ...] = importlib.import_module(f"drive_env.devices.{name}.bindings").BINDINGS
     return Device(

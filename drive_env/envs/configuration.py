@@ -9,6 +9,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
 
+from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_toml
 
 Config = TypeVar("Config")
@@ -67,7 +68,7 @@ def configured(
     known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     for name in table:
         if name not in known:
-            raise ValueError(f"there is no option {name!r}; there are {', '.join(known)}")
+            raise ValueError(f"there is no option {name!r}; there are {', '.join(known)}{did_you_mean(name, known)}")
     for field in fields(kind):  # type: ignore[arg-type]
         if field.name in table:
             _check_type(field.name, str(field.type), table[field.name])

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from drive_env.devices import find_device
+from mechanics.near_names import did_you_mean
 
 GROUPS = ("sensor", "motor", "supply", "load", "bus", "node")
 DRIVE = "tmcm1636"  # whose reactions the table has
@@ -61,7 +62,7 @@ def find_fault(name: str) -> Row:
         ValueError: If there is none of that name, with those that are.
     """
     if name not in FAULTS:
-        raise ValueError(f"no fault is named {name!r}; there are {', '.join(FAULTS)}")
+        raise ValueError(f"no fault is named {name!r}; there are {', '.join(FAULTS)}{did_you_mean(name, FAULTS)}")
     return FAULTS[name]
 
 
@@ -74,7 +75,10 @@ def names_of(chosen: str) -> tuple[str, ...]:
     if chosen in GROUPS:
         return tuple(row.name for row in FAULTS.values() if row.group == chosen)
     if chosen not in FAULTS:
-        raise ValueError(f"no fault or group is named {chosen!r}; there are {', '.join((*GROUPS, *FAULTS))}")
+        known = (*GROUPS, *FAULTS)
+        raise ValueError(
+            f"no fault or group is named {chosen!r}; there are {', '.join(known)}{did_you_mean(chosen, known)}"
+        )
     return (chosen,)
 
 
