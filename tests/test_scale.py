@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tuning import pools, sweep
+from tuning import pools, provenance, sweep
 from tuning.experiment import load_experiment
 from tuning.pools import PoolError, in_order, open_pool
 from tuning.shard_log import ShardLog, ShardLogError
@@ -321,6 +321,73 @@ def test_workers_of_another_version_are_told():
 
     (line,) = pools._Dask(Client(), 2).differences()
     assert line == f"worker tcp://b:2 has numpy 0.9, here it is {np.__version__}: last digits may differ"
+
+
+# --- the sources --------------------------------------------------------------------------------------------------
+def test_the_hash_of_the_sources_covers_every_file_that_decides_a_digit(tmp_path):
+    package = tmp_path / "package"
+    (package / "presets").mkdir(parents=True)
+    (package / "loops.py").write_text("gain = 1\n")
+    (package / "presets" / "motor.toml").write_text("poles = 4\n")
+    first = provenance.hash_of_sources([package])
+    for left_behind in ("__pycache__", ".cache"):
+        (package / left_behind).mkdir()
+        (package / left_behind / "loops.cpython-311.pyc").write_bytes(b"1")
+    (package / ".loops.py.swp").write_text("x")
+    assert provenance.hash_of_sources([package]) == first
+    seen = {first}
+    for path, text in [("loops.py", "gain = 2\n"), ("presets/motor.toml", "poles = 8\n"), ("new.json", "")]:
+        (package / path).write_text(text)
+        seen.add(provenance.hash_of_sources([package]))
+    (package / "new.json").rename(package / "other.json")
+    seen.add(provenance.hash_of_sources([package]))
+    assert len(seen) == 5
+
+
+def test_worker_processes_of_other_sources_are_refused_with_both_hashes(monkeypatch):
+    here = provenance.SOURCES
+    monkeypatch.setattr(provenance, "SOURCES", "0123456789abcdef")
+    with open_pool(1) as pool, pytest.raises(
+        PoolError, match=f"worker has sources {here}, the run was begun with 0123456789abcdef.*--resume"
+    ):  # fmt: skip
+        in_order(pool, square, [1])
+
+
+def test_a_worker_whose_files_were_edited_since_it_began_is_refused(monkeypatch):
+    monkeypatch.setattr(provenance, "hash_of_sources", lambda: "fedcba9876543210")
+    with pytest.raises(PoolError, match=f"sources fedcba9876543210, the run was begun with {provenance.SOURCES}"):
+        pools._checked(provenance.SOURCES, square, 1)
+    assert pools._versions()["sources"] == "fedcba9876543210"
+
+
+def test_a_worker_of_other_sources_that_joins_a_cluster_late_is_refused(small_cluster, monkeypatch):
+    with open_pool(cluster=small_cluster.scheduler_address) as pool:
+        assert pool.differences() == []
+        assert in_order(pool, square, [3]) == [9]
+        # It runs in this process: what it finds from now on are other files.
+        monkeypatch.setattr(provenance, "hash_of_sources", lambda: "fedcba9876543210")
+        with pytest.raises(PoolError, match=f"fedcba9876543210, the run was begun with {provenance.SOURCES}"):
+            in_order(pool, square, [4])
+
+
+def test_a_cluster_with_a_worker_of_other_sources_is_refused():
+    class Client:
+        def run(self, function):
+            here = function()
+            return {"tcp://a:1": here, "tcp://b:2": here | {"sources": "fedcba9876543210"}}
+
+    with pytest.raises(PoolError, match=rf"worker tcp://b:2 has sources fedcba9876543210, .* {provenance.SOURCES}"):
+        pools._Dask(Client(), 2).differences()
+
+
+def test_results_of_other_sources_are_not_gone_on_with(tmp_path, monkeypatch):
+    frames(tmp_path / "log")
+    before = (tmp_path / "log").read_bytes()
+    here = provenance.SOURCES
+    monkeypatch.setattr(provenance, "SOURCES", "0123456789abcdef")
+    with pytest.raises(ShardLogError, match=f"results of sources {here}, these are 0123456789abcdef"):
+        ShardLog(tmp_path / "log", "run")
+    assert (tmp_path / "log").read_bytes() == before
 
 
 # --- the command --------------------------------------------------------------------------------------------------

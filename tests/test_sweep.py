@@ -303,7 +303,7 @@ def test_settings_hold_the_experiment_and_the_versions(tmp_path, small):
     small.save(tmp_path / "run")
     text = (tmp_path / "run" / "settings.toml").read_text()
     assert set(tomllib.loads(text)["versions"]) == {
-        "drive-env", "numpy", "numba", "llvmlite", "mujoco", "python", "processor",
+        "drive-env", "numpy", "numba", "llvmlite", "mujoco", "sources", "python", "processor",
     }  # fmt: skip
     read = load_experiment(tmp_path / "run" / "settings.toml")
     assert replace(read, versions={}) == small.experiment

@@ -1,7 +1,8 @@
 """Where work runs: in this process, on processes of this machine, or on a Dask cluster.
 
 A task is a function of a module, called with one item; what it returns must depend on the item alone, so that it
-matters to no result where and in which order tasks ran.
+matters to no result where and in which order tasks ran. Every task outside this process carries the hash of our sources
+and is refused by a worker that has others, whenever that worker came.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Protocol, TypeVar
+
+from tuning import provenance
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -102,7 +106,8 @@ class _Processes:
         self.width = width
 
     def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
-        futures = {self._executor.submit(function, item): k for k, item in enumerate(items)}
+        checked = partial(_checked, provenance.SOURCES, function)
+        futures = {self._executor.submit(checked, item): k for k, item in enumerate(items)}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
@@ -131,7 +136,8 @@ class _Dask:
         from distributed.scheduler import KilledWorker
 
         # Not pure: equal items of two runs on one cluster are computed twice rather than taken from its memory.
-        futures = {self._client.submit(function, item, pure=False): k for k, item in enumerate(items)}
+        checked = partial(_checked, provenance.SOURCES, function)
+        futures = {self._client.submit(checked, item, pure=False): k for k, item in enumerate(items)}
         try:
             with self._told_of_no_workers():
                 for future in as_completed_there(list(futures), loop=self._client.loop):
@@ -172,7 +178,7 @@ class _Dask:
             ended.set()
 
     def differences(self) -> list[str]:
-        here, lines = _versions(), set()
+        here, lines = provenance.versions(), set()
         try:
             there: Mapping[str, dict[str, str]] = self._client.run(_versions)
         except ImportError as error:
@@ -180,6 +186,11 @@ class _Dask:
                 f"a worker of the cluster at {self._address} cannot run this: {error}; install drive-env where it runs"
             ) from None
         for address, found in there.items():
+            if found.get("sources") != here["sources"]:
+                raise PoolError(
+                    f"worker {address} has sources {found.get('sources', 'unknown')}, here they are {here['sources']}, "
+                    "and results are not mixed: install the same files there and start it again"
+                )
             for name, version in found.items():
                 if here.get(name) != version:
                     lines.add(f"worker {address} has {name} {version}, here it is {here.get(name)}: last digits may "
@@ -210,10 +221,19 @@ def _cluster(address: str) -> Iterator[Pool]:
         yield _Dask(client, sum(threads.values()), address)
 
 
-def _versions() -> dict[str, str]:
-    from tuning.provenance import versions
+def _checked(sources: str, function: Callable[[Item], Result], item: Item) -> Result:
+    """Do a task on a worker, if its sources are those of the process that gives the work."""
+    try:
+        provenance.check_sources(sources)
+    except ValueError as error:
+        raise PoolError(str(error)) from None
+    return function(item)
 
-    return versions()
+
+def _versions() -> dict[str, str]:
+    """Return the versions of a worker, its sources as they lie there now if they were edited since it began."""
+    found, now = provenance.versions(), provenance.hash_of_sources()
+    return found if now == found["sources"] else found | {"sources": now}
 
 
 def _as_worker() -> None:

@@ -1,13 +1,14 @@
-"""Where results go and what made them: run folders that are complete or absent, and the versions that computed them."""
+"""Where results go and what made them: run folders that are complete or absent, versions and a hash of the sources."""
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import os
 import platform
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,13 +16,48 @@ from drive_env.whole_file import keep_names
 
 HEADER = "# The whole experiment of this run. It repeats from this file: drive-tune sweep --config settings.toml\n"
 _PACKAGES = ("drive-env", "numpy", "numba", "llvmlite", "mujoco")
+_ROOT = Path(__file__).parent.parent
+_OURS = tuple(_ROOT / name for name in ("drive_env", "mechanics", "tuning", "agents"))
+
+
+def hash_of_sources(folders: Iterable[Path] = _OURS) -> str:
+    """Return a hash of the names and contents of all files of our packages, data files included."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted(folder.rglob("*")):
+            parts = path.relative_to(folder.parent).parts
+            # What Python or an editor leaves there decides nothing.
+            if path.suffix == ".pyc" or any(part.startswith(".") for part in parts) or not path.is_file():
+                continue
+            content = path.read_bytes()
+            digest.update(f"{'/'.join(parts)} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:16]
+
+
+# As this process was loaded: a file that is edited later changes what it reads, but not what it runs.
+SOURCES = hash_of_sources()
+
+
+def check_sources(expected: str) -> None:
+    """Raise ValueError, with both hashes, if this process was loaded from other sources, or its files are others now.
+
+    Args:
+        expected: The hash of the process that gives the work.
+    """
+    for found in (SOURCES, hash_of_sources()):
+        if found != expected:
+            raise ValueError(
+                f"a worker has sources {found}, the run was begun with {expected}, and their results are not mixed: "
+                "install the same files there, start the worker again, and go on with --resume"
+            )
 
 
 def versions() -> dict[str, str]:
-    """Return what decides the last digit: packages, Python, and the processor for which the kernels are compiled."""
+    """Return what decides the digits: packages, our sources, Python, the processor for which kernels are compiled."""
     import llvmlite.binding
 
     found = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    found["sources"] = SOURCES
     return found | {"python": platform.python_version(), "processor": str(llvmlite.binding.get_host_cpu_name())}
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mechanics.untrusted import MOST_ARRAYS, parse_json, read_arrays
+from tuning import provenance
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -37,7 +38,7 @@ class ShardLog:
         key: What the results belong to: a text that another run does not have.
 
     Raises:
-        ShardLogError: If the file belongs to another run.
+        ShardLogError: If the file belongs to another run, or was begun with other sources.
         OSError: If it cannot be written.
     """
 
@@ -51,7 +52,7 @@ class ShardLog:
         self._file.truncate(end)
         self._file.seek(end)
         if end == 0:
-            self._file.write(json.dumps({"run": self._key}).encode() + b"\n")
+            self._file.write(json.dumps({"run": self._key, "sources": provenance.SOURCES}).encode() + b"\n")
             self._flush()
 
     def append(self, shard: int, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -85,6 +86,12 @@ class ShardLog:
             first = _header(file)
             if first is None:
                 return 0  # killed before the first line was complete
+            if first.get("sources") != provenance.SOURCES:
+                raise ShardLogError(
+                    f"{self.path} holds results of sources {first.get('sources', 'unknown')}, these are "
+                    f"{provenance.SOURCES}, and they are not mixed; go on with the sources that it was begun with, or "
+                    "remove it"
+                )
             if first.get("run") != self._key:
                 raise ShardLogError(
                     f"{self.path} holds results of another experiment, or of another version; give the experiment that "
