@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drive_env.dictionary import units
-from drive_env.dictionary.access import CANNOT_BE_STORED, VALUE_RANGE, ObjectAccessError, check_allowed, check_limits
+from drive_env.dictionary.access import CANNOT_BE_STORED, ObjectAccessError, check_allowed, check_limits
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import Entry
 from drive_env.firmware import cycle, protection
@@ -142,8 +142,6 @@ class Axis:
                 check_state(device, entry, self.state)
             if keeps_mode and raw == mode[mode_place]:
                 refuse_same_mode(entry, raw)
-            if key == POSITION_SCALER and raw == 0:
-                raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be 0 increments per revolution")
 
         return check
 

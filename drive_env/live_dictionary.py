@@ -15,7 +15,6 @@ from drive_env.devices import Device
 from drive_env.dictionary import units
 from drive_env.dictionary.access import (
     CANNOT_BE_STORED,
-    VALUE_RANGE,
     WRONG_STATE,
     ObjectAccessError,
     check_allowed,
@@ -312,8 +311,6 @@ class LiveDictionary:
 
     def _rescale(self, entry: Entry, raw: Integers, where: Mask) -> None:
         """Change 2058h: what is stored in increments keeps its integers, and so changes its SI value."""
-        if np.any(raw[where] == 0):
-            raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be 0 increments per revolution")
         kept = [
             (other, self._read(other))
             for other in self.entries

@@ -82,7 +82,10 @@ def refusal(drives, name, value, **how):
         (0x6060, 2, BAD_VALUE, ["6060h:00 Modes of operation", "2", "0, 1, 3"]),
         (0x6060, -1, TOO_LOW, ["6060h:00", "-1"]),
         (0x6060, 0, NOT_NOW, ["6060h:00", "0", "already"]),
-        (0x2058, 0, BAD_VALUE, ["2058h:00", "0"]),  # no increments per revolution would be no positions
+        (0x2058, 0, TOO_LOW, ["2058h:00", "0", "1"]),  # no increments per revolution would be no positions
+        (0x2058, -65536, TOO_LOW, ["2058h:00", "-65536", "1"]),  # and negative ones no scale of 6081h and 6083h
+        (0x60F2, 3, TOO_HIGH, ["60F2h:00", "3", "2"]),  # table 178: reserved
+        (0x60F2, 4, TOO_HIGH, ["60F2h:00", "4", "2"]),  # bits 0 and 1 only
         ((0x1010, 1), 0x65766173, NOT_STORED, ["1010h:01"]),
         (0x6081, 1.0, WRONG_TYPE, ["6081h:00 Profile velocity", "1.0", "float"]),
         (0x6081, np.float64(5), WRONG_TYPE, ["6081h:00", "float"]),
@@ -291,7 +294,7 @@ def test_every_writable_object_takes_its_range_and_reads_back(drives, entry):
     values = {entry.low, entry.high, entry.default}
     if key in DEVICE.allowed_values:
         values = set(DEVICE.allowed_values[key])
-    values = sorted(values - {0} if key == (0x2058, 0) else values)
+    values = sorted(values)
     only = np.array([False, True, False])
     others = drives.read(key)[[0, 2]].tolist()
     for value in values:

@@ -24,7 +24,7 @@ DISABLED, OPEN_LOOP, HALL, ENCODER = range(4)
 HALL_POLARITY, HALL_DIRECTION, HALL_INTERPOLATION, HALL_OFFSET = ((0x2070, k) for k in range(1, 5))
 ENCODER_DIRECTION, ENCODER_STEPS, ENCODER_INIT = ((0x2080, k) for k in range(1, 4))
 ESTIMATE_OFFSET, USE_OFFSET, USE_HALL = range(3)
-INITIALIZED, INITIALIZATION_ERROR = 1 << 15, 1 << 7  # 2101h, table 85
+STOP_MODE, MODULE_INITIALIZED, INITIALIZATION_ERROR = 1 << 8, 1 << 15, 1 << 7  # 2101h, table 85
 
 
 @pytest.fixture
@@ -286,8 +286,9 @@ def test_estimate_offset_turns_the_rotor_and_finds_the_angle_from_everywhere(bui
     drives.machine.set("motor.commutation_offset", np.linspace(-3.0, 3.0, 16))  # what was known before is wrong
     place(drives, start)
     drives.write(ENCODER_INIT, ESTIMATE_OFFSET)
-    assert np.all(drives.read(0x2101) & INITIALIZED == 0)
+    assert np.all(drives.read(0x2101) & MODULE_INITIALIZED)  # the module's, not the encoder's
     motion.enable(drives, mode="pv")
+    assert np.all(drives.read(0x2101) & STOP_MODE)
     states, angles = [], []
     for _ in range(30):
         drives.advance(0.05)
@@ -296,7 +297,7 @@ def test_estimate_offset_turns_the_rotor_and_finds_the_angle_from_everywhere(bui
     states, angles = np.array(states), np.array(angles)
     assert np.all(states[0] == alignment.FIRST_ANGLE)
     assert np.all(states[-1] == alignment.DONE)
-    assert np.all(drives.read(0x2101) & INITIALIZED)
+    assert np.all(drives.read(0x2101) & STOP_MODE == 0)
     # It stands a quarter electrical turn further than at the end of the first angle, where it still swings a little.
     last_first = np.argmax(states == alignment.SECOND_ANGLE, axis=0)[0]
     turned = np.degrees(angles[-1] - angles[last_first])
@@ -324,15 +325,14 @@ def test_estimate_offset_fails_when_blocked_and_is_tried_again_at_the_next_enabl
     assert status[0] & 0x4F == 0x08
     assert status[1] & 0x6F == 0x27
     assert list(flags & INITIALIZATION_ERROR) == [INITIALIZATION_ERROR, 0]
-    assert list(flags & INITIALIZED) == [0, INITIALIZED]
+    assert list(flags & STOP_MODE) == [STOP_MODE, 0]
     assert lanes(drives, "i_d")[0] == 0.0
     drives.machine.set("load.coulomb", 0.002)
     drives.machine.set("load.breakaway", 0.003)
     motion.enable(drives)
     drives.advance(1.5)
     assert np.all(drives.read(0x6041) & 0x6F == 0x27)
-    assert np.all(drives.read(0x2101) & INITIALIZED)
-    assert np.all(drives.read(0x2101) & INITIALIZATION_ERROR == 0)
+    assert np.all(drives.read(0x2101) & (STOP_MODE | INITIALIZATION_ERROR) == 0)
     assert [m.code for m in drives.emergencies()] == [0x0000]
 
 
@@ -356,7 +356,7 @@ def test_use_offset_is_the_alignment_from_before(build):
     drives.machine.set("motor.commutation_offset", left)
     place(drives, [0.0, 1.0, 2.0, 3.0])
     drives.advance(0.01)
-    assert np.all(drives.read(0x2101) & INITIALIZED)
+    assert np.all(lanes(drives, "init_state") == alignment.DONE)
     np.testing.assert_allclose(torque_factor(drives), np.cos(left), atol=0.01)
 
 

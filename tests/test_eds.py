@@ -195,7 +195,7 @@ ENTRIES = [
     (0x2055, 0, "Commutation Mode", U8, "rw", 0, 3, 3, "", 0, 71),  # modes of table 69
     (0x2056, 0, "Motor Pole Pairs", U8, "rw", 1, 255, 12, "", 0, 73),  # the table swaps 12 and 255
     (0x2057, 0, "Motor Shaft Direction", U8, "rw", 0, 1, 0, "", 0, 75),
-    (0x2058, 0, "Position Scaler", I32, "rw", LOW32, HIGH32, 65536, "inc/rev", 0, 77),
+    (0x2058, 0, "Position Scaler", I32, "rw", 1, HIGH32, 65536, "inc/rev", 0, 77),  # the table: any SIGNED32
     (0x2060, 0, "Highest sub-index supported", U8, "ro", 0, BYTE, 7, "", 0, 79),
     (0x2060, 1, "ADC_I0_Raw", U16, "ro", 0, WORD, 0, "", 0, 79),
     (0x2060, 2, "ADC_I1_Raw", U16, "ro", 0, WORD, 0, "", 0, 79),
@@ -259,7 +259,7 @@ ENTRIES = [
     (0x6083, 0, "Profile acceleration", U32, "rw", 0, DWORD, 0, "pps^2", 0, 173),
     (0x6084, 0, "Profile deceleration", U32, "rw", 0, DWORD, 0, "pps^2", 0, 175),
     (0x6085, 0, "Quick stop deceleration", U32, "rw", 0, DWORD, 51200, "pps^2", 0, 177),
-    (0x60F2, 0, "Positioning option code", U16, "rw", 0, WORD, 0, "", 0, 180),
+    (0x60F2, 0, "Positioning option code", U16, "rw", 0, 2, 0, "", 0, 180),  # table 178: 3 is reserved, no other bits
     (0x60FF, 0, "Target velocity", I32, "rw", LOW32, HIGH32, 0, "pps", 1, 208),
     (0x607C, 0, "Home offset", I32, "rw", LOW32, HIGH32, 0, "inc", 0, 224),
     (0x6098, 0, "Homing method", I8, "rw", -128, 127, 0, "", 0, 226),

@@ -456,6 +456,28 @@ def test_a_warning_that_lasts_is_sent_once():
         assert messages(drives) == [(0, 0x4310, (1, 0, 0, 0, 0))]
 
 
+def test_2101h_tells_what_is_wrong_now_not_what_came_first():
+    """Table 85 is a status: a second cause shows, and the first does no longer once it is gone."""
+    undervoltage, emergency_stop = 1 << 1, 1 << 12
+    with EmulatedDrives(load="inertia", num_machines=2) as drives:
+        turn(drives)
+        enable_input(False)(drives)
+        drives.advance(0.01)
+        assert drives.read(0x2101)[0] & FAULT_FLAGS == emergency_stop
+        drives.machine.supply = [5.0, 24.0]
+        drives.advance(0.5)
+        assert drives.read(0x2101)[0] & FAULT_FLAGS == emergency_stop | undervoltage
+        enable_input(True)(drives)
+        drives.advance(0.01)
+        assert drives.read(0x2101)[0] & FAULT_FLAGS == undervoltage
+        assert state(drives) == FAULT
+        drives.machine.supply = 24.0
+        drives.advance(0.5)
+        assert drives.read(0x2101)[0] & FAULT_FLAGS == 0
+        assert state(drives) == FAULT
+        assert [code for _, code, _ in messages(drives)] == [0x5441]
+
+
 # --- limits of travel -----------------------------------------------------------------------------------------------
 class Limit(NamedTuple):
     """A limit of travel: first additional byte of FF01h (table 303), load, side, and where it stands [inc]."""
@@ -467,6 +489,7 @@ class Limit(NamedTuple):
 
 
 TURNS_TO_SWITCH = 0.23 / (2.0 * np.pi * 0.006366)  # pulley of the belt axis
+NO_ERROR = (0, 0x0000, (0, 0, 0, 0, 0))  # CiA 301: 1001h has fallen to 0
 LIMITS = {
     "positive software limit": Limit(1, "inertia", +1, 250_000),
     "negative software limit": Limit(2, "inertia", -1, -350_000),
@@ -511,6 +534,7 @@ def test_limit_of_travel_stops_the_axis_and_leaves_it_enabled(name):
         drives.write(0x60FF, [-limit.side * 300_000, 0])
         drives.advance(0.5)
         assert drives.read(0x1001).tolist() == [0, 0]
+        assert messages(drives) == [NO_ERROR]
 
 
 def command(drives: Drives, mode: str, way: int) -> None:
@@ -556,7 +580,44 @@ def test_axis_leaves_a_limit_but_goes_no_further(name, mode):
         assert back > 20_000
         assert bits(drives, INTERNAL_LIMIT) == 0
         assert state(drives) == ENABLED
-        assert messages(drives) == []
+        assert messages(drives) == [NO_ERROR]
+
+
+@pytest.mark.parametrize("side", [+1, -1])
+@pytest.mark.parametrize("mode", ["pp", "csp", "csv", "pv"])
+def test_axis_that_its_load_pushes_past_a_software_limit_tells_and_can_be_led_back(mode, side):
+    """Section 6.1.11: the limits are the actual position's, too; table 303: "the actual position is outside"."""
+    with EmulatedDrives(load="inertia", num_machines=2) as drives:
+        drives.write("Software position limit.Minimum Position Limit", -30_000)
+        drives.write("Software position limit.Maximum Position Limit", 30_000)
+        drives.write(0x2003, [200, 2000])
+        drives.write(0x6065, 0)
+        motion.enable(drives, mode=mode)
+        drives.advance(0.02)
+        drives.machine.load_torque = [side * 0.02, 0.0]
+        while side * int(drives.read(0x6064)[0]) < 60_000:
+            drives.advance(0.01)
+        drives.machine.load_torque = 0.0
+        assert [(m.axis, m.code, m.error_register, m.extra) for m in drives.emergencies()] == [
+            (0, 0xFF01, 0x21, (1 if side > 0 else 2, 0, 0, 0, 0))
+        ]
+        assert drives.read(0x1001).tolist() == [0x21, 0]
+        assert [bits(drives, INTERNAL_LIMIT, machine) for machine in (0, 1)] == [INTERNAL_LIMIT, 0]
+        assert state(drives) == ENABLED
+        drives.write(0x2003, 2000)
+        drives.advance(0.5)
+        # A position mode goes back by itself; a velocity mode is led.
+        if mode in ("csv", "pv"):
+            assert drives.read(0x1001).tolist() == [0x21, 0]
+            drives.write(0x60FF, [-side * 300_000, 0])
+            while side * int(drives.read(0x6064)[0]) > 0:
+                drives.advance(0.001)
+            drives.write(0x60FF, 0)
+            drives.advance(0.1)
+        assert abs(drives.read(0x6064)[0]) < 29_000
+        assert [(m.axis, m.code, m.error_register, m.extra) for m in drives.emergencies()] == [(0, 0, 0, (0,) * 5)]
+        assert drives.read(0x1001).tolist() == [0, 0]
+        assert bits(drives, INTERNAL_LIMIT) == 0
 
 
 def test_positions_beyond_a_software_limit_are_not_approached():

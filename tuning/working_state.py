@@ -32,7 +32,7 @@ MOTOR_TYPE, COMMUTATION, POLE_PAIRS, OPEN_LOOP_CURRENT = 0x2050, 0x2055, 0x2056,
 MAX_CURRENT, ENCODER_DIRECTION, ENCODER_STEPS, SHAFT_DIRECTION = 0x2003, (0x2080, 1), (0x2080, 2), 0x2057
 FOLLOWING_WINDOW, LIMIT_SWITCHES, INPUTS, MOTOR_FLAGS, INIT_MODE = 0x6065, 0x2005, 0x60FD, 0x2101, (0x2080, 3)
 BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
-INITIALIZED = 1 << 15  # of 2101h: the encoder is aligned
+STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is aligned
 # What experiments change, in the order in which it is given back.
 CHANGED = (
     MAX_CURRENT, OPEN_LOOP_CURRENT, *GAIN_OBJECTS, MOTOR_TYPE, COMMUTATION, POLE_PAIRS, ENCODER_STEPS, 0x6083, 0x6084,
@@ -181,7 +181,7 @@ def enable(working: Working, mode: str, where: Mask | None = None) -> None:
         motion.enable(drives, mode=mode, where=axes, timeout=ENABLE_TIME)
         waited = 0.0
         aligns = axes & (drives.read(COMMUTATION) == BY_ENCODER) & (drives.read(MOTOR_TYPE) == BRUSHLESS)
-        while np.any(aligns & (drives.read(MOTOR_FLAGS) & INITIALIZED == 0)) and waited < ALIGNMENT_TIME:
+        while np.any(aligns & (drives.read(MOTOR_FLAGS) & STOP_MODE != 0)) and waited < ALIGNMENT_TIME:
             drives.advance(50 * CYCLE)
             waited += 50 * CYCLE
     except (TimeoutError, RuntimeError) as error:

@@ -447,7 +447,8 @@ class Tracking(Lanes):
         """Return what ended each lane: emergencies by name, "diverged", "fell", "not enabled"; "" where nothing did."""
         names: list[list[str]] = [[] for _ in range(self.num_envs)]
         for message in self.drives.emergencies():
-            names[message.axis // self._axes].append(message.name)
+            if message.code:
+                names[message.axis // self._axes].append(message.name)
         machine = getattr(self.drives, "machine", None)
         diverged = machine.diverged if machine is not None else np.zeros(self.num_envs, bool)
         found = np.full(self.num_envs, "", object)

@@ -429,6 +429,7 @@ def power_on(records, where):
         drive.drive_function[lane] = 0.0
         drive.stage_on[lane] = 0.0
         drive.active[lane] = 0
+        drive.present[lane] = 0
         drive.blocked[lane] = 0
         drive.warning[lane] = 0
         drive.overload[lane] = 0.0

@@ -257,7 +257,7 @@ def fault(drive, lane, cut):
 
 @stage
 def update_statusword(drive, lane, mode_bits):
-    """Write 6041h and the status flags from the state; `mode_bits` are bits 12 and 13.
+    """Write 6041h and the status flags from the state; `mode_bits` are bits 11 to 13.
 
     Bit 4 tells that the supply is present, bit 9 (remote) is always set: this drive takes commands from the bus only.
     Bit 15 is set while the motor turns in the negative direction (the manual does not say which).

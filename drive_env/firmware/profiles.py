@@ -29,7 +29,7 @@ def unwrapped(target, position, scaler):
     Positions on the bus wrap at 2^31 increments (`scaler` per revolution); a target that the master gives refers to
     what it reads.
     """
-    turn = 4294967296.0 * 6.283185307179586 / abs(scaler)
+    turn = 4294967296.0 * 6.283185307179586 / scaler
     if abs(position) < 0.5 * turn:
         return target
     return target + turn * math.floor((position - target) / turn + 0.5)

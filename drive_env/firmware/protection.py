@@ -50,6 +50,8 @@ CAUSES = (
     Cause("negative_limit_switch", LIMIT, 0x20, 0x0),
     # From outside the axis (`trip`): its network was stopped or lost.
     Cause("communication_error", STOP, 0x10, 0x0),
+    # The axis has left its limits: 0000h too, as CiA 301 has it, but no command, and nothing else ends with it.
+    Cause("fault_reset", WARN, 0x00, 0x0),
 )
 (
     _RESET,
@@ -72,10 +74,13 @@ CAUSES = (
     POSITIVE_SWITCH,
     NEGATIVE_SWITCH,
     COMMUNICATION,
+    LIMITS_LEFT,
 ) = range(len(CAUSES))
 GENERIC_ERROR = 0x01  # bit 0 of 1001h is set with every error
 BLOCKS_NEGATIVE, BLOCKS_POSITIVE = 1, 2
 ROUNDING = 1e-9  # rad: a target at the corrected limit itself is within it
+# rad, one degree of the rotor: an axis that is held at its limit moves by less, and is not told of.
+LIMIT_MARGIN = 0.017453292519943295
 HOMING = 6  # limit switches are what homing looks for
 
 _CUTS, _STOPS, _LIMITS, _WARNS = (
@@ -84,6 +89,9 @@ _CUTS, _STOPS, _LIMITS, _WARNS = (
 )
 _POSITIVE = 1 << POSITIVE_SOFTWARE | 1 << POSITIVE_SWITCH
 _NEGATIVE = 1 << NEGATIVE_SOFTWARE | 1 << NEGATIVE_SWITCH
+_SOFTWARE = 1 << POSITIVE_SOFTWARE | 1 << NEGATIVE_SOFTWARE
+# What is over as soon as the stage is off: the driver shows it until the reset.
+_HELD = 1 << HIGH_SIDE | 1 << BRIDGE_A | 1 << BRIDGE_B | 1 << OPEN_LOAD_A | 1 << OPEN_LOAD_B | 1 << OVERLOAD
 _REGISTER = tuple(cause.error_register for cause in CAUSES)
 _FLAGS = tuple(cause.status_flag for cause in CAUSES)
 
@@ -157,14 +165,42 @@ def conditions(drive, lane):
             bits |= 1 << FOLLOWING_ERROR
         # Limit switches are what homing looks for, and before it positions mean nothing.
         if drive.mode_display[lane] != HOMING:
-            if drive.position_demand[lane] > corrected_maximum(drive, lane):
-                bits |= 1 << POSITIVE_SOFTWARE
-            if drive.position_demand[lane] < corrected_minimum(drive, lane):
-                bits |= 1 << NEGATIVE_SOFTWARE
+            bits |= demand_beyond(drive, lane) | actual_beyond(drive, lane)
             if inputs.is_active(drive, lane, 1):
                 bits |= 1 << POSITIVE_SWITCH
             if inputs.is_active(drive, lane, 0):
                 bits |= 1 << NEGATIVE_SWITCH
+    return bits
+
+
+@stage
+def demand_beyond(drive, lane):
+    """Return the software limits that the position demand is past.
+
+    Only position modes have such a demand: what the velocity modes integrate for 6062h is shifted against the axis by a
+    load that pushes it.
+    """
+    if drive.loop_level[lane] != 2:
+        return 0
+    bits = 0
+    if drive.position_demand[lane] > corrected_maximum(drive, lane):
+        bits |= 1 << POSITIVE_SOFTWARE
+    if drive.position_demand[lane] < corrected_minimum(drive, lane):
+        bits |= 1 << NEGATIVE_SOFTWARE
+    return bits
+
+
+@stage
+def actual_beyond(drive, lane):
+    """Return the software limits that the axis is past (manual, section 6.1.11); one told lasts to its edge."""
+    position = drive.theta_meas[lane]
+    past_positive = 0.0 if drive.active[lane] & 1 << POSITIVE_SOFTWARE else LIMIT_MARGIN
+    past_negative = 0.0 if drive.active[lane] & 1 << NEGATIVE_SOFTWARE else LIMIT_MARGIN
+    bits = 0
+    if position > corrected_maximum(drive, lane) + past_positive:
+        bits |= 1 << POSITIVE_SOFTWARE
+    if position < corrected_minimum(drive, lane) - past_negative:
+        bits |= 1 << NEGATIVE_SOFTWARE
     return bits
 
 
@@ -194,6 +230,7 @@ def protect(drive, lane, dt):
     """Look at every cause; one that appears queues its emergency and has its reaction."""
     watch_phases(drive, lane, dt)
     present = conditions(drive, lane)
+    drive.present[lane] = present
     if drive.fsa[lane] < fsa.SWITCHED or drive.fsa[lane] == fsa.FAULTED:
         # A drive whose supply or enable is missing is in no fault before anybody switches it on.
         present &= ~(_CUTS | _STOPS)
@@ -204,14 +241,17 @@ def protect(drive, lane, dt):
     told = drive.active[lane] & _STOPS if drive.fsa[lane] == fsa.REACTING else 0
     drive.active[lane] = present | told
     drive.warning[lane] = 1 if present & _WARNS else 0
-    drive.blocked[lane] = (BLOCKS_POSITIVE if present & _POSITIVE else 0) | (
-        BLOCKS_NEGATIVE if present & _NEGATIVE else 0
+    # A position demand that is within the limits leads an axis back that was pushed past them.
+    blocking = present & ~_SOFTWARE | demand_beyond(drive, lane) if drive.loop_level[lane] == 2 else present
+    drive.blocked[lane] = (BLOCKS_POSITIVE if blocking & _POSITIVE else 0) | (
+        BLOCKS_NEGATIVE if blocking & _NEGATIVE else 0
     )
     # A limit shows in 1001h while it lasts; what made a fault stays there until the reset.
     if present & _LIMITS:
         drive.error_register[lane] |= GENERIC_ERROR | _REGISTER[POSITIVE_SOFTWARE]
-    elif drive.fault[lane] == 0:
+    elif drive.fault[lane] == 0 and drive.error_register[lane] != 0:
         drive.error_register[lane] = 0
+        fsa.push_emergency(drive, lane, LIMITS_LEFT)
     if appeared == 0:
         return
     for cause in range(1, len(_REGISTER)):
@@ -251,6 +291,18 @@ def trip(records, first_axis, num_axes, cause):
 
 @stage
 def fault_flags(drive, lane):
-    """Return the bits of 2101h that tell which fault the drive is in."""
-    flags = _FLAGS[drive.fault[lane] - 1] if drive.fault[lane] > 0 else 0
+    """Return the bits of 2101h that tell what is wrong now, in whatever state the drive is."""
+    causes = drive.present[lane]
+    if drive.fault[lane] > 0:
+        causes |= 1 << (drive.fault[lane] - 1) & _HELD
+    flags = 0
+    for cause in range(1, len(_FLAGS)):
+        if causes & 1 << cause:
+            flags |= _FLAGS[cause]
     return flags
+
+
+@stage
+def limit_bit(drive, lane):
+    """Return bit 11 of the statusword while the axis is past a software limit."""
+    return 0x0800 if drive.active[lane] & _SOFTWARE else 0

@@ -208,6 +208,7 @@ STATE = (
     Field("open_load_time_a", "f8", "s", "time for which phase A carried no current although it should"),
     Field("open_load_time_b", "f8", "s", "the same of phase B"),
     Field("active", "i4", "", "bits of the causes whose condition held at the last look"),
+    Field("present", "i4", "", "bits of the causes whose condition holds now, whatever the state"),
     Field("warning", "i4", "", "statusword bit 7"),
     Field("block_uses_halls", "i4", "", "lane 0: 1 if a lane of this block commutates by halls"),
     Field("block_has_open_phase", "i4", "", "lane 0: 1 if a lane of this block has a broken phase"),

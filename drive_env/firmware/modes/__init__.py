@@ -35,9 +35,12 @@ PP, PV, HM, CSP, CSV, CST = 1, 3, 6, 8, 9, 10
 def slow_down_ramp(drive, lane):
     """Return the deceleration [rad/s^2] of the mode in use; 0 where it is not set, which stops at once.
 
-    pv has one ramp for both ways (manual, 6083h); cst and no mode have none of their own and take 6084h.
+    pv has one ramp for both ways (manual, 6083h), and so has hm (609Ah); cst and no mode have none of their own and
+    take 6084h.
     """
-    rate = drive.deceleration[lane]
+    rate = drive.homing_acceleration[lane] if drive.mode_display[lane] == HM else 0.0
+    if rate == 0.0:
+        rate = drive.deceleration[lane]
     if drive.mode_display[lane] == PV or rate == 0.0:
         rate = drive.acceleration[lane]
     return rate
@@ -196,9 +199,12 @@ def generate_demand(drive, lane, dt):
 
 @stage
 def mode_bits(drive, lane):
-    """Return bits 12 and 13 of the statusword as the present mode documents them (tables 148, 217, 237, 263, 283)."""
+    """Return bits 12 and 13 of the statusword as the present mode documents them (tables 148, 217, 237, 263, 283).
+
+    And bit 11 of an axis that is past a software limit, beside that of a target that is.
+    """
     mode = drive.mode_display[lane]
-    bits = 0
+    bits = protection.limit_bit(drive, lane)
     if mode == PP:
         if drive.set_point_acknowledged[lane] == 1:
             bits |= 0x1000
@@ -227,10 +233,12 @@ FLAG_POSITION_END, FLAG_INITIALIZED, FLAG_BRAKE = 1 << 14, 1 << 15, 1 << 18
 @stage
 def status_flags(drive, lane):
     """Return the bits of 2101h that tell what the motor does."""
-    flags = FLAG_INITIALIZED if drive.init_state[lane] == alignment.DONE else 0
+    flags = FLAG_INITIALIZED if drive.fsa[lane] != fsa.NOT_READY else 0
     if abs(drive.omega_slow[lane]) <= drive.standstill[lane]:
         flags |= FLAG_HALTED
-    if drive.drive_function[lane] == 0.0 or drive.stopping[lane] == 1 or drive.braking[lane] == 1:
+    stops = drive.drive_function[lane] == 0.0 or drive.stopping[lane] == 1 or drive.braking[lane] == 1
+    # While the encoder is aligned the motor is in none of its modes.
+    if stops or alignment.is_busy(drive, lane):
         flags |= FLAG_STOP
     elif drive.loop_level[lane] == 2.0:
         flags |= FLAG_POSITION
