@@ -17,7 +17,7 @@ from drive_env.positioning import plan_move
 from drive_env.safety.envelope import SafetyError
 from drive_env.score import HiddenScore
 from tuning import auto as auto_module
-from tuning import auto_margins, auto_search, auto_trials
+from tuning import auto_margins, auto_search, auto_trials, provenance
 from tuning.auto import BUDGET, auto
 from tuning.auto_certificate import certificate
 from tuning.auto_checks import unsafe_gains
@@ -113,6 +113,7 @@ def test_the_certificate_says_what_was_done(five):
     assert [list(axis.before) for axis in paper.axes] == before[0].tolist()
     assert [list(axis.after) for axis in paper.axes] == after[0].tolist()
     assert all(axis.reason for axis in paper.axes)
+    assert paper.versions["sources"] == provenance.SOURCES
     tuned = paper.axes[NORMAL]
     assert tuned.identified["inertia"].value == pytest.approx(1.48e-5, rel=0.1)
     assert "verified by a move, its reversal, and a move with 1.5 times velocity P" in tuned.reason
