@@ -368,6 +368,7 @@ class CanDrives:
 
     def read_entry(self, entry: Entry) -> Any:
         """Read an object of every axis without being watched."""
+        entry = self._description.shown_by(entry)
         check_readable(entry)
         values = [self.read_axis(entry, axis) for axis in range(self.num_axes)]
         if not self._description.is_number(entry):

@@ -59,12 +59,15 @@ class Entry:
 
 
 def read_eds(path: Path, node_id: int = 1) -> canopen.ObjectDictionary:
-    """Return python-canopen's model of an EDS; a file that is not UTF-8 is read as cp1252, which many vendors' are."""
+    """Return python-canopen's model of an EDS; a file that is not UTF-8 is read as cp1252, which many vendors' are.
+
+    Bytes that cp1252 lacks stand in names and comments alone, where they are shown as unknown.
+    """
     raw = read_bytes(path)
     try:
-        text = raw.decode("utf-8")
+        text = raw.decode("utf-8-sig")
     except UnicodeDecodeError:
-        text = raw.decode("cp1252")
+        text = raw.decode("cp1252", errors="replace")
     source = io.StringIO(text)
     source.name = str(path)
     return canopen.import_od(source, node_id)

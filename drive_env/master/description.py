@@ -43,6 +43,7 @@ EMERGENCY_NAMES = {
 KINDS: dict[Key, int] = {(0x6040, 0): 16, (0x6041, 0): 16, (0x6060, 0): 8, (0x6061, 0): 8, (0x6064, 0): 32,
                          (0x606C, 0): 32, (0x6077, 0): 16, (0x607A, 0): 32, (0x60FF, 0): 32, (0x6071, 0): 16,
                          (0x605A, 0): 16}  # fmt: skip
+MODE, MODE_DISPLAY = (0x6060, 0), (0x6061, 0)
 LONGEST_TIMEOUT = 3600.0  # s: no drive takes so long, and a wait of 1e300 s is none that an operating system knows
 CIA_402 = MasterHints(rpdo_type=1, current_limit=(0x6073, 0), timeout=0.5, timeouts={0x1010: 10.0, 0x1011: 10.0})
 
@@ -84,6 +85,12 @@ class Description:
             if offset.first <= entry.index <= offset.last:
                 return entry.index + axis * offset.step, entry.sub
         return entry.index, entry.sub
+
+    def shown_by(self, entry: Entry) -> Entry:
+        """Return the entry that shows another one: 6061h shows a 6060h that can only be written (CiA 402)."""
+        if entry.access == "wo" and (entry.index, entry.sub) == MODE and self.has(MODE_DISPLAY):
+            return self.dictionary.find(MODE_DISPLAY)
+        return entry
 
     def label(self, entry: Entry, axis: int) -> str:
         """Return what a message calls the object of an axis."""

@@ -10,13 +10,14 @@ from drive_env.canopen.frames import EXTENDED, IDENTIFIER, INVALID, RPDO, TPDO
 from drive_env.dictionary.access import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.master.description import Description
-from drive_env.master.errors import BusError
+from drive_env.master.errors import BusError, RefusedError
 from drive_env.master.mapping import PDO_BITS, Slots, pack
 from drive_env.master.sdo import SdoClient
 from drive_env.master.tidying import Tidying
 
 # Transmission types of a TPDO (CiA 301, table 74): at each SYNC; with a SYNC at all.
 SYNC_EVERY, WITH_SYNC = 1, range(241)
+SYNCHRONOUS = (1, 0)  # types of an RPDO that waits for SYNC, of which some drives take one alone
 
 
 class Direction(NamedTuple):
@@ -225,8 +226,9 @@ class PdoConfiguration:
             members.append(Member(entry, axis, start, size))
             start += size
         cob_id = before.cob_id & ~(INVALID | IDENTIFIER) | can_id
-        kind = self._description.hints.rpdo_type if direction is INTO_DRIVE else SYNC_EVERY
-        self._write_all(direction, number, cob_id, kind, mapping, len(mapping), self._sdo.write)
+        own = self._description.hints.rpdo_type
+        kinds = dict.fromkeys((own, *SYNCHRONOUS)) if direction is INTO_DRIVE else (SYNC_EVERY,)
+        self._write_all(direction, number, cob_id, (*kinds,), mapping, len(mapping), self._sdo.write)
         return Pdo(label, can_id, start, tuple(members))
 
     def _look(self, direction: Direction, number: int) -> _Before:
@@ -252,7 +254,7 @@ class PdoConfiguration:
             self._quiet.discard(before.number)
         # Entries that are not in use are parameters, too: a backup has them.
         self._write_all(
-            direction, before.number, before.cob_id, before.kind, before.mapping, before.in_use, self._sdo.put_back
+            direction, before.number, before.cob_id, (before.kind,), before.mapping, before.in_use, self._sdo.put_back
         )
 
     def _write_all(
@@ -260,16 +262,25 @@ class PdoConfiguration:
         direction: Direction,
         number: int,
         cob_id: int,
-        kind: int,
+        kinds: tuple[int, ...],
         mapping: Sequence[int],
         count: int,
         write: Callable[[int, int, bytes, str, float], None],
     ) -> None:
-        """Remap in the order that CiA 301 demands: off, no entries, entries, their number, on."""
+        """Remap in the order that CiA 301 demands: off, no entries, entries, their number, on.
+
+        Of the transmission types the first one is written that the drive takes.
+        """
         put = partial(self._put, write=write)
         communication = direction.communication + number
         put(communication, 1, cob_id | INVALID, 4)
-        put(communication, 2, kind, 1)
+        for place, kind in enumerate(kinds, 1):
+            try:
+                put(communication, 2, kind, 1)
+                break
+            except RefusedError:
+                if place == len(kinds):
+                    raise
         put(direction.mapping + number, 0, 0, 1)
         for sub, value in enumerate(mapping, 1):
             put(direction.mapping + number, sub, value, 4)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.master.description import Key
+from drive_env.master.errors import RefusedError
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import (
     FOLLOWING_WINDOW,
@@ -140,7 +141,10 @@ class LimitsInForce:
     def _lend_one(self, key: Key, axis: int, limit: float, is_upper: bool) -> None:
         entry = self._drives.description.dictionary.find(key)
         assert entry.low is not None and entry.high is not None, "a limit is a number"
-        own = int(self._drives.read_axis(entry, axis))
+        try:
+            own = int(self._drives.read_axis(entry, axis))
+        except RefusedError:  # the EDS lists what the drive has not: the envelope alone watches then
+            return
         switched_off = own == 0 and key in (FOLLOWING_WINDOW, MAX_PROFILE_VELOCITY, MAX_MOTOR_SPEED)
         value = max(min(limit, float(entry.high)), float(entry.low))
         tighter = switched_off or (value < own if is_upper else value > own)
