@@ -103,6 +103,10 @@ class CanDrives:
         self.num_axes = len(self.nodes) * self._description.num_axes
         if pace not in ("real-time", "lockstep"):
             raise ValueError(f"pace is 'real-time' or 'lockstep', not {pace!r}")
+        if not isinstance(safety, bool | Limits):  # None, say, must not quietly mean that nobody watches
+            raise TypeError(
+                f"safety = {safety!r} must be Limits, True for those of the drives, or False for an emulator"
+            )
         # A dry run has nothing to wait for either.
         by_sync = pace == "lockstep" or bool(dry_run)
         self._pace: Pace = LockstepPace() if by_sync else RealTimePace(self._description.cycle)

@@ -47,6 +47,13 @@ def test_limits_that_cannot_be_are_told(given, text):
         Limits(**given)
 
 
+@pytest.mark.parametrize("safety", [None, 0, 1, "off", {}])
+def test_nobody_is_left_unwatched_by_mistake(bus, drive, safety):
+    with pytest.raises(TypeError, match=r"safety = .* must be Limits, True .*, or False for an emulator"):
+        CanDrives(bus=bus, pace="lockstep", safety=safety)
+    assert not drive.log
+
+
 def test_a_limit_has_one_value_or_one_for_each_axis(bus):
     with pytest.raises(ValueError, match="position has 2 values for 1 axes; give one for all, or one each"):
         CanDrives(bus=bus, pace="lockstep", safety=Limits(position=((0, 0), (5, 5))))
