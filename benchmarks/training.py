@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from importlib.util import find_spec
 from typing import Any
@@ -23,7 +22,7 @@ def training(environment: str, section: str | None, rollouts: int) -> dict[str, 
     given = hyperparameters.load(environment, "ppo", "quick", section=section)
     given["n_timesteps"] = rollouts * given["n_envs"] * given["n_steps"]
     given["imitate"] = None  # that is before the training
-    cores = min(CORES, os.cpu_count() or 1)
+    cores = min(CORES, usable_cores())
     hyperparameters.merge(given, {"env_kwargs": {"num_threads": cores}})
     told: list[Progress] = []
     with tempfile.TemporaryDirectory() as folder:

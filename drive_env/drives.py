@@ -5,7 +5,6 @@ Whatever acts on a drive uses this interface and nothing deeper, so that it runs
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.arguments import checked_mask, object_names, whole_cycles
+from drive_env.cores import usable_cores
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.entries import ObjectName
 from drive_env.emergency import EmergencyMessage
@@ -67,7 +67,7 @@ class EmulatedDrives:
         ideal: Take a stage, encoder and bearings without faults.
         parameters: True machine parameters [SI] that replace defaults and draws: one value or one per machine.
         supply: Supply voltage [V]; the motor's by default.
-        num_threads: Threads that run machines; the number of cores by default.
+        num_threads: Threads that run machines; the cores that this process may use by default.
         physics_steps: Physics steps per velocity-loop period.
         integrator: "leapfrog", or "rk4", the slower oracle.
         friction: How the load's friction is modelled: "none", "coulomb_viscous", "stribeck" or "lugre".
@@ -107,7 +107,7 @@ class EmulatedDrives:
         self.num_machines = num_machines
         self.num_axes = num_machines * self.load.num_axes
         self._records = new_records(self.num_axes)
-        self._threads = max(1, num_threads if num_threads is not None else os.cpu_count() or 1)
+        self._threads = max(1, num_threads if num_threads is not None else usable_cores())
         self._executor: ThreadPoolExecutor | None = None
         self._reported = np.zeros(num_machines, bool)
         numbers = (

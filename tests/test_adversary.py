@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import random
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
@@ -29,6 +28,7 @@ from adversary import (
 from fault_injection import eds_read_once
 
 from drive_env import Limits
+from drive_env.cores import usable_cores
 from drive_env.firmware.fsa import State
 
 SAMPLE, MANY = 40, 600
@@ -44,7 +44,7 @@ def test_the_envelope_withstands_a_sample():
 
 @pytest.mark.slow
 def test_the_envelope_withstands_many():
-    cores = os.cpu_count() or 1
+    cores = usable_cores()
     tally = Tally()
     with ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
         for part in pool.map(attack_machines, [range(SAMPLE + k, SAMPLE + MANY, cores) for k in range(cores)]):

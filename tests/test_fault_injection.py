@@ -43,6 +43,7 @@ from fault_injection import (
 )
 
 from drive_env import EmulatedDrives
+from drive_env.cores import usable_cores
 
 # Every frame takes a quarter of an hour, every third one some minutes: FAULT_STRIDE=1 is for whoever changes what
 # enables, commands or stops.
@@ -105,7 +106,7 @@ def every_frame(name, kind, first, step):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SESSIONS)
 def test_a_fault_at_any_frame_leaves_no_axis_running(name, kind):
-    cores = os.cpu_count() or 1
+    cores = usable_cores()
     with ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
         parts = [
             pool.submit(every_frame, name, kind, first * STRIDE, cores * STRIDE) for first in range(cores)
