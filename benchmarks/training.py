@@ -22,6 +22,8 @@ def training(environment: str, section: str | None, rollouts: int) -> dict[str, 
     given = hyperparameters.load(environment, "ppo", "quick", section=section)
     given["n_timesteps"] = rollouts * given["n_envs"] * given["n_steps"]
     given["imitate"] = None  # that is before the training
+    from drive_env.cores import usable_cores
+
     cores = min(CORES, usable_cores())
     hyperparameters.merge(given, {"env_kwargs": {"num_threads": cores}})
     told: list[Progress] = []

@@ -42,7 +42,8 @@ def machine(tmp_path, monkeypatch):
           "sys/fs/cgroup/pod/cpu.max": "300000 100000\n"}, 3),
         # Version 1.
         ({"proc/self/cgroup": "7:memory:/box\n3:cpu,cpuacct:/box\n",
-          "sys/fs/cgroup/cpu/box/cpu.cfs_quota_us": "400000\n", "sys/fs/cgroup/cpu/box/cpu.cfs_period_us": "100000\n"}, 4),
+          "sys/fs/cgroup/cpu/box/cpu.cfs_quota_us": "400000\n",
+          "sys/fs/cgroup/cpu/box/cpu.cfs_period_us": "100000\n"}, 4),
         ({"proc/self/cgroup": "1:cpu:/\n", "sys/fs/cgroup/cpu/cpu.cfs_quota_us": "-1\n",
           "sys/fs/cgroup/cpu/cpu.cfs_period_us": "100000\n"}, MANY),
         # What cannot be understood is no quota.
