@@ -11,8 +11,10 @@ from typer.testing import CliRunner
 
 from drive_env import CanDrives
 from drive_env.cli import app
+from drive_env.devices import find_device
 from drive_env.master import parameters
-from drive_env.master.parameters import CommandObjectError, command, write_all_or_none
+from drive_env.master.description import CIA_402
+from drive_env.master.parameters import CommandObjectError, command, restorable, write_all_or_none
 
 DONE, REFUSED, USER_ERROR = 0, 1, 2
 PROFILE_VELOCITY = 0x6081
@@ -209,8 +211,19 @@ def test_nor_does_a_program_write_them_among_parameters(drive):
 
 
 def test_the_controlword_of_a_second_axis_is_a_command_too():
-    assert command(0x6840) == command(0x7040) == command(0x6040) == "controlword: a command"
-    assert not command(0x2840) and not command(0x6081)
+    hints = find_device("tmcm1636").master
+    assert {command(index, hints) for index in (0x6040, 0x6840, 0x7040)} == {"controlword: a command"}
+    assert not command(0x2840, hints) and not command(0x6081, hints)
+
+
+def test_of_another_maker_s_drive_the_same_numbers_are_parameters():
+    """2703h to 2706h and 5FFFh are what the TMCM-1636 has made of them."""
+    ours, theirs = find_device("tmcm1636").master, CIA_402
+    for index in (0x2703, 0x2706, 0x5FFF):
+        assert command(index, ours) and not command(index, theirs)
+    values = {(0x2704, 0): 1, (0x2705, 0): 2, (0x6081, 0): 3}
+    assert restorable(values, ours) == {(0x6081, 0): 3}
+    assert restorable(values, theirs) == values
 
 
 @pytest.mark.parametrize("arguments", [("restore", "drive.toml"), ("commission", "qbl4208")], ids=lambda a: a[0])

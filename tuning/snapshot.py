@@ -148,7 +148,8 @@ def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
     tables = data.get("axis")
     if not isinstance(tables, list) or not tables or not isinstance(data.get("device"), str):
         raise SnapshotError(f"{where} is no snapshot; give a file that drive-tune left before a change")
-    dictionary = describe(data["device"], None).dictionary
+    known = describe(data["device"], None)
+    dictionary = known.dictionary
     axes = []
     for table in tables:
         if not isinstance(table, dict):
@@ -164,7 +165,7 @@ def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
             except (ValueError, ObjectAccessError) as error:
                 raise SnapshotError(f"{where}: {text} = {value!r}: {error}") from None
             values[key] = int(value)
-        check_no_commands(values, where)
+        check_no_commands(values, where, known.hints)
         axes.append(values)
     check_seal(where, data, unchecked=unchecked)
     nodes = [load_identity(table) for table in data.get("node", []) if isinstance(table, dict)]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib
 import tomllib
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from drive_env.dictionary.bindings import Binding
@@ -77,6 +79,9 @@ class MasterHints(NamedTuple):
         timeouts: Index -> longest wait, of objects that take longer.
         position_scale: Object that holds the increments of a revolution, of a device that has its own.
         turns_positions_round: Objects that change what a position means besides its scale and zero: its direction.
+        commands: Index -> what it is, of the device's own objects that can be written but are no parameters.
+        addresses: Index -> what it is, of those that a backup keeps and nobody restores: the node would be another one
+            after its next reset, or mute.
     """
 
     rpdo_type: int
@@ -85,6 +90,8 @@ class MasterHints(NamedTuple):
     timeouts: dict[int, float]
     position_scale: tuple[int, int] | None = None
     turns_positions_round: tuple[tuple[int, int], ...] = ((0x607E, 0),)
+    commands: Mapping[int, str] = MappingProxyType({})
+    addresses: Mapping[int, str] = MappingProxyType({})
 
 
 class Device(NamedTuple):
@@ -208,6 +215,8 @@ def _master(data: dict[str, Any]) -> MasterHints:
         timeouts={int(index, 16): time for index, time in data["timeouts"].items()},
         position_scale=_key(data["position_scale"]) if "position_scale" in data else None,
         turns_positions_round=tuple(_key(text) for text in data["turns_positions_round"]),
+        commands={int(index, 16): what for index, what in data.get("commands", {}).items()},
+        addresses={int(index, 16): what for index, what in data.get("addresses", {}).items()},
     )
 
 

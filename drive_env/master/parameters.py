@@ -18,10 +18,11 @@ from drive_env.master.errors import BusError
 
 if TYPE_CHECKING:
     from drive_env.can_drives import CanDrives
+    from drive_env.devices import MasterHints
 
 Key = tuple[int, int]
 
-# What can be written but is no parameter.
+# What can be written but is no parameter, by CiA 301 and 402; a device's own are in its data.
 COMMANDS = {
     0x1003: "error history: a service",
     0x1010: "store: a service",
@@ -29,9 +30,6 @@ COMMANDS = {
     0x1F50: "program download: a service",
     0x1F51: "program control: a service",
     0x1F52: "program verification: a service",
-    0x2706: "store bus settings: a service",
-    0x5FFF: "bootloader: a service",
-    0x2703: "digital outputs: a command",
     0x6040: "controlword: a command",
     0x6042: "vl target velocity: a command",
     0x6060: "modes of operation: a command",
@@ -45,8 +43,6 @@ COMMANDS = {
     0x60FE: "digital outputs: a command",
     0x60FF: "target velocity: a command",
 }
-# Kept in a backup, never restored: the node would be somebody else after its next reset, or mute.
-IDENTITY_OF_THE_NODE = {0x2704: "CAN bit rate", 0x2705: "node-ID"}
 _DEVICE_OBJECTS = 0x2000  # from here on; what lies below is how a node talks
 _PROFILE = range(0x6000, 0xA000)  # the profile areas of up to eight axes (CiA 301)
 _COMMUNICATION = (range(0x1400, 0x1600), range(0x1800, 0x1A00))
@@ -80,23 +76,23 @@ def of_first_axis(index: int) -> int:
     return _PROFILE.start + (index - _PROFILE.start) % PROFILE_OFFSET
 
 
-def command(index: int) -> str:
-    """Return what command or service an object is, "" for none; those of a node's further axes are the same."""
-    return COMMANDS.get(of_first_axis(index), "")
+def command(index: int, hints: MasterHints) -> str:
+    """Return what command or service an object of a device is, "" for none; those of further axes are the same."""
+    return COMMANDS.get(of_first_axis(index)) or hints.commands.get(index, "")
 
 
-def check_no_commands(keys: Iterable[Key], where: object) -> None:
-    """Raise CommandObjectError, naming them, if any of these objects are commands or services."""
-    found = dict.fromkeys(f"{index:04X}h ({command(index)})" for index, _ in keys if command(index))
+def check_no_commands(keys: Iterable[Key], where: object, hints: MasterHints) -> None:
+    """Raise CommandObjectError, naming them, if any of these objects of a device are commands or services."""
+    found = dict.fromkeys(f"{index:04X}h ({command(index, hints)})" for index, _ in keys if command(index, hints))
     if found:
         raise CommandObjectError(
             f"{where} holds what is no parameter: {', '.join(found)}. Nothing was written; take it out"
         )
 
 
-def restorable(values: Mapping[Key, int]) -> dict[Key, int]:
-    """Return the values that are ever written back: not what makes a node somebody else, or mute."""
-    return {key: value for key, value in values.items() if key[0] not in IDENTITY_OF_THE_NODE}
+def restorable(values: Mapping[Key, int], hints: MasterHints) -> dict[Key, int]:
+    """Return the values that are ever written back to a device: not what makes a node somebody else, or mute."""
+    return {key: value for key, value in values.items() if key[0] not in hints.addresses}
 
 
 def parameters(drives: CanDrives) -> list[Entry]:
@@ -104,7 +100,9 @@ def parameters(drives: CanDrives) -> list[Entry]:
     return [
         entry
         for entry in drives.description.dictionary
-        if entry.access in ("rw", "rwr", "rww") and not command(entry.index) and drives.description.is_number(entry)
+        if entry.access in ("rw", "rwr", "rww")
+        and not command(entry.index, drives.description.hints)
+        and drives.description.is_number(entry)
     ]
 
 
@@ -139,9 +137,10 @@ def write_all_or_none(drives: CanDrives, wanted: Mapping[Key, int], axis: int = 
         NotRestoredError: If the drive refused or holds something else than was written; it is as it was before.
         RollbackError: If it could not be brought back; the message says what is left.
     """
-    check_no_commands(wanted, "what is to be written")
+    hints = drives.description.hints
+    check_no_commands(wanted, "what is to be written", hints)
     check_at_rest(drives, wanted, axis)
-    chosen = restorable(wanted)
+    chosen = restorable(wanted, hints)
     changes = compare(drives, chosen, axis)
     absent = [change.entry.label for change in changes if change.found is None]
     if absent:

@@ -127,7 +127,7 @@ def set_object(
                 print(f"{axis_name(drives, axis)}  {entry.label} = {_text(now, entry, scale, raw)}")
         differs = readable and any(a != b for a, b in zip(found, wanted, strict=True))
         # Stores and the like take a signature and read something else.
-        if differs and not command(entry.index).endswith("a service"):
+        if differs and not command(entry.index, drives.description.hints).endswith("a service"):
             fail(f"{entry.label} does not read back as it was written ({wanted[0]})", REFUSED)
 
 

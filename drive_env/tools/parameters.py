@@ -149,9 +149,10 @@ def restore(
     from drive_env.master.parameters import check_no_commands
 
     with errors_as_exit_codes():
-        wanted = load_parameters(file, describe(device, eds).dictionary)
+        known = describe(device, eds)
+        wanted = load_parameters(file, known.dictionary)
         written, axis_then = _check_file(file, unchecked=unchecked)
-        check_no_commands(wanted, file)
+        check_no_commands(wanted, file, known.hints)
         bus = _Bus(interface, channel, node, device, eds, bitrate, timeout)
 
         def check(drives: Any) -> None:
@@ -235,9 +236,10 @@ def _exchange(
         json: Print JSON.
         dry_run: Say what would be written, and write nothing.
     """
+    from drive_env.master.description import describe
     from drive_env.master.parameters import check_at_rest, compare, list_differences, restorable, write_all_or_none
 
-    wanted = restorable(wanted)
+    wanted = restorable(wanted, describe(bus.device, bus.eds).hints)
     if dry_run:  # to open a node that is stopped would send it an NMT command
         look_first(bus.interface, bus.channel, [bus.node], bus.bitrate, bus.device, bus.eds, bus.timeout)
     with _connected(*bus) as drives:

@@ -86,7 +86,7 @@ def _restore(
     verified = 0
     with CanDrives(snapshot.device, safety=False, **address) as drives:
         for axis, values in enumerate(snapshot.axes):
-            wanted = restorable(values)
+            wanted = restorable(values, drives.description.hints)
             verified += len(wanted)
             if left := compare(drives, wanted, axis):
                 fail(
