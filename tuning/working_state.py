@@ -181,6 +181,9 @@ def enable(working: Working, mode: str, where: Mask | None = None) -> None:
         motion.enable(drives, mode=mode, where=axes, timeout=ENABLE_TIME)
         waited = 0.0
         aligns = axes & (drives.read(COMMUTATION) == BY_ENCODER) & (drives.read(MOTOR_TYPE) == BRUSHLESS)
+        if aligns.any():  # the flags are those of the millisecond before; and what was switched on comes to rest
+            drives.advance(50 * CYCLE)
+            waited += 50 * CYCLE
         while np.any(aligns & (drives.read(MOTOR_FLAGS) & STOP_MODE != 0)) and waited < ALIGNMENT_TIME:
             drives.advance(50 * CYCLE)
             waited += 50 * CYCLE
