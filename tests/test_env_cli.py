@@ -420,11 +420,20 @@ def test_scope_waits_for_its_trigger(run, shared, tmp_path):
     out = tmp_path / "edge"
     code, _, error = run("scope", "6064", "--trigger", "606C > 100 rpm", "--wait", 0.2, "--out", out)
     assert (code, "did not fire within 0.2 s" in error) == (REFUSED, True), error
-    timer = threading.Timer(0.5, lambda: shared[1][0].write("Target velocity", 77))
-    timer.start()
+    recorded = threading.Event()
+
+    def now_and_then():  # again and again: nobody knows when the scope begins to look
+        while not recorded.wait(0.5):
+            shared[1][0].write("Target velocity", 77)
+            recorded.wait(0.5)
+            shared[1][0].write("Target velocity", 0)
+
+    other = threading.Thread(target=now_and_then)
+    other.start()
     arguments = ["--trigger", "60FF == 77", "--wait", 20, "--before", 0.01, "--duration", 0.02, "--out", out]
     code, _, error = run("scope", "60FF", *arguments)
-    timer.join()
+    recorded.set()
+    other.join()
     assert code == DONE, error
     rows = list(csv.reader(out.with_suffix(".csv").open()))[1:]
     assert len(rows) == 30
