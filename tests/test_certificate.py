@@ -35,7 +35,8 @@ from tuning.certificate import (
 from tuning.certificate_pictures import AFTER, BEFORE, DOUBTFUL, bode_picture, step_picture
 from tuning.cli import app
 from tuning.identification import Estimate, Identification, refused
-from tuning.margins import margins
+from tuning.margins import Margins, margins
+from tuning.measured_loop import AtLeast
 from tuning.report import to_html
 
 DEVICE = find_device("tmcm1636")
@@ -65,6 +66,7 @@ def certificate():
         axis=0,
         accepted=True,
         reason="all checks passed",
+        reservations=(),
         identified={
             "resistance": Parameter(0.3612, 0.355, 0.367, "ohm"),
             "resonance": Parameter(math.nan, math.nan, math.nan, "Hz", "travel too short: 0.1 <turns>"),
@@ -108,7 +110,7 @@ def test_the_file_is_strict_json_with_all_that_is_promised(certificate):
         "sha256",
     }  # fmt: skip
     assert set(data["axes"][0]) == {
-        "axis", "accepted", "reason", "identified", "before", "after", "before_si", "after_si", "steps",
+        "axis", "accepted", "reason", "reservations", "identified", "before", "after", "before_si", "after_si", "steps",
         "frequency_responses", "notes", "hardware_seconds", "aborts",
     }  # fmt: skip
 
@@ -152,10 +154,10 @@ def test_any_change_shows(certificate, tmp_path, where, value):
 
 @pytest.mark.parametrize(("text", "message"), [
     ("", "is no certificate"),
-    ("[1]", "is no certificate of format 1"),
-    ('{"a": 1}', "is no certificate of format 1"),
+    ("[1]", "is no certificate of format 2"),
+    ('{"a": 1}', "is no certificate of format 2"),
     ('{"format": 1, "sha256": "", "x": NaN}', "NaN is no number of JSON"),
-    ('{"format": 1, "sha256": ""}', "is no certificate of this version: 'tuner'"),
+    ('{"format": 2, "sha256": ""}', "is no certificate of this version: 'tuner'"),
 ])  # fmt: skip
 def test_what_is_no_certificate_is_said_to_be_none(tmp_path, text, message):
     path = tmp_path / "certificate.json"
@@ -240,7 +242,35 @@ def test_the_report_says_everything_that_the_certificate_holds(certificate):
                  "none", "418.9", "numpy", "phase margin [deg]", "90", "settling [s]", "0.07824", "seed", "7",
                  certificate.hash()):  # fmt: skip
         assert any(said in word for word in words), said
-    assert "gains as before" in to_html(replace(certificate, axes=(replace(certificate.axes[0], accepted=False),)))
+
+
+DOUBT = "no margins <yet>"
+
+
+@pytest.mark.parametrize(("accepted", "reservations", "verdict", "colour", "words"), [
+    (True, (), "accepted", "accepted", "new gains in the drive"),
+    (True, (DOUBT,), "accepted with reservations", "reserved", "new gains in the drive, with reservations"),
+    (False, (DOUBT,), "rejected", "rejected", "gains as before"),
+])  # fmt: skip
+def test_a_verdict_has_three_colours_and_names_each_reservation(
+    certificate, accepted, reservations, verdict, colour, words
+):
+    axis = replace(certificate.axes[0], accepted=accepted, reservations=reservations)
+    page = to_html(replace(certificate, axes=(axis,)))
+    assert axis.verdict == verdict
+    assert f"<span class='{colour}'>{words}</span>" in page
+    assert page.count("no margins &lt;yet&gt;") == len(reservations)
+
+
+def test_a_margin_that_was_not_seen_is_there_as_what_it_is_at_least():
+    L = np.full(F.shape, np.nan + 0j)
+    nothing = Margins(*(np.nan,) * 5)
+    shown = frequency_response("velocity loop", F, L, nothing, tuned=True, at_least=AtLeast(31.0, np.inf))
+    assert shown.margins["phase margin, at least [deg]"] == 31.0
+    assert "gain margin, at least [dB]" not in shown.margins
+    seen = nothing._replace(phase_deg=40.0)
+    shown = frequency_response("velocity loop", F, L, seen, tuned=True, at_least=AtLeast(31.0, 8.0))
+    assert [name for name in shown.margins if "at least" in name] == ["gain margin, at least [dB]"]
 
 
 def test_what_a_tuner_guessed_is_in_neither_file(certificate):
@@ -265,7 +295,7 @@ def test_what_has_no_guesses_is_identified_as_it_is():
 
 
 def test_an_axis_of_which_nothing_is_known_has_a_report_too(certificate):
-    bare = AxisCertificate(3, False, "the encoder turns the other way", {}, (0,) * 5, (0,) * 5, {}, {})
+    bare = AxisCertificate(3, False, "the encoder turns the other way", (), {}, (0,) * 5, (0,) * 5, {}, {})
     page = Page(to_html(replace(certificate, axes=(bare,))))
     assert "the encoder turns the other way" in page.words
     assert page.images == []

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tuning.margins import hidden_crossing, margins
+from tuning.margins import margins
 
 F = np.geomspace(1.0, 1000.0, 2000)
 S = 2j * math.pi * F
@@ -62,9 +62,6 @@ def test_a_crossing_that_nobody_saw_gives_no_margin():
     assert math.isnan(found.phase_deg)
     assert math.isnan(found.crossover_hz)
     assert found.gain_db == pytest.approx(20.0 * math.log10(125.0 / 20.0), abs=0.02)
-    assert hidden_crossing(F, L, seen) == pytest.approx((20.0 * math.exp(-0.2), 20.0 * math.exp(0.2)), rel=0.02)
-    assert hidden_crossing(F, L, np.ones(F.shape, bool)) is None
-    assert hidden_crossing(F, L, F > 30.0) is None  # it may pass 1 below, or not
 
 
 def test_a_phase_of_minus_180_degrees_that_nobody_saw_gives_no_gain_margin():

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tuning.auto_margins import measure
-from tuning.auto_moves import look_back, show
+from tuning.auto_margins import judge, measure
+from tuning.auto_moves import look_back, show, stand
 from tuning.auto_run import Run
 from tuning.auto_search import compute, identify, prepare
 from tuning.auto_settings import begin, commission, write
@@ -122,8 +122,10 @@ def prove_found(
         show(run)
         say("measuring the frequency response", 0.85)
         measure(run)
-        say("comparing with the gains before", 0.95)
+        say("comparing with the gains before", 0.93)
         look_back(run)
+        stand(run, target)
+        judge(run)
         tell_of_lateness(run)
         say("writing", 0.96)
         accepted = write(run, transaction)
@@ -146,7 +148,7 @@ def tell_of_lateness(run: Run) -> None:
     timing = drives.total_timing
     worst = 1e3 * timing.worst
     if timing.late:
-        run.note(
+        run.reserve(
             np.ones(run.target.num_axes, bool),
             f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {worst:.1f} ms: "
             "this computer is busy, and moves and responses are distorted by that; end other programs, or put "

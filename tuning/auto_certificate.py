@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env.gains import GAIN_OBJECTS
 from tuning.certificate import (
     AxisCertificate,
     Certificate,
@@ -17,8 +16,7 @@ from tuning.certificate import (
     identified,
     si_gains,
 )
-from tuning.linear_model import velocity_open_loop
-from tuning.load_step import load_step
+from tuning.linear_model import OPEN_LOOPS
 from tuning.margins import Margins, margins
 from tuning.provenance import versions
 
@@ -31,7 +29,7 @@ SETTLED = 0.01  # of the move: what counts as there
 
 
 def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") -> Certificate:
-    """Return the certificate of a run of auto; emulated axes feel a load step for it.
+    """Return the certificate of a run of auto.
 
     Args:
         target: What was tuned.
@@ -39,12 +37,7 @@ def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") 
         seed: That of the run.
         tuner: What found the gains.
     """
-    loaded = {}
-    if target.drives.machine is not None:
-        # Not of drives that were given other gains since.
-        now = np.stack([target.drives.read(name) for name in GAIN_OBJECTS], axis=1)
-        loaded = load_step(target, result.accepted & np.all(now == [run.after for run in result.axes], axis=1))
-    axes = tuple(_axis(target, result, axis, run, loaded.get(axis)) for axis, run in enumerate(result.axes))
+    axes = tuple(_axis(target, result, axis, run) for axis, run in enumerate(result.axes))
     return Certificate(
         tuner=tuner,
         device=target.device.name,
@@ -58,23 +51,29 @@ def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") 
     )
 
 
-def _axis(target: Target, result: Result, axis: int, run: AxisRun, loaded: StepResponse | None) -> AxisCertificate:
+def _axis(target: Target, result: Result, axis: int, run: AxisRun) -> AxisCertificate:
     supply = float(target.supply[axis])
+    loaded = [result.loaded[axis]] if axis in result.loaded else []
     return AxisCertificate(
         axis=axis,
         accepted=run.accepted,
-        reason=run.reason or f"every check was passed: the gains were verified {run.verified}",
+        reservations=tuple(run.reservations),
+        reason=run.reason or f"{_opening(run)}: the gains were verified {run.verified}",
         identified={} if run.identified is None else identified(run.identified),
         before=tuple(run.before),
         after=tuple(run.after),
         before_si=si_gains(target.device, supply, run.before),
         after_si=si_gains(target.device, supply, run.after),
-        steps=(*_steps(result, axis), *([loaded] if loaded else [])) if run.accepted else (),
+        steps=(*_steps(result, axis), *loaded) if run.accepted else (),
         frequency_responses=_responses(target, result, axis, run) if run.accepted else (),
         notes=tuple(run.notes),
         hardware_seconds=float(result.drive_seconds[axis]),
         aborts=int(result.aborts[axis]),
     )
+
+
+def _opening(run: AxisRun) -> str:
+    return "every check was passed" if not run.reservations else "every check that could be made was passed"
 
 
 def _steps(result: Result, axis: int) -> tuple[StepResponse, ...]:
@@ -98,35 +97,53 @@ def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
         "overshoot [%]": 100.0 * max(float(beyond.max()), 0.0) / size,
         "largest following error [rad]": float(np.abs(demand - actual).max()),
         "error at the end [rad]": float(demand[-1] - actual[-1]),
+        "current at rest afterwards, RMS over rated [%]": 100.0 * float(shown.swing[axis]),
     }
     return StepResponse("move", tuned, "rad", shown.t, demand, actual, way * shown.current[:, axis], figures)
 
 
 def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple[FrequencyResponse, ...]:
-    """Return the velocity loop as measured with the new gains, and as computed with those before."""
+    """Return both outer loops as measured with the new gains, and as computed with those before."""
     response = result.response
-    if response is None or run.is_kept or not np.isfinite(response.open_loop[:, axis]).any():
+    if response is None or not np.isfinite(response.open_loop[:, axis]).any():
         return ()
     # Too few lines are coherent for margins: then they are shown as what they are.
-    found = Margins(*(np.nan,) * len(Margins._fields)) if run.margins is None else run.margins
-    measured = frequency_response(
-        "velocity loop",
-        response.f,
-        response.open_loop[:, axis],
-        found,
-        tuned=True,
-        coherence=response.coherence[:, axis],
-        source="multisine, 1 kHz samples",
-    )
-    if run.plant is None or 0 in (run.before.torque_p, run.before.velocity_p):
-        return (measured,)  # an open loop has no response
-    L = velocity_open_loop(target.device, run.plant, run.before, response.f)
-    before = frequency_response(
-        "velocity loop",
-        response.f,
-        L,
-        margins(response.f, L),
-        tuned=False,
-        source="the linear model of what was identified, for the gains before",
-    )
-    return before, measured
+    nothing = Margins(*(np.nan,) * len(Margins._fields))
+    loops, device = response.loops(run.after, axis, plant=run.plant, refined=False), target.device
+    changed = not np.array_equal(response.gains[axis], run.after)
+    sources = {
+        "velocity": "multisine, 1 kHz samples"
+        + (", with other gains, and by how much these differ" if changed else ""),
+        "position": "the measured velocity loop and position P",
+    }
+    closed = run.plant is not None and 0 not in (run.before.torque_p, run.before.velocity_p)
+    shown = []
+    for name, L in (("velocity", loops.velocity), ("position", loops.position)):
+        if name == "position" and name not in run.margins:
+            continue  # too little was seen, or an axis alone that never goes alone
+        if closed and not (name == "position" and run.before.position_p == 0) and not run.is_kept:
+            assert run.plant is not None, "it was looked for"
+            before = OPEN_LOOPS[name](device, run.plant, run.before, response.f)
+            shown.append(
+                frequency_response(
+                    f"{name} loop",
+                    response.f,
+                    before,
+                    margins(response.f, before),
+                    tuned=False,
+                    source="the linear model of what was identified, for the gains before",
+                )
+            )
+        shown.append(
+            frequency_response(
+                f"{name} loop",
+                response.f,
+                L,
+                run.margins.get(name, nothing),
+                at_least=run.at_least.get(name),
+                tuned=True,
+                coherence=response.coherence[:, axis],
+                source=sources[name],
+            )
+        )
+    return tuple(shown)

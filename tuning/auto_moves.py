@@ -1,4 +1,4 @@
-"""Moves for the record: with the new gains, and with those before, which are kept where they do better."""
+"""Moves for the record, with the new gains and those before, and whether axes stand still after them."""
 
 from __future__ import annotations
 
@@ -7,18 +7,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
 from tuning.auto_run import MOVE_TIME, TRIAL_TIME
 from tuning.auto_trials import faster
+from tuning.load_step import SWING, load_step
 from tuning.proving import RESTLESS
 
 if TYPE_CHECKING:
     from tuning.auto_run import Run
+    from tuning.target import Target
 
 Mask = NDArray[np.bool_]
 
 SHOWINGS, AT_THE_EDGE = 3, 0.6  # moves for the record until one passes, and the factor of the gains between them
-EASED = 0.8  # the factor of gains with which an axis shook at rest
+CALMING = 0.5  # s after a load step that did not end, with gains that hold
+OVERTIME = 2.5  # s beyond the budget for axes that still shake: so near to the end they are not given up
+EASED, EASINGS = 0.8, 3  # the factor of gains with which an axis shook at rest, and how often they are eased
 
 
 def show(run: Run, where: Mask | None = None) -> None:
@@ -41,8 +46,8 @@ def show(run: Run, where: Mask | None = None) -> None:
         # Time for a response, and for what may follow from it, is kept; what was calmed by one is not eased, too.
         later = run.response_time + TRIAL_TIME + MOVE_TIME + run.look_back_time
         again = going & ~failed & shown.restless & ~eased & run.affordable(MOVE_TIME + later) & (where is None)
-        for k in map(int, np.flatnonzero(going & ~failed & shown.restless)):
-            _ease(run, k, float(shown.swing[k]), bool(again[k]))
+        for k in map(int, np.flatnonzero(again)):
+            _ease(run, k, _shook(float(shown.swing[k]), "at rest"))
         eased |= again
         for k in map(int, np.flatnonzero(failed)):
             axis, why = run.axes[k], shown.reason[k]
@@ -64,17 +69,70 @@ def show(run: Run, where: Mask | None = None) -> None:
     run.drop_faults("it moved with the new gains")
 
 
-def _ease(run: Run, k: int, swing: float, again: bool) -> None:
-    """Say that an axis shook at rest; where there is another move for it, take calmer gains for that."""
-    shook = f"its current swung by {100.0 * swing:.0f} % of the rated one (RMS) at rest"
-    if not again:
-        run.axes[k].notes.append(f"it shakes at rest: {shook}; {100.0 * RESTLESS:.0f} % is still")
-    elif run.spare[k].any():
+def _ease(run: Run, k: int, why: str) -> None:
+    """Take calmer gains for an axis that shook: what was second best, the same slowed down, or the fitted rule's."""
+    axis, rule = run.axes[k], run.reference[k]
+    was_rule = np.array_equal(run.gains[k], rule)
+    if run.spare[k].any():
         run.gains[k], run.spare[k] = run.spare[k], 0
-        run.axes[k].notes.append(f"the second best of the trial: with the best, {shook}")
-    else:
+        axis.notes.append(f"the second best of the trial: with the best, {why}")
+    elif not axis.eased or was_rule:
         run.gains[k] = faster(run.gains[k], EASED)
-        run.axes[k].notes.append(f"slowed to {100.0 * EASED:.0f} % after the trial: {shook}")
+        axis.notes.append(f"slowed to {100.0 * EASED:.0f} %: {why}")
+    else:
+        run.gains[k] = rule
+        axis.notes.append(f"the gains of the fitted rule: with faster ones {why}")
+    axis.eased += 1
+
+
+def _shook(swing: float, when: str) -> str:
+    allowed = f"{100.0 * RESTLESS:.0f} % is still"
+    return f"its current swung by {100.0 * swing:.1f} % of the rated one (RMS) {when}, and {allowed}"
+
+
+def stand(run: Run, target: Target) -> None:
+    """Have axes stand still: what shakes at rest, on emulated machines after a load step too, is softened or refused.
+
+    Args:
+        run: The run.
+        target: Its target, whose time is not counted: a load step is no part of tuning.
+    """
+    for attempt in range(EASINGS + 1):
+        shaking = _shaking(run, target)
+        last = attempt == EASINGS
+        again = np.zeros(run.target.num_axes, bool)
+        for k, why in shaking.items():
+            axis = run.axes[k]
+            if last or axis.is_kept or not run.affordable(MOVE_TIME - OVERTIME)[k]:
+                axis.reason = f"it shakes at rest: {why}"
+            else:
+                _ease(run, k, why)
+                again[k] = True
+        if not again.any():
+            return
+        show(run, again & run.going)
+
+
+def _shaking(run: Run, target: Target) -> dict[int, str]:
+    """Return the axes that do not stand still, and what they did."""
+    going, shown = run.going, run.shown
+    if shown is None or not going.any():
+        return {}
+    found = {k: _shook(float(shown.swing[k]), "at rest") for k in np.flatnonzero(going & shown.restless).tolist()}
+    if target.drives.machine is not None:
+        still = run.whole_machines(going & ~shown.restless)
+        write_gains(target.drives, run.gains, still)
+        run.loaded |= load_step(target, still)
+        for k in np.flatnonzero(still).tolist():
+            swing = 0.01 * run.loaded[k].figures[SWING]
+            if swing > RESTLESS:
+                found[k] = _shook(swing, "after a load step of 0.3 of the rated torque")
+        shook = run.whole_machines(~np.isin(np.arange(run.target.num_axes), list(found)))
+        if not shook[still].all():
+            # What the load step has set swinging says nothing of the next gains.
+            write_gains(target.drives, run.fallbacks[-1], still & ~shook)
+            target.drives.advance(CALMING)
+    return found
 
 
 def look_back(run: Run) -> None:
@@ -117,7 +175,8 @@ def _keep_what_is_better(run: Run, where: Mask) -> None:
     assert run.shown is not None and run.earlier is not None, "both moves are recorded"
     lanes = run.target.axes_per_machine
     now, before = (np.repeat(m.cost.reshape(-1, lanes).max(axis=1), lanes) for m in (run.shown, run.earlier))
-    kept = where & (before < now)
+    # Gains with which an axis shakes at rest are nobody's choice.
+    kept = where & (before < now) & ~np.repeat(run.earlier.restless.reshape(-1, lanes).any(axis=1), lanes)
     if not kept.any():
         return
     run.gains = np.where(kept[:, None], run.before, run.gains)
@@ -125,8 +184,7 @@ def _keep_what_is_better(run: Run, where: Mask) -> None:
     run.earlier = run.earlier._replace(where=run.earlier.where & ~kept)
     for k in map(int, np.flatnonzero(kept)):
         axis = run.axes[k]
-        # What was measured with the new gains says nothing of these.
-        axis.is_kept, axis.margins, axis.proof = True, None, float(before[k])
+        axis.is_kept, axis.proof = True, float(before[k])
         axis.verified = "by a move, which was better than with the new ones: they are those before"
         axis.notes.append(
             f"the gains before are kept: J by the measured terms of a move was {now[k]:.2f} with the new ones, and "

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import Gains
+from tuning.certificate import verdict
 
 if TYPE_CHECKING:
+    from tuning.certificate import StepResponse
     from tuning.identification import Identification
     from tuning.linear_model import Plant
     from tuning.margins import Margins
-    from tuning.measured_loop import MeasuredLoop
+    from tuning.measured_loop import AtLeast, MeasuredLoop
     from tuning.proving import Shown
 
 Floats = NDArray[np.float64]
@@ -29,6 +31,7 @@ class AxisRun:
 
     Attributes:
         reason: Why it stopped; "" while it goes on.
+        reservations: What a user of the gains should not rely on; each takes the certificate's plain yes away.
         notes: What else there is to say.
         before, after: Raw gains.
         identified: What its signals said, None before.
@@ -36,26 +39,36 @@ class AxisRun:
         twin: Hidden J that the twin gives the gains it found.
         proof: J by measured terms of the gains that were taken; nan before.
         verified: How the gains were verified, in words; "" where they were not.
-        margins: Of the velocity loop as measured, None where nothing was.
+        margins: Of the outer loops as measured, "velocity" and "position"; nothing where nothing was.
+        at_least: What margins are at least that were not seen, alike.
+        eased: How often it got calmer gains because it shook at rest.
         is_kept: Whether the gains before were better, and are the ones after.
     """
 
     before: Gains
     after: Gains
     reason: str = ""
+    reservations: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     identified: Identification | None = None
     plant: Plant | None = None
     twin: float = np.nan
     proof: float = np.nan
     verified: str = ""
-    margins: Margins | None = None
+    margins: dict[str, Margins] = field(default_factory=dict)
+    at_least: dict[str, AtLeast] = field(default_factory=dict)
+    eased: int = 0
     is_kept: bool = False
 
     @property
     def accepted(self) -> bool:
-        """Whether it got through everything."""
+        """Whether it got through everything, with reservations or without."""
         return not self.reason
+
+    @property
+    def verdict(self) -> str:
+        """Which of `tuning.certificate.VERDICTS` it is."""
+        return verdict(self.accepted, self.reservations)
 
 
 class Result(NamedTuple):
@@ -63,6 +76,7 @@ class Result(NamedTuple):
 
     drive_seconds, moves, aborts and violations: Of each axis, (num_axes,). shown: A recorded move with the new gains,
     None if none was made. earlier: One with those before, likewise. response: The velocity loop's, likewise.
+    loaded: What a load step did to axes, of emulated machines.
     file: The snapshot that brings everything back. kept: Whether drives on a bus keep the gains over a power cycle.
     """
 
@@ -74,6 +88,7 @@ class Result(NamedTuple):
     shown: Shown | None
     earlier: Shown | None
     response: MeasuredLoop | None
+    loaded: dict[int, StepResponse]
     file: Path
     kept: bool
 

@@ -18,6 +18,7 @@ from tuning.ladder import OTHERS
 from tuning.stop_causes import stop_causes
 
 if TYPE_CHECKING:
+    from tuning.certificate import StepResponse
     from tuning.measured_loop import MeasuredLoop
     from tuning.proving import ProvingGround, Shown
     from tuning.target import DriveTime, Target
@@ -28,7 +29,7 @@ Mask = NDArray[np.bool_]
 
 # Drive time of the parts [s]: a frequency response of an axis; a trial, with what recovery takes; a move for the
 # record; and one from where a response has ended.
-RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, LOOK_BACK_TIME = 2.3, 0.85, 0.5, 1.0
+RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, LOOK_BACK_TIME = 2.3, 0.85, 0.8, 1.3
 MODE = 0x6060
 
 
@@ -55,7 +56,8 @@ class Run:
         unsafe: Why an axis is not to be moved with the gains before, "" where it may be.
         fresh: Axes that came fresh from the factory, (num_axes,).
         ground: Where gains are tried, None before.
-        shown, earlier, response: As in `Result`.
+        shown, earlier, response, loaded: As in `Result`.
+        unseen: Axes of which the response says nothing, (num_axes,).
         response_time: Drive time of a frequency response of all axes of a machine [s].
         spent: Of each axis, what passed while it took part [s]: axes that are through wait for others at no cost of
             their own.
@@ -78,6 +80,8 @@ class Run:
         self.shown: Shown | None = None
         self.earlier: Shown | None = None
         self.response: MeasuredLoop | None = None
+        self.unseen: Mask = np.zeros(n, bool)
+        self.loaded: dict[int, StepResponse] = {}
         # Axes of one machine are shaken one after the other.
         self.response_time = RESPONSE_TIME * target.axes_per_machine
         self.spent: Floats = np.zeros(n)
@@ -105,6 +109,11 @@ class Run:
         """Say something of axes."""
         for axis in np.flatnonzero(where):
             self.axes[axis].notes.append(text)
+
+    def reserve(self, where: Mask, text: str) -> None:
+        """Say of axes what nobody is to rely on."""
+        for axis in np.flatnonzero(where):
+            self.axes[axis].reservations.append(text)
 
     def room(self) -> tuple[Floats, Floats]:
         """Return how far the rotors may turn from where they are now [rad], down and up, each (num_axes,)."""
@@ -148,4 +157,6 @@ class Run:
         """Return what was done."""
         ground, zero = self.ground, np.zeros(self.target.num_axes, np.int64)
         counts = (zero, zero, zero) if ground is None else (ground.moves, ground.aborts, ground.violations)
-        return Result(tuple(self.axes), self.spent, *counts, self.shown, self.earlier, self.response, file, kept)
+        return Result(
+            tuple(self.axes), self.spent, *counts, self.shown, self.earlier, self.response, self.loaded, file, kept
+        )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
@@ -25,13 +25,22 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from tuning.identification import Identification
     from tuning.margins import Margins
+    from tuning.measured_loop import AtLeast
     from tuning.target import Target
 
-FORMAT = 1
+FORMAT = 2
 HASH = "sha256"
 MAXIMUM_CURRENT = 0x2003
 
 Floats = NDArray[np.float64]
+
+
+VERDICTS = ("accepted", "accepted with reservations", "rejected")
+
+
+def verdict(accepted: bool, reservations: Sequence[str]) -> str:
+    """Return which of `VERDICTS` an axis has."""
+    return VERDICTS[2] if not accepted else VERDICTS[1] if reservations else VERDICTS[0]
 
 
 class CertificateError(ValueError):
@@ -105,7 +114,8 @@ class AxisCertificate:
     Attributes:
         axis: Number of the axis.
         accepted: Whether the new gains passed the checks and are in the drive; else those before are.
-        reason: Why it stopped, in words: always said.
+        reason: Why it stopped, or how it was verified, in words: always said.
+        reservations: What could not be checked, or is near to a limit: the yes is none without them.
         identified: Name -> parameter.
         before, after: Raw integers in the order of `Gains`, of the drive before and now.
         before_si, after_si: The same in SI, as `drive_env.gains.gains_in_si` has them: name with unit -> value.
@@ -119,6 +129,7 @@ class AxisCertificate:
     axis: int
     accepted: bool
     reason: str
+    reservations: tuple[str, ...]
     identified: Mapping[str, Parameter]
     before: tuple[int, ...]
     after: tuple[int, ...]
@@ -129,6 +140,11 @@ class AxisCertificate:
     notes: tuple[str, ...] = ()
     hardware_seconds: float = 0.0
     aborts: int = 0
+
+    @property
+    def verdict(self) -> str:
+        """Which of `VERDICTS` it is."""
+        return verdict(self.accepted, self.reservations)
 
 
 @dataclass(frozen=True)
@@ -237,10 +253,14 @@ def frequency_response(
     margins: Margins,
     *,
     tuned: bool,
+    at_least: AtLeast | None = None,
     coherence: ArrayLike | None = None,
     source: str = "",
 ) -> FrequencyResponse:
-    """Return an open loop, complex of shape (n,) at frequencies [Hz], as a certificate has it; nan was not seen."""
+    """Return an open loop, complex of shape (n,) at frequencies [Hz], as a certificate has it; nan was not seen.
+
+    `at_least` says what those margins are at least that were not seen.
+    """
     L = np.asarray(open_loop, complex)
     seen = np.isfinite(L) & (L != 0.0)
     magnitude, phase = np.full(L.shape, np.nan), np.full(L.shape, np.nan)
@@ -253,9 +273,19 @@ def frequency_response(
         magnitude,
         phase,
         np.full(L.shape, np.nan) if coherence is None else np.asarray(coherence, float),
-        {MARGIN_NAMES[key]: float(value) for key, value in margins._asdict().items()},
+        {MARGIN_NAMES[key]: float(value) for key, value in margins._asdict().items()} | _bounds(margins, at_least),
         source,
     )
+
+
+def _bounds(margins: Margins, least: AtLeast | None) -> dict[str, float]:
+    """Return what those margins are at least that were not seen."""
+    found = {} if least is None else least._asdict()
+    return {
+        MARGIN_NAMES[key].replace(" [", ", at least ["): float(value)
+        for key, value in found.items()
+        if math.isfinite(value) and not math.isfinite(getattr(margins, key))
+    }
 
 
 # --- reading and checking ---------------------------------------------------------------------------------------------

@@ -75,6 +75,7 @@ def measure(
     traced: bool = False,
     confirmed: bool = False,
     softened: bool = False,
+    periods: int = PERIODS,
     progress: Callable[[float], None] | None = None,
 ) -> MeasuredLoop:
     """Measure a loop's frequency response on its axes; they end where they began, as they were found.
@@ -96,6 +97,7 @@ def measure(
         confirmed: Look longer, and again with half the strength: a resonance that is then another is refused.
         softened: Quarter the velocity gains, twice at most, of an axis that oscillates in the trial, and leave them so;
             its drives are watched (`tuning.oscillation_watch`).
+        periods: Of every pass that are looked at: more of them are less noise, and more time.
         progress: Called with the share done.
 
     Raises:
@@ -128,7 +130,7 @@ def measure(
             chosen = axes & closed & (position == k)
             if not chosen.any():
                 continue
-            measurement = _Measurement(target, loop, chosen, lines, top, kind, traced, confirmed, softened)
+            measurement = _Measurement(target, loop, chosen, lines, top, kind, traced, confirmed, softened, periods)
 
             def show(share: float, k: int = k) -> None:
                 if progress is not None:
@@ -156,9 +158,9 @@ class _Measurement:
 
     def __init__(
         self, target: Target, loop: str, where: Mask, lines: Lines, top: float, kind: str, traced: bool,
-        confirmed: bool, softened: bool,
+        confirmed: bool, softened: bool, periods: int,
     ) -> None:  # fmt: skip
-        self._top, self._softened = top, softened
+        self._top, self._softened, self._periods = top, softened, periods
         self._passes, self._confirmed = (CONFIRMING if confirmed else PASSES), confirmed
         self._target, self._loop, self._lines, self._kind, self._traced = target, loop, lines, kind, traced
         self._device: Device = target.device
@@ -185,10 +187,10 @@ class _Measurement:
                 shaker.fastest = np.minimum(shaker.fastest, RETURN_SHARE * self._stoppable)
                 less = None
                 with shaken(counted.drives, SWING * limit):
-                    seen = shaker.run(amplitude, sign * speed, self._passes, PERIODS, traced=self._traced)
+                    seen = shaker.run(amplitude, sign * speed, self._passes, self._periods, traced=self._traced)
                     progress(0.5 if self._confirmed else 0.9)
                     if self._confirmed:
-                        less = shaker.run(LESS * amplitude, sign * speed, self._passes, PERIODS)
+                        less = shaker.run(LESS * amplitude, sign * speed, self._passes, self._periods)
         self._drive_time = clock.seconds + shaker.traced_time
         stopped = where & ~seen.enabled
         causes = stop_causes(target.drives) if stopped.any() else []
@@ -247,7 +249,7 @@ class _Measurement:
         mobility = np.median(np.abs(gain / current * omega)[low], axis=0)
         top = SPEED * self._target.speed
         by_ramp = IN_RAMP * available * mobility * RAMP * CYCLE
-        by_way = room / _duration(PERIODS, lines)
+        by_way = room / _duration(self._periods, lines)
         fastest = np.minimum(np.minimum(top, by_ramp), by_way)
         # Where the way is short, a steady speed would be too slow for the encoder: the motion reverses then.
         largest = np.minimum(np.maximum(0.9 * fastest, OVER_NOISE * CREST * self._noise()), 0.9 * top)

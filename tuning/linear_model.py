@@ -199,6 +199,22 @@ def position_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLi
     return np.asarray(regulator.position * inner / (1.0 + velocity_open_loop(device, plant, raw, at)))
 
 
+def outer_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike, velocity: Complex) -> Complex:
+    """Return the open loop of the position loop around a velocity loop that is known, measured or not.
+
+    Args:
+        device: The drive.
+        plant: The axis; its velocity filter matters, which the position loop does not see.
+        gains: Raw integers in the order of `Gains`.
+        f: Frequencies [Hz], shape (n,).
+        velocity: Open loop of the velocity loop there, shape (n,).
+    """
+    at = _below(f, device.velocity_rate)
+    z = np.exp(2j * math.pi * at / device.velocity_rate)
+    speed = velocity / (1.0 + velocity) / velocity_filter_response(device, plant, at)
+    return np.asarray(controllers(device, gains).position * speed / (device.velocity_rate * (1.0 - 1.0 / z)))
+
+
 OPEN_LOOPS = {"current": current_open_loop, "velocity": velocity_open_loop, "position": position_open_loop}
 
 

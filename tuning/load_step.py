@@ -1,6 +1,7 @@
 """What a load step does to axes that stand still: on emulated machines only, for a certificate.
 
-Hardware has no load step. It comes after tuning, is no experiment, and nothing is tuned by it.
+Hardware has no load step. It is no experiment, and nothing is found by it; gains with which an axis does not come to
+rest after it are not accepted.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import motion, response
-from drive_env.positioning import CURRENT, CYCLE, POSITION, wrapped
+from drive_env.positioning import CURRENT, CYCLE, POSITION, STATUS, wrapped
 from tuning.certificate import StepResponse
 
 if TYPE_CHECKING:
@@ -21,11 +22,13 @@ Mask = NDArray[np.bool_]
 
 NAME = "load step of 0.3 rated torque at standstill"
 SHARE = 0.3  # of the rated torque
-REST, BEFORE, AFTER = 0.1, 0.02, 0.3  # s: until the axis stands, then recorded before the step and after it
+# s: until the axis stands, then recorded before the step and after it, and at the end of that looked whether it stands.
+REST, BEFORE, AFTER, LOOKED_AT = 0.1, 0.02, 0.3, 0.1
+SWING = "current at rest afterwards, RMS over rated [%]"
 
 
 def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
-    """Return what a load step does to emulated axes with the gains they have; afterwards they are disabled.
+    """Return what a load step does to emulated axes with the gains they have; those that were off are off again.
 
     Args:
         target: Emulated machines.
@@ -41,6 +44,8 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     packed = one(drives.load)
     # On the load, where it disturbs: the axis with the longest lever feels the share.
     lever = float(np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max())
+    mask, value = motion.OPERATION_ENABLED
+    off = axes & (drives.read(STATUS) & mask != value)
     motion.enable(drives, mode="pp", where=axes)
     drives.advance(REST)
     try:
@@ -50,16 +55,22 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     finally:
         drives.machine.load_torque = 0.0
         drives.advance(REST)
-        motion.disable(drives, where=axes)
+        if off.any():
+            motion.disable(drives, where=off)
     raw = np.concatenate([rest[POSITION], loaded[POSITION]])
     angle = wrapped(raw - raw[0]) / target.increments()
     current = np.concatenate([rest[CURRENT], loaded[CURRENT]]) * 1e-3
     t = np.arange(len(angle), dtype=np.float64) * CYCLE
+    swing = current[-round(LOOKED_AT / CYCLE) :].std(axis=0) / target.motor.rated_current
     found = response.disturbance_metrics(t, angle, np.zeros(target.num_axes), t_load=BEFORE)
     return {
         axis: StepResponse(
             NAME, True, "rad", t, np.zeros(len(t)), angle[:, axis], current[:, axis],
-            {"disturbance dip [rad]": float(found.dip[axis]), "recovery [s]": float(found.recovery_time[axis])},
+            {
+                "disturbance dip [rad]": float(found.dip[axis]),
+                "recovery [s]": float(found.recovery_time[axis]),
+                SWING: 100.0 * float(swing[axis]),
+            },
         )
         for axis in map(int, np.flatnonzero(axes))
     }  # fmt: skip

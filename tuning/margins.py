@@ -87,17 +87,6 @@ def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None
     return Margins(phase, gain, crossover, _bandwidth(at, closed), float(sensitivity.max()), phase_at, gain_at)
 
 
-def hidden_crossing(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike) -> tuple[float, float] | None:
-    """Return between which two frequencies [Hz] the gain passes 1 with none trusted, the lowest; None if nowhere.
-
-    `margins` has no phase margin then.
-    """
-    at, L = np.asarray(f, float), np.asarray(open_loop, complex)
-    known = np.flatnonzero(np.asarray(trusted, bool) & np.isfinite(L))
-    unseen = _unseen(known, np.log(np.abs(np.where(np.isfinite(L), L, 1.0))))
-    return (float(at[known[unseen[0]]]), float(at[known[unseen[0] + 1]])) if unseen.size else None
-
-
 def _unseen(known: NDArray[np.int64], log_gain: Floats) -> NDArray[np.int64]:
     """Return after which of the trusted frequencies others follow among which the gain passes 1."""
     return np.flatnonzero((np.diff(known) > 1) & (np.diff(np.sign(log_gain[known])) != 0.0))

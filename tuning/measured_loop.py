@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tuning import margins as margins_
+from tuning.linear_model import controllers, outer_loop, velocity_open_loop
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from tuning.identification import Estimate
+    from tuning.linear_model import Plant
     from tuning.plant_fit import PlantFit
 
 Floats = NDArray[np.float64]
@@ -26,6 +28,27 @@ COHERENT = 0.95  # from which on a line is trusted
 FINE = 10  # points between two lines, where margins are looked for
 GOOD_MISFIT = 2.0  # of a fit that is good enough to read margins between lines by
 SMOOTHING = 1.5  # lines, standard deviation
+DRAWS, DRAWN_SEED, SURE = 100, 20, 2.5  # plants within a fit's intervals, and the percentile that is "at least"
+MODEL_POINTS, MODEL_LOW, NYQUIST = 400, 2.0, 0.49  # frequencies of a model: how many, from [Hz], up to of its rate
+
+
+class Loops(NamedTuple):
+    """Both outer loops of an axis as one measurement shows them: frequencies [Hz], complex open loops, what is trusted.
+
+    All of shape (n,). The position loop is that of the measured velocity loop, closed, and of the position P.
+    """
+
+    f: Floats
+    velocity: Complex
+    position: Complex
+    trusted: Mask
+
+
+class AtLeast(NamedTuple):
+    """What margins are at least, where they were not seen; nan where nothing says so."""
+
+    phase_deg: float
+    gain_db: float
 
 
 @dataclass(frozen=True)
@@ -97,6 +120,57 @@ class MeasuredLoop:
         # Neighbours together may be as certain as one line must be.
         known = total >= COHERENT / (1.0 - COHERENT)
         return at, fine * np.where(known, near @ quotient / np.maximum(total, np.finfo(float).tiny), 1.0), known
+
+    def loops(
+        self, gains: Sequence[int] | Integers, axis: int = 0, *, plant: Plant | None = None, refined: bool = True
+    ) -> Loops:
+        """Return what a measured velocity loop says of other gains: by as much as those change the linear model.
+
+        What is not in the model, as friction or a second resonance, was measured; gains of the outer loops change it by
+        a factor that is known exactly, those of the torque loop by what the winding makes of them.
+
+        Args:
+            gains: Raw gains, shape (5,).
+            axis: Number of the axis.
+            plant: The axis, for other gains of the torque loop; what was fitted by default.
+            refined: Between the lines too, as `refined` has them; else the lines as they are.
+
+        Raises:
+            ValueError: For the response of a position loop.
+        """
+        fit = self.fits[axis]
+        if fit is None:
+            raise ValueError(f"a measured {self.loop} loop says nothing of others; measure the velocity loop")
+        then, now, known = self.gains[axis], np.asarray(gains), plant or fit.plant
+        lines = self.f, self.open_loop[:, axis], self.trusted[:, axis]
+        f, L, trusted = self.refined(axis) if refined else lines
+        if np.array_equal(then[:2], now[:2]):
+            z = np.exp(2j * math.pi * f / self.device.velocity_rate)
+            ratio = controllers(self.device, now).velocity(z) / controllers(self.device, then).velocity(z)
+        else:
+            ratio = velocity_open_loop(self.device, known, now, f) / velocity_open_loop(self.device, known, then, f)
+        velocity = L * ratio
+        return Loops(f, velocity, outer_loop(self.device, fit.plant, now, f, velocity), trusted)
+
+    def at_least(self, loop: str, gains: Sequence[int] | Integers, axis: int = 0) -> AtLeast:
+        """Return what the margins of a loop are at least, by the fitted model, everything within its intervals.
+
+        Args:
+            loop: "velocity" or "position".
+            gains: Raw gains, shape (5,).
+            axis: Number of the axis.
+        """
+        fit = self.fits[axis]
+        if fit is None or fit.reason or fit.misfit > GOOD_MISFIT:
+            return AtLeast(math.nan, math.nan)
+        f = np.geomspace(MODEL_LOW, NYQUIST * self.device.velocity_rate, MODEL_POINTS)
+        found = []
+        for drawn in fit.drawn(np.random.default_rng(DRAWN_SEED), DRAWS):
+            L = drawn.open_loop(self.device, np.asarray(gains), f)
+            one = margins_.margins(f, L if loop == "velocity" else outer_loop(self.device, drawn.plant, gains, f, L))
+            # A loop whose gain never passes 1, or whose phase never reaches -180 degrees, has all the margin there is.
+            found.append((180.0 if math.isnan(one.phase_deg) else one.phase_deg, one.gain_db))
+        return AtLeast(*(float(value) for value in np.percentile(found, SURE, axis=0, method="lower")))
 
     def estimates(self, axis: int = 0) -> dict[str, Estimate]:
         """Return inertia, velocity_filter, loop_delay, anti_resonance, resonance and damping of an axis.

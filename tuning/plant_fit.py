@@ -8,7 +8,7 @@ swings has seven, one with two springs in a row ten; which it is, the data decid
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -59,6 +59,8 @@ RATIOS = (1.15, 1.4, 1.8, 2.6)  # of a resonance over its anti-resonance, where 
 RIGID_ENOUGH = 1.5  # misfit up to which no further resonance is looked for
 NAMES = ("inertia", "velocity_filter", "loop_delay", "anti_resonance", "resonance", "damping")
 _UNITS = dict(zip(NAMES, ("kg*m^2", "Hz", "s", "Hz", "Hz", "1"), strict=True))
+_FIELDS = {"loop_delay": "delay"}  # names of estimates that a plant calls otherwise
+NORMAL_95 = 1.96  # standard deviations to either side that hold 95 %
 _LOWEST_FILTER, _HIGHEST_FILTER, _LONGEST_DELAY = 50.0, 2000.0, 5e-3
 
 
@@ -91,6 +93,17 @@ class PlantFit(NamedTuple):
     def open_loop(self, device: Device, gains: NDArray[np.int64], f: Floats) -> Complex:
         """Return the velocity loop's open loop at frequencies [Hz], shape (n,)."""
         return _open_loop(device, _Model(self.plant, self.second), gains, f, self.lost)
+
+    def drawn(self, rng: np.random.Generator, count: int) -> Iterator[PlantFit]:
+        """Yield fits whose parameters lie as the intervals say, each on its own; what was refused stays as it is."""
+        for _ in range(count):
+            values = {}
+            for name, estimate in self.estimates.items():
+                if math.isfinite(estimate.value) and math.isfinite(estimate.high - estimate.low):
+                    at = rng.normal(estimate.value, (estimate.high - estimate.low) / (2.0 * NORMAL_95))
+                    values[_FIELDS.get(name, name)] = max(at, 0.1 * estimate.value)
+            if values.get("anti_resonance", 0.0) < values.get("resonance", math.inf):
+                yield self._replace(plant=replace(self.plant, **values))  # type: ignore[arg-type]  # none of them is counts
 
 
 class _Model(NamedTuple):

@@ -55,9 +55,10 @@ OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
 ENABLING = 5.0  # s, the longest wait for an axis that is switched on: some align their encoder first
 TARGET_VELOCITY = 0x60FF
 SHORTEST = 16.0  # counts of the encoder: a move that is shorter proves nothing
-# After a move for the record: the time at rest [s], of which all but the first third is looked at, and what the current
-# may swing then (RMS about its mean, over the rated one). Loops at their edge begin to shake once the move is over.
-REST, RESTLESS = 0.15, 0.05
+# After a move for the record it is looked whether the axis stands, in so many places of an encoder count: a loop at its
+# edge swings between two counts in one place, and stands in another. Windows of 25 ms in each, how many of them pass
+# before, and what the current may swing (RMS about its mean, over the rated one).
+PLACES, REST, SETTLED, RESTLESS = 3, 6, 2, 0.05
 
 
 class Proof(NamedTuple):
@@ -87,7 +88,8 @@ class Shown(NamedTuple):
     """A recorded move: times [s], (n,); demand and actual angle from its start [rad] and current [A], (n, num_axes).
 
     where: Axes that made it, (num_axes,). reason: Of each axis, why it does not pass, "" if it does. cost: J by its
-    measured terms, (num_axes,). swing: Of the current at rest afterwards, over the rated one (RMS), (num_axes,).
+    measured terms, (num_axes,). swing: Of the current at rest afterwards, over the rated one (RMS), where it was most
+    of several places of an encoder count, (num_axes,).
     """
 
     t: Floats
@@ -228,7 +230,7 @@ class ProvingGround:
         for _ in range(TRIAL // WATCH):
             traces.append(drives.record(objects, WATCH * CYCLE))
             stopped |= self._stop(where & ~stopped & self._shakes(traces[-1]))
-        swing = drives.record([CURRENT], REST)[CURRENT][round(REST / CYCLE) // 3 :].std(axis=0) * 1e-3 / rated
+        swing = self._swing(away, where & ~stopped)
         position, demanded, current = (np.concatenate([part[name] for part in traces]) for name in objects[:3])
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
         way = np.sign(self._direction * self.move.distance)
@@ -247,6 +249,31 @@ class ProvingGround:
         self._direction = np.where(where, -self._direction, self._direction)
         t = np.arange(len(demand), dtype=np.float64) * CYCLE
         return Shown(t, demand, actual, current * 1e-3, where, reason, costs, swing)
+
+    def _swing(self, at: Integers, where: Mask) -> Floats:
+        """Return how much the current swings at rest, over the rated one (RMS), the most of several places.
+
+        Args:
+            at: Where the axes are [inc]; they end within a count of it, on the side from which they came.
+            where: Axes that are looked at; one that oscillates is stopped.
+        """
+        drives, rated = self.target.drives, self.target.motor.rated_current
+        back = -np.sign(self._direction * self.move.distance)
+        worst = np.zeros(self.target.num_axes)
+        for place in range(PLACES):
+            if place:
+                # Increments may be as coarse as counts.
+                apart = np.maximum(np.rint(place * self._count / PLACES), place)
+                start(drives, wrapped(at + back * apart).astype(np.int64), where)
+            seen = []
+            for _ in range(REST):
+                window = drives.record([CURRENT, STATUS], WATCH * CYCLE)
+                stopped = self._stop(where & self._shakes(window))
+                worst[stopped] = OSCILLATION
+                self._shaken |= stopped
+                seen.append(window[CURRENT])
+            worst = np.maximum(worst, np.concatenate(seen[SETTLED:]).std(axis=0) * 1e-3 / rated)
+        return worst
 
     def _hold_still(self, where: Mask) -> None:
         """Come to rest with the gains there are, and take that for the beginning: a response leaves an axis turning.

@@ -29,7 +29,15 @@ th { font-weight: 600; border-bottom: 1px solid #999; } td.number, th.number { t
 td { border-bottom: 1px solid #e6e6e6; font-variant-numeric: tabular-nums; }
 img { max-width: 100%; height: auto; } .refused { color: #777; } code { font-size: .85em; overflow-wrap: anywhere; }
 .accepted { color: #00693e; font-weight: 600; } .rejected { color: #a4001d; font-weight: 600; }
+.reserved { color: #8a5a00; font-weight: 600; } ul.reserved { font-weight: 400; }
 """
+
+# Of a verdict: its class, and what holds then.
+COLOURS = {
+    "accepted": ("accepted", "new gains in the drive"),
+    "accepted with reservations": ("reserved", "new gains in the drive, with reservations"),
+    "rejected": ("rejected", "gains as before"),
+}
 
 
 def to_html(certificate: Certificate) -> str:
@@ -79,6 +87,7 @@ def _summary(certificate: Certificate) -> str:
         "time on the drive [s]": _figure(max((axis.hardware_seconds for axis in axes), default=0.0)),
         "trials stopped": str(sum(axis.aborts for axis in axes)),
         "axes with new gains": f"{sum(axis.accepted for axis in axes)} of {len(axes)}",
+        "of these with reservations": str(sum(axis.accepted and bool(axis.reservations) for axis in axes)),
     } | {
         f"limit: {name}": _figure(value) if math.isfinite(value) else "none"
         for name, value in certificate.envelope.items()
@@ -87,15 +96,16 @@ def _summary(certificate: Certificate) -> str:
 
 
 def _axis(axis: AxisCertificate) -> list[str]:
-    verdict = ("accepted", "new gains in the drive") if axis.accepted else ("rejected", "gains as before")
+    colour, words = COLOURS[axis.verdict]
     parts = [
-        f"<h2>Axis {axis.axis}: <span class='{verdict[0]}'>{verdict[1]}</span></h2>",
+        f"<h2>Axis {axis.axis}: <span class='{colour}'>{words}</span></h2>",
         f"<p>{escape(axis.reason)}</p>",
+        *([_list("reserved", axis.reservations)] if axis.reservations else []),
         "<h3>Gains</h3>",
         _gains(axis),
     ]
     if axis.notes:
-        parts.append("<ul>" + "".join(f"<li>{escape(note)}</li>" for note in axis.notes) + "</ul>")
+        parts.append(_list("notes", axis.notes))
     if axis.identified:
         parts += ["<h3>Identified, with intervals of 95 % confidence</h3>", _identified(axis)]
     for name in dict.fromkeys(step.name for step in axis.steps):
@@ -110,6 +120,10 @@ def _axis(axis: AxisCertificate) -> list[str]:
             parts.append(f"<p>From {escape(sources)}.</p>")
         parts.append(_before_and_after([(found.tuned, found.margins) for found in responses], absent="not seen"))
     return parts
+
+
+def _list(kind: str, lines: Iterable[str]) -> str:
+    return f'<ul class="{kind}">' + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
 
 
 def _gains(axis: AxisCertificate) -> str:

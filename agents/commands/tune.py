@@ -252,7 +252,8 @@ def _report(done: Run, folder: Path, json: bool, bus: bool) -> None:
     if json:
         print_json(
             {
-                "accepted": not refused, "reason": axis.reason, "notes": axis.notes, "before": list(axis.before),
+                "verdict": axis.verdict, "accepted": not refused, "reason": axis.reason,
+                "reservations": axis.reservations, "notes": axis.notes, "before": list(axis.before),
                 "after": list(axis.after), "J of the rule": rule, "J": axis.proof, "drive seconds": seconds,
                 "stored": result.kept, "certificate": str(folder / "certificate.json"),
                 "report": str(folder / "report.html"),
@@ -283,6 +284,10 @@ def _print(done: Run, refused: list[str], rule: float | None) -> None:
         if loop.tuned:
             margins = {n: f"{value:.3g}" if math.isfinite(value) else "not seen" for n, value in loop.margins.items()}
             print(f"{loop.name}: {', '.join(f'{name} {text}' for name, text in margins.items())}")
+    if axis.accepted:
+        print(axis.verdict)
+    for reservation in axis.reservations:
+        print(f"reservation: {reservation}")
     for note in axis.notes:
         print(note)
     for line in refused:

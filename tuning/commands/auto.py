@@ -21,7 +21,7 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.auto_result import Result
+    from tuning.auto_result import AxisRun, Result
     from tuning.target import Target
 
 
@@ -38,8 +38,9 @@ def auto(
 ) -> None:
     """Tune a drive: check, identify, compute, try, verify, write and keep; what fails a check is rolled back.
 
-    A motor turns, for less than 10 s in all. Writes before.toml, from which `drive-tune restore` brings back what
-    was, certificate.json and report.html. Exit code 1 if an axis was rolled back; why is said.
+    A motor turns, for about 10 s in all. The verdict is accepted, accepted with reservations, which are named, or
+    rejected. Writes before.toml, from which `drive-tune restore` brings back what was, certificate.json and
+    report.html. Exit code 1 if an axis was rejected; why is said.
     """
     with errors_as_exit_codes():
         from tuning import provenance
@@ -91,7 +92,9 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         rows = [
             {
                 "axis": k,
+                "verdict": axis.verdict,
                 "accepted": axis.accepted,
+                "reservations": axis.reservations,
                 "reason": axis.reason,
                 "verified": axis.verified,
                 "before": axis.before._asdict(),
@@ -110,12 +113,13 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD)
-    for title in ("axis", "", "torque P, I", "velocity P, I", "position P", "phase\ndeg", "gain\ndB"):
-        table.add_column(title)
+    heads = ("axis", "", "torque P, I", "velocity P, I", "position P", "velocity\nloop", "position\nloop")
+    for title in heads:
+        table.add_column(title, no_wrap=True)
     for k, axis in enumerate(result.axes):
         for name, gains in (("before", axis.before), ("after", axis.after)):
-            found = axis.margins if name == "after" and axis.accepted else None
-            margins = ("", "") if found is None else (_margin(found.phase_deg), _margin(found.gain_db))
+            told = name == "after" and axis.accepted
+            margins = [_margins(axis, loop) if told else "" for loop in ("velocity", "position")]
             pairs = f"{gains.torque_p}, {gains.torque_i}", f"{gains.velocity_p}, {gains.velocity_i}"
             table.add_row(str(k) if name == "before" else "", name, *pairs, str(gains.position_p), *margins)
     console = Console()
@@ -127,7 +131,8 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         elif not axis.accepted:
             lines.append(f"axis {k} was rolled back: {axis.reason}")
         else:
-            lines.append(f"axis {k} was verified {axis.verified}")
+            lines.append(f"axis {k}: {axis.verdict}; it was verified {axis.verified}")
+            lines += [f"axis {k}: reservation: {reservation}" for reservation in axis.reservations]
         lines += [f"axis {k}: {note}" for note in axis.notes]
     kept = "; the drive keeps the gains" if result.kept else ""
     stopped = int(result.aborts.sum())
@@ -139,6 +144,15 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
     console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
 
 
-def _margin(value: float) -> str:
-    """Return a measured margin; what the coherent lines do not show, a phase of -180 degrees too, is not seen."""
-    return f"{value:.0f}" if math.isfinite(value) else "not seen"
+def _margins(axis: AxisRun, loop: str) -> str:
+    """Return phase and gain margin of a loop; what was not seen as what it is at least."""
+    found, least = axis.margins.get(loop), axis.at_least.get(loop)
+    texts = []
+    for key, unit in (("phase_deg", "°"), ("gain_db", " dB")):
+        seen = math.nan if found is None else getattr(found, key)
+        bound = math.nan if least is None else getattr(least, key)
+        if math.isfinite(seen):
+            texts.append(f"{seen:.0f}{unit}")
+        else:
+            texts.append(f"≥{bound:.0f}{unit}" if math.isfinite(bound) else "?")
+    return ", ".join(texts) if texts != ["?", "?"] else "not seen"
