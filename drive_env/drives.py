@@ -26,7 +26,7 @@ from drive_env.firmware.protection import CAUSES
 from drive_env.firmware.record import get_lanes, new_records, set_lanes
 from drive_env.group import Group, call_of, channels, rates_of
 from drive_env.live_dictionary import NOTHING, LiveDictionary
-from drive_env.machine import Machines
+from drive_env.machine import Machines, checked_supply
 from drive_env.misfit import warn_of_misfits
 from drive_env.motors import find_motor
 from drive_env.parameters import apply_to_records, check_known, check_parameter, draw_parameters, parameter_table
@@ -106,6 +106,7 @@ class EmulatedDrives:
         self.load = find_load(load)
         self.num_machines = num_machines
         self.num_axes = num_machines * self.load.num_axes
+        volts = checked_supply(self.motor.voltage if supply is None else supply, 1)
         self._records = new_records(self.num_axes)
         self._threads = max(1, num_threads if num_threads is not None else usable_cores())
         self._executor: ThreadPoolExecutor | None = None
@@ -119,7 +120,7 @@ class EmulatedDrives:
         self._fleet = cycle.Fleet(np.array([group.machinery.address for group in self._groups], np.int64), self._turn)
         nothing = np.empty((0, 0, self.num_axes))
         self._nothing = call_of(nothing, NOTHING, nothing, NOTHING, 1)
-        self._set_constants(self.motor.voltage if supply is None else supply)
+        self._set_constants(float(volts[0]))
         for name, values in self._parameters.items():
             everywhere = np.ones(self.num_axes, bool)
             per_axis = np.repeat(values, self.load.num_axes)

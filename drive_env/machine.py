@@ -27,6 +27,15 @@ Mask = NDArray[np.bool_]
 _BRAKES = ("open", "closed", "with_stage")  # numbers of firmware/cycle.py
 
 
+def checked_supply(value: ArrayLike, num_axes: int) -> Floats:
+    """Return the supply voltage of each axis [V], shape (num_axes,); ValueError for one that cannot be."""
+    volts = np.broadcast_to(np.asarray(value, float), (num_axes,))
+    bad = ~np.isfinite(volts) | (volts < 0.0)
+    if np.any(bad):
+        raise ValueError(f"supply voltage must be finite and 0 V or more, not {volts[bad][0]:g} V")
+    return volts
+
+
 class Machines:
     """The emulated machines behind drives: one value per machine, shape (num_machines,), unless said otherwise."""
 
@@ -149,9 +158,7 @@ class Machines:
     @supply.setter
     def supply(self, value: ArrayLike) -> None:
         drives = self._drives
-        volts = np.broadcast_to(np.asarray(value, float), (drives.num_axes,))
-        if not np.all(np.isfinite(volts)) or np.any(volts < 0.0):
-            raise ValueError(f"supply voltage must be 0 V or more, not {np.min(volts):g} V")
+        volts = checked_supply(value, drives.num_axes)
         with drives._faults.suspended():
             set_lanes(drives._records, "supply_voltage", volts)
 

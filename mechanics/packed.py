@@ -24,6 +24,8 @@ Floats = NDArray[np.float64]
 
 # Above this phase per step [rad] the discrete resonance cannot be put at the true one any more with good accuracy.
 MAX_PHASE_PER_STEP = 0.7
+# Damping that couples resonances by more than this per step is off by more than 0.5 % of the peak speed.
+MAX_COUPLING_PER_STEP = 0.1
 _DISABLED = (
     mujoco.mjtDisableBit.mjDSBL_ACTUATION
     | mujoco.mjtDisableBit.mjDSBL_SENSOR
@@ -335,6 +337,9 @@ class PackedLoad:
             stiffness=np.zeros((dofs, dofs, copies)),
             held=np.zeros((dofs, dofs, copies)),
             held_moment=np.zeros((dofs, axes, copies)),
+            damper=np.zeros((dofs, dofs, copies)),
+            ends=np.zeros((axes, dofs, copies)),
+            ends_of_speed=np.zeros((axes, dofs, copies)),
             spring_zero=np.array(self.model.qpos_spring[:dofs]),
             damping=np.zeros((dofs, copies)),
             bias=np.zeros((dofs, copies)),
@@ -346,7 +351,7 @@ class PackedLoad:
             bristle=np.zeros((copies, frictions)),
             stuck=np.zeros((frictions, copies), np.int64),
             holding=np.zeros((frictions, copies)),
-            contact=np.zeros((contacts, 6, copies)),
+            contact=np.zeros((contacts, 7, copies)),
             carried=np.zeros((copies, contacts)),
             roll_dof=np.array([self.joints.index(row.joint) for row in self.load.rolls], np.int64),
             roll=np.zeros((copies, len(self.load.rolls), 4)),
@@ -391,12 +396,17 @@ class PackedLoad:
         self.data.qpos[:], self.data.qvel[:] = moving
         plant.damping[:] = self.values.damping.T
         if self.staggered:
-            found = corrections(inertia, self.values.stiffness[copies], plant.axis_motion, self.h)
+            stiffness, damping = self.values.stiffness[copies], self.values.damping[copies]
+            found = corrections(inertia, stiffness, damping, plant.axis_motion, self.h)
             self._check_phase(found.phase, found.shapes, copies)
+            self._check_coupling(found.coupling, found.shapes, copies)
             plant.stiffness[..., copies] = _copies_last(found.stiffness)
             plant.held[..., copies] = _copies_last(found.held)
             plant.held_moment[..., copies] = _copies_last(found.held_moment)
             plant.axis_kick[..., copies] = _copies_last(found.kick)
+            plant.damper[..., copies] = _copies_last(found.damping)
+            plant.ends[..., copies] = _copies_last(found.ends)
+            plant.ends_of_speed[..., copies] = _copies_last(found.ends_of_speed)
         # The springs' force is the plant's, since the corrected one is no spring of a joint any more.
         self._by_copy(self.model.jnt_stiffness)[:] = 0.0 if self.staggered else self.values.stiffness
         self._by_copy(self.model.dof_damping)[:] = self.values.damping * (0.5 if self.staggered else 1.0)
@@ -493,6 +503,7 @@ class PackedLoad:
             plant.contact[:, 2, copies] *= np.sinc(phase / np.pi) ** 2
             plant.contact[:, 4, copies] = np.sinc(2.0 * phase / np.pi) - 1.0
             plant.contact[:, 5, copies] = 2.0 * phase / self.h * np.sin(phase)
+            plant.contact[:, 6, copies] = np.sinc(phase / np.pi) / np.cos(phase) - 1.0
         if phase.size and 2.0 * phase.max() > MAX_PHASE_PER_STEP:
             k, worst = np.unravel_index(int(phase.argmax()), phase.shape)
             self._refuse(f"contact {self.load.contacts[int(k)].name!r}", int(copies[worst]), float(phase.max()))
@@ -503,6 +514,20 @@ class PackedLoad:
             # The joint whose spring takes most of that mode's energy.
             dof = int(np.argmax(self.values.stiffness[copies[worst]] * shapes[worst, :, mode] ** 2))
             self._refuse(f"joint {self.joints[dof]!r}", int(copies[worst]), float(phase.max()))
+
+    def _check_coupling(self, coupling: Floats, shapes: Floats, copies: NDArray[np.intp]) -> None:
+        limit = MAX_COUPLING_PER_STEP / self.h
+        if np.abs(coupling).max() > limit:
+            worst, *modes = (int(k) for k in np.unravel_index(int(np.abs(coupling).argmax()), coupling.shape))
+            damping = self.values.damping[copies[worst]]
+            # The joint whose damper couples those two modes most.
+            dof = int(np.argmax(np.abs(damping * shapes[worst][:, modes].prod(axis=1))))
+            raise ValueError(
+                f"joint {self.joints[dof]!r} of machine {self._first_machine + int(copies[worst])} is damped by "
+                f"{damping[dof]:g}, so strongly that its resonances brake each other at {np.abs(coupling).max():.0f} "
+                f"1/s; the limit is {limit:.0f} 1/s at a physics step of {self.h * 1e6:.0f} us; lower its damping or "
+                "take more physics steps per millisecond"
+            )
 
     def _refuse(self, what: str, copy_: int, phase: float) -> None:
         raise ValueError(

@@ -55,6 +55,9 @@ class Plant(Bundle):
     stiffness: Cube  # (D, D, C) [N*m/rad]
     held: Cube  # (D, D, C)
     held_moment: Cube  # (D, A, C) [1/s]
+    damper: Cube  # (D, D, C) [N*m*s/rad]
+    ends: Cube  # (A, D, C)
+    ends_of_speed: Cube  # (A, D, C) [s]
     spring_zero: Vector  # (D,) [rad]
     damping: Matrix  # (D, C) whole damping [N*m*s/rad]
     bias: Matrix  # (D, C) forces that MuJoCo adds by itself, with its sign of qfrc_bias
@@ -70,8 +73,8 @@ class Plant(Bundle):
     # (F, C) torque of each friction in the last step: frictions that hold coupled motions need to know of each other,
     # or the load creeps.
     holding: Matrix
-    contact: Cube  # (B, 6, C): free from, free to, stiffness, damping, and modal.py's held, held moment
-    carried: Matrix  # (C, B) force of each contact
+    contact: Cube  # (B, 7, C): free from, free to, stiffness, damping, and modal.py's held, held moment, ends
+    carried: Matrix  # (C, B) mean force of each contact over the last step
     roll_dof: Numbers  # (R,)
     roll: Cube  # (C, R, 4): start, core, thickness, density
     roll_armature: Matrix  # (C, R) without what is wound up

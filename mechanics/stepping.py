@@ -2,7 +2,8 @@
 
 Time is staggered (leapfrog): qvel stands at step ends, qpos at step middles. MuJoCo's semi-implicit step then is the
 leapfrog scheme, of second order, at the price of one force evaluation. Damping is kept second-order by giving half of
-it to MuJoCo, which takes it at the step's end, and half to the applied force, at the step's start.
+it to MuJoCo, which takes it at the step's end, and half to the applied force, at the step's start. Springs and their
+dampers are exact by modal.py's corrections.
 """
 
 from __future__ import annotations
@@ -82,6 +83,7 @@ def drive(plant, torque, moment, h):
                     applied[d, copy] += factor * torque[copy * A + a]
     if plant.elastic:
         held, stiffness, held_moment, spring_zero = plant.held, plant.stiffness, plant.held_moment, plant.spring_zero
+        damper = plant.damper
         for d in range(D):
             for copy in range(copies):
                 total[d, copy] = applied[d, copy] - bias[d, copy]
@@ -92,6 +94,8 @@ def drive(plant, torque, moment, h):
                     applied[d, copy] += held[d, k, copy] * total[k, copy]
                 for copy in range(copies):
                     applied[d, copy] -= stiffness[d, k, copy] * (position[k, copy] - zero)
+                for copy in range(copies):
+                    applied[d, copy] -= damper[d, k, copy] * speed[k, copy]
         for a in range(A):
             for copy in range(copies):
                 lane[0, copy] = moment[copy * A + a]
@@ -195,9 +199,10 @@ def press(plant, moment, h):
             lane[force, copy] = lane[force, copy] if pushes else 0.0
             lane[correction, copy] = lane[correction, copy] if pushes else 0.0
         for copy in range(copies):
-            carried[copy, b] = lane[force, copy]
-        for copy in range(copies):
             lane[force, copy] += lane[correction, copy]
+        # With the correction it is what the contact really transmits, mean over the step.
+        for copy in range(copies):
+            carried[copy, b] = lane[force, copy]
         for d in range(D):
             add_product(applied, d, motion[e, d], lane, force)
             add_product(total, d, motion[e, d], lane, force)
@@ -300,7 +305,7 @@ def report(plant, torque, moment, h, theta, omega, reaction, position):
     place, before, speed, lane, diverged = plant.position, plant.speed, plant.reached, plant.lane, plant.diverged
     axis_motion, axis_position, axis_start = plant.axis_motion, plant.axis_position, plant.axis_start
     stuck, motion, share, mass = plant.stuck, plant.motion, plant.share, plant.mass
-    kick = plant.axis_kick
+    kick, ends, ends_of_speed, spring_zero = plant.axis_kick, plant.ends, plant.ends_of_speed, plant.spring_zero
     A = axis_motion.shape[0]
     gather(place, plant.qpos)
     for f in range(stuck.shape[0]):
@@ -324,7 +329,7 @@ def report(plant, torque, moment, h, theta, omega, reaction, position):
             for d in range(D):
                 for copy in range(copies):
                     place[d, copy] -= kick[a, d, copy] * lane[0, copy]
-    # From the step's middle back to its end.
+    # From the step's middle back to its end: what has no spring moves evenly since its impulse in the middle.
     back = 0.5 * h if plant.staggered else 0.0
     rate = 1.0 / h
     # Rows of `lane`.
@@ -341,25 +346,68 @@ def report(plant, torque, moment, h, theta, omega, reaction, position):
             if factor != 0.0:
                 for copy in range(copies):
                     lane[at, copy] += factor * (place[d, copy] - back * speed[d, copy])
+        if plant.elastic:
+            for d in range(D):
+                zero = spring_zero[d]
+                for copy in range(copies):
+                    lane[angle, copy] += ends[a, d, copy] * (place[d, copy] - back * speed[d, copy] - zero)
+                for copy in range(copies):
+                    lane[angle, copy] += ends_of_speed[a, d, copy] * speed[d, copy]
         start = axis_start[a]
         for copy in range(copies):
             lane[acceleration, copy] = (lane[w, copy] - lane[acceleration, copy]) * rate
         for copy in range(copies):
-            theta[copy * A + a] = (
-                lane[angle, copy] - start - back * (lane[w, copy] + 0.5 * back * lane[acceleration, copy])
-            )
+            theta[copy * A + a] = lane[angle, copy] - start - back * lane[w, copy]
         for copy in range(copies):
             omega[copy * A + a] = lane[w, copy]
         for copy in range(copies):
             reaction[copy * A + a] = torque[copy * A + a] - mass[a, copy] * lane[acceleration, copy]
         for copy in range(copies):
             position[copy * A + a] = lane[at, copy]
+    if plant.contact.shape[0] > 0 and plant.staggered:
+        report_contacts(plant, back, theta)
     scatter(place, plant.qpos)
     scatter(speed, plant.qvel)
     for copy in range(copies):
         if diverged[copy]:
             for axis in range(copy * A, copy * A + A):
                 theta[axis], omega[axis], reaction[axis], position[axis] = 0.0, 0.0, 0.0, 0.0
+
+
+@stage
+def report_contacts(plant, back, theta):
+    """Bring the axes' angles at the step's end to where the springs of contacts have them, as `ends` does of joints."""
+    D, copies = plant.damping.shape
+    place, speed, lane, contact = plant.position, plant.reached, plant.lane, plant.contact
+    axis_motion, motion, share, carried = plant.axis_motion, plant.motion, plant.share, plant.carried
+    A, F = axis_motion.shape[0], plant.friction.shape[0]
+    # Rows of `lane`.
+    x, pressed, turned = 0, 1, 2
+    for b in range(contact.shape[0]):
+        e = F + b
+        touching = 0
+        for copy in range(copies):
+            touching += 1 if carried[copy, b] != 0.0 else 0
+        if touching == 0:
+            continue
+        for copy in range(copies):
+            lane[x, copy] = 0.0
+        for d in range(D):
+            add_product(lane, x, motion[e, d], place, d)
+            add_product(lane, x, -back * motion[e, d], speed, d)
+        for copy in range(copies):
+            low, high = contact[b, 0, copy], contact[b, 1, copy]
+            lane[pressed, copy] = max(low - lane[x, copy], 0.0) + min(high - lane[x, copy], 0.0)
+        for a in range(A):
+            for copy in range(copies):
+                lane[turned, copy] = 0.0
+            for d in range(D):
+                factor = axis_motion[a, d]
+                if factor != 0.0:
+                    for copy in range(copies):
+                        lane[turned, copy] += share[e, d, copy] * factor
+            for copy in range(copies):
+                theta[copy * A + a] -= contact[b, 6, copy] * lane[turned, copy] * lane[pressed, copy]
 
 
 @inlined

@@ -116,6 +116,16 @@ def test_unknown_names_list_what_there_is():
             EmulatedDrives(**options)
 
 
+@pytest.mark.parametrize("volts", [-1.0, float("nan"), float("inf")])
+def test_a_supply_that_cannot_be_is_refused_when_it_is_given_and_when_it_is_set(axis, volts):
+    message = f"supply voltage must be finite and 0 V or more, not {volts:g} V"
+    with pytest.raises(ValueError, match=message):
+        EmulatedDrives(supply=volts)
+    with pytest.raises(ValueError, match=message):
+        axis.machine.supply = volts
+    assert axis.machine.supply == 24.0
+
+
 @pytest.mark.parametrize(
     ("options", "meant"),
     [
