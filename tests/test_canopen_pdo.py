@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+import tomllib
 
 import pytest
 from canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame
+from drive_env.devices import allowed_values
 
 
 @pytest.fixture(scope="module")
@@ -245,6 +247,53 @@ def test_type_0_is_sent_at_sync_if_a_value_has_changed(wire):
 
 def test_type_1_is_sent_at_every_sync(wire):
     wire.play("rx 080\ntx 385  50 02 00 00 00 00\ntx 485  50 02 00 00 00 00\n" * 5)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 240])
+def test_type_n_is_sent_at_every_nth_sync(wire, n):
+    configure(wire, 0x1802, 2, n, 1)
+    configure(wire, 0x1803, 1, 0xC000_0485, 4)
+    for _ in range(3):
+        wire.play("rx 080\n" * (n - 1))
+        wire.play("rx 080\ntx 385  50 02 00 00 00 00")
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, 240])
+def test_received_data_of_every_synchronous_type_take_effect_at_the_next_sync(wire, kind):
+    """CiA 301: an RPDO of type 0 to 240 is taken over with the next SYNC, not with the nth."""
+    configure(wire, 0x1400, 2, kind, 1)
+    configure(wire, 0x1802, 1, 0xC000_0385, 4)
+    wire.play("""
+        rx 205  06 00
+        wait 5 ms                     # nothing, as the statusword is what it was
+        rx 080
+        tx 485  31 02 00 00 00 00
+        wait 1 ms
+        tx 185  31 02
+        tx 285  31 02 00
+    """)
+
+
+# --- the manual's text, which has fewer types than its tables ---------------------------------------------------------
+@pytest.fixture
+def strict(drives):
+    """Node 5 of a drive with the quirk that takes the text by the letter."""
+    device = drives.device
+    data = tomllib.loads(device.eds.with_name("device.toml").read_text(encoding="utf-8"))
+    data["quirks"]["strict_transmission_types"] = True
+    drives.device = device._replace(allowed_values=allowed_values(data))
+    drives.machine.reset()
+    yield Wire(drives)
+    drives.device = device
+
+
+@pytest.mark.parametrize(("index", "text"), [(0x1400, {0, 254, 255}), (0x1403, {0, 254, 255}),
+                                             (0x1800, {0, 1, 254, 255}), (0x1803, {0, 1, 254, 255})])  # fmt: skip
+def test_transmission_types_of_the_tables_and_of_the_strict_quirk(wire, strict, index, text):
+    """Sections 3.1.17 and 3.1.19: the tables have UNSIGNED8, of which CiA 301 reserves 241 to 251."""
+    for kind in range(256):
+        assert (wire.download(index, 2, kind, 1) == 0) is (kind <= 240 or kind >= 254), kind
+        assert (strict.download(index, 2, kind, 1) == 0) is (kind in text), kind
 
 
 @pytest.mark.parametrize("sync", ["rx 080", "rx 080  01", "rx 080  F0"])

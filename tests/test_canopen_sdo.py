@@ -166,12 +166,12 @@ REFUSED = [
     ("23 00 18 01 86 01 00 40", "08000022"),
     ("23 00 14 01 05 02 00 20", "06090030"),
     ("23 00 14 01 05 0A 00 40", "06090030"),
-    # transmission types that the manual does not have, and what must not change while a PDO is in use
-    ("2F 00 14 02 01 00 00 00", "06090030"),
-    ("2F 00 14 02 F0 00 00 00", "06090030"),
+    # transmission types that are reserved or need remote frames, and what must not change while a PDO is in use
+    ("2F 00 14 02 F1 00 00 00", "06090030"),
     ("2F 00 14 02 FC 00 00 00", "06090030"),
-    ("2F 00 18 02 02 00 00 00", "06090030"),
-    ("2F 00 18 02 F0 00 00 00", "06090030"),
+    ("2F 00 14 02 FD 00 00 00", "06090030"),
+    ("2F 00 18 02 F1 00 00 00", "06090030"),
+    ("2F 00 18 02 FC 00 00 00", "06090030"),
     ("2F 00 18 02 FD 00 00 00", "06090030"),
     ("2B 00 18 03 05 00 00 00", "08000022"),
     # signatures
