@@ -341,7 +341,6 @@ def test_a_read_is_a_copy(drives):
 def context(scaler=65536.0, **other):
     values = {
         "position_scaler": np.array([scaler]),
-        "encoder_steps": np.array([4096.0]),
         "current_lsb": 100.0 / 32768.0,
     }
     values.update(other)
