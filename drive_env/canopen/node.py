@@ -169,6 +169,9 @@ class Node:
         for axis in self._axes:
             for emergency in axis.take_emergencies():
                 self._tell_of(axis, emergency, now)
+        if self._emergency.told and not self._error_register():
+            # CiA 301: whoever was told of an error is told when there is none any more, however it ended.
+            self._emergency.push(self._device.emergencies[CAUSES[FAULT_RESET].name], 0)
         self._flush(now)
         if nmt.SERVICES[self.state].pdo:
             for pdo in self._event_tpdos:
