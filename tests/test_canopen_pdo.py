@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 import tomllib
 
@@ -399,6 +400,61 @@ def test_the_inhibit_time_holds_back_the_event_timer_too(wire):
         wait 1 ms
         tx 185  50 02
         wait 29 ms
+        wait 1 ms
+        tx 185  50 02
+    """)
+
+
+TIMED = [254, 255]
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, 240, *TIMED])
+def test_the_event_timer_belongs_to_event_driven_types(wire, kind):
+    """CiA 301, 1800h:05: the longest interval of types 254 and 255; a synchronous PDO waits for its SYNC."""
+    configure(wire, 0x1801, 1, 0xC000_0285, 4)
+    configure(wire, 0x1800, 2, kind, 1)
+    configure(wire, 0x1800, 5, 10, 2)
+    wire.wait(1)
+    wire.take()
+    wire.wait(100)
+    assert [frame.can_id for frame in wire.take()] == ([0x185] * 10 if kind in TIMED else [])
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, *TIMED])
+def test_the_inhibit_time_belongs_to_event_driven_types(wire, kind):
+    """CiA 301, 1800h:03: the shortest interval of types 254 and 255; whoever sends SYNC decides how often."""
+    for index in (0x1800, 0x1801, 0x1803):
+        configure(wire, index, 1, 0xC000_0000 | wire.value(index, 1), 4)
+    configure(wire, 0x1800, 2, kind, 1)
+    configure(wire, 0x1800, 3, 50, 2)
+    configure(wire, 0x1802, 1, 0xC000_0385, 4)
+    configure(wire, 0x1800, 1, 0x4000_0185, 4)
+    times = []
+    for k in range(200):
+        wire.receive(0x205, "06 00" if k % 2 else "00 00")  # each changes the statusword
+        sent = wire.receive(0x080)
+        wire.wait(1)
+        times += [k for frame in (*sent, *wire.take()) if frame.can_id == 0x185]
+    apart = {later - before for before, later in itertools.pairwise(times)}
+    assert apart == {50 if kind in TIMED else max(kind, 1)}
+
+
+def test_another_type_or_event_timer_does_not_end_the_inhibit_time(wire):
+    configure(wire, 0x1801, 1, 0xC000_0285, 4)
+    configure(wire, 0x1800, 1, 0xC000_0185, 4)
+    configure(wire, 0x1800, 3, 20, 2)
+    configure(wire, 0x1800, 1, 0x4000_0185, 4)
+    wire.play("""
+        wait 1 ms
+        tx 185  50 02
+        rx 605  2B 00 18 05 05 00 00 00   # event timer 5 ms
+        tx 585  60 00 18 05 00 00 00 00
+        rx 605  2F 00 18 02 FE 00 00 00
+        tx 585  60 00 18 02 00 00 00 00
+        wait 19 ms
+        wait 1 ms
+        tx 185  50 02
+        wait 19 ms
         wait 1 ms
         tx 185  50 02
     """)

@@ -48,6 +48,8 @@ class CanopenBehaviour(NamedTuple):
 
     Attributes:
         sdo_timeout: Time after which the server gives a transfer up.
+        frames_per_cycle: Frames that the firmware takes in a communication cycle of 1 ms, where time is real.
+        receive_buffer: Frames that wait until it does; more are lost.
         inhibit_unit: Unit of a TPDO's inhibit time.
         event_unit: Unit of a TPDO's event timer.
         error_behaviour: Value of 1029h -> NMT state that the node enters, or "stay".
@@ -59,6 +61,8 @@ class CanopenBehaviour(NamedTuple):
     """
 
     sdo_timeout: float
+    frames_per_cycle: int
+    receive_buffer: int
     inhibit_unit: float
     event_unit: float
     error_behaviour: dict[int, str]
@@ -212,6 +216,8 @@ def _values(item: int | str) -> Sequence[int]:
 def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
     return CanopenBehaviour(
         sdo_timeout=data["sdo_timeout"],
+        frames_per_cycle=data["frames_per_cycle"],
+        receive_buffer=data["receive_buffer"],
         inhibit_unit=data["inhibit_unit"],
         event_unit=data["event_unit"],
         error_behaviour={int(value): state for value, state in data["error_behaviour"].items()},
