@@ -28,7 +28,7 @@ from drive_env.live_dictionary import (
 )
 
 # Units whose factor an axis can change while it runs.
-_CHANGING = units.SCALED_BY_POSITION | {"encoder inc"}
+_CHANGING = units.SCALED_BY_POSITION
 
 
 class Port(NamedTuple):
@@ -76,7 +76,6 @@ class Axis:
         self._fsa = self._place("fsa")[1]
         self._fresh = self._place("set_point_fresh")[1]
         self._scaler = self._place("position_scaler")[1]
-        self._steps = self._place("encoder_steps")[1]
         self._error_register = self._place("error_register")[1]
         self._ports: dict[tuple[int, int], Port] = {}
 
@@ -166,9 +165,7 @@ class Axis:
         return write
 
     def _factor(self, unit: str) -> float:
-        context = units.Context(
-            self._reals[self._scaler], self._reals[self._steps], self._device.current_full_scale / 32768.0
-        )
+        context = units.Context(self._reals[self._scaler], self._device.current_full_scale / 32768.0)
         return units.factor_of_one(unit, context)
 
     def _reader(self, entry: Entry, binding: Binding) -> Callable[[], int]:

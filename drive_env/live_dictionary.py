@@ -94,9 +94,7 @@ class LiveDictionary:
             if isinstance(values, np.ndarray):
                 values[chosen] = raw[chosen]
         after = self._context()
-        if np.any(before.position_scaler != after.position_scaler) or np.any(
-            before.encoder_steps != after.encoder_steps
-        ):
+        if np.any(before.position_scaler != after.position_scaler):
             self._scale_changes += 1
         cycle.power_on(self._records, axes)
 
@@ -226,10 +224,7 @@ class LiveDictionary:
 
     def _stored_image(self) -> LaneImage:
         """Return the fields that `_restore` would set from what is stored, converted by the scales that are stored."""
-        steps = next(key for key, binding in self.device.bindings.items() if binding.field == "encoder_steps")
-        context = self._context()._replace(
-            position_scaler=self._stored[POSITION_SCALER].astype(float), encoder_steps=self._stored[steps].astype(float)
-        )
+        context = self._context()._replace(position_scaler=self._stored[POSITION_SCALER].astype(float))
         bound = [key for key in self._stored if key in self.device.bindings]
         rows = [self.device.bindings[key] for key in bound if self.entries.find(key).access not in ("ro", "const")]
         values = [self._from_od(row, self._stored[row.index, row.sub], context) for row in rows]
@@ -242,7 +237,6 @@ class LiveDictionary:
         device = self.device
         return units.Context(
             position_scaler=get_lanes(self._records, "position_scaler", self.num_axes).astype(float),
-            encoder_steps=get_lanes(self._records, "encoder_steps", self.num_axes).astype(float),
             current_lsb=device.current_full_scale / 32768.0,
         )
 

@@ -26,7 +26,7 @@ Integers = NDArray[np.int64]
 # Units whose conversion is more than a factor; their objects take the long way.
 SPECIAL_UNITS = frozenset({"position window", "position limit", "1/65536 turn"})
 # Fields that factors depend on: played, they would change between two rows.
-SCALES = frozenset({"position_scaler", "encoder_steps"})
+SCALES = frozenset({"position_scaler"})
 
 
 class Row(NamedTuple):

@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 
 POSITION_DEMAND, POSITION, VELOCITY, CURRENT = (0x6062, 0), (0x6064, 0), (0x606C, 0), (0x6077, 0)
 TARGET_VELOCITY, TARGET_CURRENT, MODE = (0x60FF, 0), (0x6071, 0), (0x6061, 0)
-POSITION_SCALER, ENCODER_STEPS = (0x2058, 0), (0x2080, 2)
+POSITION_SCALER = (0x2058, 0)
 _RECORDED = (POSITION_DEMAND, POSITION, VELOCITY, CURRENT, TARGET_VELOCITY, TARGET_CURRENT, MODE)
 _PROFILED_MODES = (1, 3, 8)  # pp, pv, csp: 6062h goes on in them, and its slope is the velocity demand
 _CSV, _CST = 9, 10
@@ -169,6 +169,5 @@ def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> N
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
     return units.Context(
         position_scaler=drives.read(POSITION_SCALER)[axes].astype(float),
-        encoder_steps=drives.read(ENCODER_STEPS)[axes].astype(float),
         current_lsb=drives.device.current_full_scale / 32768.0,
     )

@@ -277,6 +277,22 @@ def test_every_readable_object_reads(drives):
         assert (raw <= entry.high).all()
 
 
+# What is measured reads what is, not the manual's default of 0.
+LIVE = {
+    (0x2101, 0): 1 << 15 | 1 << 8 | 1 << 4,  # table 85: module initialised, stop mode, motor halted
+    (0x2104, 0): 5461,  # the middle of the hall sector at angle 0: 30 degrees of 65536 steps
+    (0x2702, 0): 0b1111,  # limit and home switches that are not connected read active; enabled
+    (0x60FD, 0): 0b1111,
+    (0x6041, 0): 0x0250,  # switch on disabled, voltage enabled, remote
+}
+
+
+def test_a_drive_as_the_factory_leaves_it_reads_the_manuals_defaults_but_for_what_it_measures():
+    with EmulatedDrives(load="inertia", motor=None, num_threads=1, ideal=True) as factory:
+        found = {(e.index, e.sub): factory.read((e.index, e.sub))[0] for e in ENTRIES if e.bits is not None}
+    assert {key: raw for key, raw in found.items() if raw != DICTIONARY.find(key).default} == LIVE
+
+
 WRITABLE = [e for e in ENTRIES if e.access in ("rw", "wo") and e.bits and (e.index, e.sub) not in DEVICE.unsupported]
 
 
@@ -325,7 +341,6 @@ def test_a_read_is_a_copy(drives):
 def context(scaler=65536.0, **other):
     values = {
         "position_scaler": np.array([scaler]),
-        "encoder_steps": np.array([4096.0]),
         "current_lsb": 100.0 / 32768.0,
     }
     values.update(other)

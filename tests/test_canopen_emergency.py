@@ -8,6 +8,7 @@ from canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.emergency import CONDITIONS, QUEUE
+from drive_env.canopen.frames import Frame
 from drive_env.canopen.nmt import State
 from drive_env.devices import find_device
 from drive_env.firmware import fsa
@@ -182,6 +183,104 @@ def test_overruns(wire, buffer, extra):
     wire.node.overrun(wire.now, buffer)
     assert len(wire.take()) == 1, "each is an event"
     assert wire.value(0x1001) == 0, "it is over when told"
+
+
+# How each condition of the bus comes about, and how it ends by itself: by another frame, or it is over when it is told.
+def lose_heartbeat(wire):
+    assert wire.download(0x1016, 1, 0x0007_0032, 4) == 0  # node 7, 50 ms
+    wire.node.receive(Frame(0x707, b"\x05"), wire.now)
+    wire.wait(60)
+
+
+def lose_guarding(wire):
+    assert wire.download(0x100C, 0, 25, 2) == 0
+    assert wire.download(0x100D, 0, 2, 1) == 0
+    wire.node.receive(REQUEST, wire.now)
+    wire.wait(60)
+
+
+def lose_the_bus(wire):
+    wire.node.bus_off(wire.now)
+    wire.node.bus_on(wire.now)
+
+
+def frame(can_id, text):
+    return lambda wire: wire.node.receive(Frame(can_id, bytes.fromhex(text)), wire.now)
+
+
+def nothing(wire):
+    pass
+
+
+REQUEST = Frame(0x705, b"", True, 1)
+ENDS = {
+    "pdo_not_accepted": (frame(0x305, "00 00 02"), frame(0x305, "00 00 01")),
+    "pdo_too_short": (frame(0x205, "00"), frame(0x205, "00 00")),
+    "pdo_too_long": (frame(0x205, "00 00 00"), frame(0x205, "00 00")),
+    "heartbeat_lost": (lose_heartbeat, frame(0x707, "05")),
+    "life_guarding_lost": (lose_guarding, lambda wire: wire.node.receive(REQUEST, wire.now)),
+    "error_passive": (lambda wire: wire.node.error_passive(wire.now), nothing),
+    "controller_overflow": (lambda wire: wire.node.overrun(wire.now, "controller"), nothing),
+    "transmit_overflow": (lambda wire: wire.node.overrun(wire.now, "transmit"), nothing),
+    "receive_overflow": (lambda wire: wire.node.overrun(wire.now, "receive"), nothing),
+    "bus_off_recovered": (lose_the_bus, nothing),
+}
+
+
+def test_every_condition_of_the_bus_has_its_end():
+    """8100h comes with a fault and ends with its reset; the axis' own rows are in test_protection.py."""
+    assert set(ENDS) - {"life_guarding_lost"} == set(CONDITIONS) - {"communication_error"}
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_0000h_tells_that_1001h_has_fallen_to_0_by_itself(wire, name):
+    begin, end = ENDS[name]
+    row = find_device("tmcm1636").emergencies["heartbeat_lost" if name == "life_guarding_lost" else name]
+    assert wire.download(0x1029, 1, 1, 1) == 0  # stay operational
+    wire.start()
+    begin(wire)
+    told = [f.data for f in wire.take() if f.can_id == 0x085]
+    assert [data[:2] + data[3:] for data in told] == [row.code.to_bytes(2, "little") + bytes(row.extra)]
+    assert told[0][2] & 0x11, "generic error, and communication or profile"
+    if end is not nothing:
+        wire.wait(100)
+        assert [f for f in wire.take() if f.can_id == 0x085] == [], "the error is there still"
+        assert wire.value(0x1001) == told[0][2]
+    end(wire)
+    wire.wait(1)
+    assert [str(f) for f in wire.take() if f.can_id == 0x085] == ["085  00 00 00 00 00 00 00 00"]
+    assert wire.value(0x1001) == 0
+    wire.wait(20)
+    assert [f for f in wire.take() if f.can_id == 0x085] == [], "once"
+
+
+def test_0000h_waits_until_all_errors_are_gone(wire):
+    wire.start()
+    wire.play("""
+        rx 305  00 00 02
+        tx 085  20 63 21 00 FF 00 00 00
+        rx 205  00
+        tx 085  10 82 31 00 FF 00 00 00
+        rx 305  00 00 01
+        wait 1 ms
+        tx 285  50 02 01
+        rx 205  00 00
+        wait 1 ms
+        tx 085  00 00 00 00 00 00 00 00
+    """)
+
+
+def test_an_error_that_nobody_was_told_of_has_no_end(wire):
+    wire.start()
+    wire.play("""
+        rx 605  23 14 10 00 85 00 00 80   # off
+        tx 585  60 14 10 00 00 00 00 00
+        rx 205  00
+        rx 605  23 14 10 00 85 00 00 00   # on
+        tx 585  60 14 10 00 00 00 00 00
+        rx 205  00 00
+        wait 10 ms
+    """)
 
 
 def test_error_passive(wire):

@@ -119,7 +119,9 @@ def test_it_is_watched_anew_after_its_next_heartbeat(wire):
         rx 707  7F
         rx 605  40 01 10 00 00 00 00 00
         tx 585  4F 01 10 00 00 00 00 00
-        wait 51 ms
+        wait 1 ms
+        tx 085  00 00 00 00 00 00 00 00   # no error any more
+        wait 50 ms
         tx 085  30 81 11 00 FF 00 00 00
     """)
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import time
+import tomllib
 
 import pytest
 from canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame
+from drive_env.devices import allowed_values
 
 
 @pytest.fixture(scope="module")
@@ -247,6 +250,53 @@ def test_type_1_is_sent_at_every_sync(wire):
     wire.play("rx 080\ntx 385  50 02 00 00 00 00\ntx 485  50 02 00 00 00 00\n" * 5)
 
 
+@pytest.mark.parametrize("n", [1, 2, 3, 240])
+def test_type_n_is_sent_at_every_nth_sync(wire, n):
+    configure(wire, 0x1802, 2, n, 1)
+    configure(wire, 0x1803, 1, 0xC000_0485, 4)
+    for _ in range(3):
+        wire.play("rx 080\n" * (n - 1))
+        wire.play("rx 080\ntx 385  50 02 00 00 00 00")
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, 240])
+def test_received_data_of_every_synchronous_type_take_effect_at_the_next_sync(wire, kind):
+    """CiA 301: an RPDO of type 0 to 240 is taken over with the next SYNC, not with the nth."""
+    configure(wire, 0x1400, 2, kind, 1)
+    configure(wire, 0x1802, 1, 0xC000_0385, 4)
+    wire.play("""
+        rx 205  06 00
+        wait 5 ms                     # nothing, as the statusword is what it was
+        rx 080
+        tx 485  31 02 00 00 00 00
+        wait 1 ms
+        tx 185  31 02
+        tx 285  31 02 00
+    """)
+
+
+# --- the manual's text, which has fewer types than its tables ---------------------------------------------------------
+@pytest.fixture
+def strict(drives):
+    """Node 5 of a drive with the quirk that takes the text by the letter."""
+    device = drives.device
+    data = tomllib.loads(device.eds.with_name("device.toml").read_text(encoding="utf-8"))
+    data["quirks"]["strict_transmission_types"] = True
+    drives.device = device._replace(allowed_values=allowed_values(data))
+    drives.machine.reset()
+    yield Wire(drives)
+    drives.device = device
+
+
+@pytest.mark.parametrize(("index", "text"), [(0x1400, {0, 254, 255}), (0x1403, {0, 254, 255}),
+                                             (0x1800, {0, 1, 254, 255}), (0x1803, {0, 1, 254, 255})])  # fmt: skip
+def test_transmission_types_of_the_tables_and_of_the_strict_quirk(wire, strict, index, text):
+    """Sections 3.1.17 and 3.1.19: the tables have UNSIGNED8, of which CiA 301 reserves 241 to 251."""
+    for kind in range(256):
+        assert (wire.download(index, 2, kind, 1) == 0) is (kind <= 240 or kind >= 254), kind
+        assert (strict.download(index, 2, kind, 1) == 0) is (kind in text), kind
+
+
 @pytest.mark.parametrize("sync", ["rx 080", "rx 080  01", "rx 080  F0"])
 def test_sync_with_and_without_counter(wire, sync):
     wire.play(f"{sync}\ntx 385  50 02 00 00 00 00\ntx 485  50 02 00 00 00 00")
@@ -350,6 +400,61 @@ def test_the_inhibit_time_holds_back_the_event_timer_too(wire):
         wait 1 ms
         tx 185  50 02
         wait 29 ms
+        wait 1 ms
+        tx 185  50 02
+    """)
+
+
+TIMED = [254, 255]
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, 240, *TIMED])
+def test_the_event_timer_belongs_to_event_driven_types(wire, kind):
+    """CiA 301, 1800h:05: the longest interval of types 254 and 255; a synchronous PDO waits for its SYNC."""
+    configure(wire, 0x1801, 1, 0xC000_0285, 4)
+    configure(wire, 0x1800, 2, kind, 1)
+    configure(wire, 0x1800, 5, 10, 2)
+    wire.wait(1)
+    wire.take()
+    wire.wait(100)
+    assert [frame.can_id for frame in wire.take()] == ([0x185] * 10 if kind in TIMED else [])
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2, *TIMED])
+def test_the_inhibit_time_belongs_to_event_driven_types(wire, kind):
+    """CiA 301, 1800h:03: the shortest interval of types 254 and 255; whoever sends SYNC decides how often."""
+    for index in (0x1800, 0x1801, 0x1803):
+        configure(wire, index, 1, 0xC000_0000 | wire.value(index, 1), 4)
+    configure(wire, 0x1800, 2, kind, 1)
+    configure(wire, 0x1800, 3, 50, 2)
+    configure(wire, 0x1802, 1, 0xC000_0385, 4)
+    configure(wire, 0x1800, 1, 0x4000_0185, 4)
+    times = []
+    for k in range(200):
+        wire.receive(0x205, "06 00" if k % 2 else "00 00")  # each changes the statusword
+        sent = wire.receive(0x080)
+        wire.wait(1)
+        times += [k for frame in (*sent, *wire.take()) if frame.can_id == 0x185]
+    apart = {later - before for before, later in itertools.pairwise(times)}
+    assert apart == {50 if kind in TIMED else max(kind, 1)}
+
+
+def test_another_type_or_event_timer_does_not_end_the_inhibit_time(wire):
+    configure(wire, 0x1801, 1, 0xC000_0285, 4)
+    configure(wire, 0x1800, 1, 0xC000_0185, 4)
+    configure(wire, 0x1800, 3, 20, 2)
+    configure(wire, 0x1800, 1, 0x4000_0185, 4)
+    wire.play("""
+        wait 1 ms
+        tx 185  50 02
+        rx 605  2B 00 18 05 05 00 00 00   # event timer 5 ms
+        tx 585  60 00 18 05 00 00 00 00
+        rx 605  2F 00 18 02 FE 00 00 00
+        tx 585  60 00 18 02 00 00 00 00
+        wait 19 ms
+        wait 1 ms
+        tx 185  50 02
+        wait 19 ms
         wait 1 ms
         tx 185  50 02
     """)

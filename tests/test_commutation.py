@@ -398,3 +398,28 @@ def test_the_three_angles_are_live(build):
     assert np.max(np.abs(wrapped(encoder - true))) < math.radians(1.0)
     assert 20.0 < np.degrees(np.max(np.abs(wrapped(halls - true)))) < 31.0
     np.testing.assert_allclose(wrapped(np.diff(open_loop)), N_P * 20.0 * 0.003, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("always_use_encoder", "per_turn"),
+    [(0, 6 * N_P), (1, MOTOR.encoder_counts)],  # section 4.1.21: "in encoder or hall increments"
+)
+def test_2140h_counts_with_the_sensor_that_tells_the_position(build, always_use_encoder, per_turn):
+    drives = build(parameters=None)  # with friction: it comes to rest
+    drives.write(0x2055, HALL)
+    drives.write((0x2043, 3), always_use_encoder)
+    motion.enable(drives, mode="pv")
+    drives.write(0x60FF, 5 * TURN)
+    drives.advance(1.0)
+    motion.disable(drives)
+    drives.advance(0.5)
+    position = int(drives.read(0x6064)[0])
+    assert position > 2 * TURN
+    drives.write(0x607C, 10 * TURN)  # not told, and method 35 does not use it
+    drives.write(0x6098, 35)
+    drives.write(0x6060, 6)
+    drives.advance(0.002)
+    drives.write(0x6040, 0x10)
+    drives.advance(0.002)
+    assert drives.read(0x6064)[0] == 0
+    assert drives.read(0x2140)[0] == round(position / TURN * per_turn)

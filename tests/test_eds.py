@@ -64,23 +64,23 @@ ENTRIES = [
     # Section 3, communication area
     (0x1000, 0, "Device type", U32, "ro", 0, DWORD, 0xFFFC0192, "", 0, 6),
     (0x1001, 0, "Error register", U8, "ro", 0, BYTE, 0, "", 0, 8),
-    (0x1005, 0, "COB-ID SYNC message", U32, "rw", 0, DWORD, 0x80, "", 0, 12),
+    (0x1005, 0, "COB-ID SYNC message", U32, "rw", None, None, 0x80, "", 0, 12),
     (0x1008, 0, "Manufacturer device name", STRING, "ro", None, None, "TMCM-1636", "", 0, 14),
     (0x1009, 0, "Manufacturer hardware version", STRING, "ro", None, None, "1.0", "", 0, 16),
     (0x100A, 0, "Manufacturer software version", STRING, "ro", None, None, "1.09", "", 0, 18),
     (0x100C, 0, "Guard time", U16, "rw", 0, WORD, 0, "ms", 0, 20),
     (0x100D, 0, "Life time factor", U8, "rw", 0, BYTE, 0, "", 0, 22),
     (0x1010, 0, "Highest sub-index supported", U8, "ro", 0, BYTE, 4, "", 0, 25),
-    (0x1010, 1, "Save all parameters", U32, "rw", 0, DWORD, 1, "", 0, 25),  # reads 1: can be stored
-    (0x1010, 2, "Save communication parameters", U32, "rw", 0, DWORD, 1, "", 0, 25),
-    (0x1010, 3, "Save device profile parameters", U32, "rw", 0, DWORD, 1, "", 0, 25),
-    (0x1010, 4, "Save motor axis 0 parameters", U32, "rw", 0, DWORD, 1, "", 0, 25),
+    (0x1010, 1, "Save all parameters", U32, "rw", None, None, 1, "", 0, 25),  # reads 1: can be stored
+    (0x1010, 2, "Save communication parameters", U32, "rw", None, None, 1, "", 0, 25),
+    (0x1010, 3, "Save device profile parameters", U32, "rw", None, None, 1, "", 0, 25),
+    (0x1010, 4, "Save motor axis 0 parameters", U32, "rw", None, None, 1, "", 0, 25),
     (0x1011, 0, "Highest sub-index supported", U8, "ro", 0, BYTE, 4, "", 0, 28),
-    (0x1011, 1, "Restore all parameters", U32, "rw", 0, DWORD, 1, "", 0, 28),  # reads 1: can be restored
-    (0x1011, 2, "Restore communication parameters", U32, "rw", 0, DWORD, 1, "", 0, 28),
-    (0x1011, 3, "Restore device profile parameters", U32, "rw", 0, DWORD, 1, "", 0, 28),
-    (0x1011, 4, "Restore motor axis 0 parameters", U32, "rw", 0, DWORD, 1, "", 0, 28),
-    (0x1014, 0, "COB-ID EMCY", U32, "rw", 0, DWORD, 0x80 + NODE, "", 0, 30),
+    (0x1011, 1, "Restore all parameters", U32, "rw", None, None, 1, "", 0, 28),  # reads 1: can be restored
+    (0x1011, 2, "Restore communication parameters", U32, "rw", None, None, 1, "", 0, 28),
+    (0x1011, 3, "Restore device profile parameters", U32, "rw", None, None, 1, "", 0, 28),
+    (0x1011, 4, "Restore motor axis 0 parameters", U32, "rw", None, None, 1, "", 0, 28),
+    (0x1014, 0, "COB-ID EMCY", U32, "rw", None, None, 0x80 + NODE, "", 0, 30),
     (0x1015, 0, "Inhibit time EMCY", U16, "rw", 0, WORD, 0, "100us", 0, 32),  # table 31's name is a slip
     (0x1016, 0, "Number of entries", U8, "ro", 0, BYTE, 1, "", 0, 35),
     (0x1016, 1, "Consumer heartbeat time 1", U32, "rw", 0, DWORD, 0, "", 0, 35),
@@ -90,77 +90,77 @@ ENTRIES = [
     (0x1018, 2, "Product code", U32, "ro", 0, DWORD, 1636, "", 0, 39),
     (0x1018, 3, "Revision number", U32, "ro", 0, DWORD, 0x0001_0009, "", 0, 39),  # V1.09
     (0x1029, 0, "Number of error classes", U8, "ro", 0, BYTE, 2, "", 0, 41),
-    (0x1029, 1, "Communication error", U8, "rw", 0, BYTE, 0, "", 0, 41),
-    (0x1029, 2, "Application error", U8, "rw", 0, BYTE, 1, "", 0, 41),
+    (0x1029, 1, "Communication error", U8, "rw", 0, 2, 0, "", 0, 41),
+    (0x1029, 2, "Application error", U8, "rw", 0, 2, 1, "", 0, 41),
     # PDO COB-IDs: bit 30 is always set (3.1.17)
     (0x1400, 0, "Largest sub-index supported", U8, "ro", 2, 2, 2, "", 0, 43),
-    (0x1400, 1, "COB-ID used by PDO", U32, "rw", 0, DWORD, 0x4000_0200 + NODE, "", 0, 43),
+    (0x1400, 1, "COB-ID used by PDO", U32, "rw", None, None, 0x4000_0200 + NODE, "", 0, 43),
     (0x1400, 2, "Transmission type", U8, "rw", 0, BYTE, 0xFF, "", 0, 43),
     (0x1401, 0, "Largest sub-index supported", U8, "ro", 2, 2, 2, "", 0, 43),
-    (0x1401, 1, "COB-ID used by PDO", U32, "rw", 0, DWORD, 0x4000_0300 + NODE, "", 0, 43),
+    (0x1401, 1, "COB-ID used by PDO", U32, "rw", None, None, 0x4000_0300 + NODE, "", 0, 43),
     (0x1401, 2, "Transmission type", U8, "rw", 0, BYTE, 0xFF, "", 0, 43),
     (0x1402, 0, "Largest sub-index supported", U8, "ro", 2, 2, 2, "", 0, 43),
-    (0x1402, 1, "COB-ID used by PDO", U32, "rw", 0, DWORD, 0x4000_0400 + NODE, "", 0, 43),
+    (0x1402, 1, "COB-ID used by PDO", U32, "rw", None, None, 0x4000_0400 + NODE, "", 0, 43),
     (0x1402, 2, "Transmission type", U8, "rw", 0, BYTE, 0xFF, "", 0, 43),
     (0x1403, 0, "Largest sub-index supported", U8, "ro", 2, 2, 2, "", 0, 43),
-    (0x1403, 1, "COB-ID used by PDO", U32, "rw", 0, DWORD, 0x4000_0500 + NODE, "", 0, 43),
+    (0x1403, 1, "COB-ID used by PDO", U32, "rw", None, None, 0x4000_0500 + NODE, "", 0, 43),
     (0x1403, 2, "Transmission type", U8, "rw", 0, BYTE, 0xFE, "", 0, 43),
     (0x1600, 0, "Number of mapped application objects in PDO", U8, "rw", 0, 3, 1, "", 0, 45),
-    (0x1600, 1, "Mapping entry 1", U32, "rw", 0, DWORD, 0x6040_0010, "", 0, 45),
-    (0x1600, 2, "Mapping entry 2", U32, "rw", 0, DWORD, 0, "", 0, 45),
-    (0x1600, 3, "Mapping entry 3", U32, "rw", 0, DWORD, 0, "", 0, 45),
+    (0x1600, 1, "Mapping entry 1", U32, "rw", None, None, 0x6040_0010, "", 0, 45),
+    (0x1600, 2, "Mapping entry 2", U32, "rw", None, None, 0, "", 0, 45),
+    (0x1600, 3, "Mapping entry 3", U32, "rw", None, None, 0, "", 0, 45),
     (0x1601, 0, "Number of mapped application objects in PDO", U8, "rw", 0, 3, 2, "", 0, 45),
-    (0x1601, 1, "Mapping entry 1", U32, "rw", 0, DWORD, 0x6040_0010, "", 0, 45),
-    (0x1601, 2, "Mapping entry 2", U32, "rw", 0, DWORD, 0x6060_0008, "", 0, 45),
-    (0x1601, 3, "Mapping entry 3", U32, "rw", 0, DWORD, 0, "", 0, 45),
+    (0x1601, 1, "Mapping entry 1", U32, "rw", None, None, 0x6040_0010, "", 0, 45),
+    (0x1601, 2, "Mapping entry 2", U32, "rw", None, None, 0x6060_0008, "", 0, 45),
+    (0x1601, 3, "Mapping entry 3", U32, "rw", None, None, 0, "", 0, 45),
     (0x1602, 0, "Number of mapped application objects in PDO", U8, "rw", 0, 3, 2, "", 0, 45),
-    (0x1602, 1, "Mapping entry 1", U32, "rw", 0, DWORD, 0x6040_0010, "", 0, 45),
-    (0x1602, 2, "Mapping entry 2", U32, "rw", 0, DWORD, 0x607A_0020, "", 0, 45),
-    (0x1602, 3, "Mapping entry 3", U32, "rw", 0, DWORD, 0, "", 0, 45),
+    (0x1602, 1, "Mapping entry 1", U32, "rw", None, None, 0x6040_0010, "", 0, 45),
+    (0x1602, 2, "Mapping entry 2", U32, "rw", None, None, 0x607A_0020, "", 0, 45),
+    (0x1602, 3, "Mapping entry 3", U32, "rw", None, None, 0, "", 0, 45),
     (0x1603, 0, "Number of mapped application objects in PDO", U8, "rw", 0, 3, 2, "", 0, 45),
-    (0x1603, 1, "Mapping entry 1", U32, "rw", 0, DWORD, 0x6040_0010, "", 0, 45),
-    (0x1603, 2, "Mapping entry 2", U32, "rw", 0, DWORD, 0x60FF_0020, "", 0, 45),
-    (0x1603, 3, "Mapping entry 3", U32, "rw", 0, DWORD, 0, "", 0, 45),
+    (0x1603, 1, "Mapping entry 1", U32, "rw", None, None, 0x6040_0010, "", 0, 45),
+    (0x1603, 2, "Mapping entry 2", U32, "rw", None, None, 0x60FF_0020, "", 0, 45),
+    (0x1603, 3, "Mapping entry 3", U32, "rw", None, None, 0, "", 0, 45),
     (0x1800, 0, "Largest sub-index supported", U8, "ro", 5, 5, 5, "", 0, 47),
-    (0x1800, 1, "COB-ID", U32, "rw", 0, DWORD, 0x4000_0180 + NODE, "", 0, 47),
+    (0x1800, 1, "COB-ID", U32, "rw", None, None, 0x4000_0180 + NODE, "", 0, 47),
     (0x1800, 2, "Transmission type", U8, "rw", 0, BYTE, 0xFF, "", 0, 47),
     (0x1800, 3, "Inhibit time", U16, "rw", 0, WORD, 0, "ms", 0, 47),
     (0x1800, 4, "Compatibility entry", U8, "ro", 0, BYTE, 0, "", 0, 47),
     (0x1800, 5, "Event timer", U16, "rw", 0, WORD, 0, "ms", 0, 47),
     (0x1801, 0, "Largest sub-index supported", U8, "ro", 5, 5, 5, "", 0, 47),
-    (0x1801, 1, "COB-ID", U32, "rw", 0, DWORD, 0x4000_0280 + NODE, "", 0, 47),
+    (0x1801, 1, "COB-ID", U32, "rw", None, None, 0x4000_0280 + NODE, "", 0, 47),
     (0x1801, 2, "Transmission type", U8, "rw", 0, BYTE, 0xFF, "", 0, 47),
     (0x1801, 3, "Inhibit time", U16, "rw", 0, WORD, 0, "ms", 0, 47),
     (0x1801, 4, "Compatibility entry", U8, "ro", 0, BYTE, 0, "", 0, 47),
     (0x1801, 5, "Event timer", U16, "rw", 0, WORD, 0, "ms", 0, 47),
     (0x1802, 0, "Largest sub-index supported", U8, "ro", 5, 5, 5, "", 0, 47),
-    (0x1802, 1, "COB-ID", U32, "rw", 0, DWORD, 0x4000_0380 + NODE, "", 0, 47),
+    (0x1802, 1, "COB-ID", U32, "rw", None, None, 0x4000_0380 + NODE, "", 0, 47),
     (0x1802, 2, "Transmission type", U8, "rw", 0, BYTE, 1, "", 0, 47),
     (0x1802, 3, "Inhibit time", U16, "rw", 0, WORD, 0, "ms", 0, 47),
     (0x1802, 4, "Compatibility entry", U8, "ro", 0, BYTE, 0, "", 0, 47),
     (0x1802, 5, "Event timer", U16, "rw", 0, WORD, 0, "ms", 0, 47),
     (0x1803, 0, "Largest sub-index supported", U8, "ro", 5, 5, 5, "", 0, 47),
-    (0x1803, 1, "COB-ID", U32, "rw", 0, DWORD, 0x4000_0480 + NODE, "", 0, 47),
+    (0x1803, 1, "COB-ID", U32, "rw", None, None, 0x4000_0480 + NODE, "", 0, 47),
     (0x1803, 2, "Transmission type", U8, "rw", 0, BYTE, 1, "", 0, 47),
     (0x1803, 3, "Inhibit time", U16, "rw", 0, WORD, 0, "ms", 0, 47),
     (0x1803, 4, "Compatibility entry", U8, "ro", 0, BYTE, 0, "", 0, 47),
     (0x1803, 5, "Event timer", U16, "rw", 0, WORD, 0, "ms", 0, 47),
     (0x1A00, 0, "Number of mapped application objects in PDO", U8, "rw", 0, 3, 1, "", 0, 49),
-    (0x1A00, 1, "Mapping entry 1", U32, "rw", 0, DWORD, 0x6041_0010, "", 0, 49),
-    (0x1A00, 2, "Mapping entry 2", U32, "rw", 0, DWORD, 0, "", 0, 49),
-    (0x1A00, 3, "Mapping entry 3", U32, "rw", 0, DWORD, 0, "", 0, 49),
+    (0x1A00, 1, "Mapping entry 1", U32, "rw", None, None, 0x6041_0010, "", 0, 49),
+    (0x1A00, 2, "Mapping entry 2", U32, "rw", None, None, 0, "", 0, 49),
+    (0x1A00, 3, "Mapping entry 3", U32, "rw", None, None, 0, "", 0, 49),
     (0x1A01, 0, "Number of mapped application objects in PDO", U8, "rw", 0, 3, 2, "", 0, 49),
-    (0x1A01, 1, "Mapping entry 1", U32, "rw", 0, DWORD, 0x6041_0010, "", 0, 49),
-    (0x1A01, 2, "Mapping entry 2", U32, "rw", 0, DWORD, 0x6061_0008, "", 0, 49),
-    (0x1A01, 3, "Mapping entry 3", U32, "rw", 0, DWORD, 0, "", 0, 49),
+    (0x1A01, 1, "Mapping entry 1", U32, "rw", None, None, 0x6041_0010, "", 0, 49),
+    (0x1A01, 2, "Mapping entry 2", U32, "rw", None, None, 0x6061_0008, "", 0, 49),
+    (0x1A01, 3, "Mapping entry 3", U32, "rw", None, None, 0, "", 0, 49),
     (0x1A02, 0, "Number of mapped application objects in PDO", U8, "rw", 0, 3, 2, "", 0, 49),
-    (0x1A02, 1, "Mapping entry 1", U32, "rw", 0, DWORD, 0x6041_0010, "", 0, 49),
-    (0x1A02, 2, "Mapping entry 2", U32, "rw", 0, DWORD, 0x6064_0020, "", 0, 49),
-    (0x1A02, 3, "Mapping entry 3", U32, "rw", 0, DWORD, 0, "", 0, 49),
+    (0x1A02, 1, "Mapping entry 1", U32, "rw", None, None, 0x6041_0010, "", 0, 49),
+    (0x1A02, 2, "Mapping entry 2", U32, "rw", None, None, 0x6064_0020, "", 0, 49),
+    (0x1A02, 3, "Mapping entry 3", U32, "rw", None, None, 0, "", 0, 49),
     (0x1A03, 0, "Number of mapped application objects in PDO", U8, "rw", 0, 3, 2, "", 0, 49),
-    (0x1A03, 1, "Mapping entry 1", U32, "rw", 0, DWORD, 0x6041_0010, "", 0, 49),
-    (0x1A03, 2, "Mapping entry 2", U32, "rw", 0, DWORD, 0x606C_0020, "", 0, 49),
-    (0x1A03, 3, "Mapping entry 3", U32, "rw", 0, DWORD, 0, "", 0, 49),
+    (0x1A03, 1, "Mapping entry 1", U32, "rw", None, None, 0x6041_0010, "", 0, 49),
+    (0x1A03, 2, "Mapping entry 2", U32, "rw", None, None, 0x606C_0020, "", 0, 49),
+    (0x1A03, 3, "Mapping entry 3", U32, "rw", None, None, 0, "", 0, 49),
     # Section 4, manufacturer specific area
     (0x2000, 0, "Highest sub-index supported", U8, "ro", 0, BYTE, 5, "", 0, 51),
     (0x2000, 1, "MC_Type", U32, "ro", 0, DWORD, 0, "", 0, 51),
@@ -224,13 +224,13 @@ ENTRIES = [
     (0x2703, 2, "Output mask", U32, "rw", 0, DWORD, 0, "", 1, 100),
     (0x2704, 0, "CAN Bit Rate", U16, "rw", 20, 1000, 1000, "kbit/s", 0, 102),
     (0x2705, 0, "Node ID", U8, "rw", 1, 127, 1, "", 0, 104),
-    (0x2706, 0, "Store", U32, "rw", 0, DWORD, 0, "", 0, 106),
+    (0x2706, 0, "Store", U32, "rw", None, None, 0, "", 0, 106),
     (0x2707, 0, "CAN Bit Rate Load", U16, "ro", 20, 1000, 1000, "kbit/s", 0, 108),  # 1000 needs 16 bits
     (0x2708, 0, "Node ID Load", U8, "ro", 1, 127, 1, "", 0, 110),
     (0x270E, 0, "Highest sub-index supported", U8, "ro", 0, BYTE, 2, "", 0, 112),
     (0x270E, 1, "AI0", U16, "ro", 0, 4095, 0, "", 0, 112),
     (0x270E, 2, "AI1", U16, "ro", 0, 4095, 0, "", 0, 112),
-    (0x5FFF, 0, "Bootloader mode", U32, "rw", 0, 0x1234_5678, 0, "", 0, 114),
+    (0x5FFF, 0, "Bootloader mode", U32, "rw", None, None, 0, "", 0, 114),
     # Section 5, profile specific area
     (0x605A, 0, "Quick stop option code", I16, "rw", 1, 6, 2, "", 0, 117),
     (0x605B, 0, "Shutdown option code", U16, "rw", 0, 0, 0, "", 0, 120),
@@ -262,7 +262,7 @@ ENTRIES = [
     (0x60F2, 0, "Positioning option code", U16, "rw", 0, 2, 0, "", 0, 180),  # table 178: 3 is reserved, no other bits
     (0x60FF, 0, "Target velocity", I32, "rw", LOW32, HIGH32, 0, "pps", 1, 208),
     (0x607C, 0, "Home offset", I32, "rw", LOW32, HIGH32, 0, "inc", 0, 224),
-    (0x6098, 0, "Homing method", I8, "rw", -128, 127, 0, "", 0, 226),
+    (0x6098, 0, "Homing method", I8, "rw", 0, 35, 0, "", 0, 226),
     (0x6099, 0, "Highest sub-index supported", U8, "ro", 0, BYTE, 2, "", 0, 228),
     (0x6099, 1, "Fast homing speed", U32, "rw", 0, DWORD, 0, "pps", 0, 228),
     (0x6099, 2, "Slow homing speed", U32, "rw", 0, DWORD, 0, "pps", 0, 228),
@@ -326,6 +326,15 @@ def test_dictionary_and_table_hold_the_same_entries():
     assert {index for index, *_ in GROUPS} == grouped
 
 
+# Rules that no limits tell: identifiers, mapping entries, signatures.
+WITHOUT_LIMITS = {
+    (0x1005, 0), (0x1014, 0), (0x2706, 0), (0x5FFF, 0),
+    *((index, sub) for index in (0x1010, 0x1011) for sub in (1, 2, 3, 4)),
+    *((first + k, 1) for first in (0x1400, 0x1800) for k in range(4)),
+    *((index, sub) for index in MAPPINGS for sub in (1, 2, 3)),
+}  # fmt: skip
+
+
 def test_every_numeric_entry_has_limits_within_its_type_and_a_default_within_them():
     for found in all_entries(OD):
         if found.data_type == datatypes.VISIBLE_STRING:
@@ -334,7 +343,10 @@ def test_every_numeric_entry_has_limits_within_its_type_and_a_default_within_the
         bits = len(found)
         signed = found.data_type in datatypes.SIGNED_TYPES
         lowest, highest = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
-        assert None not in (found.min, found.max, found.default), where
+        assert lowest <= found.default <= highest, where
+        if (found.index, found.subindex) in WITHOUT_LIMITS:
+            assert (found.min, found.max) == (None, None), where
+            continue
         assert lowest <= found.min <= found.default <= found.max <= highest, where
 
 
@@ -414,7 +426,7 @@ def test_every_section_has_the_keys_of_its_kind():
         top = eds[f"{found.index:04X}"]["ObjectType"] == "0x7"
         section = eds[f"{found.index:04X}" if top else f"{found.index:04X}sub{found.subindex:X}"]
         wanted = {"ParameterName", "ObjectType", "DataType", "AccessType", "DefaultValue", "PDOMapping"}
-        if found.data_type != datatypes.VISIBLE_STRING:
+        if found.data_type != datatypes.VISIBLE_STRING and (found.index, found.subindex) not in WITHOUT_LIMITS:
             wanted |= {"LowLimit", "HighLimit"}
         assert set(section) - {"Unit"} == wanted
         assert section["ObjectType"] == "0x7"

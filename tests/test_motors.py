@@ -197,6 +197,7 @@ def test_preset_motions_are_within_the_motors_reach(motor):
     assert 0.3 <= torque / motor.rated_torque <= 0.7
     assert objects["Profile deceleration"] == objects["Profile acceleration"]
     assert objects["Quick stop deceleration"] == 2 * objects["Profile acceleration"]
+    assert objects["Homing acceleration"] == objects["Profile acceleration"]
     assert objects["Position window"] == 200
     assert objects["Position window time"] == 2
     assert objects["Following error window"] == 655_360

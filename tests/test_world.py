@@ -354,8 +354,49 @@ def test_what_the_bus_cannot_carry_is_lost_and_told():
     # Manual, table 303: 8110h, CAN overrun; byte 3 is 2 for the transmit buffer.
     told = [frame.data.hex() for frame in heard if 0x081 <= frame.can_id <= 0x084]
     assert told
-    assert {data[:4] for data in told} == {"1081"}
-    assert {data[6:8] for data in told} == {"02"}
+    assert {(data[:4], data[6:8]) for data in told} == {("1081", "02"), ("0000", "00")}  # and that it is over
+    world.close()
+
+
+def flood(world, can_id, count):
+    """Send frames without data, as fast as the bus carries them; return node 5's emergencies until they are over."""
+    heard = []
+    world.listeners.append(lambda ended: heard.append(ended.frame))
+    for _ in range(count):
+        world.receive(Frame(can_id, b""), "flood")
+    world.run_until(world.time + 0.2)
+    assert world.wire.waiting("flood") == 0
+    return [frame.data.hex(" ") for frame in heard if frame.can_id == 0x085]
+
+
+def test_what_a_node_does_not_take_in_time_fills_its_buffer_and_is_told():
+    """Table 303: 8110h with 3. A full bus of SYNC has 20 frames a millisecond, and the firmware takes 16."""
+    world = World(lockstep=False)
+    world.add(EmulatedDrives(load="inertia", num_threads=1), [5])
+    world.power_on()
+    world.run_until(0.01)
+    assert flood(world, 0x080, 300) == [], "64 may wait"
+    assert flood(world, 0x123, 2000) == [], "frames of others do not pass its controller's filters"
+    # Told once until it has caught up, and that it is over.
+    assert flood(world, 0x080, 2000) == ["10 81 11 03 ff 00 00 00", "00 00 00 00 00 00 00 00"]
+    answers = []
+    world.listeners.append(lambda ended: answers.append(str(ended.frame)))
+    world.receive(Frame(0x605, bytes.fromhex("40 01 10 00 00 00 00 00")))
+    world.run_until(world.time + 0.01)
+    assert answers == ["605  40 01 10 00 00 00 00 00", "585  4F 01 10 00 00 00 00 00"]
+    world.close()
+
+
+def test_in_lockstep_frames_take_no_time_and_none_is_lost():
+    world = World()
+    world.add(EmulatedDrives(load="inertia", num_threads=1), [5])
+    world.power_on()
+    answers = []
+    world.listeners.append(lambda ended: answers.append(ended.frame.can_id))
+    for _ in range(500):
+        world.receive(Frame(0x605, bytes.fromhex("40 01 10 00 00 00 00 00")))
+    assert answers.count(0x585) == 500
+    assert 0x085 not in answers
     world.close()
 
 

@@ -240,7 +240,7 @@ class Controllers(NamedTuple):
 def controllers(device: Device, gains: RawGains) -> Controllers:
     """Return raw gains in SI."""
     raw = Gains(*(int(gain) for gain in gains))
-    context = Context(65536.0, 1.0, device.current_full_scale / 32768.0)
+    context = Context(65536.0, device.current_full_scale / 32768.0)
     names = ("current P", "I", "velocity P", "I", "position P")
     return Controllers(*(value * float(UNITS[name].factor(context)) for value, name in zip(raw, names, strict=True)))
 

@@ -106,8 +106,12 @@ class World:
 
             def make(send: Callable[[Frame], None], k: int = k, path: Path | None = path) -> Node:
                 bit_rate = round(self.wire.bit_rate)
-                nodes.append(Node(node_ids[k], drives, k * per_node, send=send, store=path, bit_rate=bit_rate))
-                return nodes[-1]
+                real = not self.lockstep
+                node = Node(
+                    node_ids[k], drives, k * per_node, send=send, store=path, bit_rate=bit_rate, takes_time=real
+                )
+                nodes.append(node)
+                return node
 
             self.attach(node_id, make)
             self._sync_objects.append(nodes[-1].dictionary.port(*SYNC_OBJECT))

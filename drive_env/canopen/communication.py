@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 from drive_env.axis import Port
 from drive_env.canopen import frames, mapping
 from drive_env.devices import Device
@@ -18,6 +20,7 @@ from drive_env.dictionary.access import (
     VALUE_RANGE,
     WRONG_STATE,
     ObjectAccessError,
+    check_allowed,
     check_limits,
 )
 from drive_env.dictionary.entries import Entry, ObjectDictionary
@@ -116,9 +119,8 @@ class ModuleObjects:
         def checked(raw: int) -> None:
             check_limits(entry, raw)
             allowed = self._device.allowed_values.get(key)
-            if allowed is not None and raw not in allowed:
-                known = ", ".join(str(value) for value in allowed)
-                raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {raw}; it knows {known}")
+            if allowed is not None:
+                check_allowed(entry, np.array([raw]), allowed)
             if check is not None:
                 check(self, entry, raw)
 

@@ -46,9 +46,13 @@ class EmergencyProducer:
 
     Args:
         send: Takes a frame.
+
+    Attributes:
+        told: Error register of the last message that was queued; 0 before the first.
     """
 
     def __init__(self, send: Callable[[Frame], None]) -> None:
+        self.told = 0
         self._send = send
         self._waiting: deque[bytes] = deque()
         self._sent_at: float | None = None
@@ -64,6 +68,7 @@ class EmergencyProducer:
         if self._can_id is not None and len(self._waiting) < QUEUE:
             head = emergency.code.to_bytes(2, "little") + bytes((error_register,))
             self._waiting.append(head + bytes(emergency.extra))
+            self.told = error_register
 
     def flush(self, now: float) -> None:
         """Send what may be sent at `now` [s]."""
@@ -77,6 +82,7 @@ class EmergencyProducer:
         """Forget what waits."""
         self._waiting.clear()
         self._sent_at = None
+        self.told = 0
 
 
 class ErrorHistory:

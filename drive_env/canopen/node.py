@@ -7,6 +7,8 @@ service is a file of its own and knows nothing of the others. A node reads no cl
 from __future__ import annotations
 
 import logging
+import math
+from collections import deque
 from collections.abc import Callable, Hashable
 from functools import partial
 from pathlib import Path
@@ -53,6 +55,7 @@ class Node:
         store: The file that is its non-volatile memory; without one it lasts as long as the node.
         bit_rate: That of the bus [bit/s], and the node's own while it has stored none. With another one stored the node
             is mute and deaf, as its controller understands nothing. None: the factory's, and whatever is stored fits.
+        takes_time: Its firmware takes no more frames in a cycle than it can; the next ones wait in its receive buffer.
 
     Raises:
         ValueError: For a number that no node can have, axes that the drives do not have, a bit rate that the device
@@ -75,6 +78,7 @@ class Node:
         send: Callable[[Frame], None],
         store: Path | None = None,
         bit_rate: int | None = None,
+        takes_time: bool = False,
     ) -> None:
         device = drives.device
         if not 1 <= node_id <= 127:
@@ -122,6 +126,9 @@ class Node:
         self._tpdos = [TransmitPdo(i, self._module, port, *units) for i in indices if i in communication.TPDO]
         self._pdos = {pdo.index: pdo for pdo in (*self._rpdos, *self._tpdos)}
         self._handlers: dict[int, tuple[Callable[[bytes, float], None], ...]] = {}
+        self._frames_left = self._frames_per_cycle = device.canopen.frames_per_cycle if takes_time else math.inf
+        self._received: deque[Frame] = deque()
+        self._has_lost = False  # frames, since its receive buffer was last half empty
 
     # --- the interface --------------------------------------------------------------------------------------------
     @property
@@ -137,10 +144,24 @@ class Node:
     def receive(self, frame: Frame, now: float) -> None:
         """Take a frame of the bus at time `now` [s]; whatever it holds, nothing is raised."""
         self._now = now
-        if not self._is_online:
+        if not self._is_online or not self._accepts(frame):
             return
+        if self._frames_left > 0 and not self._received:
+            self._frames_left -= 1
+            self._take(frame, now)
+        elif len(self._received) < self._device.canopen.receive_buffer:
+            self._received.append(frame)
+        elif not self._has_lost:
+            self._has_lost = True
+            self.overrun(now, "receive")
+
+    def _accepts(self, frame: Frame) -> bool:
+        """Return whether a frame passes the controller's filters."""
+        return frame.can_id == frames.ERROR_CONTROL + self.node_id if frame.rtr else frame.can_id in self._handlers
+
+    def _take(self, frame: Frame, now: float) -> None:
         if frame.rtr:  # the device supports remote frames for guarding alone
-            if frame.can_id == frames.ERROR_CONTROL + self.node_id and self._heartbeat.period == 0.0:
+            if self._heartbeat.period == 0.0:
                 self._transmit(Frame(frame.can_id, self._guarding.answer(self.state, now)))
                 self._conditions.pop("guarding", None)
             return
@@ -155,6 +176,12 @@ class Node:
         self._now = now
         if not self._is_online:
             return
+        self._frames_left = self._frames_per_cycle
+        while self._received and self._frames_left > 0:
+            self._frames_left -= 1
+            self._take(self._received.popleft(), now)
+        if len(self._received) < self._device.canopen.receive_buffer // 2:
+            self._has_lost = False
         for consumer in self._consumers:
             if consumer.is_lost(now):
                 self._lose("heartbeat", consumer.node_id, now)
@@ -169,6 +196,9 @@ class Node:
         for axis in self._axes:
             for emergency in axis.take_emergencies():
                 self._tell_of(axis, emergency, now)
+        if self._emergency.told and not self._error_register():
+            # CiA 301: whoever was told of an error is told when there is none any more, however it ended.
+            self._emergency.push(self._device.emergencies[CAUSES[FAULT_RESET].name], 0)
         self._flush(now)
         if nmt.SERVICES[self.state].pdo:
             for pdo in self._event_tpdos:
@@ -197,6 +227,7 @@ class Node:
         if not self._is_online:
             return
         self._is_online = False
+        self._received.clear()
         for axis in self._axes:
             axis.trip()
         self._react(COMMUNICATION_ERROR)
@@ -248,6 +279,7 @@ class Node:
         """Bring the communication objects back, send the boot-up message and become pre-operational."""
         self.state = State.INITIALISING
         self._leaves_for_bootloader = False
+        self._received.clear()
         self._sdo.close()
         self._emergency.clear()
         self._conditions.clear()

@@ -31,6 +31,7 @@ class Pdo:
         self.index = index
         self._objects = objects
         self._port = port
+        self.can_id: int | None = None
         self.configure()
 
     def configure(self) -> None:
@@ -105,7 +106,8 @@ class TransmitPdo(Pdo):
 
     Event-driven ones (254, 255) are sent when a mapped value has changed since the last look, once per communication
     cycle, and when their event timer ends; so is one when the node becomes operational, since then nobody knows its
-    values. Synchronous ones are sampled at SYNC: type n at every n-th, type 0 if a value has changed since the last.
+    values. Synchronous ones are sampled at SYNC: type n at every n-th, type 0 if a value has changed since the last;
+    event timer and inhibit time are not theirs (CiA 301, 1800h).
     """
 
     def __init__(
@@ -117,21 +119,25 @@ class TransmitPdo(Pdo):
         event_unit: float,
     ) -> None:
         self._inhibit_unit, self._event_unit = inhibit_unit, event_unit
+        self._sent_at: float | None = None
         super().__init__(index, objects, port)
 
     def configure(self) -> None:
         """Take over what the objects say."""
+        before = self.can_id, self._sent_at
         super().configure()
         self._readers = [port.read for port in self._ports]
         self._inhibit = self._objects.value(self.index, 3) * self._inhibit_unit
         self._period = self._objects.value(self.index, 5) * self._event_unit
         self.start()
+        if self.can_id is not None and self.can_id == before[0]:
+            self._sent_at = before[1]  # the inhibit time of a PDO that stays on runs on
 
     def start(self) -> None:
         """Begin anew, as on entering operational."""
         self._seen: bytes | None = None
         self._is_due = False
-        self._sent_at: float | None = None
+        self._sent_at = None
         self._syncs = 0
 
     def on_sync(self) -> bytes | None:

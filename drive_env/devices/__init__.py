@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -48,6 +48,8 @@ class CanopenBehaviour(NamedTuple):
 
     Attributes:
         sdo_timeout: Time after which the server gives a transfer up.
+        frames_per_cycle: Frames that the firmware takes in a communication cycle of 1 ms, where time is real.
+        receive_buffer: Frames that wait until it does; more are lost.
         inhibit_unit: Unit of a TPDO's inhibit time.
         event_unit: Unit of a TPDO's event timer.
         error_behaviour: Value of 1029h -> NMT state that the node enters, or "stay".
@@ -59,6 +61,8 @@ class CanopenBehaviour(NamedTuple):
     """
 
     sdo_timeout: float
+    frames_per_cycle: int
+    receive_buffer: int
     inhibit_unit: float
     event_unit: float
     error_behaviour: dict[int, str]
@@ -181,7 +185,7 @@ def find_device(name: str) -> Device:
         overload_time=data["current"]["overload_time"],
         standstill=data["motion"]["standstill"],
         write_states={_key(text): state for text, state in data["states"].items()},
-        allowed_values={_key(text): tuple(values) for text, values in data["values"].items()},
+        allowed_values=allowed_values(data),
         unsupported=frozenset(_key(text) for text in data["unsupported"]["objects"]),
         refuses_same_mode=data["quirks"]["refuses_same_mode"],
         emergencies={n: Emergency(e["code"], tuple(e["bytes"])) for n, e in data["emergencies"].items()},
@@ -193,9 +197,27 @@ def find_device(name: str) -> Device:
     )
 
 
+def allowed_values(data: dict[str, Any]) -> dict[tuple[int, int], tuple[int, ...]]:
+    """Return the few values of each object that knows a few only, from a device's data."""
+    rows: dict[str, list[int | str]] = dict(data["values"])
+    if data["quirks"]["strict_transmission_types"]:
+        rows |= data["strict_transmission_types"]
+    return {_key(text): tuple(value for item in items for value in _values(item)) for text, items in rows.items()}
+
+
+def _values(item: int | str) -> Sequence[int]:
+    """Return one value as it is, or all of a range such as "0...240"."""
+    if isinstance(item, int):
+        return (item,)
+    first, last = item.split("...")
+    return range(int(first), int(last) + 1)
+
+
 def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
     return CanopenBehaviour(
         sdo_timeout=data["sdo_timeout"],
+        frames_per_cycle=data["frames_per_cycle"],
+        receive_buffer=data["receive_buffer"],
         inhibit_unit=data["inhibit_unit"],
         event_unit=data["event_unit"],
         error_behaviour={int(value): state for value, state in data["error_behaviour"].items()},

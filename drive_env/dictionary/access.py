@@ -103,9 +103,19 @@ def check_allowed(entry: Entry, raw: NDArray[np.int64], allowed: tuple[int, ...]
     """Raise 06090030h for a value that is none of the few that the object knows."""
     wrong = raw[~np.isin(raw, allowed)]
     if wrong.size:
-        raise ObjectAccessError(
-            VALUE_RANGE, f"{entry.label} cannot be {wrong[0]}; it knows {', '.join(str(a) for a in allowed)}"
-        )
+        raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {wrong[0]}; it knows {_listed(allowed)}")
+
+
+def _listed(values: tuple[int, ...]) -> str:
+    """Return ascending values as a message tells them: what follows one another, from three on, as a range."""
+    runs: list[list[int]] = []
+    for value in values:
+        if runs and value == runs[-1][-1] + 1:
+            runs[-1].append(value)
+        else:
+            runs.append([value])
+    texts = [[f"{run[0]} to {run[-1]}"] if len(run) > 2 else [str(value) for value in run] for run in runs]
+    return ", ".join(text for run in texts for text in run)
 
 
 def check_limits(entry: Entry, raw: int) -> None:

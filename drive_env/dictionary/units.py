@@ -21,7 +21,6 @@ class Context(NamedTuple):
     """What factors depend on, one value per axis or one for all."""
 
     position_scaler: Floats | float  # [inc/rev], 2058h
-    encoder_steps: Floats | float  # [1/rev], 2080h:02
     current_lsb: float  # [A] per LSB of the current loop
 
 
@@ -45,7 +44,6 @@ UNITS: dict[str, Unit] = {
         Unit("mA", "milliamperes of peak i_q", lambda c: 1e-3),
         Unit("ms", "milliseconds", lambda c: 1e-3),
         Unit("inc", "increments of position, 2058h per revolution", lambda c: TWO_PI / c.position_scaler),
-        Unit("encoder inc", "steps of the encoder", lambda c: TWO_PI / c.encoder_steps),
         Unit("0.1V", "tenths of a volt", lambda c: 0.1),
         Unit("pps", "increments per second", lambda c: TWO_PI / c.position_scaler),
         Unit("pps^2", "increments per second squared", lambda c: TWO_PI / c.position_scaler),

@@ -435,6 +435,7 @@ def power_on(records, where):
         drive.overload[lane] = 0.0
         drive.init_state[lane] = alignment.NEEDED
         drive.home_shift[lane] = 0.0
+        drive.home_count[lane] = 0.0
         drive.homing_state[lane] = hm.IDLE
         drive.homing_attained[lane] = 0
         drive.loop_level[lane] = 0

@@ -199,6 +199,7 @@ STATE = (
     Field("homing_attained", "i4", "", "statusword bit 12 in hm"),
     Field("homing_edge", "f8", "rad", "where the switch changed"),
     Field("home_shift", "f8", "rad", "what is taken from the position since the last homing"),
+    Field("home_count", "f8", "", "2140h: home as the position sensor counted it from power-on, 607Ch left out"),
     Field("init_state", "i4", "", "encoder initialisation, see alignment.py"),
     Field("init_time", "f8", "s", "time in this state"),
     Field("init_angle", "f8", "rad", "rotor angle, as the encoder tells it, at the beginning of this state"),

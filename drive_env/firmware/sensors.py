@@ -6,7 +6,7 @@ import numpy as np
 
 from drive_env.firmware.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.compiled import inlined, stage
 
 SQRT3 = 3.0**0.5
 PI = 3.141592653589793
@@ -179,3 +179,11 @@ def measure_currents(drive):
 
 # Reading of the ADC registers at zero current when the channel has no offset error (default of 2060h:03 and :04).
 ADC_CENTRE = 33500.0
+
+
+@stage
+def counts_per_turn(drive, lane):
+    """Return the counts of a revolution of the sensor that tells the position: the halls, or the encoder."""
+    if drive.angle_source[lane] == 2.0 and drive.always_use_encoder[lane] == 0.0:
+        return 6.0 * drive.pole_pairs[lane]
+    return drive.encoder_steps[lane]

@@ -48,7 +48,7 @@ BINDINGS = (
     Binding(0x2102, 0, "angle_open_loop", "1/65536 turn"),
     Binding(0x2103, 0, "angle_encoder", "1/65536 turn"),
     Binding(0x2104, 0, "angle_hall", "1/65536 turn"),
-    Binding(0x2140, 0, "home_shift", "encoder inc"),
+    Binding(0x2140, 0, "home_count"),
     Binding(0x2702, 0, "inputs"),
     Binding(0x6040, 0, "controlword", event="controlword"),
     Binding(0x6041, 0, "statusword"),

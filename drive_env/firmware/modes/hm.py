@@ -13,7 +13,8 @@ edge as the methods have them:
 
 from __future__ import annotations
 
-from drive_env.firmware import fsa, inputs, profiles
+from drive_env.firmware import fsa, inputs, profiles, sensors
+from drive_env.firmware.arithmetic import TWO_PI
 from mechanics.compiled import stage
 
 LEFT, RIGHT, HOME = 0, 1, 2
@@ -76,6 +77,7 @@ def forget(drive, lane):
 @stage
 def set_home(drive, lane, position, value):
     """Give `position` [rad] the value `value` [rad]; demand and measurement move together, so nothing jumps."""
+    drive.home_count[lane] = (position + drive.home_shift[lane]) * sensors.counts_per_turn(drive, lane) / TWO_PI
     shift = position - value
     drive.home_shift[lane] += shift
     drive.theta_meas[lane] -= shift

@@ -1,0 +1,117 @@
+"""What the EDS promises is what a node takes: every object that can be written, over SDO, at the ends of its range.
+
+What has no limits there is decided by a rule; rows have values that it takes and values that it refuses.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import pytest
+from canopen.objectdictionary import ODVariable
+from canopen_wire import Wire
+
+from drive_env import EmulatedDrives
+from drive_env.devices import find_device
+from drive_env.dictionary.access import CANNOT_BE_STORED, NO_SUCH_OBJECT, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
+from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
+
+EDS = find_device("tmcm1636").eds
+WRITABLE = {
+    (entry.index, entry.subindex): entry
+    for item in read_eds(EDS).values()
+    for entry in ([item] if isinstance(item, ODVariable) else item.values())
+    if entry.access_type in ("rw", "wo")
+}
+LIMITED = {key: entry for key, entry in WRITABLE.items() if entry.min is not None}
+OFF = 0xC000_0000
+DWORD = 0xFFFF_FFFF
+MAPPED = {False: (0x6040_0010, 0x6060_0008, 0x607A_0020), True: (0x6041_0010, 0x6061_0008, 0x6064_0020)}  # by direction
+SAVE, LOAD = 0x6576_6173, 0x6461_6F6C
+
+
+class Rule(NamedTuple):
+    """Objects without limits: what they take, what they refuse, and with which abort code."""
+
+    keys: tuple[tuple[int, int], ...]
+    takes: tuple[int, ...]
+    refuses: tuple[int, ...]
+    code: int
+
+
+RULES = (
+    # Reserved (CiA 301, table 41): 001h to 07Fh, 101h to 180h, 581h to 5FFh, 601h to 67Fh, 6E0h to 6FFh, 701h to 7FFh.
+    Rule(((0x1005, 0),), (0x80, 0x700), (0, 0x7F, 0x701, 0x4000_0080, DWORD), VALUE_RANGE),
+    Rule(((0x1014, 0),), (0x80, 0x700, 0x8000_0000), (0, 0x7F, 0x701, 0x4000_0080, DWORD), VALUE_RANGE),
+    Rule(
+        tuple((first + k, 1) for first in (0x1400, 0x1800) for k in range(4)),
+        (0x4000_0080, 0x4000_0700, OFF), (0, 0x7F, 0x701, 0x6000_0200, DWORD), VALUE_RANGE,
+    ),
+    Rule(
+        tuple((0x1600 + k, sub) for k in range(4) for sub in (1, 2, 3)),
+        (0, 0x6040_0010, 0x60FF_0020), (1, 0x1FFF_FFFF, DWORD), NO_SUCH_OBJECT,
+    ),
+    Rule(
+        tuple((0x1A00 + k, sub) for k in range(4) for sub in (1, 2, 3)),
+        (0, 0x6041_0010, 0x60FD_0020), (1, 0x1FFF_FFFF, DWORD), NO_SUCH_OBJECT,
+    ),
+    Rule((*((0x1010, sub) for sub in (1, 2, 3, 4)), (0x2706, 0)), (SAVE,), (0, LOAD, DWORD), CANNOT_BE_STORED),
+    Rule(tuple((0x1011, sub) for sub in (1, 2, 3, 4)), (LOAD,), (0, SAVE, DWORD), CANNOT_BE_STORED),
+    Rule(((0x5FFF, 0),), (0x1234_5678,), (0, 0x1234_5679, DWORD), VALUE_RANGE),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def drives():
+    with EmulatedDrives(load="inertia", num_threads=1) as made:
+        yield made
+
+
+def prepare(drives, key):
+    """Return a node that has just booted, with what the manual wants before this object is written."""
+    drives.machine.reset()
+    wire = Wire(drives)
+    index = key[0]
+    if index == 0x1014:
+        assert wire.download(0x1014, 0, 0x8000_0085, 4) == 0
+    elif 0x1400 <= index < 0x1C00:
+        communication = index & ~0x200
+        assert wire.download(communication, 1, OFF | 0x200, 4) == 0
+        if index != communication:  # a mapping: its entries first, then their number
+            assert wire.download(index, 0, 0, 1) == 0
+            for k, raw in enumerate(MAPPED[index >= 0x1A00], 1):
+                assert wire.download(index, k, raw, 4) == 0
+    elif index == 0x6060:  # the same mode twice is refused
+        assert wire.download(0x6060, 0, 3, 1) == 0
+    return wire
+
+
+def test_every_object_that_can_be_written_is_in_one_of_the_tables():
+    ruled = [key for rule in RULES for key in rule.keys]
+    assert len(ruled) == len(set(ruled))
+    assert set(WRITABLE) - set(LIMITED) == set(ruled)
+    assert len(LIMITED) > 80
+
+
+@pytest.mark.parametrize("key", LIMITED, ids=lambda key: f"{key[0]:04X}:{key[1]}")
+def test_a_node_takes_both_ends_of_the_range_and_nothing_beyond(drives, key):
+    low, high = LIMITED[key].min, LIMITED[key].max
+    bits, lowest, highest = INTEGER_TYPES[LIMITED[key].data_type]
+    for raw, code in ((low - 1, VALUE_TOO_LOW), (low, 0), (high, 0), (high + 1, VALUE_TOO_HIGH)):
+        if lowest <= raw <= highest:
+            wire = prepare(drives, key)
+            assert wire.download(*key, raw, bits // 8) == code, raw
+            if code == 0 and key != (0x6040, 0):
+                assert wire.value(*key) == raw
+
+
+@pytest.mark.parametrize(
+    ("key", "rule"),
+    [(key, rule) for rule in RULES for key in rule.keys],
+    ids=lambda x: "" if isinstance(x, Rule) else f"{x[0]:04X}:{x[1]}",
+)
+def test_what_has_no_limits_takes_what_its_rule_says(drives, key, rule):
+    for raw in rule.takes:
+        assert prepare(drives, key).download(*key, raw, 4) == 0, f"{raw:08X}h"
+    for raw in rule.refuses:
+        assert prepare(drives, key).download(*key, raw, 4) == rule.code, f"{raw:08X}h"
