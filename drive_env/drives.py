@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,8 +33,9 @@ from drive_env.process_image import ProcessImage
 from drive_env.trace import Trace
 from mechanics.load import Load
 from mechanics.loads import find_load
-from mechanics.model import compile_packed, copies_per_model
+from mechanics.model import copies_per_model
 from mechanics.packed import PackedLoad
+from mechanics.template import Template
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -259,9 +259,8 @@ class EmulatedDrives:
         ideal: bool,
         given: Mapping[str, ArrayLike],
     ) -> None:
-        template = compile_packed(self.load, 1)
         axes = (1, self.load.num_axes)
-        single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6, template=template)
+        single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6)
         defaults = {p.name: float(single.get(p.name)[0]) for p in self.load.parameters}
         table = parameter_table(self.device, self.motor, self.load, defaults)
         self._parameters, noise = draw_parameters(table, seed, numbers, randomise, ideal)
@@ -274,7 +273,8 @@ class EmulatedDrives:
 
     def _build_groups(self, physics_steps: int, integrator: str, friction: str) -> list[Group]:
         rates = rates_of(self.device, physics_steps)
-        templates: dict[int, Any] = {}
+        templates: dict[int, Template] = {}
+        armature, bearings = self._armature(), self._bearings()
         groups = []
         per_group = copies_per_model(self.load)
         axes_per_group = per_group * self.load.num_axes
@@ -282,11 +282,11 @@ class EmulatedDrives:
             machines = slice(first, min(first + per_group, self.num_machines))
             count = machines.stop - machines.start
             if count not in templates:
-                templates[count] = compile_packed(self.load, count)
+                templates[count] = Template(self.load, count)
             load = PackedLoad(
                 self.load,
-                self._armature()[machines],
-                self._bearings()[machines],
+                armature[machines],
+                bearings[machines],
                 {p.name: self._parameters[f"load.{p.name}"][machines] for p in self.load.parameters},
                 rates.window / physics_steps,
                 integrator=integrator,
@@ -368,22 +368,23 @@ class EmulatedDrives:
         if not mechanical:
             return
         loads = [name.removeprefix("load.") for name in mechanical if name.startswith("load.")]
+        armature, bearings = self._armature(), self._bearings()
         for group in self._groups:
             group.load.set_all(
                 {name: self._parameters[f"load.{name}"][group.machines] for name in loads},
                 machines[group.machines],
-                self._armature()[group.machines],
-                self._bearings()[group.machines],
+                armature[group.machines],
+                bearings[group.machines],
             )
         self._refresh_inertia()
 
     def _apply_to_loads(self, name: str, machines: Mask) -> None:
-        values = self._parameters[name]
+        values, armature, bearings = self._parameters[name], self._armature(), self._bearings()
         for group in self._groups:
             if name.startswith("load."):
                 group.load.set(name.removeprefix("load."), values[group.machines], machines[group.machines])
             else:
-                group.load.set_motor(self._armature()[group.machines], self._bearings()[group.machines])
+                group.load.set_motor(armature[group.machines], bearings[group.machines])
 
     def _refresh_inertia(self) -> None:
         axes = self.load.num_axes
