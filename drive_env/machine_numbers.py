@@ -39,8 +39,8 @@ def machine_numbers(seed: int, machines: Sequence[int], count: int) -> tuple[Flo
     Raises:
         ValueError: For a negative seed or number.
     """
-    distinct, place = np.unique(np.array(machines, object), return_inverse=True)
-    if len(distinct) < len(machines):
+    if len(set(machines)) < len(machines):
+        distinct, place = np.unique(np.array(machines, object), return_inverse=True)
         integers, shares = machine_numbers(seed, distinct.tolist(), count)
         return integers[place], shares[place]
     integers, shares = np.empty(len(machines)), np.empty((len(machines), count))
@@ -56,7 +56,7 @@ def machine_numbers(seed: int, machines: Sequence[int], count: int) -> tuple[Flo
         for k in range(count):
             shares[short, k] = (next(stream) >> np.uint64(11)) * 2.0**-53
         short[np.flatnonzero(short)[first == 0]] = False
-    for k in np.flatnonzero(~short):
+    for k in np.flatnonzero(~short).tolist():
         generator = np.random.default_rng((seed, machines[k]))
         integers[k], shares[k] = generator.integers(1, 2**32), generator.random(count)
     return integers, shares
@@ -79,7 +79,7 @@ def _seeds(entropy: list[_Halves]) -> tuple[_Wide, _Wide]:
         return value ^ value >> np.uint32(16)
 
     def mixed(left: _Halves, right: _Halves) -> _Halves:
-        value = left * _MIX_LEFT - right * _MIX_RIGHT
+        value: _Halves = left * _MIX_LEFT - right * _MIX_RIGHT
         return value ^ value >> np.uint32(16)
 
     nothing = np.zeros_like(entropy[0])
@@ -109,9 +109,10 @@ def _pcg64(seed: _Wide, increment: _Wide) -> Iterator[_Words]:
     state = _step(_sum(odd, seed), odd)
     while True:
         state = _step(state, odd)
-        turn = state[0] >> np.uint64(58)
-        folded = state[0] ^ state[1]
-        yield folded >> turn | folded << (np.uint64(64) - turn & np.uint64(63))
+        turn: _Words = state[0] >> np.uint64(58)
+        folded: _Words = state[0] ^ state[1]
+        turned: _Words = folded >> turn | folded << (np.uint64(64) - turn & np.uint64(63))
+        yield turned
 
 
 def _step(state: _Wide, increment: _Wide) -> _Wide:
@@ -130,4 +131,5 @@ def _upper(one: _Words, other: np.uint64) -> _Words:
     """Return the upper 64 bits of a product."""
     a, b, c, d = one >> _HALF, one & _LOW_HALF, other >> _HALF, other & _LOW_HALF
     middle = a * d + (b * d >> _HALF)
-    return a * c + (middle >> _HALF) + (b * c + (middle & _LOW_HALF) >> _HALF)
+    product: _Words = a * c + (middle >> _HALF) + (b * c + (middle & _LOW_HALF) >> _HALF)
+    return product

@@ -186,12 +186,17 @@ def _done(parts: list[Shard], left: list[int], pool: Pool | None, report: Progre
     shares = dict.fromkeys(left, 0.0)
     sizes = [part.last - part.first for part in parts]
 
+    def done() -> float:
+        return sum(shares.get(n, 1.0) * size for n, size in enumerate(sizes)) / sum(sizes)
+
     def say(k: int, share: float) -> None:
         shares[k] = share
-        report("simulating", sum(shares.get(n, 1.0) * size for n, size in enumerate(sizes)) / sum(sizes))
+        report("simulating", done())
 
     if pool is not None:
-        for place, arrays in pool.unordered(simulate, [parts[k] for k in left]):
+        for place, arrays in pool.unordered(
+            simulate, [parts[k] for k in left], lambda what: report(what or "simulating", done())
+        ):
             say(left[place], 1.0)
             yield left[place], arrays
         return
