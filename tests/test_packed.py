@@ -3,13 +3,11 @@
 import dataclasses
 import warnings
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from mechanics import loads
 from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.model import compile_packed
@@ -24,7 +22,7 @@ INTEGRATORS = ("leapfrog", "rk4")
 END_STOPS = [name for name, row in LOADS.items() if any(not contact.transmits for contact in row.contacts)]
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def step_plant(plant, torque, h, motion_, carried):
     """Step all copies through torques (n, C A); write angle, speed and reaction of each axis, shape (n, 3, C A).
 
