@@ -115,16 +115,45 @@ def test_shards_are_the_grid_without_gap_or_overlap_whatever_runs_them(experimen
     assert edges == [(part.first, part.last) for part in sweep.shards(experiment, num_threads=7)]
 
 
+@pytest.mark.parametrize(("width", "size"), [
+    (1, 1024), (2, 256), (4, 128), (9, 64),
+    (800, 64),  # a packed model is not taken apart
+])  # fmt: skip
+def test_many_workers_get_smaller_shards_of_whole_models(experiment, width, size):
+    parts = sweep.shards(experiment, width=width)
+    assert [part.first for part in parts] == list(range(0, 2304, size))
+    assert all(part.last == min(part.first + size, 2304) for part in parts)
+
+
+def test_a_run_goes_on_between_what_another_width_has_done(experiment):
+    left = sweep.shards(experiment, width=2, done={0: 576, 1024: 1088})
+    edges = [(part.first, part.last) for part in left]
+    assert edges == [(576, 832), (832, 1024), (1088, 1344), (1344, 1600), (1600, 1856), (1856, 2112), (2112, 2304)]
+
+
+def test_any_cut_gives_the_digits_of_any_other(experiment, whole, tmp_path):
+    class Wide:
+        width, shares_disk = 9, True
+
+        def unordered(self, function, items, say):
+            return iter([(k, function(item)) for k, item in enumerate(items)])
+
+    with ShardLog(tmp_path / "shards", "x") as log:
+        log.append(576, sweep.simulate(sweep.Shard(experiment, 576, 1152, 1)))
+        equal(whole, sweep.run(experiment, pool=Wide(), log=log))
+        assert sorted(log.done) == [*range(0, 640, 64), *range(1152, 2304, 64)]
+
+
 def test_only_what_is_not_done_is_simulated(experiment, whole, tmp_path, monkeypatch):
     with ShardLog(tmp_path / "shards", "x") as log:
         sweep.run(experiment, log=log)
         kept = dict(log.done)
-    assert sorted(kept) == [0, 1, 2]
+    assert sorted(kept) == [0, 1024, 2048]
     simulated = []
     truly = sweep.simulate
     monkeypatch.setattr(sweep, "simulate", lambda shard, *rest: simulated.append(shard.first) or truly(shard, *rest))
     with ShardLog(tmp_path / "some", "x") as log:
-        log.append(1, kept[1])
+        log.append(1024, kept[1024])
         result = sweep.run(experiment, log=log)
     assert sorted(simulated) == [0, 2048]
     equal(whole, result)
@@ -231,7 +260,7 @@ def test_worker_processes_give_the_digits_of_one_process_and_go_on_from_what_is_
     with open_pool(2) as pool, ShardLog(tmp_path / "shards", "x") as log:
         log.append(0, first)
         equal(whole, sweep.run(experiment, pool=pool, log=log))
-        assert sorted(log.done) == [0, 1, 2]
+        assert sorted(log.done) == [0, *range(1024, 2304, 256)]
 
 
 def test_a_cluster_that_loses_one_of_two_workers_gives_the_digits_of_one_process(experiment, whole, saved, tmp_path):
@@ -256,7 +285,7 @@ def test_a_cluster_that_loses_one_of_two_workers_gives_the_digits_of_one_process
             assert killed
             with pytest.raises(ProcessLookupError):
                 os.kill(victim, 0)
-    assert sorted(log.done) == [0, 1, 2]
+    assert sorted(log.done) == list(range(0, 2304, 256))
     equal(whole, result)
     assert contents(result.save(tmp_path / "run")) == saved
 
