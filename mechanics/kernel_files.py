@@ -65,6 +65,7 @@ class KernelFiles:
         try:
             content = path.read_bytes()
         except OSError:
+            logger.info("compiling %s: once for these sources, the emulator's takes half a minute", self._name)
             return None
         digest, data = content[:_DIGEST], content[_DIGEST:]
         if hashlib.sha256(data).digest() == digest:

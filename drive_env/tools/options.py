@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from drive_env.commands import CLOSED, output_is_closed
+from drive_env.tools.program import is_quiet
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -187,7 +188,7 @@ def progress_on(console: Console, *, transient: bool = False) -> Progress:
         TaskProgressColumn(),
         TimeElapsedColumn(),
     )
-    return Progress(*columns, console=console, transient=transient)
+    return Progress(*columns, console=console, transient=transient, disable=is_quiet())
 
 
 def print_json(value: Any) -> None:
