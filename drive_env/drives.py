@@ -24,8 +24,9 @@ from drive_env.firmware.cycle import Call
 from drive_env.firmware.protection import CAUSES
 from drive_env.firmware.record import get_lanes, new_records, set_lanes
 from drive_env.group import Group, call_of, channels, rates_of
-from drive_env.live_dictionary import NOTHING, LiveDictionary
+from drive_env.live_dictionary import NOTHING, POSITION_SCALER, LiveDictionary
 from drive_env.machine import Machines
+from drive_env.master.quantities import integers, is_quantity
 from drive_env.misfit import warn_of_misfits
 from drive_env.motors import find_motor
 from drive_env.parameters import apply_to_records, check_known, check_parameter, draw_parameters, parameter_table
@@ -137,6 +138,7 @@ class EmulatedDrives:
             preset = {"Limit switches": 3, **preset}
         self._objects = LiveDictionary(self.device, self._records, self.num_axes, preset)
         self._objects.restart(np.ones(self.num_axes, bool))
+        self._scale: tuple[int, list[float | None]] = (-1, [])
 
     # --- the interface --------------------------------------------------------------------------------------------
     def read(self, name: ObjectName) -> Integers:
@@ -148,14 +150,27 @@ class EmulatedDrives:
         return self._objects.read(name)
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object of the axes where the mask is true: one integer, or one per axis.
+        """Write an object of the axes where the mask is true: one integer, one per axis, or a quantity, "500 rpm".
 
         A write is checked for all axes before it changes any.
 
         Raises:
             ObjectAccessError: With the SDO abort code, if the object, the value or the state does not allow it.
+            ValueError: For a quantity that the object is none of.
         """
-        self._objects.write(name, value, checked_mask(where, self.num_axes))
+        axes = checked_mask(where, self.num_axes)
+        if is_quantity(value):
+            entry = self._objects.entries.find(name)
+            if entry.bits is not None:
+                value = integers(str(value), entry, self._increments(), axes)
+        self._objects.write(name, value, axes)
+
+    def _increments(self) -> list[float | None]:
+        """Return the position increments per revolution of each axis, read again once they were written."""
+        if self._scale[0] != self._objects.scale_changes:
+            read = self.read(POSITION_SCALER).tolist()
+            self._scale = self._objects.scale_changes, [float(scaler) or None for scaler in read]
+        return self._scale[1]
 
     def advance(self, duration: float) -> None:
         """Let `duration` [s] pass, whole communication cycles of 1 ms."""
@@ -219,7 +234,8 @@ class EmulatedDrives:
 
     def _trace(self, values: dict[tuple[int, int], Integers], rows: int, every: int) -> Trace:
         t = np.arange(rows, dtype=np.float64) * (every * self._cycle)
-        return Trace(t, values, self._objects.entries)
+        scale = self._increments()
+        return Trace(t, values, self._objects.entries, lambda: scale)
 
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis."""

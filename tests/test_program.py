@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import logging
 import os
 import subprocess
 import sys
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 import agents.cli
 import drive_env.cli
 import tuning.cli
+from drive_env.tools.program import Quiet, Verbose, say_as_much
 
 APPS = {"drive-env": drive_env.cli.app, "drive-tune": tuning.cli.app, "drive-agent": agents.cli.app}
 
@@ -70,10 +73,38 @@ def test_a_kind_of_names_that_there_is_not_is_answered_with_those_that_there_are
     assert "there are devices, motors, loads, not 'motor'; did you mean 'motors'?" in result.stderr
 
 
-def test_quiet_shows_results_and_errors_alone():
+def test_quiet_shows_errors_and_no_progress_bar():
     loud, quiet = (
-        run("drive-tune", *more, "response", "--load", "inertia", "--out", os.devnull + "/nowhere")
+        run("drive-tune", *more, "response", "--load", "inertia", "--out", "/dev/null/nowhere")
         for more in ((), ("--quiet",))
     )
     assert loud.returncode == quiet.returncode != 0
     assert quiet.stderr.startswith("drive-tune: ")
+
+
+def test_quiet_hides_bars_and_warnings(capfd):
+    from rich.console import Console
+
+    from drive_env.tools.options import progress_on
+
+    app = typer.Typer()
+
+    @app.callback()
+    def main(quiet: Quiet = False, verbose: Verbose = False) -> None:
+        say_as_much(quiet, verbose)
+
+    @app.command()
+    def work() -> None:
+        with progress_on(Console(stderr=True, force_terminal=True)) as progress:
+            progress.update(progress.add_task("working", total=1.0), completed=1.0)
+        logging.getLogger("drive_env").warning("something odd")
+
+    shown = {}
+    try:
+        for option in ((), ("--quiet",)):
+            shown[option] = CliRunner().invoke(app, [*option, "work"])
+    finally:
+        logging.disable(logging.NOTSET)
+    assert [result.exit_code for result in shown.values()] == [0, 0]
+    assert "working" in shown[()].output
+    assert shown["--quiet",].output == ""

@@ -7,7 +7,6 @@ import logging
 import warnings
 from typing import Annotated
 
-import click
 import typer
 
 PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
@@ -44,6 +43,5 @@ def say_as_much(quiet: bool, verbose: bool) -> None:
 
 
 def is_quiet() -> bool:
-    """Return whether the program that runs was asked to be quiet."""
-    context = click.get_current_context(silent=True)
-    return context is not None and bool(context.find_root().params.get("quiet"))
+    """Return whether the program that runs was asked to be quiet: warnings are off."""
+    return not logging.getLogger("drive_env").isEnabledFor(logging.WARNING)
