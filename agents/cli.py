@@ -7,10 +7,10 @@ import importlib
 import typer
 
 from agents.commands.options import interrupted
+from drive_env.tools.program import Quiet, Verbose, Version, say_as_much
 
 app = typer.Typer(
     name="drive-agent",
-    add_completion=False,
     no_args_is_help=True,
     rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
     pretty_exceptions_enable=False,
@@ -28,12 +28,13 @@ for panel, names in PANELS.items():
 
 
 @app.callback()
-def drive_agent() -> None:
+def drive_agent(version: Version = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
     """Train agents for servo drives, judge them, and let them act: on emulated drives, and on real ones over CAN.
 
     Exit codes: 0 done, 1 drive, bus or the watch over the agent said no, 2 a mistake in the command, 130
     Ctrl-C, 141 nobody takes the output any more.
     """
+    say_as_much(quiet, verbose)
 
 
 def main() -> None:

@@ -31,6 +31,7 @@ from drive_env.master.pace import LockstepPace, Pace, RealTimePace, Timing
 from drive_env.master.pdo import PdoConfiguration
 from drive_env.master.port import Port, open_bus
 from drive_env.master.process_data import ProcessData
+from drive_env.master.quantities import INCREMENTAL, increments_per_revolution, integers, is_quantity
 from drive_env.master.sampling import run_cycles
 from drive_env.master.sdo import SdoClient
 from drive_env.safety.envelope import Envelope
@@ -148,7 +149,7 @@ class CanDrives:
         return values
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object of the axes where the mask is true: one integer, or one per axis.
+        """Write an object of the axes where the mask is true: one integer, one per axis, or a quantity, "500 rpm".
 
         Type, access and range are checked before anything is sent. What only a drive can tell it tells one axis after
         the other: those before the one that refuses keep the new value.
@@ -156,6 +157,7 @@ class CanDrives:
         Raises:
             ObjectAccessError: With the SDO abort code, if the object, the value or the state does not allow it.
             SafetyError: If a limit does not; NoAnswerError if a node is silent.
+            ValueError: For a quantity that the object is none of.
         """
         self._enter()
         entry = self._description.dictionary.find(name)
@@ -165,6 +167,9 @@ class CanDrives:
             for axis in np.flatnonzero(axes):
                 self.write_axis(entry, int(axis), value)
             return
+        if is_quantity(value):
+            scale = increments_per_revolution(self) if entry.unit in INCREMENTAL else [None] * self.num_axes
+            value = integers(str(value), entry, scale, axes)
         raw = checked_values(entry, value, self.num_axes)
         if self.safety is not None:
             self.safety.before_write(entry, raw, axes)
@@ -226,7 +231,7 @@ class CanDrives:
             key = (entry.index, entry.sub)
             values[key] = np.tile(self.read_entry(entry), (rows, 1)) if self._dry else found[key][::every]
         times = np.arange(rows, dtype=np.float64) * (every * self._description.cycle)
-        return Trace(times, values, self._description.dictionary)
+        return Trace(times, values, self._description.dictionary, lambda: increments_per_revolution(self))
 
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis.

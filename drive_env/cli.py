@@ -12,8 +12,10 @@ from drive_env.tools.get import get, set_object
 from drive_env.tools.jog import jog
 from drive_env.tools.log import log, replay
 from drive_env.tools.monitor import monitor
+from drive_env.tools.names import list_names
 from drive_env.tools.options import INTERRUPTED
 from drive_env.tools.parameters import backup, commission, diff, restore
+from drive_env.tools.program import Quiet, Verbose, Version, say_as_much
 from drive_env.tools.render import render
 from drive_env.tools.scan import scan
 from drive_env.tools.scope import scope
@@ -21,7 +23,6 @@ from drive_env.tools.serve import serve
 
 app = typer.Typer(
     name="drive-env",
-    add_completion=False,
     no_args_is_help=True,
     rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
     pretty_exceptions_enable=False,
@@ -38,6 +39,7 @@ PANELS = {
         ("jog", jog),
     ),
     "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
+    "What there is": (("list", list_names),),
     "Frames": (("log", log), ("replay", replay)),
     "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("compare", compare)),
 }
@@ -47,13 +49,14 @@ for panel, commands in PANELS.items():
 
 
 @app.callback()
-def drive_env() -> None:
+def drive_env(version: Version = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
     """Servo drives: real ones and emulated ones, over CAN.
 
     Interface, channel and time-out may stand in DRIVE_ENV_INTERFACE, DRIVE_ENV_CHANNEL and DRIVE_ENV_TIMEOUT, the token
     of a hub that asks for one in DRIVE_ENV_TOKEN. Exit codes: 0 done, 1 the drive or the bus said no (or differs), 2 a
     mistake in the command, 130 Ctrl-C, 141 nobody takes the output any more.
     """
+    say_as_much(quiet, verbose)
 
 
 def main() -> None:

@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +24,9 @@ from drive_env.firmware.cycle import Call
 from drive_env.firmware.protection import CAUSES
 from drive_env.firmware.record import get_lanes, new_records, set_lanes
 from drive_env.group import Group, call_of, channels, rates_of
-from drive_env.live_dictionary import NOTHING, LiveDictionary
+from drive_env.live_dictionary import NOTHING, POSITION_SCALER, LiveDictionary
 from drive_env.machine import Machines, checked_supply
+from drive_env.master.quantities import integers, is_quantity
 from drive_env.misfit import warn_of_misfits
 from drive_env.motors import find_motor
 from drive_env.parameters import apply_to_records, check_known, check_parameter, draw_parameters, parameter_table
@@ -34,8 +34,9 @@ from drive_env.process_image import ProcessImage
 from drive_env.trace import Trace
 from mechanics.load import Load
 from mechanics.loads import find_load
-from mechanics.model import compile_packed, copies_per_model
+from mechanics.model import copies_per_model
 from mechanics.packed import PackedLoad
+from mechanics.template import Template
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -138,6 +139,7 @@ class EmulatedDrives:
             preset = {"Limit switches": 3, **preset}
         self._objects = LiveDictionary(self.device, self._records, self.num_axes, preset)
         self._objects.restart(np.ones(self.num_axes, bool))
+        self._scale: tuple[int, list[float | None]] = (-1, [])
 
     # --- the interface --------------------------------------------------------------------------------------------
     def read(self, name: ObjectName) -> Integers:
@@ -149,14 +151,27 @@ class EmulatedDrives:
         return self._objects.read(name)
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object of the axes where the mask is true: one integer, or one per axis.
+        """Write an object of the axes where the mask is true: one integer, one per axis, or a quantity, "500 rpm".
 
         A write is checked for all axes before it changes any.
 
         Raises:
             ObjectAccessError: With the SDO abort code, if the object, the value or the state does not allow it.
+            ValueError: For a quantity that the object is none of.
         """
-        self._objects.write(name, value, checked_mask(where, self.num_axes))
+        axes = checked_mask(where, self.num_axes)
+        if is_quantity(value):
+            entry = self._objects.entries.find(name)
+            if entry.bits is not None:
+                value = integers(str(value), entry, self._increments(), axes)
+        self._objects.write(name, value, axes)
+
+    def _increments(self) -> list[float | None]:
+        """Return the position increments per revolution of each axis, read again once they were written."""
+        if self._scale[0] != self._objects.scale_changes:
+            read = self.read(POSITION_SCALER).tolist()
+            self._scale = self._objects.scale_changes, [float(scaler) or None for scaler in read]
+        return self._scale[1]
 
     def advance(self, duration: float) -> None:
         """Let `duration` [s] pass, whole communication cycles of 1 ms."""
@@ -220,7 +235,8 @@ class EmulatedDrives:
 
     def _trace(self, values: dict[tuple[int, int], Integers], rows: int, every: int) -> Trace:
         t = np.arange(rows, dtype=np.float64) * (every * self._cycle)
-        return Trace(t, values, self._objects.entries)
+        scale = self._increments()
+        return Trace(t, values, self._objects.entries, lambda: scale)
 
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis."""
@@ -260,9 +276,8 @@ class EmulatedDrives:
         ideal: bool,
         given: Mapping[str, ArrayLike],
     ) -> None:
-        template = compile_packed(self.load, 1)
         axes = (1, self.load.num_axes)
-        single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6, template=template)
+        single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6)
         defaults = {p.name: float(single.get(p.name)[0]) for p in self.load.parameters}
         table = parameter_table(self.device, self.motor, self.load, defaults)
         self._parameters, noise = draw_parameters(table, seed, numbers, randomise, ideal)
@@ -275,7 +290,8 @@ class EmulatedDrives:
 
     def _build_groups(self, physics_steps: int, integrator: str, friction: str) -> list[Group]:
         rates = rates_of(self.device, physics_steps)
-        templates: dict[int, Any] = {}
+        templates: dict[int, Template] = {}
+        armature, bearings = self._armature(), self._bearings()
         groups = []
         per_group = copies_per_model(self.load)
         axes_per_group = per_group * self.load.num_axes
@@ -283,11 +299,11 @@ class EmulatedDrives:
             machines = slice(first, min(first + per_group, self.num_machines))
             count = machines.stop - machines.start
             if count not in templates:
-                templates[count] = compile_packed(self.load, count)
+                templates[count] = Template(self.load, count)
             load = PackedLoad(
                 self.load,
-                self._armature()[machines],
-                self._bearings()[machines],
+                armature[machines],
+                bearings[machines],
                 {p.name: self._parameters[f"load.{p.name}"][machines] for p in self.load.parameters},
                 rates.window / physics_steps,
                 integrator=integrator,
@@ -369,22 +385,23 @@ class EmulatedDrives:
         if not mechanical:
             return
         loads = [name.removeprefix("load.") for name in mechanical if name.startswith("load.")]
+        armature, bearings = self._armature(), self._bearings()
         for group in self._groups:
             group.load.set_all(
                 {name: self._parameters[f"load.{name}"][group.machines] for name in loads},
                 machines[group.machines],
-                self._armature()[group.machines],
-                self._bearings()[group.machines],
+                armature[group.machines],
+                bearings[group.machines],
             )
         self._refresh_inertia()
 
     def _apply_to_loads(self, name: str, machines: Mask) -> None:
-        values = self._parameters[name]
+        values, armature, bearings = self._parameters[name], self._armature(), self._bearings()
         for group in self._groups:
             if name.startswith("load."):
                 group.load.set(name.removeprefix("load."), values[group.machines], machines[group.machines])
             else:
-                group.load.set_motor(self._armature()[group.machines], self._bearings()[group.machines])
+                group.load.set_motor(armature[group.machines], bearings[group.machines])
 
     def _refresh_inertia(self) -> None:
         axes = self.load.num_axes

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-import mechanics.compiled
 from drive_env.dictionary.entries import ObjectName
 from drive_env.group import call_of
 from drive_env.process_image import ProcessImage, from_od_rows, to_od_rows
@@ -25,7 +23,6 @@ from mechanics.compiled import cached
 if TYPE_CHECKING:
     from drive_env.drives import EmulatedDrives
 
-_SOURCES = (Path(__file__).parent / "firmware", Path(mechanics.compiled.__file__).parent)
 Integers = NDArray[np.int64]
 
 
@@ -97,7 +94,7 @@ class Conversion(Bundle):
 conversion_at = reader(Conversion)
 
 
-@cached(*_SOURCES, allocates=False)
+@cached(allocates=False)
 def convert_in(address: Any, first: Any, count: Any) -> Any:
     """Run the hook before, and bring what is played into SI; return 0 if an integer is out of range."""
     own = conversion_at(address)
@@ -112,7 +109,7 @@ def convert_in(address: Any, first: Any, count: Any) -> Any:
     return 1
 
 
-@cached(*_SOURCES, allocates=False)
+@cached(allocates=False)
 def convert_out(address: Any, first: Any, count: Any) -> Any:
     """Bring samples into drive units, and run the hook after."""
     own = conversion_at(address)

@@ -9,7 +9,7 @@ import numpy as np
 
 from drive_env.motors import Motor
 from mechanics.packed import PackedLoad
-from mechanics.shaft import shaft_load
+from mechanics.shaft import shaft_load, way
 
 # Auto-tuning fails easily beyond 15 to 30 times the rotor's inertia (Yaskawa's manuals).
 MAX_INERTIA_RATIO = 30.0
@@ -26,7 +26,8 @@ def warn_of_misfits(loads: Sequence[PackedLoad], motor: Motor) -> None:
         loads: The packed loads of all machines.
         motor: Their motor.
     """
-    found = [shaft_load(load) for load in loads]
+    turning = way(loads[0]).joints
+    found = [shaft_load(load, turning) for load in loads]
     gravity = np.concatenate([row.gravity for row in found])
     friction = np.concatenate([row.friction for row in found])
     ratio = np.concatenate([row.inertia / load.armature for row, load in zip(found, loads, strict=True)])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from drive_env import motors
 from drive_env.devices import Device
 from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.machine_numbers import machine_numbers
 from drive_env.motors import Motor
 from mechanics.load import Load
 from mechanics.near_names import did_you_mean
@@ -146,15 +147,7 @@ def draw_parameters(
         ValueError: If a name is none of a group or parameter.
     """
     chosen = _chosen(table, randomise)
-    shares = np.empty((len(machines), len(table)))
-    noise = np.empty(len(machines))
-    for k, number in enumerate(machines):
-        if k > 0 and number == machines[k - 1]:
-            noise[k], shares[k] = noise[k - 1], shares[k - 1]
-            continue
-        generator = np.random.default_rng((seed, number))
-        noise[k] = generator.integers(1, 2**32)
-        shares[k] = generator.random(len(table))
+    noise, shares = machine_numbers(seed, machines, len(table))
     values: dict[str, Floats] = {}
     for k, row in enumerate(table.values()):
         if row.name in chosen:

@@ -7,7 +7,6 @@ takes longer then than the drives' own millisecond.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +16,6 @@ from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.group import Channels
 from mechanics.compiled import cached, stage
-
-_SOURCES = (Path(__file__).parent,)
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -116,13 +113,13 @@ def to_od_rows(samples: Any, factors: Any, limits: Any, wraps: Any, raw: Any, fi
                 raw[k, row, axis] = 0 if np.isnan(value) else np.int64(value)
 
 
-@cached(*_SOURCES)
+@cached()
 def from_od(raw: Any, factor: Any, low: int, high: int, values: Any, k: int) -> Any:
     """Set SI values of object k; return False if an integer is out of range."""
     return from_od_rows(raw, factor, low, high, values, k, 0, values.shape[2])
 
 
-@cached(*_SOURCES)
+@cached()
 def to_od(samples: Any, factors: Any, limits: Any, wraps: Any, raw: Any) -> None:
     """Set integers of SI samples."""
     to_od_rows(samples, factors, limits, wraps, raw, 0, samples.shape[2])

@@ -2,26 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.dictionary.entries import ObjectDictionary, ObjectName
+from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
+from drive_env.master.quantities import INCREMENTAL, SHOWN, find_unit, in_unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
+Scale = Callable[[], Sequence[float | None]]
 
 
 class Trace:
-    """A recorded move: sample times `t` [s], shape (n,), and each object's integers, shape (n, num_axes)."""
+    """A recorded move: sample times `t` [s], shape (n,), and each object's integers, shape (n, num_axes).
 
-    def __init__(self, t: Floats, values: dict[tuple[int, int], Integers], dictionary: ObjectDictionary) -> None:
+    `trace["Velocity actual value"]` are integers as the wire carries them, `trace["Velocity actual value", "rad/s"]`
+    floats in a unit. Printed, it says what it holds.
+
+    Args:
+        t: Sample times [s].
+        values: Integers by index and sub-index.
+        dictionary: Where names and units are found.
+        scale: Gives the position increments per revolution of each axis, None where the drive does not say; asked
+            when a unit needs them. Without it they are not known.
+    """
+
+    def __init__(
+        self,
+        t: Floats,
+        values: dict[tuple[int, int], Integers],
+        dictionary: ObjectDictionary,
+        scale: Scale | None = None,
+    ) -> None:
         self.t = t
         self._values = values
         self._dictionary = dictionary
+        self._scale = scale
 
-    def __getitem__(self, name: ObjectName) -> Integers:
+    @overload
+    def __getitem__(self, name: tuple[ObjectName, str]) -> Floats: ...
+    @overload
+    def __getitem__(self, name: ObjectName) -> Integers: ...
+    def __getitem__(self, name: ObjectName | tuple[ObjectName, str]) -> Integers | Floats:
+        if isinstance(name, tuple) and isinstance(name[1], str):
+            entry = self._dictionary.find(name[0])
+            return in_unit(self[name[0]], entry, name[1], self._increments(entry))
         entry = self._dictionary.find(name)
         if (entry.index, entry.sub) not in self._values:
             recorded = ", ".join(self._dictionary.find(key).label for key in self._values)
@@ -34,7 +67,86 @@ class Trace:
         first = traces[0]
         values = {key: np.concatenate([trace._values[key] for trace in traces]) for key in first._values}
         rows = sum(map(len, traces))
-        return cls(np.arange(rows, dtype=np.float64) * period, values, first._dictionary)
+        return cls(np.arange(rows, dtype=np.float64) * period, values, first._dictionary, first._scale)
 
     def __len__(self) -> int:
         return len(self.t)
+
+    def __repr__(self) -> str:
+        axes = self._axes
+        lines = [
+            f"{len(self)} samples"
+            + (f" from {self.t[0]:g} to {self.t[-1]:g} s" if len(self) else "")
+            + f", {axes} {'axis' if axes == 1 else 'axes'}"
+        ]
+        for key, values in self._values.items():
+            entry = self._dictionary.find(key)
+            spread = f": {values.min()} to {values.max()} {entry.unit}".rstrip() if values.size else ""
+            lines.append(f"  {entry.label}{spread}")
+        return "\n".join(lines)
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write time and integers as a table with a line of names and units, a column for each axis; return its path.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        with Path(path).open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["t [s]", *(name for name, _ in self._columns())])
+            columns = [values.tolist() for _, values in self._columns()]
+            writer.writerows(zip((f"{time:.6g}" for time in self.t), *columns, strict=True))
+        return Path(path)
+
+    def to_frame(self) -> Any:
+        """Return a pandas DataFrame over the time, with the columns of `to_csv`.
+
+        Raises:
+            ImportError: If pandas is not installed.
+        """
+        try:
+            from pandas import DataFrame, Index  # type: ignore[import-not-found,import-untyped,unused-ignore]
+        except ImportError:
+            raise ImportError("to_frame needs pandas, which is not installed: pip install pandas") from None
+        return DataFrame(dict(self._columns()), index=Index(self.t, name="t [s]"))
+
+    def plot(self) -> Figure:
+        """Return a matplotlib figure: a panel for each object, a line for each axis, in units that people read."""
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(9.0, 1.2 + 1.9 * len(self._values)), layout="constrained")
+        panels = figure.subplots(len(self._values), 1, sharex=True, squeeze=False)[:, 0]
+        for panel, (key, values) in zip(panels, self._values.items(), strict=True):
+            entry = self._dictionary.find(key)
+            scale = self._increments(entry)
+            units = {
+                None if unit is None else SHOWN[unit.dimension]
+                for unit in (find_unit(entry.unit, one) for one in scale)
+            }
+            unit = units.pop() if len(units) == 1 else None
+            panel.plot(self.t, values if unit is None else in_unit(values, entry, unit, scale))
+            panel.set_title(entry.name, loc="left", fontsize="medium")
+            panel.set_ylabel(entry.unit if unit is None else unit)
+            panel.grid(alpha=0.3)
+        if self._axes > 1:
+            panels[0].legend([f"axis {axis}" for axis in range(self._axes)], loc="upper right", fontsize="small")
+        panels[-1].set_xlabel("t [s]")
+        return figure
+
+    @property
+    def _axes(self) -> int:
+        return next((values.shape[-1] for values in self._values.values()), 0)
+
+    def _columns(self) -> Iterator[tuple[str, Integers]]:
+        """Give name and values of each column, shape (n,)."""
+        for key, values in self._values.items():
+            entry = self._dictionary.find(key)
+            name = f"{entry.label} [{entry.unit}]" if entry.unit else entry.label
+            for axis in range(values.shape[-1]):
+                yield (name if self._axes == 1 else f"{name} (axis {axis})"), values[:, axis]
+
+    def _increments(self, entry: Entry) -> Sequence[float | None]:
+        # Not asked of a drive where no unit follows them.
+        if self._scale is None or entry.unit not in INCREMENTAL:
+            return [None] * self._axes
+        return self._scale()

@@ -7,6 +7,7 @@ shape of each array; what is passed is the table's address. Compiled code reads 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
@@ -60,23 +61,24 @@ class Bundle:
         """Set fields; compiled code sees them from its next call on."""
         for name, value in values.items():
             setattr(self, name, value)
-        known = fields_of(self._layout)
-        self._fill({name: known[name] for name in values})
+        self._fill(values)
 
-    def _fill(self, fields: dict[str, types.Type]) -> None:
-        for name, kind in fields.items():
-            value, start = getattr(self, name), place_of(self._layout, name)
-            if isinstance(kind, types.Array):
-                assert value.ndim == kind.ndim and value.flags.c_contiguous and value.flags.aligned, name
-                assert value.dtype.itemsize == _item_size(kind), name
-                self._table[start] = value.__array_interface__["data"][0]
-                self._table[start + 1 : start + 1 + value.ndim] = value.shape
-            elif isinstance(kind, BundleType):
-                self._table[start] = value.address
+    def _fill(self, names: Collection[str]) -> None:
+        reals = self._table.view(np.float64)
+        for name, start, kind, ndim, item_size in slots_of(self._layout):
+            if name not in names:
+                continue
+            value = getattr(self, name)
+            if ndim:
+                flags = value.flags
+                assert value.ndim == ndim and flags.c_contiguous and flags.aligned, name
+                assert value.dtype.itemsize == item_size, name
+                self._table[start] = value.ctypes.data
+                self._table[start + 1 : start + 1 + ndim] = value.shape
             elif kind is types.float64:
-                self._table.view(np.float64)[start] = value
+                reals[start] = value
             else:
-                self._table[start] = int(value)
+                self._table[start] = value.address if isinstance(kind, BundleType) else int(value)
 
 
 class BundleType(types.Type):  # type: ignore[misc]
@@ -97,6 +99,17 @@ def fields_of(layout: Any) -> dict[str, types.Type]:
         else:
             found[name] = _SCALARS[hint] if hint in _SCALARS else BundleType(hint)
     return found
+
+
+@cache
+def slots_of(layout: Any) -> tuple[tuple[str, int, types.Type, int, int], ...]:
+    """Return of each field its name, first slot in the table, type, and of an array its dimensions and item size."""
+    return tuple(
+        (name, place_of(layout, name), kind, kind.ndim, _item_size(kind))
+        if isinstance(kind, types.Array)
+        else (name, place_of(layout, name), kind, 0, 0)
+        for name, kind in fields_of(layout).items()
+    )
 
 
 @cache

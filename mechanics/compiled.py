@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar
 
 import numba
@@ -19,6 +22,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 # error_model="numpy" makes a division by zero give inf as the hardware does; Python's raises, which is a branch in
 # every division and keeps LLVM from vectorising the loop around it.
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
+
+_OURS = ("mechanics", "drive_env", "tuning", "agents")
+# At the beginning of a line: what a function or `if TYPE_CHECKING` imports is none that kernels see.
+_IMPORT = re.compile(r"^(?:from ([\w.]+) import (\([^)]*\)|.*)|import (.*))$", re.MULTILINE)
 
 # Without Numba's runtime no references to arrays are counted. To count those of a load's many arrays, atomically, at
 # each call of a stage took 0.2 to 1.3 us, half of what the emulator added to 64 steps of MuJoCo's.
@@ -38,31 +45,60 @@ def user_cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))) / "drive-env"
 
 
-def source_hash(folders: Iterable[Path]) -> str:
-    """Return a hash of all Python sources under the folders and of Numba's version.
+def sources(module: ModuleType) -> dict[str, Path]:
+    """Return the files of everything that a module's kernels may call or hold: its own, and of ours all it imports.
+
+    What it imports only where the types are checked is not loaded by it, and does not count.
+
+    Args:
+        module: A module that is loaded, or whose imports are.
+    """
+    found: dict[str, Path] = {}
+    waiting = [module]
+    while waiting:
+        one = waiting.pop()
+        path = getattr(one, "__file__", None)
+        if one.__name__ in found or path is None:
+            continue
+        found[one.__name__] = Path(path)
+        waiting += [sys.modules[name] for name in _imports(Path(path)) if name in sys.modules]
+    return found
+
+
+@cache
+def _imports(path: Path) -> frozenset[str]:
+    """Return what of ours a file imports when it is loaded; of `from a import b` both a and a.b, which may be none."""
+    names: set[str] = set()
+    for line in _IMPORT.finditer(path.read_text(encoding="utf-8")):
+        package, parts, plain = line.groups()
+        whole = [name.split(" as ")[0].strip(" ()\n") for name in re.sub(r"#.*", "", parts or plain).split(",")]
+        names |= {package, *(f"{package}.{name}" for name in whole)} if package else set(whole)
+    return frozenset(name for name in names if name.split(".")[0] in _OURS)
+
+
+def source_hash(files: Mapping[str, Path]) -> str:
+    """Return a hash of the names and contents of modules and of Numba's version; where they lie does not matter.
 
     Numba's own cache looks at the file of the outermost function only, so an edit in a stage that is inlined from
     another file would go unseen; a folder per state of the sources cannot miss one.
     """
     digest = hashlib.sha256(numba.__version__.encode())
-    for folder in folders:
-        for path in sorted(folder.rglob("*.py")):
-            digest.update(path.relative_to(folder).as_posix().encode())
-            digest.update(path.read_bytes())
+    for name, path in sorted(files.items()):
+        digest.update(f"{name}\n".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-def cached(*folders: Path, allocates: bool = True) -> Callable[[Function], Function]:
-    """Return a decorator that compiles an entry point and keeps its machine code on disk, keyed by the sources.
+def cached(*, allocates: bool = True) -> Callable[[Function], Function]:
+    """Return a decorator that compiles an entry point and keeps its machine code on disk, keyed by its sources.
 
     Args:
-        folders: The source folders of everything that the entry point calls.
         allocates: Whether it makes arrays; if not, it counts no references, see `stage`.
     """
     options = OPTIONS if allocates else OPTIONS | UNCOUNTED
-    folder = user_cache_folder() / source_hash(folders)
 
     def decorate(function: Function) -> Function:
+        stamp = source_hash(sources(sys.modules[function.__module__]))
+        folder = user_cache_folder() / stamp
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError:
@@ -71,7 +107,7 @@ def cached(*folders: Path, allocates: bool = True) -> Callable[[Function], Funct
         before = config.CACHE_DIR
         config.CACHE_DIR = str(folder)
         try:
-            kernel._cache = KernelCache(function)  # what cache=True does, with files that can be trusted
+            kernel._cache = KernelCache(function, folder, stamp)  # what cache=True does, with files that can be trusted
         except RuntimeError:  # Numba finds no folder that can be written
             return kernel  # type: ignore[no-any-return]
         finally:

@@ -28,14 +28,23 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]  # Numba has no types
-    """Numba's cache of a function's kernels, with files of ours."""
+    """Numba's cache of a function's kernels, with files of ours.
 
-    def __init__(self, function: Any) -> None:
+    Args:
+        function: What is compiled.
+        folder: Where its kernels are; it exists.
+        stamp: Of all sources that it is compiled from.
+    """
+
+    def __init__(self, function: Any, folder: Path, stamp: str) -> None:
         super().__init__(function)
-        implementation = self._impl
-        self._cache_file = KernelFiles(
-            Path(self._cache_path), implementation.filename_base, implementation.locator.get_source_stamp()
-        )
+        self._cache_path = str(folder)
+        self._cache_file = KernelFiles(folder, self._impl.filename_base, stamp)
+
+    def _save_overload(self, signature: Any, kernel: Any) -> None:
+        # Numba's own makes a folder besides, named after where the source lies.
+        if self._enabled and self._impl.check_cachable(kernel):
+            self._cache_file.save(self._index_key(signature, kernel.codegen), self._impl.reduce(kernel))
 
 
 class KernelFiles:
@@ -44,7 +53,7 @@ class KernelFiles:
     Args:
         folder: Where they are; it exists.
         name: Of the function, with place and Python version.
-        stamp: Of the function's source file.
+        stamp: Of the function's sources.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any) -> None:
@@ -56,6 +65,7 @@ class KernelFiles:
         try:
             content = path.read_bytes()
         except OSError:
+            logger.info("compiling %s: once for these sources, the emulator's takes half a minute", self._name)
             return None
         digest, data = content[:_DIGEST], content[_DIGEST:]
         if hashlib.sha256(data).digest() == digest:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -29,6 +29,7 @@ class LoadValues:
         load: The row, resolved (model.py).
         model: Its packed model, not stepped yet.
         joints: Names of a copy's joints.
+        bodies: Element of a parameter -> the number of every copy's body of that name (template.py).
         armature: Rotor inertia of each copy's axes [kg*m^2], shape (copies, axes).
         motor_friction: Of each copy's axes, shape (copies, axes, 4): coulomb, breakaway, stribeck, viscous.
 
@@ -39,19 +40,22 @@ class LoadValues:
         roll: Shape (copies, rolls, ROLL_COLUMNS).
         stiffness: Of the joints' springs, shape (copies, D).
         damping: Of the joints, shape (copies, D).
-
-    Raises:
-        ValueError: If a parameter of the row lives nowhere.
     """
 
     def __init__(
-        self, load: Load, model: mujoco.MjModel, joints: Sequence[str], armature: Floats, motor_friction: Floats
+        self,
+        load: Load,
+        model: mujoco.MjModel,
+        joints: Sequence[str],
+        bodies: Mapping[str, NDArray[np.int64]],
+        armature: Floats,
+        motor_friction: Floats,
     ) -> None:
         self._load = load
         self._model = model
         self._joints = joints
         self._copies, self._axes = armature.shape
-        self._body_numbers: dict[str, NDArray[np.int64]] = {}
+        self._bodies = bodies
         self.armature: Floats = np.array(armature)
         self.friction = np.zeros((self._copies, self._axes + len(load.frictions), len(FRICTION_COLUMNS)))
         self.friction[:, :, FRICTION_COLUMNS.index("efficiency")] = 1.0
@@ -64,8 +68,6 @@ class LoadValues:
         self.roll = np.tile(np.array(rolls, float).reshape(-1, 4), (self._copies, 1, 1))
         self.stiffness: Floats = model.jnt_stiffness.reshape(self._copies, len(joints)).copy()
         self.damping: Floats = model.dof_damping.reshape(self._copies, len(joints)).copy()
-        for parameter in load.parameters:
-            self._check_place(parameter)
 
     @property
     def motor_friction(self) -> Floats:
@@ -76,9 +78,9 @@ class LoadValues:
         """Return a parameter of every copy, shape (copies,)."""
         parameter = self._parameter(name)
         if parameter.field in _BODY_FIELDS:
-            bodies = self._bodies(parameter.element)
+            bodies = self._bodies[parameter.element]
             if parameter.field == "body_ipos":
-                return np.array([np.linalg.norm(place) for place in self._model.body_ipos[bodies]])
+                return self._distances(bodies)
             return np.array(self._model.body_mass[bodies] if parameter.field == "body_mass"
                             else self._model.body_inertia[bodies, 0])  # fmt: skip
         if parameter.field == "gap":
@@ -91,12 +93,10 @@ class LoadValues:
         self.check(name, values)
         parameter = self._parameter(name)
         if parameter.field in _BODY_FIELDS:
-            bodies = self._bodies(parameter.element)[where]
+            bodies = self._bodies[parameter.element][where]
             chosen = np.broadcast_to(values, bodies.shape)
             if parameter.field == "body_ipos":
-                for body, value in zip(bodies, chosen, strict=True):
-                    place = self._model.body_ipos[body]
-                    self._model.body_ipos[body] = place * (value / np.linalg.norm(place))
+                self._model.body_ipos[bodies] *= (chosen / self._distances(bodies))[:, None]
             elif parameter.field == "body_mass":
                 self._model.body_mass[bodies] = chosen
             else:
@@ -127,34 +127,9 @@ class LoadValues:
         names = ", ".join(p.name for p in self._load.parameters)
         raise ValueError(f"load {self._load.name!r} has no parameter {name!r}; it has {names}")
 
-    def _check_place(self, parameter: Parameter) -> None:
-        """Refuse a parameter that lives nowhere, with the places that there are."""
-        load, field = self._load, parameter.field
-        bodies = [str(self._model.body(k).name) for k in range(1, self._model.nbody)]
-        places = {
-            _BODY_FIELDS: [name.removeprefix("0/") for name in bodies if name.startswith("0/")],
-            ("jnt_stiffness", "dof_damping"): self._joints,
-            FRICTION_COLUMNS: [row.name for row in load.frictions],
-            (*CONTACT_COLUMNS, "gap"): [row.name for row in load.contacts],
-            ROLL_COLUMNS: [row.name for row in load.rolls],
-        }
-        for fields, names in places.items():
-            if field in fields and parameter.element in names:
-                return
-            if field in fields:
-                raise ValueError(
-                    f"load {load.name!r}: its parameter {parameter.name!r}, a {field}, names {parameter.element!r}; "
-                    f"there are {', '.join(names) or '(none)'}"
-                )
-        known = ", ".join(name for fields in places for name in fields)
-        raise ValueError(f"load {load.name!r}: its parameter {parameter.name!r} is no {field!r}; there are {known}")
-
-    def _bodies(self, element: str) -> NDArray[np.int64]:
-        """Return the numbers of every copy's body of a name."""
-        if element not in self._body_numbers:
-            numbers = [self._model.body(f"{k}/{element}").id for k in range(self._copies)]
-            self._body_numbers[element] = np.array(numbers, np.int64)
-        return self._body_numbers[element]
+    def _distances(self, bodies: NDArray[np.int64]) -> Floats:
+        """Return how far bodies' centres of mass are from their frames [m]."""
+        return np.sqrt([place @ place for place in self._model.body_ipos[bodies]])
 
     def _column(self, parameter: Parameter, field: str) -> Floats:
         """Return the view, shape (copies,), in which a parameter lives that is not a body's."""
@@ -168,3 +143,41 @@ class LoadValues:
             return self.roll[:, [r.name for r in self._load.rolls].index(element), ROLL_COLUMNS.index(field)]
         array = {"jnt_stiffness": self.stiffness, "dof_damping": self.damping}[field]
         return array[:, self._joints.index(element)]
+
+
+def check_places(load: Load, model: mujoco.MjModel, joints: Sequence[str]) -> None:
+    """Raise ValueError, with the places that there are, if a parameter of a load lives nowhere.
+
+    Args:
+        load: The row, resolved.
+        model: Its packed model.
+        joints: Names of a copy's joints.
+    """
+    bodies = [str(model.body(k).name) for k in range(1, model.nbody)]
+    places = {
+        _BODY_FIELDS: [name.removeprefix("0/") for name in bodies if name.startswith("0/")],
+        ("jnt_stiffness", "dof_damping"): joints,
+        FRICTION_COLUMNS: [row.name for row in load.frictions],
+        (*CONTACT_COLUMNS, "gap"): [row.name for row in load.contacts],
+        ROLL_COLUMNS: [row.name for row in load.rolls],
+    }
+    for parameter in load.parameters:
+        found = [names for fields, names in places.items() if parameter.field in fields]
+        if not found:
+            known = ", ".join(name for fields in places for name in fields)
+            raise ValueError(
+                f"load {load.name!r}: its parameter {parameter.name!r} is no {parameter.field!r}; there are {known}"
+            )
+        if not any(parameter.element in names for names in found):
+            raise ValueError(
+                f"load {load.name!r}: its parameter {parameter.name!r}, a {parameter.field}, names "
+                f"{parameter.element!r}; there are {', '.join(found[0]) or '(none)'}"
+            )
+
+
+def body_numbers(load: Load, model: mujoco.MjModel, copies: int) -> dict[str, NDArray[np.int64]]:
+    """Return the numbers of every copy's bodies that parameters of a load name: element -> shape (copies,)."""
+    elements = {parameter.element for parameter in load.parameters if parameter.field in _BODY_FIELDS}
+    return {
+        element: np.array([model.body(f"{k}/{element}").id for k in range(copies)], np.int64) for element in elements
+    }

@@ -17,8 +17,8 @@ from mechanics.friction import BRISTLE_DAMPING, FrictionModel, find_friction
 from mechanics.load import Combination, Friction, Load
 from mechanics.load_values import FRICTION_COLUMNS, LoadValues
 from mechanics.modal import corrections
-from mechanics.model import compile_packed, is_constant, is_constrained, is_varying, motion_of, read_model
 from mechanics.plant import Plant
+from mechanics.template import Template
 
 Floats = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class PackedLoad:
         h: Physics step [s].
         integrator: "leapfrog" (implicitfast, staggered) or "rk4", the slower oracle.
         friction: Model of the load's friction, a row of friction.py.
-        template: Compiled model to copy instead of compiling again.
+        template: Of this load and as many copies, instead of one made anew.
         first_machine: Number of copy 0, for messages.
         weigh_every: Steps after which the inertias that friction sees are brought to the present position.
 
@@ -73,7 +73,7 @@ class PackedLoad:
         *,
         integrator: str = "leapfrog",
         friction: str = "stribeck",
-        template: mujoco.MjModel | None = None,
+        template: Template | None = None,
         first_machine: int = 0,
         weigh_every: int = 1,
     ) -> None:
@@ -87,13 +87,14 @@ class PackedLoad:
             raise ValueError(f"no integrator is named {integrator!r}; there are {', '.join(_INTEGRATORS)}")
         self.staggered = integrator == "leapfrog"
         self._model_of_friction: FrictionModel = find_friction(friction)
-        self.model = compile_packed(load, self.copies) if template is None else copy.copy(template)
-        self.num_dofs = self.model.nv // self.copies
-        self.constrained = is_constrained(self.model)
-        single = read_model(load)
+        self.template = Template(load, self.copies) if template is None else template
+        self.model = copy.copy(self.template.model)
+        self.num_dofs = self.template.num_dofs
+        self.joints = self.template.joints
+        self.constrained = self.template.constrained
         # Runge-Kutta looks at everything anew, too: it is the oracle.
-        self._looking = not self.staggered or self.constrained or is_varying(single)
-        self._constant = not self._looking and is_constant(single)
+        self._looking = not self.staggered or self.constrained or self.template.varying
+        self._constant = not self._looking and self.template.constant
         # Rolls grow slowly and change nothing but their own inertia; where something else does, all is looked at.
         self._looking |= bool(load.rolls) and not self._constant
         self.varying = self._looking or bool(load.rolls)
@@ -103,14 +104,8 @@ class PackedLoad:
         if load.rolls:
             # MuJoCo takes the inertia of simple joints from a constant; a roll's grows.
             self.model.dof_simplenum[:] = 0
-        self.joints = [
-            str(self.model.joint(int(self.model.dof_jntid[d])).name).removeprefix("0/") for d in range(self.num_dofs)
-        ]
-        # Rotor angle from joints: the bearings' friction acts on this motion.
-        turning = [
-            {name: gear * c for name, c in motion_of(self.model, joint, "0/").items()}
-            for joint, gear in zip(load.joints, load.gears, strict=True)
-        ]
+        # The bearings' friction acts on the rotors' motions.
+        turning = self.template.turning
         # Friction on a rotor's own motion is computed in one with its bearing's, unless it has bristles.
         self._merged = {} if self._model_of_friction.bristles else _proportional(turning, load.frictions)
         apart = [row.motion for k, row in enumerate(load.frictions) if k not in self._merged]
@@ -120,7 +115,7 @@ class PackedLoad:
         self.start = np.array(self.model.qpos0[: self.num_dofs])
         for joint, position in load.start.items():
             self.start[self.joints.index(joint)] = position
-        self.values = LoadValues(load, self.model, self.joints, armature, motor_friction)
+        self.values = LoadValues(load, self.model, self.joints, self.template.bodies, armature, motor_friction)
         springs = any(p.field == "jnt_stiffness" for p in load.parameters) or bool(np.any(self.values.stiffness))
         self._elastic = self.staggered and springs
         for name, values in parameters.items():
@@ -197,19 +192,13 @@ class PackedLoad:
 
     def reset(self, where: NDArray[np.bool_]) -> None:
         """Put the copies where the mask is true to rest at their start; a frozen one lives again."""
-        for k in np.flatnonzero(where):
-            dofs = slice(k * self.num_dofs, (k + 1) * self.num_dofs)
-            self.data.qpos[dofs] = self.start
-            self.data.qvel[dofs] = 0.0
-            self.data.qfrc_applied[dofs] = 0.0
-            self.data.qacc_warmstart[dofs] = 0.0
-            self.plant.qvel_before[dofs] = 0.0
-            self.plant.bristle[k] = 0.0
-            self.plant.holding[:, k] = 0.0
-            self.plant.carried[k] = 0.0
-            self.plant.diverged[k] = 0
-            self.plant.load_torque[k] = 0.0
-            self.plant.clock[k] = 0.0
+        plant, data = self.plant, self.data
+        self._by_copy(data.qpos)[where] = self.start
+        for array in (data.qvel, data.qfrc_applied, data.qacc_warmstart, plant.qvel_before):
+            self._by_copy(array)[where] = 0.0
+        plant.holding[:, where] = 0.0
+        for values in (plant.bristle, plant.carried, plant.diverged, plant.load_torque, plant.clock):
+            values[where] = 0
 
     def jam(self, torque: Floats) -> None:
         """Hold the loads of axes by dry friction that withstands a torque seen from the rotor.
@@ -251,11 +240,7 @@ class PackedLoad:
     def mass_matrix(self) -> Floats:
         """Return each copy's inertia matrix with the rotors', shape (copies, D, D), at the present position."""
         mujoco.mj_forward(self.model, self.data)
-        full = np.zeros((self.model.nv, self.model.nv))
-        mujoco.mj_fullM(self.model, self.data, full)
-        blocks = full.reshape(self.copies, self.num_dofs, self.copies, self.num_dofs)
-        index = np.arange(self.copies)
-        return blocks[index, :, index, :]
+        return self.template.inertia(self.data)
 
     @property
     def armature(self) -> Floats:
@@ -329,9 +314,7 @@ class PackedLoad:
             applied=np.zeros((dofs, copies)),
             total=np.zeros((dofs, copies)),
             axis_motion=self._combinations(self._motions[:axes]),
-            axis_position=self._combinations(
-                list(self.load.positions) or [motion_of(self.model, joint, "0/") for joint in self.load.joints]
-            ),
+            axis_position=self._combinations(self.template.position),
             axis_start=self._combinations(self._motions[:axes]) @ self.start,
             axis_kick=np.zeros((axes, dofs, copies)),
             stiffness=np.zeros((dofs, dofs, copies)),
@@ -390,7 +373,7 @@ class PackedLoad:
         moving = (self.data.qpos.copy(), self.data.qvel.copy())
         mujoco.mj_setConst(self.model, self.data)
         # At the reference position, so that setting one copy cannot change the rounding of another.
-        self.data.qpos[:], self.data.qvel[:] = np.tile(self.start, self.copies), 0.0
+        self._by_copy(self.data.qpos)[:], self.data.qvel[:] = self.start, 0.0
         inertia = self.mass_matrix()[copies]
         plant.bias[:, copies] = self._by_copy(self.data.qfrc_bias)[copies].T
         self.data.qpos[:], self.data.qvel[:] = moving
@@ -431,8 +414,7 @@ class PackedLoad:
             if name in self.joints:
                 armature[:, self.joints.index(name)] = values
             else:
-                for k, value in enumerate(values):
-                    self.model.tendon_armature[self.model.tendon(f"{k}/{name}").id] = value
+                self.model.tendon_armature[self.template.tendons[name]] = values
         for k, row in enumerate(self.load.rolls):
             dof = self.joints.index(row.joint)
             self.plant.roll_armature[:, k] = armature[:, dof]

@@ -67,24 +67,24 @@ def way(load: PackedLoad) -> Way:
     return Way(joints, position, linear, angles[0], angles[1])
 
 
-def shaft_load(load: PackedLoad) -> ShaftLoad:
-    """Return what the shafts see when each axis turns alone, passive joints at rest and backlash taken up."""
-    plant, turning = load.plant, way(load).joints
+def shaft_load(load: PackedLoad, turning: Floats | None = None) -> ShaftLoad:
+    """Return what the shafts see when each axis turns alone, passive joints at rest and backlash taken up.
+
+    Args:
+        load: The packed load.
+        turning: The joints' speeds of `way`, the same for every packed model of a load; looked up by default.
+    """
+    plant, turning = load.plant, way(load).joints if turning is None else turning
     frictions = plant.motion[: load.num_frictions]
     breakaway = np.einsum("fc,fa->ca", plant.friction[:, 1], np.abs(frictions @ turning.T))
-    model, data = load.model, mujoco.MjData(load.model)
+    model, data = load.model, load.template.scratch
     generator = np.random.default_rng(0)
     gravity, inertia = np.zeros_like(breakaway), np.zeros_like(breakaway)
     for pose in range(POSES if load.varying else 1):
         share = generator.random(load.num_dofs) if pose else np.full(load.num_dofs, 0.5)
-        data.qpos[:] = np.tile(load.start + pose_of(load, share), load.copies)
+        data.qpos.reshape(load.copies, -1)[:] = load.start + pose_of(load, share)
         mujoco.mj_forward(model, data)
-        full = np.zeros((model.nv, model.nv))
-        mujoco.mj_fullM(model, data, full)
-        blocks = full.reshape(load.copies, load.num_dofs, load.copies, load.num_dofs)
-        index = np.arange(load.copies)
-        mass = blocks[index, :, index, :]
-        weight = data.qfrc_bias.reshape(load.copies, load.num_dofs)
+        mass, weight = load.template.inertia(data), data.qfrc_bias.reshape(load.copies, load.num_dofs)
         gravity = np.maximum(gravity, np.abs(weight @ turning.T))
         inertia = np.maximum(inertia, np.einsum("ad,cde,ae->ca", turning, mass, turning))
     return ShaftLoad(gravity, breakaway, inertia - load.armature)

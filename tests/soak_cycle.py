@@ -5,21 +5,16 @@ It composes the stages as firmware/cycle.py does; a file of its own, so that it 
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-import drive_env.firmware
-import mechanics
 from drive_env.firmware.cycle import mechanics_window, meet, start_window, supervise, tick
 from drive_env.firmware.record import LANES
 from mechanics.compiled import cached
 
-FOLDERS = (Path(drive_env.firmware.__file__).parent, Path(mechanics.__file__).parent)
 BRIDGE, COPPER, SHAFT, SOURCE, CHOPPER, IDLE, OFF_CURRENT, LEAP, SPEED = range(9)
 
 
-@cached(*FOLDERS)
+@cached()
 def run_cycle(records, plant, rates, scratch, num_axes, sums, change):
     """Run one communication cycle; sums, (9, axes): six energies [J], current while off [A], leap [rad], speed [rad/s].
 

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import mechanics.compiled
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.exchange import Exchange, Hooks, exchange
 from mechanics.bundle import Bundle, Cube, Matrix, Numbers, Vector, reader
 from mechanics.compiled import cached
 
-FOLDERS = (Path(mechanics.compiled.__file__).parent, Path(__file__).parent)
 SAMPLED = (0x6041, 0x6064, 0x606C)
 
 
@@ -43,7 +40,7 @@ class Noted(Bundle):
 outer_at, noted_at = reader(Outer), reader(Noted)
 
 
-@cached(*FOLDERS)
+@cached()
 def total(address, seen):
     own = outer_at(address)
     seen[0] = own.numbers.sum()
@@ -55,13 +52,13 @@ def total(address, seen):
     own.matrix[1, 0] = 7.0
 
 
-@cached(*FOLDERS)
+@cached()
 def note_before(address, first, count):
     noted_at(address).calls[first // 64, 0] += count
     return 1
 
 
-@cached(*FOLDERS)
+@cached()
 def note_after(address, first, count):
     noted_at(address).calls[first // 64, 1] += count
     return 0

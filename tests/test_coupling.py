@@ -4,8 +4,6 @@ The gate (design, section 4): the largest velocity error at window ends, in % of
 resonance of 150 Hz and 0.3 % up to 450 Hz.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -17,7 +15,6 @@ from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
 
-FOLDER = Path(stepping.__file__).parent  # its sources key the cache of compiled wrappers
 TICK = 40e-6  # current loop [s]
 WINDOW = 200e-6  # velocity loop and physics step [s]
 TICKS = 5
@@ -29,7 +26,7 @@ DURATION = 0.4
 ORACLE_SUBSTEPS = 4  # 10 us: 100 steps per ms
 
 
-@cached(FOLDER)
+@cached()
 def step_load(plant, torque, moment, h):
     """Step one copy through mean torques and first moments (n,); return angle and speed of the rotor, every qvel."""
     dofs = plant.damping.shape[0]
@@ -43,7 +40,7 @@ def step_load(plant, torque, moment, h):
     return motion_
 
 
-@cached(FOLDER)
+@cached()
 def rk4_oracle(torque, dt, substeps, J_m, J_l, k, d):
     """Return theta_m, theta_l, omega_m, omega_l after each torque, held for dt [s]: classical Runge-Kutta."""
     h = dt / substeps
@@ -262,7 +259,7 @@ def test_halving_the_physics_step_changes_no_verdict(load):
 
 
 # --- prediction within a window ---------------------------------------------------------------------------------------
-@cached(FOLDER, Path(cycle.__file__).parent)
+@cached()
 def windows(records, plant, rates, scratch, count):
     """Run windows; return rotor angle and speed of axis 0 as its ticks predict them and as the mechanics has them."""
     out = np.zeros((count, 4))

@@ -1,7 +1,6 @@
 """Friction: F(v) = Fc + (Fs - Fc) exp(-(v/vs)^2) + b |v| against the motion, and sticking at standstill."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from mechanics import friction, loads
+from mechanics import friction
 from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
@@ -29,7 +28,7 @@ REST = 1e-12  # rad/s, three nanoradians in an hour
 COULOMB, BREAKAWAY, STRIBECK, VISCOUS = 2e-3, 3e-3, 2.0, 2e-5
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def step_plant(plant, torque, h, qvel):
     """Step one copy through torques (n,); write every qvel, shape (n, D)."""
     theta, omega, reaction, position, moment = np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1), np.zeros(1)

@@ -11,13 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drive_env import EmulatedDrives
-from drive_env.firmware import cycle
+from drive_env import EmulatedDrives, exchange, process_image
+from drive_env.envs import bus_delays, tracking_cycle
+from drive_env.firmware import cycle, protection
 from drive_env.process_image import from_od
 from mechanics import kernel_files
-from mechanics.compiled import user_cache_folder
+from mechanics.compiled import source_hash, sources, user_cache_folder
 from mechanics.kernel_files import KernelFiles
 
+ROOT = Path(kernel_files.__file__).parent.parent
 # What a program does with two small kernels, and how many it compiled.
 SMALL = """
 import logging, numpy as np
@@ -152,3 +154,61 @@ def test_a_full_disk_costs_the_cache_alone(tmp_path, monkeypatch, caplog):
         "Make room, or name another folder in DRIVE_ENV_CACHE"
     ]
     assert list(tmp_path.iterdir()) == []
+
+
+# --- what a kernel is keyed by ----------------------------------------------------------------------------------------
+def compiled_from(function: object) -> set[str]:
+    """Return the modules of all compiled functions that a kernel calls, found by walking their globals."""
+    found: set[str] = set()
+    waiting = [function]
+    while waiting:
+        one = waiting.pop()
+        python = getattr(one, "py_func", None)
+        if python is None or (name := f"{python.__module__}.{python.__qualname__}") in found:
+            continue
+        found.add(name)
+        closure = [cell.cell_contents for cell in python.__closure__ or ()]
+        waiting += [python.__globals__[each] for each in python.__code__.co_names if each in python.__globals__]
+        waiting += closure
+    return {name.rpartition(".")[0] for name in found}
+
+
+KERNELS = [
+    (kernel, module)
+    for module in (cycle, protection, exchange, process_image, tracking_cycle, bus_delays)
+    for kernel in vars(module).values()
+    if hasattr(kernel, "py_func") and kernel.py_func.__module__ == module.__name__ and hasattr(kernel._cache, "flush")
+]
+
+
+@pytest.mark.parametrize(("kernel", "module"), KERNELS, ids=[kernel.__name__ for kernel, _ in KERNELS])
+def test_a_kernel_is_keyed_by_every_file_that_it_calls_and_by_no_command(kernel, module):
+    known = sources(module)
+    assert compiled_from(kernel) <= known.keys()
+    assert not [name for name in known if ".tools" in name or ".commands" in name or name.endswith("cli")]
+
+
+def test_the_exchange_is_keyed_by_the_process_image_and_the_firmware_by_no_python_around_it():
+    assert {"drive_env.process_image", "drive_env.firmware.loops", "mechanics.stepping"} <= sources(exchange).keys()
+    assert not {"drive_env.drives", "drive_env.process_image", "mechanics.packed"} & sources(cycle).keys()
+
+
+def test_the_key_is_that_of_names_and_contents_wherever_they_lie(tmp_path):
+    files = sources(cycle)
+    elsewhere = {name: tmp_path / f"{k}.py" for k, name in enumerate(files)}
+    for name, path in files.items():
+        shutil.copyfile(path, elsewhere[name])
+    assert source_hash(elsewhere) == source_hash(files)
+    edited = elsewhere["drive_env.firmware.loops"]
+    edited.write_text(edited.read_text() + "# another\n")
+    assert source_hash(elsewhere) != source_hash(files)
+
+
+def test_kernels_of_a_copy_of_the_sources_are_those_of_the_original(cache, tmp_path):
+    for name in ("mechanics", "drive_env"):
+        shutil.copytree(ROOT / name, tmp_path / "copy" / name, ignore=shutil.ignore_patterns("__pycache__"))
+    found = subprocess.run(
+        [sys.executable, "-c", SMALL], cwd=tmp_path / "copy", capture_output=True, text=True, timeout=300,
+        env={**os.environ, "DRIVE_ENV_CACHE": str(cache), "PYTHONPATH": str(tmp_path / "copy")},
+    )  # fmt: skip
+    assert (found.stdout, found.stderr) == ("compiled 0 kept 1\n", "")

@@ -1,7 +1,6 @@
 """The rows of the loads: complete, resonant where their numbers say so, and honest about energy."""
 
 import dataclasses
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from scipy.linalg import eigh, null_space
 
 from drive_env.motors import MOTORS
-from mechanics import loads
 from mechanics.compiled import cached
 from mechanics.friction import FRICTION_MODELS
 from mechanics.load import Contact, Friction, Roll
@@ -23,7 +21,7 @@ FINE = 62.5e-6  # 16 steps per ms
 J_M = MOTORS["qbl4208"].inertia
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def step_plant(plant, torque, h, qpos, qvel, carried):
     """Step all copies through torques (n, C A); write every qpos and qvel, (n, C D), and contact force, (n, C, B)."""
     rows = np.zeros((5, torque.shape[1]))

@@ -3,7 +3,6 @@ dz/dt = v - s_0 |v| z / g(v), g = F_c + (F_s - F_c) exp(-(v/v_s)^2), F = s_0 z +
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from scipy.integrate import solve_ivp
 
 from drive_env import EmulatedDrives
 from mechanics import friction as friction_laws
-from mechanics import loads
 from mechanics.compiled import cached
 from mechanics.friction import FRICTION_MODELS, find_friction
 from mechanics.loads import LOADS
@@ -36,7 +34,7 @@ ROW = (S_0, S_1, F_C, F_S, V_S, S_2, 0.0)  # the order of bristle_torque
 J_M, J_L = 4.8e-6, 1e-5
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def push(row, mass, force, h, seen):
     """Let forces (n,), held for a step each, push a mass; write its position, speed and friction, (n, 3)."""
     v, x, z = 0.0, 0.0, 0.0
@@ -48,7 +46,7 @@ def push(row, mass, force, h, seen):
         seen[n] = x, v, friction
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def slide(row, speed, h, friction):
     """Write the friction of a mass too heavy to be slowed that slides at speeds (n,)."""
     z = 0.0
@@ -58,7 +56,7 @@ def slide(row, speed, h, friction):
         )
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def turn(plant, torque, h, seen):
     """Step one copy through torques (n,); write rotor angle and speed, (n, 2)."""
     theta, omega, reaction, position, moment = np.zeros((5, 1))
@@ -222,7 +220,7 @@ def test_stick_slip_of_a_mass_pulled_by_a_spring_follows_the_equations():
     assert np.abs(x - true.y[0]).max() < 2e-3 * np.ptp(x)
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def pull_by_spring(row, mass, stiffness, pull, h, position, speed):
     v, x, z = 0.0, 0.0, 0.0
     for n in range(position.shape[0]):
@@ -373,7 +371,7 @@ def test_stiff_bristles_and_high_speeds_brake_to_rest(v, stiffness):
     assert seen[-1, 0] == pytest.approx(0.5 * v * v, rel=2e-2, abs=2.0 / stiffness + v * h)
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def coast(row, v, h, seen):
     x, z = 0.0, 0.0
     for n in range(seen.shape[0]):

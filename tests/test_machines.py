@@ -4,14 +4,12 @@ import math
 import re
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
 from drive_env.misfit import MisfitWarning
-from mechanics import loads
 from mechanics.compiled import cached
 from mechanics.load import Friction, Load
 from mechanics.loads import LOADS, find_load
@@ -63,7 +61,7 @@ def run_at(drives, rpm, settle=0.5, measure=0.4):
     return seen.mean(axis=0)
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def step_plant(plant, torque, h, qvel):
     """Step one copy of one axis through torques (n,); write every qvel, shape (n, D)."""
     theta, omega, reaction, position, moment = np.zeros((5, 1))

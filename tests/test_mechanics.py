@@ -1,12 +1,9 @@
 """The loads: inertias, resonances, energy and parameters against hand calculation."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from mechanics import loads
 from mechanics.compiled import cached
 from mechanics.loads import LOADS, find_load
 from mechanics.model import compile_packed, motion_of
@@ -21,7 +18,7 @@ MOTOR_SIDE = J_M + J_HUB
 FRICTIONLESS = {"coulomb": 0.0, "breakaway": 0.0, "viscous": 0.0}
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def step_plant(plant, torque, h, qpos, qvel):
     """Step all copies through torques (n, C); write every qpos and qvel, shape (n, C D)."""
     rows = np.zeros((5, torque.shape[1]))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from mechanics import Contact, Friction, Load, Parameter, loads
+from mechanics import Contact, Friction, Load, Parameter
 from mechanics.compiled import cached
 from mechanics.loads import find_load
 from mechanics.model import CONSTRAINED_PACKING_BOUND, compile_packed, copies_per_model, is_constrained, read_model
@@ -110,7 +110,7 @@ def two(actuators=""):
     return TWO.replace("ACTUATORS", f"<actuator>{actuators}</actuator>" if actuators else "")
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def step_plant(plant, torque, h, qpos):
     """Step all copies through torques (n, C A); write every qpos, shape (n, C D)."""
     theta, omega, reaction, position, moment = np.zeros((5, torque.shape[1]))

@@ -3,13 +3,11 @@
 import dataclasses
 import warnings
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from mechanics import loads
 from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.model import compile_packed
@@ -24,7 +22,7 @@ INTEGRATORS = ("leapfrog", "rk4")
 END_STOPS = [name for name, row in LOADS.items() if any(not contact.transmits for contact in row.contacts)]
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def step_plant(plant, torque, h, motion_, carried):
     """Step all copies through torques (n, C A); write angle, speed and reaction of each axis, shape (n, 3, C A).
 
@@ -142,7 +140,7 @@ def test_every_copy_of_eight_is_itself_alone():
 def test_a_template_gives_the_same_model_and_shares_no_memory():
     values, armature, bearing = parameters("two_mass", 8)
     first = PackedLoad(LOADS["two_mass"], armature, bearing, values, 200e-6)
-    second = PackedLoad(LOADS["two_mass"], armature, bearing, values, 200e-6, template=first.model)
+    second = PackedLoad(LOADS["two_mass"], armature, bearing, values, 200e-6, template=first.template)
     assert np.array_equal(first.mass_matrix(), second.mass_matrix())
     second.set("inertia", np.full(8, 9e-5), np.ones(8, bool))
     assert np.array_equal(first.get("inertia"), values["inertia"])
@@ -235,3 +233,19 @@ def test_a_torque_that_is_no_number_is_refused():
     assert drives.machine.load_torque.tolist() == [0.0, 0.0]
     with pytest.raises(ValueError, match="one for each of 2 machines"):
         drives.machine.load_torque = [0.0, 0.0, 0.0]
+
+
+def test_files_are_read_and_models_compiled_as_often_for_many_machines_as_for_few(monkeypatch):
+    from mechanics import model, template
+
+    seen = []
+    for module, name in ((model, "_spec"), (template, "compile_packed")):
+        truly = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *args, _name=name, _truly=truly: seen.append(_name) or _truly(*args))
+    counts = []
+    for num_machines in (64, 640):
+        seen.clear()
+        EmulatedDrives(num_machines=num_machines).close()
+        counts.append({name: seen.count(name) for name in seen})
+    assert counts[0] == counts[1]
+    assert counts[0]["compile_packed"] == 2  # of the machine from which defaults are read, and of 64

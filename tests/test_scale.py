@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -114,16 +115,45 @@ def test_shards_are_the_grid_without_gap_or_overlap_whatever_runs_them(experimen
     assert edges == [(part.first, part.last) for part in sweep.shards(experiment, num_threads=7)]
 
 
+@pytest.mark.parametrize(("width", "size"), [
+    (1, 1024), (2, 256), (4, 128), (9, 64),
+    (800, 64),  # a packed model is not taken apart
+])  # fmt: skip
+def test_many_workers_get_smaller_shards_of_whole_models(experiment, width, size):
+    parts = sweep.shards(experiment, width=width)
+    assert [part.first for part in parts] == list(range(0, 2304, size))
+    assert all(part.last == min(part.first + size, 2304) for part in parts)
+
+
+def test_a_run_goes_on_between_what_another_width_has_done(experiment):
+    left = sweep.shards(experiment, width=2, done={0: 576, 1024: 1088})
+    edges = [(part.first, part.last) for part in left]
+    assert edges == [(576, 832), (832, 1024), (1088, 1344), (1344, 1600), (1600, 1856), (1856, 2112), (2112, 2304)]
+
+
+def test_any_cut_gives_the_digits_of_any_other(experiment, whole, tmp_path):
+    class Wide:
+        width, shares_disk = 9, True
+
+        def unordered(self, function, items, say):
+            return iter([(k, function(item)) for k, item in enumerate(items)])
+
+    with ShardLog(tmp_path / "shards", "x") as log:
+        log.append(576, sweep.simulate(sweep.Shard(experiment, 576, 1152, 1)))
+        equal(whole, sweep.run(experiment, pool=Wide(), log=log))
+        assert sorted(log.done) == [*range(0, 640, 64), *range(1152, 2304, 64)]
+
+
 def test_only_what_is_not_done_is_simulated(experiment, whole, tmp_path, monkeypatch):
     with ShardLog(tmp_path / "shards", "x") as log:
         sweep.run(experiment, log=log)
         kept = dict(log.done)
-    assert sorted(kept) == [0, 1, 2]
+    assert sorted(kept) == [0, 1024, 2048]
     simulated = []
     truly = sweep.simulate
     monkeypatch.setattr(sweep, "simulate", lambda shard, *rest: simulated.append(shard.first) or truly(shard, *rest))
     with ShardLog(tmp_path / "some", "x") as log:
-        log.append(1, kept[1])
+        log.append(1024, kept[1024])
         result = sweep.run(experiment, log=log)
     assert sorted(simulated) == [0, 2048]
     equal(whole, result)
@@ -230,7 +260,7 @@ def test_worker_processes_give_the_digits_of_one_process_and_go_on_from_what_is_
     with open_pool(2) as pool, ShardLog(tmp_path / "shards", "x") as log:
         log.append(0, first)
         equal(whole, sweep.run(experiment, pool=pool, log=log))
-        assert sorted(log.done) == [0, 1, 2]
+        assert sorted(log.done) == [0, *range(1024, 2304, 256)]
 
 
 def test_a_cluster_that_loses_one_of_two_workers_gives_the_digits_of_one_process(experiment, whole, saved, tmp_path):
@@ -255,7 +285,7 @@ def test_a_cluster_that_loses_one_of_two_workers_gives_the_digits_of_one_process
             assert killed
             with pytest.raises(ProcessLookupError):
                 os.kill(victim, 0)
-    assert sorted(log.done) == [0, 1, 2]
+    assert sorted(log.done) == list(range(0, 2304, 256))
     equal(whole, result)
     assert contents(result.save(tmp_path / "run")) == saved
 
@@ -284,12 +314,21 @@ def test_a_scheduler_that_goes_is_told_with_the_remedy(small_cluster):
             small_cluster.close(timeout=PATIENCE)
 
 
+def test_what_dask_says_itself_of_a_lost_connection_is_not_shown(small_cluster, capfd):
+    level = logging.getLogger("distributed.client").level
+    with open_pool(cluster=small_cluster.scheduler_address):
+        logging.getLogger("distributed.client").error("Traceback (most recent call last)")
+    assert capfd.readouterr().err == ""
+    assert logging.getLogger("distributed.client").level == level
+
+
 def test_a_cluster_without_workers_is_told_and_waited_for(small_cluster, monkeypatch, caplog):
     monkeypatch.setattr(pools, "WORKERS_PERIOD", 0.05)
     with open_pool(cluster=small_cluster.scheduler_address) as pool:
         small_cluster.scale(0)
         deadline = time.monotonic() + PATIENCE
-        results = pool.unordered(square, [3, 4])
+        waited = []
+        results = pool.unordered(square, [3, 4], waited.append)
 
         def scale_up_once_told():
             while "has no workers left; waiting for one: `dask worker tcp://" not in caplog.text:
@@ -302,21 +341,52 @@ def test_a_cluster_without_workers_is_told_and_waited_for(small_cluster, monkeyp
             assert sorted(results) == [(0, 9), (1, 16)]
             told.result(PATIENCE)
     assert caplog.text.count("has no workers left") == 1
+    assert waited[0] == pools.FIRST_RESULT
+    assert any(text.startswith("waiting for a worker: `dask worker tcp://") for text in waited)
+    assert waited[-1] == ""
 
 
-def test_a_worker_without_the_package_is_told():
-    class Client:
-        def run(self, function):
-            raise ModuleNotFoundError("No module named 'tuning'")
+# A worker of another computer, on which drive-env is not installed.
+BARE_WORKER = """
+import sys
+sys.modules["tuning"] = None
+from distributed.cli.dask_worker import main
+main()
+"""
 
-    with pytest.raises(PoolError, match=r"cannot run this: No module named 'tuning'; install drive-env where it runs"):
-        pools._Dask(Client(), 1, "tcp://a:1").differences()
+
+@pytest.fixture
+def bare_cluster():
+    distributed = pytest.importorskip("distributed")
+    options = {"n_workers": 0, "protocol": "tcp://", "dashboard_address": "127.0.0.1:0"}
+    with distributed.LocalCluster(host="127.0.0.1", silence_logs="CRITICAL", **options) as cluster:
+        address = cluster.scheduler_address
+        process = subprocess.Popen(
+            [sys.executable, "-c", BARE_WORKER, address, "--host", "127.0.0.1", "--no-nanny", "--no-dashboard"],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            with distributed.Client(address, set_as_default=False) as client:
+                client.wait_for_workers(1, timeout=PATIENCE)
+            yield cluster
+        finally:
+            process.kill()
+            process.wait()
+
+
+def test_a_worker_without_the_package_is_told_before_and_when_it_joins_late(bare_cluster):
+    told = r" of the cluster at tcp://.* cannot run this: .*tuning.*; install drive-env where it runs, and go on with"
+    with open_pool(cluster=bare_cluster.scheduler_address) as pool:
+        with pytest.raises(PoolError, match=rf"^worker tcp://127\.0\.0\.1:\d+{told}"):
+            pool.differences()
+        with pytest.raises(PoolError, match=f"^a worker{told}"):
+            in_order(pool, square, [3])
 
 
 def test_workers_of_another_version_are_told():
     class Client:
-        def run(self, function):
-            here = function()
+        def run(self, function, call, on_error):
+            here = function(call)
             return {"tcp://a:1": here, "tcp://b:2": here | {"numpy": "0.9"}}
 
     (line,) = pools._Dask(Client(), 2).differences()
@@ -372,8 +442,8 @@ def test_a_worker_of_other_sources_that_joins_a_cluster_late_is_refused(small_cl
 
 def test_a_cluster_with_a_worker_of_other_sources_is_refused():
     class Client:
-        def run(self, function):
-            here = function()
+        def run(self, function, call, on_error):
+            here = function(call)
             return {"tcp://a:1": here, "tcp://b:2": here | {"sources": "fedcba9876543210"}}
 
     with pytest.raises(PoolError, match=rf"worker tcp://b:2 has sources fedcba9876543210, .* {provenance.SOURCES}"):

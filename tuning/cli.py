@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+from drive_env.tools.program import Quiet, Verbose, Version, say_as_much
 from tuning.commands.auto import auto
 from tuning.commands.compare import compare
 from tuning.commands.identify import identify
@@ -17,7 +18,6 @@ from tuning.commands.verify import verify
 
 app = typer.Typer(
     name="drive-tune",
-    add_completion=False,
     no_args_is_help=True,
     rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
     pretty_exceptions_enable=False,
@@ -35,12 +35,13 @@ for panel, commands in PANELS.items():
 
 
 @app.callback()
-def drive_tune() -> None:
+def drive_tune(version: Version = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
     """Tune servo drives: emulated ones, and with --bus real ones, inside the safety envelope.
 
     Exit codes: 0 done, 1 the drive or the bus said no, 2 a mistake in the command, 130 Ctrl-C, 141
     nobody takes the output any more.
     """
+    say_as_much(quiet, verbose)
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import pickle
 import re
 import signal
 import threading
@@ -23,10 +24,12 @@ from typing import Any, Protocol, TypeVar
 
 from tuning import provenance
 
+Say = Callable[[str], None]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
+FIRST_RESULT = "waiting for the first result (a worker that never ran before compiles for half a minute)"
 WORKERS_PERIOD = 3.0  # s, between two looks at whether a cluster has workers
 
 logger = logging.getLogger(__name__)
@@ -36,14 +39,26 @@ class PoolError(RuntimeError):
     """Work could not be done where it was to run: one line with its remedy."""
 
 
+def _silent(_what: str) -> None:
+    pass
+
+
 class Pool(Protocol):
     """Somewhere for work to run."""
 
     width: int  # tasks that run at a time, about
     shares_disk: bool  # whether tasks can go on from files of this machine
 
-    def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
-        """Give the number of an item and its result as each is done."""
+    def unordered(
+        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+    ) -> Iterator[tuple[int, Result]]:
+        """Give the number of an item and its result as each is done.
+
+        Args:
+            function: Of a module.
+            items: What it is called with.
+            say: Called with what is waited for, "" when the work goes on; from any thread.
+        """
 
     def differences(self) -> list[str]:
         """Return a line for each way in which the workers are not like this process: last digits may then differ."""
@@ -90,7 +105,9 @@ class _Here:
     width = 1
     shares_disk = True
 
-    def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+    def unordered(
+        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+    ) -> Iterator[tuple[int, Result]]:
         for k, item in enumerate(items):
             yield k, function(item)
 
@@ -105,11 +122,15 @@ class _Processes:
         self._executor = executor
         self.width = width
 
-    def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+    def unordered(
+        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+    ) -> Iterator[tuple[int, Result]]:
         checked = partial(_checked, provenance.SOURCES, function)
         futures = {self._executor.submit(checked, item): k for k, item in enumerate(items)}
+        say(FIRST_RESULT)
         try:
             for future in as_completed(futures):
+                say("")
                 yield futures[future], future.result()
         except BrokenProcessPool:
             raise PoolError(
@@ -129,20 +150,29 @@ class _Dask:
         self.width = width
         self._address = address
 
-    def unordered(self, function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+    def unordered(
+        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+    ) -> Iterator[tuple[int, Result]]:
         from concurrent.futures import CancelledError
 
         from distributed import as_completed as as_completed_there
         from distributed.scheduler import KilledWorker
 
         # Not pure: equal items of two runs on one cluster are computed twice rather than taken from its memory.
-        checked = partial(_checked, provenance.SOURCES, function)
-        futures = {self._client.submit(checked, item, pure=False): k for k, item in enumerate(items)}
+        futures = {
+            self._client.submit(pickle.loads, _call(_checked, provenance.SOURCES, function, item), pure=False): k
+            for k, item in enumerate(items)
+        }
+        say(FIRST_RESULT)
         try:
-            with self._told_of_no_workers():
+            with self._told_of_no_workers(say):
                 for future in as_completed_there(list(futures), loop=self._client.loop):
-                    yield futures[future], future.result()
+                    result = future.result()
+                    say("")
+                    yield futures[future], result
                     future.release()
+        except ImportError as error:
+            raise self._without_package(error) from None
         except KilledWorker as error:
             raise PoolError(f"workers of the cluster died over and over: {error}; go on with --resume") from None
         except (CancelledError, OSError) as error:
@@ -151,8 +181,14 @@ class _Dask:
                 "and go on with --resume"
             ) from error
 
+    def _without_package(self, error: Exception, worker: str = "a worker") -> PoolError:
+        return PoolError(
+            f"{worker} of the cluster at {self._address} cannot run this: {error}; install drive-env where it runs, "
+            "and go on with --resume"
+        )
+
     @contextmanager
-    def _told_of_no_workers(self) -> Iterator[None]:
+    def _told_of_no_workers(self, say: Say) -> Iterator[None]:
         """Say it if the last worker goes: the work waits for another one, for ever if need be."""
         ended = threading.Event()
 
@@ -163,6 +199,10 @@ class _Dask:
                     there = self._client.nthreads()
                 except Exception:  # of a scheduler that is gone, which the futures tell
                     return
+                if not there:
+                    say(f"waiting for a worker: `dask worker {self._address}`")
+                elif told:
+                    say("")
                 if not there and not told:
                     logger.warning(
                         "the cluster at %s has no workers left; waiting for one: `dask worker %s`", self._address,
@@ -179,13 +219,10 @@ class _Dask:
 
     def differences(self) -> list[str]:
         here, lines = provenance.versions(), set()
-        try:
-            there: Mapping[str, dict[str, str]] = self._client.run(_versions)
-        except ImportError as error:
-            raise PoolError(
-                f"a worker of the cluster at {self._address} cannot run this: {error}; install drive-env where it runs"
-            ) from None
+        there: Mapping[str, Any] = self._client.run(pickle.loads, _call(_versions), on_error="return")
         for address, found in there.items():
+            if isinstance(found, Exception):
+                raise self._without_package(found, f"worker {address}")
             if found.get("sources") != here["sources"]:
                 raise PoolError(
                     f"worker {address} has sources {found.get('sources', 'unknown')}, here they are {here['sources']}, "
@@ -214,11 +251,45 @@ def _cluster(address: str) -> Iterator[Pool]:
             f"no Dask scheduler answers at {address}: {reason}; start one with `dask scheduler`, and workers with "
             "`dask worker`"
         ) from None
-    with client:
+    with _quiet_dask(), client:
         threads = client.nthreads()
         if not threads:
             raise PoolError(f"the cluster at {address} has no workers; start some with `dask worker {address}`")
         yield _Dask(client, sum(threads.values()), address)
+
+
+@contextmanager
+def _quiet_dask() -> Iterator[None]:
+    """Let Dask log no tracebacks of a connection that is lost: PoolError says it in a line."""
+    loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    levels = [each.level for each in loggers]
+    for each in loggers:
+        each.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for each, level in zip(loggers, levels, strict=True):
+            each.setLevel(level)
+
+
+class _Call:
+    """A call that is made where it is unpickled."""
+
+    def __init__(self, *call: Any) -> None:
+        self._call = call
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        function, *arguments = self._call
+        return function, tuple(arguments)
+
+
+def _call(function: Callable[..., Any], *arguments: Any) -> bytes:
+    """Return what `pickle.loads` makes a call of.
+
+    Dask itself unpickles functions of tasks before they run, and a worker without our packages then ends, once and
+    again, with no word to whoever gives the work. This one is unpickled within the task, whose failure comes back.
+    """
+    return pickle.dumps(_Call(function, *arguments))
 
 
 def _checked(sources: str, function: Callable[[Item], Result], item: Item) -> Result:

@@ -22,7 +22,7 @@ from tuning import provenance
 
 Arrays = dict[str, NDArray[Any]]
 
-FORMAT = 1
+FORMAT = 2
 LONGEST_HEADER = 1000  # bytes
 
 

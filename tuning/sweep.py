@@ -5,12 +5,13 @@ from __future__ import annotations
 import csv
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from drive_env import EmulatedDrives, motion
 from drive_env.trace import Trace
 from mechanics.loads import find_load
+from mechanics.model import COPIES_PER_MODEL
 from tuning import metrics, provenance
 from tuning.experiment import Experiment, Resolved, label, resolve
 from tuning.experiment import load_experiment as load_experiment
@@ -30,7 +32,8 @@ VELOCITY, CURRENT, CURRENT_LIMIT = 0x606C, 0x6077, 0x2003
 FLAGS = ("diverged", "oscillates", "fault")
 PIECE = 0.02  # s of simulation between two reports of progress
 MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
-MAX_MACHINES = 1024  # of a shard: small enough to be spread, and for little to be lost when a run is killed
+MAX_MACHINES = 1024  # of a shard: small enough for little to be lost when a run is killed
+SHARDS_PER_WORKER = 4  # at least, where there are points enough: for the last to end soon after the first
 
 Progress = Callable[[str, float], None]
 
@@ -127,13 +130,37 @@ class Shard(NamedTuple):
     num_threads: int | None
 
 
-def shards(experiment: Experiment, num_threads: int | None = None) -> list[Shard]:
-    """Return the parts of a grid; they depend on the experiment alone."""
+def shards(
+    experiment: Experiment,
+    num_threads: int | None = None,
+    *,
+    width: int = 1,
+    done: Mapping[int, int] = MappingProxyType({}),
+) -> list[Shard]:
+    """Return the parts of a grid that are still to do; how it is cut changes no digit.
+
+    Args:
+        experiment: The experiment.
+        num_threads: Threads that simulate each.
+        width: How many can be worked on at a time: for many, parts are smaller.
+        done: First point of each part that is done -> the point after its last.
+    """
     samples = round(experiment.excitation.duration / experiment.excitation.sampling_period)
     axes = find_load(experiment.load).num_axes
-    size = int(np.clip(MAX_SAMPLES // (samples * axes), 64, MAX_MACHINES))
     points = experiment.size()
-    return [Shard(experiment, first, min(first + size, points), num_threads) for first in range(0, points, size)]
+    fair = points // (width * SHARDS_PER_WORKER) if width > 1 else MAX_MACHINES
+    fit = min(MAX_SAMPLES // (samples * axes), fair)
+    # Whole packed models, from the same points in every cut: a constraint solver works on all copies of one at once.
+    size = int(np.clip(fit, COPIES_PER_MODEL, MAX_MACHINES)) // COPIES_PER_MODEL * COPIES_PER_MODEL
+    parts, first = [], 0
+    while first < points:
+        if first in done:
+            first = done[first]
+            continue
+        last = min([first + size, points, *(other for other in done if other > first)])
+        parts.append(Shard(experiment, first, last, num_threads))
+        first = last
+    return parts
 
 
 def run(
@@ -159,9 +186,10 @@ def run(
     """
     report = progress or (lambda _what, _share: None)
     resolved = resolve(experiment)
-    parts = shards(experiment, num_threads if pool is None else 1)
     found: dict[int, Arrays] = {} if log is None else dict(log.done)
-    left = [k for k in range(len(parts)) if k not in found]
+    done = {first: first + len(arrays["score"]) for first, arrays in found.items()}
+    threads, width = (num_threads, 1) if pool is None else (1, pool.width)
+    left = shards(experiment, threads, width=width, done=done)
     report("compiling", 0.0)
     if left:
         # Of workers as well: they find the kernels compiled, and what there is to warn of is said once and here.
@@ -169,35 +197,37 @@ def run(
     started = time.perf_counter()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)  # a flag of the table
-        for k, arrays in _done(parts, left, pool, report):
-            found[k] = arrays
+        for part, arrays in _done(left, experiment.size(), pool, report):
+            found[part.first] = arrays
             if log is not None:
-                log.append(k, arrays)
+                log.append(part.first, arrays)
     wall = time.perf_counter() - started
-    simulated = experiment.excitation.duration * sum(parts[k].last - parts[k].first for k in left)
-    columns = {name: np.concatenate([found[k][name] for k in range(len(parts))]) for name in _column_names()}
-    return _ranked(
-        experiment, resolved, columns, _best([found[k] for k in range(len(parts))], experiment), simulated, wall
-    )
+    simulated = experiment.excitation.duration * sum(part.last - part.first for part in left)
+    in_order = [found[first] for first in sorted(found)]
+    columns = {name: np.concatenate([arrays[name] for arrays in in_order]) for name in _column_names()}
+    return _ranked(experiment, resolved, columns, _best(in_order, experiment), simulated, wall)
 
 
-def _done(parts: list[Shard], left: list[int], pool: Pool | None, report: Progress) -> Iterator[tuple[int, Arrays]]:
-    """Give the number and the result of each shard as it is done."""
-    shares = dict.fromkeys(left, 0.0)
-    sizes = [part.last - part.first for part in parts]
+def _done(left: list[Shard], points: int, pool: Pool | None, report: Progress) -> Iterator[tuple[Shard, Arrays]]:
+    """Give each shard and its result as it is done."""
+    shares = [0.0] * len(left)
+    sizes = [part.last - part.first for part in left]
+
+    def done() -> float:
+        return 1.0 - sum((1.0 - share) * size for share, size in zip(shares, sizes, strict=True)) / points
 
     def say(k: int, share: float) -> None:
         shares[k] = share
-        report("simulating", sum(shares.get(n, 1.0) * size for n, size in enumerate(sizes)) / sum(sizes))
+        report("simulating", done())
 
     if pool is not None:
-        for place, arrays in pool.unordered(simulate, [parts[k] for k in left]):
-            say(left[place], 1.0)
-            yield left[place], arrays
+        for k, arrays in pool.unordered(simulate, left, lambda what: report(what or "simulating", done())):
+            say(k, 1.0)
+            yield left[k], arrays
         return
     # Two at a time: what builds and judges machines holds the interpreter's lock, what simulates does not.
     with ThreadPoolExecutor(2) as executor:
-        futures = {executor.submit(simulate, parts[k], partial(say, k)): k for k in left}
+        futures = {executor.submit(simulate, part, partial(say, k)): part for k, part in enumerate(left)}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()

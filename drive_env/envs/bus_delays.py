@@ -9,18 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-import mechanics.compiled
 from mechanics.bundle import Bundle, Cube, Matrix, NumberMatrix, Numbers, Vector, reader
 from mechanics.compiled import cached, inlined, stage
-
-_SOURCES = (Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -193,7 +189,7 @@ def pass_on(line: Any, lane: Any, message: Any, latched: Any) -> None:
         held[lane, part] = messages[lane, place, part]
 
 
-@cached(*_SOURCES, allocates=False)
+@cached(allocates=False)
 def _pass_rows_on(address: Any, sent: Any, arrived: Any, latched: Any) -> None:
     line = line_at(address)
     for lane in range(sent.shape[1]):

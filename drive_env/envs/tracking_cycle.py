@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from numba import from_dtype, types
 from numpy.typing import NDArray
 
-import mechanics.compiled
 from drive_env.envs.bus_delays import Line, pass_on
 from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, Vector, reader
 from mechanics.compiled import cached, inlined, stage
-
-_SOURCES = (Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
 
 # A lane's episode: step and number of steps; the pendulum's angle at the last step [rad]; whether it fell.
 LANE = np.dtype([("step", "i8"), ("steps", "i8"), ("angle", "f8"), ("fallen", "i8")])
@@ -81,7 +77,7 @@ class Episodes(Bundle):
 episodes_at = reader(Episodes)
 
 
-@cached(*_SOURCES, allocates=False)
+@cached(allocates=False)
 def act(address, first, count):
     """Turn actions of some axes into the rows of set-points that act in this step's cycles."""
     own = episodes_at(address)
@@ -155,7 +151,7 @@ def describe(own, k):
         lane.angle = angles[k]
 
 
-@cached(*_SOURCES, allocates=False)
+@cached(allocates=False)
 def describe_lanes(address, where):
     """Write the observations of the lanes where the mask is true."""
     own = episodes_at(address)
@@ -164,7 +160,7 @@ def describe_lanes(address, where):
             describe(own, k)
 
 
-@cached(*_SOURCES, allocates=False)
+@cached(allocates=False)
 def observe(address, first, count):
     """Take some axes' samples in; write observations, rewards and their terms, and which lanes have ended."""
     own = episodes_at(address)

@@ -7,14 +7,12 @@ position and velocity loops, winding matrices; then the current ticks; then one 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from numba import from_dtype, types
 from numpy.typing import NDArray
 
-import mechanics.compiled
 from drive_env.firmware import alignment, fsa, inputs, modes, protection, thermal
 from drive_env.firmware.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.derived import derive
@@ -33,8 +31,6 @@ from mechanics.bundle import Bundle, Cube, Matrix, Numbers, reader
 from mechanics.calls import call_hook, next_number
 from mechanics.compiled import cached, inlined, stage
 from mechanics.plant import Plant
-
-_SOURCES = (Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
 
 # How a played or written value acts on a field.
 REAL, INTEGER, CONTROLWORD, MODE, SET_POINT = 0, 1, 2, 3, 4
@@ -359,7 +355,7 @@ def run_group(group, call, start, cycles):
             mechanics_window(records, plant, rates, group.motion)
 
 
-@cached(*_SOURCES, allocates=False)
+@cached(allocates=False)
 def run(fleet_address, call_address, start, cycles, first, last):
     """Run groups for whole communication cycles from `start` up to `cycles`, taking turns with other threads.
 
@@ -382,7 +378,7 @@ def run(fleet_address, call_address, start, cycles, first, last):
     return some
 
 
-@cached(*_SOURCES, allocates=False)
+@cached(allocates=False)
 def run_drives_alone(records, rates, cycles):
     """Run the drives without mechanics, rotors driven by their predicted torque balance; the benchmark's bound."""
     for _ in range(cycles):
@@ -393,7 +389,7 @@ def run_drives_alone(records, rates, cycles):
                 window(records[block], rates)
 
 
-@cached(*_SOURCES, allocates=False)
+@cached(allocates=False)
 def write_events(records, kind, values, where):
     """Process writes of the controlword or the mode for the axes where the mask is true."""
     for axis in range(values.shape[0]):
@@ -405,7 +401,7 @@ def write_events(records, kind, values, where):
                 write_mode(drive, axis % LANES, values[axis])
 
 
-@cached(*_SOURCES, allocates=False)
+@cached(allocates=False)
 def power_on(records, where):
     """Start the drive's firmware anew on the axes where the mask is true: transitions 0 and 1, encoder at zero.
 

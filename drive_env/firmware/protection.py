@@ -7,10 +7,8 @@ fault reaction of 605Eh, a limit of travel stops the axis and stays enabled, a w
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
-import mechanics.compiled
 from drive_env.firmware import alignment, fsa, inputs
 from drive_env.firmware.record import LANES
 from mechanics.compiled import cached, stage
@@ -270,7 +268,7 @@ def protect(drive, lane, dt):
             fsa.push_emergency(drive, lane, cause)
 
 
-@cached(Path(__file__).parent, Path(mechanics.compiled.__file__).parent)
+@cached()
 def trip(records, first_axis, num_axes, cause):
     """Take axes that are in operation enabled into fault, with the reaction of a cause that is outside of them.
 

@@ -7,7 +7,11 @@ from __future__ import annotations
 
 import math
 import re
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry
 
@@ -53,6 +57,19 @@ def find_unit(name: str, increments: float | None) -> Unit | None:
     return UNITS.get(name)
 
 
+def increments_per_revolution(drives: Any) -> list[float | None]:
+    """Return the position increments of a revolution of every axis, None where the drive does not say.
+
+    Args:
+        drives: On a bus.
+    """
+    known = drives.description
+    for name in ("Position Scaler", (0x608F, 1)):  # of the TMCM-1636; encoder increments of CiA 402
+        if known.has(name):
+            return [float(value) or None for value in drives.read(name)]
+    return [None] * drives.num_axes
+
+
 def parse(text: str, entry: Entry, increments: float | None) -> int:
     """Return the integer for an object that is written as text: a plain integer (also 0x...), or a quantity.
 
@@ -78,16 +95,64 @@ def parse(text: str, entry: Entry, increments: float | None) -> int:
         if number != int(number):
             raise ValueError(f"{entry.label} takes integers{_counted(entry)}; {text} is none, choose {round(number)}")
         return int(number)
+    count = number / _factor(entry, name, increments)
+    if not math.isfinite(count):
+        raise ValueError(_too_large(text, entry))
+    return round(count)
+
+
+def is_quantity(value: object) -> bool:
+    """Return whether a value is a text of a number and a unit."""
+    if not isinstance(value, str) or re.fullmatch(r"\s*0[xob]\w+\s*", value, re.IGNORECASE):
+        return False
+    found = _QUANTITY.match(value)
+    return found is not None and found[2] is not None
+
+
+def integers(
+    text: str, entry: Entry, scale: Sequence[float | None], where: NDArray[np.bool_] | None = None
+) -> NDArray[np.int64]:
+    """Return the integer of each axis for an object that is written as a quantity, 0 where the mask is not true.
+
+    Args:
+        text: As `parse` takes it.
+        entry: The object.
+        scale: Position increments per revolution of each axis, None where they are unknown.
+        where: Axes.
+
+    Raises:
+        ValueError: As `parse` does.
+    """
+    chosen = np.ones(len(scale), bool) if where is None else where
+    return np.array([parse(text, entry, one) if mine else 0 for one, mine in zip(scale, chosen, strict=True)], np.int64)
+
+
+def in_unit(raw: NDArray[np.int64], entry: Entry, unit: str, scale: Sequence[float | None]) -> NDArray[np.float64]:
+    """Return integers of an object in a unit, of the same shape; axes are the last dimension.
+
+    Args:
+        raw: As the wire carries them.
+        entry: The object.
+        unit: A row of the units, or the object's own.
+        scale: Position increments per revolution of each axis, None where they are unknown.
+
+    Raises:
+        ValueError: For a unit that does not fit the object.
+    """
+    if unit == entry.unit:
+        return np.asarray(raw, np.float64)
+    return np.asarray(raw * np.array([_factor(entry, unit, one) for one in scale]), np.float64)
+
+
+def _factor(entry: Entry, name: str, increments: float | None) -> float:
+    """Return how many of a unit one count of an object is."""
     own, given = find_unit(entry.unit, increments), find_unit(name, increments)
     if own is None:
         raise ValueError(f"{entry.label} has no unit that {name} could be turned into; give its integer")
     if given is None or given.dimension != own.dimension:
         fitting = [other for other, unit in UNITS.items() if unit.dimension == own.dimension]
         raise ValueError(f"{entry.label} is no quantity in {name!r}; it takes {', '.join([entry.unit, *fitting])}")
-    count = number * given.factor / own.factor
-    if not math.isfinite(count):
-        raise ValueError(_too_large(text, entry))
-    return round(count)
+    return own.factor / given.factor
 
 
 def parse_raw(text: str, entry: Entry) -> int:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from drive_env.commands import CLOSED, output_is_closed
+from drive_env.tools.program import is_quiet
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -187,7 +188,7 @@ def progress_on(console: Console, *, transient: bool = False) -> Progress:
         TaskProgressColumn(),
         TimeElapsedColumn(),
     )
-    return Progress(*columns, console=console, transient=transient)
+    return Progress(*columns, console=console, transient=transient, disable=is_quiet())
 
 
 def print_json(value: Any) -> None:
@@ -230,11 +231,9 @@ def ask(question: str, yes: bool) -> None:
 
 def increments_per_revolution(drives: CanDrives) -> list[float | None]:
     """Return the position increments of a revolution of every axis, None where the drive does not say."""
-    known = drives.description
-    for name in ("Position Scaler", (0x608F, 1)):  # of the TMCM-1636; encoder increments of CiA 402
-        if known.has(name):
-            return [float(value) or None for value in drives.read(name)]
-    return [None] * drives.num_axes
+    from drive_env.master import quantities
+
+    return quantities.increments_per_revolution(drives)
 
 
 def axis_name(drives: CanDrives, axis: int) -> str:

@@ -138,7 +138,7 @@ def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folde
             task = progress.add_task(texts["compiling"], total=1.0)
             return run(
                 experiment,
-                lambda what, share: progress.update(task, description=texts[what], completed=share),
+                lambda what, share: progress.update(task, description=texts.get(what, what), completed=share),
                 pool=pool,
                 log=log,
             )

@@ -1,0 +1,47 @@
+"""What the three programs have before their commands: the version, and how much is said besides results."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import logging
+import warnings
+from typing import Annotated
+
+import typer
+
+PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
+
+
+def _tell_version(context: typer.Context, asked: bool) -> None:
+    if asked:
+        print(f"{context.find_root().info_name} {importlib.metadata.version('drive-env')}")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and stop.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Results and errors alone: no progress, no warnings.")]
+Verbose = Annotated[bool, typer.Option("--verbose", help="Say what goes on besides.")]
+
+
+def say_as_much(quiet: bool, verbose: bool) -> None:
+    """Let warnings and the log of our packages through, or not.
+
+    Raises:
+        typer.BadParameter: For both.
+    """
+    if quiet and verbose:
+        raise typer.BadParameter("--quiet and --verbose exclude each other")
+    if quiet:
+        warnings.simplefilter("ignore")
+        logging.disable(logging.WARNING)
+    if verbose:
+        logging.basicConfig(format="%(message)s")
+        for name in PACKAGES:
+            logging.getLogger(name).setLevel(logging.INFO)
+
+
+def is_quiet() -> bool:
+    """Return whether the program that runs was asked to be quiet: warnings are off."""
+    return not logging.getLogger("drive_env").isEnabledFor(logging.WARNING)

@@ -1,0 +1,33 @@
+"""What machines draw: NumPy's own generators are the oracle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drive_env.machine_numbers import machine_numbers
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**32 - 1, 2**32, 2**40 + 5, 2**96, 2**130 + 17])
+@pytest.mark.parametrize(
+    "machines",
+    [
+        range(40),
+        [0],
+        [7, 7, 7],  # one machine many times
+        [5, 2, 5, 2**31],
+        [2**32 - 1, 2**32, 2**70],  # a number of two or three words is stirred in other turns
+    ],
+)
+def test_every_machine_has_the_numbers_of_a_generator_of_its_own(seed, machines):
+    integers, shares = machine_numbers(seed, machines, 9)
+    for k, machine in enumerate(machines):
+        generator = np.random.default_rng((seed, machine))
+        assert integers[k] == generator.integers(1, 2**32)
+        assert shares[k].tolist() == generator.random(9).tolist()
+
+
+@pytest.mark.parametrize(("seed", "machines"), [(-1, [0]), (0, [3, -1])])
+def test_what_is_negative_is_refused(seed, machines):
+    with pytest.raises(ValueError, match="non-negative"):
+        machine_numbers(seed, machines, 1)

@@ -1,0 +1,110 @@
+"""What the three programs have in common: version, how much they say, completion, names that there are."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import logging
+import os
+import subprocess
+import sys
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import agents.cli
+import drive_env.cli
+import tuning.cli
+from drive_env.tools.program import Quiet, Verbose, say_as_much
+
+APPS = {"drive-env": drive_env.cli.app, "drive-tune": tuning.cli.app, "drive-agent": agents.cli.app}
+
+
+@pytest.mark.parametrize("name", APPS)
+def test_the_version_is_that_of_the_package(name):
+    result = CliRunner().invoke(APPS[name], ["--version"], prog_name=name)
+    assert (result.exit_code, result.stdout) == (0, f"{name} {importlib.metadata.version('drive-env')}\n")
+
+
+@pytest.mark.parametrize("name", APPS)
+def test_quiet_and_verbose_exclude_each_other(name):
+    command = {"drive-env": "list", "drive-tune": "rules", "drive-agent": "evaluate"}[name]
+    result = CliRunner().invoke(APPS[name], ["--quiet", "--verbose", command])
+    assert result.exit_code == 2
+    assert "--quiet and --verbose exclude each other" in result.stderr
+
+
+def run(program, *arguments, **environment):
+    return subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.argv[0] = {program!r}; from drive_env import commands as c; "
+         f"c.{program.replace('-', '_')}()", *arguments],
+        env=os.environ | environment, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("program", "begun", "commands"), [
+    ("drive-env", "sc", {"scan", "scope"}),
+    ("drive-tune", "r", {"response", "rules", "restore"}),
+    ("drive-agent", "ev", {"evaluate"}),
+])  # fmt: skip
+def test_a_shell_completes_commands(program, begun, commands):
+    variable = f"_{program.replace('-', '_').upper()}_COMPLETE"
+    done = run(program, **{variable: "complete_bash", "COMP_WORDS": f"{program} {begun}", "COMP_CWORD": "1"})
+    assert set(done.stdout.split()) >= commands, done.stderr
+
+
+@pytest.mark.parametrize(("more", "there", "absent"), [
+    ((), ("tmcm1636", "qbl4208", "two_mass"), ()),
+    (("motors",), ("qbl4208",), ("tmcm1636", "two_mass")),
+])  # fmt: skip
+def test_what_there_is_is_listed(more, there, absent):
+    result = CliRunner().invoke(drive_env.cli.app, ["list", *more], env={"COLUMNS": "80"})
+    assert result.exit_code == 0
+    names = {line.split()[0] for line in result.stdout.splitlines() if line.strip()}
+    assert set(there) <= names and not set(absent) & names
+    data = json.loads(CliRunner().invoke(drive_env.cli.app, ["list", *more, "--json"]).stdout)
+    assert {name for rows in data.values() for name in rows} >= set(there)
+
+
+def test_a_kind_of_names_that_there_is_not_is_answered_with_those_that_there_are():
+    result = CliRunner().invoke(drive_env.cli.app, ["list", "motor"])
+    assert result.exit_code == 2
+    assert "there are devices, motors, loads, not 'motor'; did you mean 'motors'?" in result.stderr
+
+
+def test_quiet_shows_errors_and_no_progress_bar():
+    loud, quiet = (
+        run("drive-tune", *more, "response", "--load", "inertia", "--out", "/dev/null/nowhere")
+        for more in ((), ("--quiet",))
+    )
+    assert loud.returncode == quiet.returncode != 0
+    assert quiet.stderr.startswith("drive-tune: ")
+
+
+def test_quiet_hides_bars_and_warnings(capfd):
+    from rich.console import Console
+
+    from drive_env.tools.options import progress_on
+
+    app = typer.Typer()
+
+    @app.callback()
+    def main(quiet: Quiet = False, verbose: Verbose = False) -> None:
+        say_as_much(quiet, verbose)
+
+    @app.command()
+    def work() -> None:
+        with progress_on(Console(stderr=True, force_terminal=True)) as progress:
+            progress.update(progress.add_task("working", total=1.0), completed=1.0)
+        logging.getLogger("drive_env").warning("something odd")
+
+    shown = {}
+    try:
+        for option in ((), ("--quiet",)):
+            shown[option] = CliRunner().invoke(app, [*option, "work"])
+    finally:
+        logging.disable(logging.NOTSET)
+    assert [result.exit_code for result in shown.values()] == [0, 0]
+    assert "working" in shown[()].output
+    assert shown["--quiet",].output == ""
