@@ -314,6 +314,7 @@ def test_agents_are_found_by_name_or_file(tmp_path):
         find_agent("nobody")
 
 
+@pytest.mark.slow
 def test_the_shipped_tuner_performs_as_its_card_says():
     """On the card's own machines, of every kind, figure by figure: they are drawn from a seed and never trained on."""
     card = Bundle.load(shipped("gain_tuning")).card["figures"]

@@ -226,6 +226,7 @@ def test_gains_that_fail_every_trial_are_rolled_back_with_the_last_reason(quick,
     assert result.aborts[0] >= 3
 
 
+@pytest.mark.slow
 def test_a_drive_fresh_from_the_factory_is_commissioned_first(tmp_path):
     drives = EmulatedDrives(load="inertia", motor=None, num_threads=1)
     motor, device = find_motor("qbl4208"), find_device("tmcm1636")
@@ -459,8 +460,8 @@ def hidden_ratio(target, machines, found):
 
 @pytest.mark.slow
 def test_on_the_public_machines_it_is_far_better_than_the_fitted_rule_and_stays_inside_its_envelope(tmp_path):
-    """Every second one of the 46 of one axis; side by side they wait for each other: that counts as drive time."""
-    machines = [machine for machine in load_suite("public") if machine.load not in ("gantry", "robot")][::2]
+    """Every fourth one of the 46 of one axis; side by side they wait for each other: that counts as drive time."""
+    machines = [machine for machine in load_suite("public") if machine.load not in ("gantry", "robot")][::4]
     ratios, accepted, seconds, violations = [], [], [], 0
     for target, indices in open_machines(machines):
         chosen = [machines[k] for k in indices]
@@ -471,7 +472,7 @@ def test_on_the_public_machines_it_is_far_better_than_the_fitted_rule_and_stays_
         accepted += result.accepted.tolist()
         seconds += result.drive_seconds.tolist()
         violations += int(result.violations.sum())
-    assert len(ratios) == 23 and sum(accepted) >= 22
+    assert len(ratios) == 12 and sum(accepted) >= 11
     assert np.median(ratios) <= 0.6
     assert violations == 0
     assert np.median(seconds) < BUDGET and max(seconds) < 1.3 * BUDGET

@@ -166,6 +166,7 @@ def gantry_known(target, where):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unsafe", [False, True])
 def test_the_axes_of_a_machine_are_tuned_together_and_each_says_why_it_did_not_move(monkeypatch, tmp_path, unsafe):
     monkeypatch.setattr(auto_search, "GENERATIONS", 3)
@@ -219,6 +220,7 @@ def test_axes_that_pull_at_one_thing_move_together_or_not_at_all(what):
     assert way[:2].min() > 1000 > 100 > way[2:].max()
 
 
+@pytest.mark.slow
 def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tmp_path):
     """One joint of an arm is given wild gains: it gets slower ones, those of the other joints are tried again."""
     with emulated(load="robot", num_machines=1, num_threads=1) as target:

@@ -30,6 +30,7 @@ def gantry_on_a_bus(tmp_path, monkeypatch):
     world.close()
 
 
+@pytest.mark.slow
 def test_both_ends_of_a_gantry_on_a_bus_move_together(gantry_on_a_bus):
     done = drive_tune("identify", *gantry_on_a_bus, "--axes", "linked", "--json")
     assert done.exit_code == 0, done.output

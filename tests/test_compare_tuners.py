@@ -159,6 +159,7 @@ class KilledError(Exception):
     """Raised in place of a kill."""
 
 
+@pytest.mark.slow
 def test_a_comparison_that_was_killed_goes_on_to_the_same_figures(tmp_path):
     machines = [*RIGID[:2], *SHORT]
     calls = []

@@ -154,6 +154,7 @@ def test_a_run_that_is_killed_is_undone_by_one_command(tmp_path, command):
         assert parameters(bus) == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_a_node_in_real_time_switches_itself_off_and_is_restored(tmp_path, monkeypatch):
     # It is stopped then, and does not answer until it is woken.
@@ -168,6 +169,7 @@ def test_a_node_in_real_time_switches_itself_off_and_is_restored(tmp_path, monke
         assert parameters(bus) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_run_that_ends_well_leaves_the_drive_as_the_file_says_and_tells_it(tmp_path, command):
     app, arguments = COMMANDS[command]
@@ -183,6 +185,7 @@ def test_a_run_that_ends_well_leaves_the_drive_as_the_file_says_and_tells_it(tmp
         assert status_is(machine, *OFF)
 
 
+@pytest.mark.slow
 def test_what_rules_apply_stays_and_is_undone_by_the_file(tmp_path):
     with node() as (machine, bus):
         done = CliRunner().invoke(

@@ -182,6 +182,7 @@ def few_told(found, shares):
     return {name: (axes, told) for name, (axes, told) in counts.items() if told < shares[name] * axes}
 
 
+@pytest.mark.slow
 def test_what_is_told_briefly_is_inside_its_interval_and_the_rest_has_its_reason():
     """Eleven machines: rigid, on a spring, a belt, gears with backlash, a vertical axis, an arm, a fan."""
     chosen = (
@@ -473,6 +474,7 @@ def test_axes_that_pull_at_one_thing_move_together():
     assert sum(axis.value("inertia") for axis in found) == pytest.approx(travelling, rel=0.03)
 
 
+@pytest.mark.slow
 def test_the_joints_of_an_arm_are_identified_briefly_one_after_the_other():
     """Each by its own inertia: moved at once they pull at each other, and one seems to have a fifth of it."""
     with emulated(load="robot", num_machines=2, randomise=["load"], seed=0, num_threads=2) as target:

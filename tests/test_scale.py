@@ -263,6 +263,7 @@ def test_worker_processes_give_the_digits_of_one_process_and_go_on_from_what_is_
         assert sorted(log.done) == [0, *range(1024, 2304, 256)]
 
 
+@pytest.mark.slow
 def test_a_cluster_that_loses_one_of_two_workers_gives_the_digits_of_one_process(experiment, whole, saved, tmp_path):
     distributed = pytest.importorskip("distributed")
     options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": "127.0.0.1:0"}

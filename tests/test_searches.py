@@ -180,6 +180,7 @@ def undisturbed(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("how", ["kill", "interrupt"])
 def test_a_single_search_that_is_stopped_goes_on_to_the_same_bytes(undisturbed, tmp_path, how):
