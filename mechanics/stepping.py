@@ -397,7 +397,9 @@ def report_contacts(plant, back, theta):
             add_product(lane, x, -back * motion[e, d], speed, d)
         for copy in range(copies):
             low, high = contact[b, 0, copy], contact[b, 1, copy]
-            lane[pressed, copy] = max(low - lane[x, copy], 0.0) + min(high - lane[x, copy], 0.0)
+            deep = max(low - lane[x, copy], 0.0) + min(high - lane[x, copy], 0.0)
+            # By this copy's own force: what other copies touch must change nothing here.
+            lane[pressed, copy] = deep if carried[copy, b] != 0.0 else 0.0
         for a in range(A):
             for copy in range(copies):
                 lane[turned, copy] = 0.0

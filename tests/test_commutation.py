@@ -261,6 +261,35 @@ def test_speed_from_halls_is_within_2_percent_at_constant_speed(build, omega):
     assert np.mean(trace[0x606C]) * 2.0 * math.pi / TURN == pytest.approx(true, rel=0.02)
 
 
+def test_an_edge_that_is_crossed_back_is_no_speed(build):
+    """A rotor that trembles about the edge between two sectors passes none."""
+    drives = build(1)
+    drives.write(0x2055, HALL)
+    motion.enable(drives, mode="cst")
+    edge = -lanes(drives, "hall_true_offset")[0]
+    sectors, speeds = [], []
+    for k in range(100):
+        drives._groups[0].load.plant.qpos[:] = (edge + (0.02 if k % 2 else -0.02)) / N_P
+        drives.advance(0.002)
+        sectors.append(lanes(drives, "hall_sector")[0])
+        speeds.append(drives.read(0x606C)[0])
+    assert np.all(np.abs(np.diff(sectors)) == 1.0)
+    assert np.abs(speeds).max() == 0
+
+
+@pytest.mark.parametrize(("omega", "least"), [(12.0, 0.6), (-20.0, 0.9), (60.0, 0.98)])
+def test_a_slow_axis_under_halls_advances(build, omega, least):
+    """It stood, trembling about an edge, while 606Ch told what was asked for; a slow one still goes in jerks."""
+    drives = build(1)
+    drives.write(0x2055, HALL)
+    motion.enable(drives, mode="pv")
+    drives.write(0x60FF, to_pps(omega))
+    drives.advance(1.0)
+    start = drives.machine.rotor_angle[0]
+    drives.advance(2.0)
+    assert least < (drives.machine.rotor_angle[0] - start) / 2.0 / omega < 1.02
+
+
 def test_position_comes_from_the_halls_unless_always_use_encoder_is_set(build):
     """24 steps per turn of four pole pairs, or the encoder's 4096 (2043h:03)."""
     drives = build(2)

@@ -11,6 +11,7 @@ from mechanics.compiled import inlined, stage
 SQRT3 = 3.0**0.5
 PI = 3.141592653589793
 HALL_STANDSTILL = 0.05  # s without an edge after which the halls tell no speed
+HALL_UNKNOWN = 1.0  # s between edges, for "not known": beyond standstill
 U32 = np.uint32  # without it every operation of the generator widens to 64 bits
 # Sum of four random bytes: mean 510, variance 4 (256^2 - 1) / 12.
 _BYTES_MEAN = 510.0
@@ -84,9 +85,11 @@ def measure_halls(drive, dt):
         change = sector - drive.hall_sector[lane]
         elapsed = drive.hall_time[lane] + dt
         edge = change != 0.0
-        period = elapsed if edge else drive.hall_period[lane]
-        elapsed = 0.0 if edge else elapsed
         sense = (1.0 if change > 0.0 else -1.0) if edge else drive.hall_sense[lane]
+        # An edge that is crossed back ends no sector: how fast the rotor is, the next one tells.
+        back = sense * drive.hall_sense[lane] < 0.0
+        period = (HALL_UNKNOWN if back else elapsed) if edge else drive.hall_period[lane]
+        elapsed = 0.0 if edge else elapsed
         drive.hall_sector[lane] = sector
         drive.hall_time[lane] = elapsed
         drive.hall_period[lane] = period
