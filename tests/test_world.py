@@ -5,12 +5,13 @@ from collections import Counter
 
 import pytest
 
-from drive_env import EmulatedDrives
+from drive_env import EmulatedDrives, motion
 from drive_env.bus.bits import frame_bits
 from drive_env.bus.faults import Faults
 from drive_env.bus.wire import Wire
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
+from drive_env.canopen.nmt import State
 
 SYNC = Frame(0x080)
 
@@ -384,6 +385,46 @@ def test_what_a_node_does_not_take_in_time_fills_its_buffer_and_is_told():
     world.receive(Frame(0x605, bytes.fromhex("40 01 10 00 00 00 00 00")))
     world.run_until(world.time + 0.01)
     assert answers == ["605  40 01 10 00 00 00 00 00", "585  4F 01 10 00 00 00 00 00"]
+    world.close()
+
+
+@pytest.mark.parametrize("command", [0x81, 0x82])
+def test_a_node_that_is_reset_boots_after_its_time_and_is_deaf_until_then(command):
+    """A master that sends the command and then begins to wait hears the boot-up message."""
+    world = World(lockstep=False)
+    drives = EmulatedDrives(load="inertia", num_threads=1)
+    (node,) = world.add(drives, [5])
+    world.power_on()
+    world.run_until(0.01)
+    heard = []
+    world.listeners.append(lambda ended: heard.append((world.time, str(ended.frame))))
+    read = Frame(0x605, bytes.fromhex("40 01 10 00 00 00 00 00"))
+    world.receive(Frame(0x000, bytes((command, 5))))
+    for k in range(1, 5):  # nobody answers
+        world.run_until(0.01 + 0.01 * k)
+        world.receive(read)
+    world.run_until(0.2)
+    world.receive(read)
+    world.run_until(0.21)
+    answers = [(time, frame) for time, frame in heard if not frame.startswith(("605", "000"))]
+    assert [frame for _, frame in answers] == ["705  00", "585  4F 01 10 00 00 00 00 00"]
+    assert answers[0][0] == pytest.approx(0.01 + drives.device.canopen.boot_time, abs=0.002)
+    assert node.state is State.PRE_OPERATIONAL
+    world.close()
+
+
+def test_a_reset_switches_the_motor_off_at_once_however_long_the_node_boots():
+    world = World(lockstep=False)
+    drives = EmulatedDrives(load="inertia", num_threads=1)
+    world.add(drives, [5])
+    world.power_on()
+    world.run_until(0.01)
+    motion.enable(drives, mode="pv")
+    assert drives.read(0x6041)[0] & 0x6F == 0x27
+    world.receive(Frame(0x000, b"\x81\x05"))
+    world.run_until(0.012)
+    assert drives.read(0x6041)[0] & 0x6F == 0x40  # switch on disabled
+    assert drives._records["stage_on"][0, 0] == 0.0
     world.close()
 
 

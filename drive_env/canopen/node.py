@@ -18,7 +18,7 @@ import numpy as np
 from drive_env.axis import Axis, QueuedEmergency
 from drive_env.canopen import communication, frames, nmt
 from drive_env.canopen.communication import ModuleObjects, known_bit_rate, signed_command
-from drive_env.canopen.emergency import CONDITIONS, Condition, EmergencyProducer, ErrorHistory
+from drive_env.canopen.emergency import CONDITIONS, EPSILON, Condition, EmergencyProducer, ErrorHistory
 from drive_env.canopen.error_control import HeartbeatConsumer, HeartbeatProducer, NodeGuarding, consumers
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.nmt import Command, State
@@ -55,7 +55,8 @@ class Node:
         store: The file that is its non-volatile memory; without one it lasts as long as the node.
         bit_rate: That of the bus [bit/s], and the node's own while it has stored none. With another one stored the node
             is mute and deaf, as its controller understands nothing. None: the factory's, and whatever is stored fits.
-        takes_time: Its firmware takes no more frames in a cycle than it can; the next ones wait in its receive buffer.
+        takes_time: Its firmware takes no more frames in a cycle than it can, the next wait in its receive buffer; and
+            from an NMT reset to the boot-up message it needs the device's time, deaf and mute.
 
     Raises:
         ValueError: For a number that no node can have, axes that the drives do not have, a bit rate that the device
@@ -127,6 +128,9 @@ class Node:
         self._pdos = {pdo.index: pdo for pdo in (*self._rpdos, *self._tpdos)}
         self._handlers: dict[int, tuple[Callable[[bytes, float], None], ...]] = {}
         self._frames_left = self._frames_per_cycle = device.canopen.frames_per_cycle if takes_time else math.inf
+        self._boot_time = device.canopen.boot_time if takes_time else 0.0
+        self._boots_at: float | None = None  # while it boots
+        self._boot: Callable[[float], None] = self._reset_communication
         self._received: deque[Frame] = deque()
         self._has_lost = False  # frames, since its receive buffer was last half empty
 
@@ -139,6 +143,7 @@ class Node:
     def power_on(self, now: float) -> None:
         """Switch the device on, or off and on: stored values, boot-up, pre-operational."""
         self._now = now
+        self._boots_at = None
         self._reset_application(now)
 
     def receive(self, frame: Frame, now: float) -> None:
@@ -174,6 +179,10 @@ class Node:
         A lost master so stops the drives in the cycle that begins.
         """
         self._now = now
+        if self._boots_at is not None and now >= self._boots_at - EPSILON:
+            self._boots_at = None
+            self._is_online = True
+            self._boot(now)
         if not self._is_online:
             return
         self._frames_left = self._frames_per_cycle
@@ -347,9 +356,20 @@ class Node:
             self._enter(State.PRE_OPERATIONAL)
             self._flush(now)
         elif command is Command.RESET_NODE:
-            self._reset_application(now)
+            self._objects.restart(self._mask)  # at once, however long it takes to boot: no firmware drives the motor
+            self._restart(self._reset_application, now)
         elif command is Command.RESET_COMMUNICATION:
-            self._reset_communication(now)
+            self._restart(self._reset_communication, now)
+
+    def _restart(self, boot: Callable[[float], None], now: float) -> None:
+        """Boot, now or after the time that it takes."""
+        if self._boot_time == 0.0:
+            boot(now)
+            return
+        self.state = State.INITIALISING
+        self._is_online = False
+        self._received.clear()
+        self._boots_at, self._boot = now + self._boot_time, boot
 
     def _enter(self, state: State, *, is_commanded: bool = False) -> None:
         if state is self.state:

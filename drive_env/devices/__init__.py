@@ -48,6 +48,7 @@ class CanopenBehaviour(NamedTuple):
 
     Attributes:
         sdo_timeout: Time after which the server gives a transfer up.
+        boot_time: From an NMT reset to the boot-up message, where time is real.
         frames_per_cycle: Frames that the firmware takes in a communication cycle of 1 ms, where time is real.
         receive_buffer: Frames that wait until it does; more are lost.
         inhibit_unit: Unit of a TPDO's inhibit time.
@@ -61,6 +62,7 @@ class CanopenBehaviour(NamedTuple):
     """
 
     sdo_timeout: float
+    boot_time: float
     frames_per_cycle: int
     receive_buffer: int
     inhibit_unit: float
@@ -216,6 +218,7 @@ def _values(item: int | str) -> Sequence[int]:
 def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
     return CanopenBehaviour(
         sdo_timeout=data["sdo_timeout"],
+        boot_time=data["boot_time"],
         frames_per_cycle=data["frames_per_cycle"],
         receive_buffer=data["receive_buffer"],
         inhibit_unit=data["inhibit_unit"],
