@@ -7,6 +7,7 @@ import sys
 import typer
 
 from drive_env.tools.compare import compare
+from drive_env.tools.compiling import compile_kernels
 from drive_env.tools.fault import fault
 from drive_env.tools.get import get, set_object
 from drive_env.tools.jog import jog
@@ -39,7 +40,7 @@ PANELS = {
         ("jog", jog),
     ),
     "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
-    "What there is": (("list", list_names),),
+    "This installation": (("list", list_names), ("compile", compile_kernels)),
     "Frames": (("log", log), ("replay", replay)),
     "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("compare", compare)),
 }

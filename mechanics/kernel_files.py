@@ -65,7 +65,7 @@ class KernelFiles:
         try:
             content = path.read_bytes()
         except OSError:
-            logger.info("compiling %s: once for these sources, the emulator's takes half a minute", self._name)
+            _tell_compiling()
             return None
         digest, data = content[:_DIGEST], content[_DIGEST:]
         if hashlib.sha256(data).digest() == digest:
@@ -107,6 +107,11 @@ class KernelFiles:
 def _remove(path: Path) -> None:
     with suppress(OSError):
         path.unlink()
+
+
+@cache
+def _tell_compiling() -> None:
+    logger.info("compiling the kernels: once for this installation, half a minute (ahead: `drive-env compile`)")
 
 
 @cache

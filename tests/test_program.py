@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.metadata
+import io
 import json
 import logging
 import os
 import subprocess
 import sys
+import warnings
 
 import pytest
 import typer
@@ -16,7 +18,9 @@ from typer.testing import CliRunner
 import agents.cli
 import drive_env.cli
 import tuning.cli
+from drive_env.tools import compiling
 from drive_env.tools.program import Quiet, Verbose, say_as_much
+from mechanics import kernel_files
 
 APPS = {"drive-env": drive_env.cli.app, "drive-tune": tuning.cli.app, "drive-agent": agents.cli.app}
 
@@ -108,3 +112,51 @@ def test_quiet_hides_bars_and_warnings(capfd):
     assert [result.exit_code for result in shown.values()] == [0, 0]
     assert "working" in shown[()].output
     assert shown["--quiet",].output == ""
+
+
+def test_kernels_are_compiled_ahead_and_once():
+    first, second = (CliRunner().invoke(drive_env.cli.app, ["compile", "--json"]) for _ in range(2))
+    assert (first.exit_code, second.exit_code) == (0, 0), first.output
+    assert json.loads(second.stdout)["compiled"] == 0
+    again = CliRunner().invoke(drive_env.cli.app, ["compile"])
+    assert again.stdout.strip().startswith("nothing to compile: the kernels of these sources are in ")
+
+
+@pytest.mark.slow
+def test_after_that_drives_and_environments_compile_nothing(tmp_path):
+    cache = {"DRIVE_ENV_CACHE": str(tmp_path)}
+    done = run("drive-env", "compile", **cache)
+    assert "kernels in " in done.stdout, done.stderr
+    again = run("drive-env", "--verbose", "compile", **cache)
+    assert "nothing to compile" in again.stdout
+    assert "compiling" not in again.stderr
+
+
+def test_kernels_that_cannot_be_kept_are_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(compiling, "STEPS", {})
+    monkeypatch.setenv("DRIVE_ENV_CACHE", str(tmp_path / "none"))
+    result = CliRunner().invoke(drive_env.cli.app, ["compile"])
+    assert result.exit_code == 2
+    assert f"no kernel could be kept in {tmp_path / 'none'}; name a folder" in result.stderr
+
+
+@pytest.mark.parametrize(("terminal", "quiet", "told"), [(True, False, 1), (True, True, 0), (False, False, 0)])
+def test_a_cold_start_says_once_that_it_compiles_where_somebody_sits_before_it(monkeypatch, terminal, quiet, told):
+    class Stream(io.StringIO):
+        def isatty(self) -> bool:
+            return terminal
+
+    kernels = logging.getLogger("mechanics.kernel_files")
+    monkeypatch.setattr(kernels, "handlers", [])
+    monkeypatch.setattr(kernels, "level", kernels.level)
+    monkeypatch.setattr(kernels, "propagate", True)
+    monkeypatch.setattr(sys, "stderr", Stream())
+    kernel_files._tell_compiling.cache_clear()
+    try:
+        with warnings.catch_warnings():
+            say_as_much(quiet, False)
+        for _ in range(2):
+            kernel_files._tell_compiling()
+        assert sys.stderr.getvalue().count("compiling the kernels: once for this installation") == told
+    finally:
+        logging.disable(logging.NOTSET)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
+import sys
 import warnings
 from typing import Annotated
 
@@ -36,6 +37,12 @@ def say_as_much(quiet: bool, verbose: bool) -> None:
     if quiet:
         warnings.simplefilter("ignore")
         logging.disable(logging.WARNING)
+    elif sys.stderr.isatty():
+        # Whoever sits before a terminal that is silent for half a minute thinks that it hangs.
+        kernels = logging.getLogger("mechanics.kernel_files")
+        kernels.setLevel(logging.INFO)
+        kernels.addHandler(logging.StreamHandler())
+        kernels.propagate = False
     if verbose:
         logging.basicConfig(format="%(message)s")
         for name in PACKAGES:
