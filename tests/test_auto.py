@@ -20,10 +20,11 @@ from tuning import auto as auto_module
 from tuning import auto_margins, auto_search, auto_trials, provenance
 from tuning.auto import BUDGET, auto
 from tuning.auto_certificate import certificate
-from tuning.auto_checks import unsafe_gains
+from tuning.auto_checks import SENSITIVITY, sound_gains, unsafe_gains
 from tuning.auto_moves import OVERTIME
 from tuning.brief import identify_briefly
-from tuning.linear_model import Plant
+from tuning.linear_model import Plant, position_open_loop
+from tuning.margins import margins
 from tuning.moved_inertia import moved_inertia
 from tuning.proving import ProvingGround
 from tuning.rules import propose
@@ -164,6 +165,23 @@ def test_gains_are_safe_to_move_with_if_every_loop_has_its_margins(gains_before,
     why = unsafe_gains(device, plant, Gains(*gains_before))
     assert why.startswith(words)
     assert bool(why) == bool(words)
+
+
+@pytest.mark.parametrize("position_p", [118, 1420, 21595])
+def test_gains_are_lowered_until_the_outer_loops_are_sound_by_the_model(position_p):
+    """Against the margins of the loops themselves; what is sound already stays as it is."""
+    device, motor = find_device("tmcm1636"), find_motor("qbl4208")
+    plant = Plant.from_data_sheet(device, motor, 24.0, 1.5e-5)
+    gains = Gains(4021, 1573, 445, 329, position_p)
+    found = sound_gains(device, plant, gains)
+    f = np.geomspace(1.0, 2400.0, 3000)
+    now, then = (margins(f, position_open_loop(device, plant, one, f)) for one in (found, gains))
+    assert now.ms <= 1.02 * SENSITIVITY
+    assert found[:4] == gains[:4]
+    if then.ms <= SENSITIVITY:
+        assert found == gains
+    else:
+        assert now.ms > 0.7 * SENSITIVITY and found.position_p < position_p  # and no farther than that
 
 
 # --- rolling back -----------------------------------------------------------------------------------------------------

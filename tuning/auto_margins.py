@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 LEAST_LINES = 10  # of a frequency response, that are worth a judgement
 SENSITIVITY = 4.0  # greatest |1/(1+L)| that a measured loop may have
 CLOSE = {"phase": 14.0, "gain": 2.5}  # margins that this leaves at least [degrees, dB]
-SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5)  # factors of gains by which a lively loop is calmed
+SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # factors of gains by which a lively loop is calmed
 CALMED_NAMES = {"velocity": ("velocity P", "position P"), "position": ("position P",)}
 CALMED = {
     loop: [Gains._fields.index(name.lower().replace(" ", "_")) for name in names]

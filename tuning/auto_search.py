@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drive_env.gains import Gains, gains_from_bandwidths, rule_gains
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
-from tuning.auto_checks import unsafe_gains, wrong_wiring
+from tuning.auto_checks import sound_gains, unsafe_gains, wrong_wiring
 from tuning.ladder import BOLD, SLIPPERY
 from tuning.linear_model import Plant
 from tuning.rules import RULES, propose
@@ -103,6 +103,11 @@ def compute(run: Run) -> None:
         with Twins(target.device, target.motor, known, scaler, LANES, worlds=worlds) as twins:
             other = search(twins, found.gains, run.rng, generations=OTHER_GENERATIONS, width=OTHER_WIDTH)
         run.others[number, chosen] = other.gains[:, 0]
+    for axis in chosen:
+        plant = run.axes[axis].plant
+        assert plant is not None, "an axis that goes on has one"
+        for rows in (run.gains, *run.others):
+            rows[axis] = sound_gains(target.device, plant, Gains(*map(int, rows[axis])))
     for axis, hidden in zip(chosen, found.hidden[:, 0], strict=True):
         run.axes[axis].twin = float(hidden)
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import detrend
 
 from drive_env import motion, response
 from drive_env.positioning import CURRENT, CYCLE, POSITION, STATUS, wrapped
@@ -61,7 +62,8 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     angle = wrapped(raw - raw[0]) / target.increments()
     current = np.concatenate([rest[CURRENT], loaded[CURRENT]]) * 1e-3
     t = np.arange(len(angle), dtype=np.float64) * CYCLE
-    swing = current[-round(LOOKED_AT / CYCLE) :].std(axis=0) / target.motor.rated_current
+    # An integrator that is still on its way is no swing.
+    swing = detrend(current[-round(LOOKED_AT / CYCLE) :], axis=0).std(axis=0) / target.motor.rated_current
     found = response.disturbance_metrics(t, angle, np.zeros(target.num_axes), t_load=BEFORE)
     return {
         axis: StepResponse(
