@@ -10,8 +10,10 @@ import subprocess
 import sys
 import threading
 import uuid
+from contextlib import contextmanager
 
 import can
+import canopen
 import pytest
 from typer.testing import CliRunner
 
@@ -22,6 +24,7 @@ from drive_env.bus.world import World
 from drive_env.cli import PANELS, app
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.replay import command_of, read_log
 from drive_env.tools import scan
 
 DONE, REFUSED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
@@ -439,6 +442,91 @@ def test_scope_waits_for_its_trigger(run, shared, tmp_path):
     assert len(rows) == 30
     assert [row[1] for row in rows if float(row[0]) < 0.0] == [rows[0][1]] * 10
     assert {row[1] for row in rows if float(row[0]) >= 0.0} == {"77"}
+
+
+# What other masters send: a command of NMT (start), SYNC, an SDO request (read 6041h), and an RPDO of node 1.
+FOREIGN = {
+    "an NMT command (000h)": (0x000, "01 01"),
+    "a SYNC (080h)": (0x080, ""),
+    "an SDO request to node 1 (601h)": (0x601, "40 41 60 00 00 00 00 00"),
+    "an RPDO of node 1 (301h)": (0x301, "00 00 00 00"),
+}
+# TPDO 2 off, 6064h in place of what is mapped first, and on again: of equal length, and all wrong.
+REMAPPING = (
+    "23 01 18 01 81 02 00 80", "2F 01 1A 00 00 00 00 00", "23 01 1A 01 20 00 64 60", "2F 01 1A 00 01 00 00 00",
+    "23 01 18 01 81 02 00 00",
+)  # fmt: skip
+
+
+@contextmanager
+def other_master(channel, frames, after=0.0):
+    """A master of its own on the bus, that sends frames again and again."""
+    over = threading.Event()
+    with can.Bus(interface="virtual", channel=channel) as bus:
+
+        def send():
+            over.wait(after)
+            while not over.is_set():
+                for can_id, data in frames:
+                    bus.send(can.Message(arbitration_id=can_id, data=bytes.fromhex(data), is_extended_id=False))
+                    over.wait(0.01)
+
+        thread = threading.Thread(target=send)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+
+def mappings(channel):
+    """Return what node 1's TPDOs are, read by a client that is none of ours."""
+    network = canopen.Network()
+    network.connect(interface="virtual", channel=channel)
+    try:
+        client = network.add_node(1, canopen.ObjectDictionary()).sdo
+        client.RESPONSE_TIMEOUT = 20.0
+        found = []
+        for number in range(4):
+            found.append(client.upload(0x1800 + number, 1))
+            count = client.upload(0x1A00 + number, 0)[0]
+            found += [client.upload(0x1A00 + number, k) for k in range(count + 1)]
+        return found
+    finally:
+        network.disconnect()
+
+
+@pytest.mark.parametrize("what", FOREIGN)
+def test_scope_is_refused_where_another_master_commands_the_drive(run, shared, tmp_path, what):
+    before = mappings(shared[0])
+    with other_master(shared[0], [FOREIGN[what]]):
+        code, _, error = run("scope", "6064", "--duration", 0.1, "--out", tmp_path / "trace")
+    assert (code, f"another master commands the bus: {what}" in error) == (REFUSED, True), error
+    assert list(tmp_path.iterdir()) == []
+    assert mappings(shared[0]) == before
+
+
+def test_scope_ends_where_another_master_begins_and_no_sample_is_wrong(run, shared, tmp_path):
+    channel, (drives, _) = shared
+    drives.write("Target velocity", 78)
+    before, out = mappings(channel), tmp_path / "trace"
+    with other_master(channel, [(0x601, frame) for frame in REMAPPING], after=2.0):
+        code, _, error = run("scope", "60FF", "606C", "6077", "--duration", 60, "--out", out)
+    assert code == REFUSED and "another master commands the bus: an SDO request to node 1 (601h)" in error
+    rows = list(csv.reader(out.with_suffix(".csv").open()))[1:]
+    assert rows and {row[1] for row in rows} == {"78"}
+    assert max(abs(int(row[2])) for row in rows) < 1000  # a speed at rest, no position
+    after = mappings(channel)
+    assert after[:1] == before[:1] and after[-4:] == before[-4:]  # what nobody else has touched is as it was
+
+
+def test_what_scope_writes_by_default_compare_takes(run, tmp_path):
+    code, _, error = run("scope", "--duration", 0.1, "--out", tmp_path / "trace")
+    assert code == DONE, error
+    log = read_log(tmp_path / "trace.csv")
+    assert {index for index, _ in log.objects} == {0x6062, 0x6064, 0x606C, 0x60FF, 0x6077}
+    assert command_of(log)[0] in ((0x6062, 0), (0x60FF, 0))
 
 
 def breaks_off(monkeypatch, error, after):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -212,6 +213,18 @@ def check_free(file: Path, remedy: str = "choose another file") -> None:
     """
     if file.is_file():
         raise ValueError(f"{file} is there already, and would be replaced; {remedy}")
+
+
+def check_writable(file: Path) -> None:
+    """Raise ValueError for a file that could not be written; call it before a motor turns."""
+    if file.exists() and not file.is_file():
+        return  # a device
+    try:
+        with tempfile.NamedTemporaryFile(dir=file.parent, prefix=f".{file.name}."):
+            pass
+    except OSError as error:
+        why = (error.strerror or str(error)).lower()
+        raise ValueError(f"{file} cannot be written: {why}; give another --out") from None
 
 
 def ask(question: str, yes: bool) -> None:

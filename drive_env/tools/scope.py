@@ -22,6 +22,7 @@ from drive_env.tools.options import (
     Timeout,
     axis_name,
     check_free,
+    check_writable,
     connect,
     errors_as_exit_codes,
     fail,
@@ -30,7 +31,9 @@ from drive_env.tools.options import (
     print_json,
 )
 
-DEFAULT = ("6064", "606C", "6077")
+# Response and commands of the usual modes: what `drive-env compare` needs.
+DEFAULT = ("6062", "6064", "606C", "60FF", "6077")
+LISTENED = 0.3  # how long other masters are listened for before anything is sent [s]
 CHUNK = 0.05  # recorded at a time while the trigger is waited for [s]
 PIECE = 0.25  # recorded at a time afterwards [s]: as much is lost at most where the recording is broken off
 _TRIGGER = re.compile(r"^\s*(.+?)\s*(<=|>=|<|>|==|!=)\s*(.+?)\s*$")
@@ -46,7 +49,8 @@ class Trigger(NamedTuple):
 
 def scope(
     objects: Annotated[
-        list[str] | None, typer.Argument(help="Objects that can be mapped; by default position, velocity, current.")
+        list[str] | None,
+        typer.Argument(help="Objects that can be mapped; by default demands and responses."),
     ] = None,
     interface: Interface = None,
     channel: Channel = None,
@@ -68,7 +72,8 @@ def scope(
     """Sample objects with SYNC, one sample per millisecond, and write CSV (raw integers) and PNG (in units).
 
     After Ctrl-C, or where the bus is lost, what came until then is written, and told.
-    It sends SYNC and maps TPDOs, which it puts back: no other master may send SYNC meanwhile.
+    It sends SYNC and maps TPDOs, which it puts back. Where another master commands the drive it refuses, or ends with
+    what came until then: samples of two masters would be wrong.
     """
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     with errors_as_exit_codes():
@@ -78,6 +83,8 @@ def scope(
         table, picture = out.with_suffix(".csv"), out.with_suffix(".png")
         for file in (table, picture):
             check_free(file, "choose another --out")
+        check_writable(table)
+        _listen(interface, channel, node, bitrate)
         with connect(interface, channel, node, device, eds, **options) as drives:
             known = drives.description.dictionary
             entries = [known.find(object_name(name)) for name in objects or DEFAULT]
@@ -102,6 +109,18 @@ def scope(
         if broken is not None:
             why, code = (str(broken), REFUSED) if isinstance(broken, Exception) else ("interrupted", INTERRUPTED)
             fail(f"{why}; the {len(t)} samples that came until then are in {table} and {picture}", code)
+
+
+def _listen(interface: str | None, channel: str | None, nodes: list[int] | None, bitrate: int | None) -> None:
+    """Raise OtherMastersError where another master is at work; nothing is sent."""
+    from drive_env.master.other_masters import OtherMasters
+    from drive_env.master.port import Port, open_bus
+
+    port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
+    try:
+        OtherMasters(port, nodes or (1,)).listen(LISTENED)
+    finally:
+        port.close()
 
 
 def _check_times(**times: float) -> None:
@@ -147,12 +166,21 @@ def _record(
     import numpy as np
 
     from drive_env.master.errors import BusError
+    from drive_env.master.other_masters import OtherMasters
 
     wanted = list(dict.fromkeys([*entries, trigger.entry] if trigger else entries))
     names = [(entry.index, entry.sub) for entry in wanted]
 
+    others = OtherMasters(drives.port, drives.nodes)
+
     def record(seconds: float) -> dict[Any, Any]:
-        trace = drives.record(names, round(seconds, 3))
+        try:
+            trace = drives.record(names, round(seconds, 3))
+        except BusError:
+            others.check()  # samples that stay out are another master's doing, if there is one
+            raise
+        drives.port.drain()
+        others.check()
         return {entry: trace[name] for entry, name in zip(wanted, names, strict=True)}
 
     def rest(rows: dict[Any, Any], missing: int) -> tuple[dict[Any, Any], BaseException | None]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from drive_env.tools.options import check_free, check_writable
 from tuning.commands.options import (
     REFUSED,
     Json,
@@ -59,6 +60,9 @@ def identify(
             raise ValueError(f"there is no folder {out.parent} for --out; make it first")
         if out is not None and out.is_dir():
             raise ValueError(f"{out} is a folder; give a file for --out, e.g. {out / 'identified.json'}")
+        if out is not None:
+            check_free(out, "choose another --out")
+            check_writable(out)
         file = way_back(drive, "identify", None if out is None else out.with_suffix(""))
         from drive_env.whole_file import write_whole
         from tuning.identification import identify as run
