@@ -54,7 +54,7 @@ def test_a_trial_costs_what_the_environments_trials_cost(rigid):
     tried = bench.run(bench.rule)
     # The same by hand.
     drives = rigid.drives
-    trials = Trials(drives, rigid.motor, 1, bench._t_0)
+    trials = Trials(drives, rigid.motor, 1, bench.t_0)
     drives.machine.reset()
     everywhere = np.ones(4, bool)
     trials.recover(everywhere)

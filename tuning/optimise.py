@@ -77,6 +77,7 @@ class Row(NamedTuple):
     cost: ln J by measured terms.
     objectives: In the order of `OBJECTIVES`.
     aborted: Stopped, for it oscillated or tripped.
+    fragile: Not kept, for the axis went on shaking with these gains once something else had shaken it.
     """
 
     search: int
@@ -85,6 +86,12 @@ class Row(NamedTuple):
     cost: float
     objectives: tuple[float, ...]
     aborted: bool
+    fragile: bool = False
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the gains could be kept."""
+        return not (self.aborted or self.fragile)
 
 
 @dataclass(frozen=True)
@@ -99,6 +106,7 @@ class Optimised:
         drive_seconds: Time that passed on the drives [s].
         moves, aborts: Of every axis, (num_axes,).
         notes: What was in the way, of every machine; "" for nothing.
+        t_0: What the objective speed tells settling times over [s].
     """
 
     gains: Integers
@@ -109,10 +117,11 @@ class Optimised:
     moves: Integers
     aborts: Integers
     notes: tuple[str, ...]
+    t_0: float
 
     def front(self, objectives: Sequence[str], search: int = 0) -> list[Row]:
-        """Return the trials of a search that were not stopped and that no other beats in every objective."""
-        return pareto([row for row in self.rows if row.search == search and not row.aborted], objectives)
+        """Return the accepted trials of a search that no other of them beats in every objective."""
+        return pareto([row for row in self.rows if row.search == search and row.accepted], objectives)
 
 
 def optimise(
@@ -149,8 +158,9 @@ def optimise(
         gains, cost = search.best()
         bench.leave(gains)
     return Optimised(
-        gains, bench.rule, cost, tuple(search.rows), clock.seconds, bench.moves, bench.aborts, tuple(search.notes)
-    )
+        gains, bench.rule, cost, search.judged(), clock.seconds, bench.moves, bench.aborts, tuple(search.notes),
+        bench.t_0,
+    )  # fmt: skip
 
 
 class _Search:
@@ -213,6 +223,10 @@ class _Search:
                 if row is not None:
                     gains[self._axes_of(machine)], cost[machine] = row.gains, row.cost
         return gains, cost
+
+    def judged(self) -> tuple[Row, ...]:
+        """Return every trial, those marked whose gains were found fragile later."""
+        return tuple(row._replace(fragile=row.gains.tobytes() in self._fragile[row.search]) for row in self.rows)
 
     def _best_row(self, k: int) -> Row | None:
         unstopped = self._unstopped(k)

@@ -118,6 +118,7 @@ def joined(found: list[Optimised]) -> Optimised:
         np.concatenate([one.moves for one in found]),
         np.concatenate([one.aborts for one in found]),
         tuple(note for one in found for note in one.notes),
+        found[0].t_0,
     )
 
 
@@ -138,18 +139,20 @@ def _run(task: _Task, progress: Callable[[float], None] = lambda share: None) ->
         "costs": np.array([row.cost for row in rows], float),
         "objectives": np.array([row.objectives for row in rows], float).reshape(len(rows), -1),
         "aborted": np.array([row.aborted for row in rows], bool),
+        "fragile": np.array([row.fragile for row in rows], bool),
         "drive_seconds": np.array(found.drive_seconds),
         "moves": found.moves,
         "aborts": found.aborts,
         "notes": np.array(found.notes[:1]),
+        "t_0": np.array(found.t_0),
     }
 
 
 def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
     rows = tuple(
-        Row(search, int(number), gains, float(cost), tuple(objectives.tolist()), bool(aborted))
-        for number, gains, cost, objectives, aborted in zip(
-            *(arrays[name] for name in ("number", "tried", "costs", "objectives", "aborted")), strict=True
+        Row(search, int(number), gains, float(cost), tuple(objectives.tolist()), bool(aborted), bool(fragile))
+        for number, gains, cost, objectives, aborted, fragile in zip(
+            *(arrays[name] for name in ("number", "tried", "costs", "objectives", "aborted", "fragile")), strict=True
         )
     )
     return Optimised(
@@ -161,6 +164,7 @@ def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
         arrays["moves"],
         arrays["aborts"],
         tuple(map(str, arrays["notes"])),
+        float(arrays["t_0"]),
     )
 
 

@@ -88,6 +88,9 @@ class TrialBench:
         target: What is tuned; the drives may have any gains, also none.
         anew: Put emulated machines to rest at zero before every trial, so that a trial follows from machine, gains
             and its number alone; drives on a bus go on from where they are.
+
+    Attributes:
+        t_0: What settling times are told over [s].
     """
 
     def __init__(self, target: Target, *, anew: bool = False) -> None:
@@ -97,9 +100,9 @@ class TrialBench:
         self.moves = np.zeros(target.num_axes, np.int64)
         self._anew = anew and target.drives.machine is not None
         device, motor = target.device, target.motor
-        self._t_0 = 4.0 * float(small_time_constants(device, device.stage["velocity_filter"].default))
+        self.t_0 = 4.0 * float(small_time_constants(device, device.stage["velocity_filter"].default))
         self._drives = CalmedDrives(target.drives, motor.rated_current)
-        self._trials = Trials(self._drives, motor, target.axes_per_machine, self._t_0)
+        self._trials = Trials(self._drives, motor, target.axes_per_machine, self.t_0)
         self._reach = np.where(target.high >= -target.low, target.high, target.low)
         self._where = np.ones(target.num_axes, bool)
         self._direction = np.ones(target.num_axes, np.int64)
@@ -137,7 +140,7 @@ class TrialBench:
         for _ in range(SOFTENINGS):
             began = drives.read(POSITION)
             watched = WatchedDrives(self._drives, self._where, np.full(target.num_axes, target.current), noise)
-            trials = Trials(watched, target.motor, target.axes_per_machine, self._t_0)
+            trials = Trials(watched, target.motor, target.axes_per_machine, self.t_0)
             self.moves += MOVES_OF_IDENTIFICATION
             with suppress(OscillationError):
                 found = trials.identify(self._reach, self._where)
@@ -200,7 +203,7 @@ class TrialBench:
         self.moves[axes] += 1
         self.aborts[axes] += 1
         shape = (self.num_machines, self.target.axes_per_machine)
-        worst = np.array([np.log(1.0 + (SETTLED - PROFILE) * CYCLE / self._t_0), np.log(TRIP), 100.0])
+        worst = np.array([np.log(1.0 + (SETTLED - PROFILE) * CYCLE / self.t_0), np.log(TRIP), 100.0])
         machines = np.any(axes.reshape(shape), axis=1)
         return Tried(
             np.full(shape[0], np.log(TRIP)),
@@ -222,7 +225,7 @@ class TrialBench:
         """Return the objectives of every axis, (num_axes, 3)."""
         terms, moves = tried.terms, tried.aborted[:2].any(axis=0)
         # Of a move that was stopped it is known only that it is no good: the slowest there is.
-        slowest = 1.0 + (SETTLED - PROFILE) * CYCLE / self._t_0
+        slowest = 1.0 + (SETTLED - PROFILE) * CYCLE / self.t_0
         speed = np.log(np.where(moves, slowest, terms.settling[:2].max(axis=0)))
         # Without E_d/E_0, of which a probe with 1.5 times the gain has less in any case.
         j = cost(terms._replace(tripped=tried.aborted))

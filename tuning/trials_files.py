@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +22,15 @@ from tuning.trial_bench import OBJECTIVES
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-KEPT, STOPPED, FRONT = "#0072b2", "#d55e00", "black"
-UNITS = {"speed": "ln t_s/t_0", "robustness": "ln J worst / J moves", "current": "ripple [% of rated]",
-         COST: "ln J by measured terms"}  # fmt: skip
-
+KEPT, STOPPED, FRAGILE, FRONT = "#0072b2", "#d55e00", "#cc79a7", "black"
+# What each objective is told as, less is better; the search itself knows the first three as logarithms.
+TITLES = {COST: "J", "speed": "settles [ms]", "robustness": "worst J over J", "current": "ripple [%]"}
+MEANINGS = {
+    COST: "J by measured terms",
+    "speed": "settling time, the slower of move and reversal [ms]",
+    "robustness": "J of the worst phase over that of the moves",
+    "current": "ripple of the current [% of rated]",
+}
 
 HEADER = "# The whole search. It repeats from this file: drive-tune optimise --config settings.toml\n"
 _SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed")
@@ -49,11 +55,14 @@ def save(
     """
     table = io.StringIO()
     writer = csv.writer(table)
-    writer.writerow(["search", "trial", "axis", *Gains._fields, "cost", *OBJECTIVES, "stopped"])
+    names = (COST, *OBJECTIVES)
+    writer.writerow(
+        ["search", "trial", "axis", *Gains._fields, *(TITLES[name] for name in names), "stopped", "fragile"]
+    )
     for row in found.rows:
-        figures = [f"{value:.6g}" for value in (row.cost, *row.objectives)]
+        values = [f"{value:.6g}" for value in figures(row, names, found.t_0)]
         for axis, gains in enumerate(row.gains.tolist()):
-            writer.writerow([row.search, row.number, axis, *gains, *figures, row.aborted])
+            writer.writerow([row.search, row.number, axis, *gains, *values, row.aborted, row.fragile])
     write_whole(folder / "trials.csv", table.getvalue())
     lines = _lines({name: getattr(settings, name) for name in _SEARCH})
     if settings.journal is not None:
@@ -64,6 +73,13 @@ def save(
     picture = io.BytesIO()
     trials_figure(found, settings).savefig(picture, dpi=120)
     write_whole(folder / "trials.png", picture.getvalue())
+
+
+def figures(row: Row, objectives: Sequence[str], t_0: float) -> list[float]:
+    """Return what a trial reached in each objective, in the units of `TITLES`; `t_0` is that of the search [s]."""
+    scales = {COST: 1.0, "speed": 1e3 * t_0, "robustness": 1.0}
+    values = zip(objectives, objective_values(row, objectives), strict=True)
+    return [scales[name] * math.exp(value) if name in scales else value for name, value in values]
 
 
 def load_options(path: str | Path) -> dict[str, Any]:
@@ -107,30 +123,36 @@ def trials_figure(found: Optimised, settings: Settings) -> Figure:
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    rows = list(found.rows)
+    rows, names = list(found.rows), settings.objectives
     searches = [[row for row in rows if row.search == k] for k in sorted({row.search for row in rows})]
-    stopped = np.array([row.aborted for row in rows])
-    if len(settings.objectives) == 1:
+    values = np.array([figures(row, names[:2], found.t_0) for row in rows])
+    if len(names) == 1:
         for k, own in enumerate(searches):
-            _draw_best(axes, own, settings, "best so far" + (", of each search" if len(searches) > 1 else ""), k == 0)
+            label = "best accepted so far" + (", of each search" if len(searches) > 1 else "")
+            _draw_best(axes, own, [figures(row, names, found.t_0)[0] for row in own], label if k == 0 else None)
         axes.set_xlabel("trial")
-        axes.set_ylabel(f"{UNITS[settings.objectives[0]]}, less is better")
-        x = np.array([row.number for row in rows])
-        y = np.array([objective_values(row, settings.objectives)[0] for row in rows])
+        x, y = np.array([row.number for row in rows]), values[:, 0]
+        _scale(axes.yaxis, axes.set_yscale, names[0])
     else:
-        x, y = np.array([objective_values(row, settings.objectives)[:2] for row in rows]).T
-        kept = [row for row in rows if not row.aborted]
-        best = np.array([objective_values(row, settings.objectives)[:2] for row in pareto(kept, settings.objectives)])
-        if best.size:
-            axes.plot(*best.T, color=FRONT, marker="o", markersize=9, fillstyle="none", linestyle="none",
-                      label="beaten by none in every objective")  # fmt: skip
-        axes.set_xlabel(f"{settings.objectives[0]}: {UNITS[settings.objectives[0]]}, less is better")
-        axes.set_ylabel(f"{settings.objectives[1]}: {UNITS[settings.objectives[1]]}, less is better")
-    axes.scatter(x[~stopped], y[~stopped], s=18, color=KEPT, label="trial")
-    if stopped.any():
-        axes.scatter(x[stopped], y[stopped], s=18, color=STOPPED, marker="x", label="stopped: it oscillated or tripped")
+        x, y = values.T
+        front = [figures(row, names[:2], found.t_0) for row in pareto([row for row in rows if row.accepted], names)]
+        if front:
+            axes.plot(*np.array(front).T, color=FRONT, marker="o", markersize=9, fillstyle="none", linestyle="none",
+                      label="accepted, and beaten by none in every objective")  # fmt: skip
+        axes.set_xlabel(MEANINGS[names[0]])
+        _scale(axes.xaxis, axes.set_xscale, names[0])
+        _scale(axes.yaxis, axes.set_yscale, names[1])
+    axes.set_ylabel(MEANINGS[names[min(1, len(names) - 1)]])
+    stopped, fragile = (np.array([getattr(row, name) for row in rows]) for name in ("aborted", "fragile"))
+    for where, color, marker, label in (
+        (~stopped & ~fragile, KEPT, "o", "trial"),
+        (stopped, STOPPED, "x", "stopped: it oscillated or tripped"),
+        (fragile & ~stopped, FRAGILE, "s", "not kept: it went on shaking once something had shaken it"),
+    ):
+        if where.any():
+            axes.scatter(x[where], y[where], s=18, color=color, marker=marker, label=label)
     several = f", {len(searches)} searches" if len(searches) > 1 else ""
-    title = f"{settings.sampler}{', safe' if settings.safe else ''}, seed {settings.seed}{several}"
+    title = f"{settings.sampler}{', safe' if settings.safe else ''}, seed {settings.seed}{several}; less is better"
     axes.set_title(title, fontsize=10)
     axes.grid(color="0.9")
     axes.set_axisbelow(True)
@@ -138,9 +160,21 @@ def trials_figure(found: Optimised, settings: Settings) -> Figure:
     return figure
 
 
-def _draw_best(axes: Any, rows: list[Row], settings: Settings, label: str, named: bool) -> None:
-    """Draw what a search had found by each of its trials."""
-    value = [np.inf if row.aborted else objective_values(row, settings.objectives)[0] for row in rows]
-    best = np.minimum.accumulate(value)
+def _scale(axis: Any, set_scale: Any, name: str) -> None:
+    """Scale an axis of a picture: what is a factor by its logarithm, with plain numbers at the lines."""
+    if name == "current":
+        return
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    set_scale("log")
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _draw_best(axes: Any, rows: list[Row], values: list[float], label: str | None) -> None:
+    """Draw what a search had found by each of its trials, of those that were accepted."""
+    accepted = [value if row.accepted else np.inf for row, value in zip(rows, values, strict=True)]
+    best = np.minimum.accumulate(accepted)
     axes.step([row.number for row in rows], np.where(np.isfinite(best), best, np.nan), where="post", color=FRONT,
-              linewidth=1.2, alpha=0.8, label=label if named else None)  # fmt: skip
+              linewidth=1.2, alpha=0.8, label=label)  # fmt: skip

@@ -26,6 +26,7 @@ from agents.commands.options import (
     progress_bar,
 )
 from drive_env.tools.options import Yes, was_typed
+from drive_env.tools.tables import print_lines
 from tuning.commands.options import ask_to_turn
 
 EMULATOR = "emulator"
@@ -390,25 +391,25 @@ def _tell(
             | ({} if before is None else {"before": str(before)})
         )
         return
-    print(f"{found.policy} in {found.environment} on the {found.side}, {len(found.seeds)} episodes")
+    lines = [f"{found.policy} in {found.environment} on the {found.side}, {len(found.seeds)} episodes"]
     for name in found.values:
         one = found.interval(name)
-        print(f"{name}: {one.mean:.4g} (95 % of {one.low:.4g} to {one.high:.4g}), median {one.median:.4g}")
+        lines.append(f"{name}: {one.mean:.4g} (95 % of {one.low:.4g} to {one.high:.4g}), median {one.median:.4g}")
     count = sum(found.violations.values())
     which = "".join(f", {number} x {name}" for name, number in found.violations.items())
-    print(f"violations: {count}{which}")
+    lines.append(f"violations: {count}{which}")
     if found.pace > SLOW or found.late > LATE:
-        print(
+        lines.append(
             f"steps took {found.pace:.2f} times the time that they should, {found.late:.1%} of the SYNCs in them were "
             "more than a cycle late: this computer is too slow or too busy, and the figures show that; end other "
             "programs, put `chrt -f 10` before the command (Linux), or take a lower rate or a smaller network"
         )
-    for line in gaps:
-        print(line)
+    lines += gaps
     if before is not None:
         from tuning.snapshot import what_is_left
 
-        print(what_is_left(before))
+        lines.append(what_is_left(before))
+    print_lines(lines)
 
 
 def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:

@@ -36,7 +36,7 @@ Config = Annotated[Path | None, typer.Option("--config", help="Hyper-parameters 
 Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random.")]
 Steps = Annotated[int | None, typer.Option("--steps", help="Steps of all lanes together, in place of the preset's.")]
 Out = Annotated[
-    Path | None, typer.Option("--out", help="Folder for the results, new or empty.", show_default="runs/<timestamp>-…")
+    Path | None, typer.Option("--out", help="Folder for the results, new or empty.", show_default="a new one in runs/")
 ]
 Trust = Annotated[
     bool,

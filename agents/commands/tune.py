@@ -25,6 +25,7 @@ from agents.commands.options import (
     print_json,
 )
 from drive_env.tools.options import DeviceName, Yes, look_first, names_a_bus
+from drive_env.tools.tables import print_lines
 from tuning.commands.options import MotorName, Supply, TravelRange, ask_to_turn
 
 MOST_TRIALS = 10_000
@@ -184,30 +185,30 @@ def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:
             }
         )
         return not found.refused
-    print(f"dry run on {target.device.name}, {target.motor.name}, {target.machine}: the drive is read, nothing else")
-    for check in found.checks:
-        print(f"  {check.verdict:<4}  {check.what}: {check.found}")
-    print(f"a run would identify (about 4 s), make 1 + {trials} trials of 3 moves of 250 ms, what oscillates stopped "
-          "within 50 ms,")  # fmt: skip
-    print(
-        "show a move, measure the frequency response, move with the gains before; then the drive keeps what passed, or"
+    lines = [f"dry run on {target.device.name}, {target.motor.name}, {target.machine}: the drive is read, nothing else"]
+    lines += [f"  {check.verdict:<4}  {check.what}: {check.found}" for check in found.checks]
+    lines.append(
+        f"a run would identify (about 4 s), make 1 + {trials} trials of 3 moves of 250 ms, what oscillates stopped "
+        "within 50 ms, show a move, measure the frequency response, move with the gains before; then the drive keeps "
+        "what passed, or has again what it had. It would write:"
     )
-    print("has again what it had. It would write:")
-    for _, group in groupby(found.writes, key=lambda write: write.why):
-        _tell_writes(list(group))
-    print("What does not stay is put back at the end, and all of it if something goes wrong.")
-    print("Nothing was written.")
+    lines += [_what_is_written(list(group)) for _, group in groupby(found.writes, key=lambda write: write.why)]
+    lines += [
+        "What does not stay is put back at the end, and all of it if something goes wrong.",
+        "Nothing was written.",
+    ]
+    print_lines(lines)
     return not found.refused
 
 
-def _tell_writes(group: list[Any]) -> None:
-    """Print objects that are written for the same thing: which, what they hold now, and to what."""
+def _what_is_written(group: list[Any]) -> str:
+    """Return objects that are written for the same thing: which, what they hold now, and to what."""
     first = group[0]
     objects = ", ".join(f"{index:04X}h:{sub:02X}" for index, sub in (write.key for write in group))
     values = [value for write in group for value in write.present or ()]
     now = ", ".join(f"{value:X}h" if first.key[0] < 0x2000 else str(value) for value in values) or "not there"
     to = f", then {first.values}" if first.values else ""
-    print(f"  {objects}: {first.why}; now {now}{to}{'; stays' if first.stays else ''}")
+    return f"  {objects}: {first.why}; now {now}{to}{'; stays' if first.stays else ''}"
 
 
 def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, json: bool) -> Run:
@@ -222,22 +223,20 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
         if trial.aborted[0]:
             mark = f"stopped: it oscillated or tripped{f'; {mark}' if trial.number == 0 else ''}"
         velocity_p, velocity_i, position_p = trial.gains[0, 2:]
-        print(
-            f"{trial.number or 'rule':>5} {velocity_p:>11} {velocity_i:>11} {position_p:>11} "
-            f"{trial.measured[0]:>8.3f}  {mark}".rstrip(),
-            flush=True,
-        )
+        figures = f"{trial.number or 'rule':>5} {velocity_p:>11} {velocity_i:>11} {position_p:>11}"
+        print_lines([f"{figures} {trial.measured[0]:>8.3f}  {mark}".rstrip()])
 
     def say(what: str) -> None:
         if not json:
             print(what, flush=True)
             if what == "trials":
-                print("J, less is better, counts settling time, stiffness, noise and overshoot of a move, its reversal")
-                print("and the move with 1.5 times velocity P, which shows how near to oscillation the gains are.")
+                print("J, less is better, counts settling time, stiffness, noise and overshoot of a")
+                print("move, its reversal and the move with 1.5 times velocity P, which shows how near")
+                print("to oscillation the gains are.")
                 print("trial  velocity P  velocity I  position P        J")
 
     if not json:
-        print(f"agent {agent} tunes {target.device.name} with {target.motor.name}: {target.machine}")
+        print_lines([f"agent {agent} tunes {target.device.name} with {target.motor.name}: {target.machine}"])
     folder.mkdir(parents=True, exist_ok=True)
     return run(
         target, policy, folder / "before.toml", name=agent, keep=store, show=show, say=say,
@@ -262,7 +261,7 @@ def _report(done: Run, folder: Path, json: bool, bus: bool) -> None:
     else:
         _print(done, refused, rule)
         way_back = ", before.toml for `drive-tune restore`" if bus else ""  # an emulated drive ended with this program
-        print(f"written to {folder}: report.html to read, certificate.json{way_back}")
+        print_lines([f"written to {folder}: report.html to read, certificate.json{way_back}"])
     if refused:
         raise typer.Exit(REFUSED)
 
@@ -272,29 +271,31 @@ def _print(done: Run, refused: list[str], rule: float | None) -> None:
 
     result = done.result
     axis, certified = result.axes[0], done.certificate.axes[0]
-    print(f"{'':<7}{''.join(f'{name:>12}' for name in GAIN_NAMES)}")
+    lines = [f"{'':<7}{''.join(f'{name:>12}' for name in GAIN_NAMES)}"]
     for name, gains in (("before", axis.before), ("after", axis.after)):
-        print(f"{name:<7}{''.join(f'{value:>12}' for value in gains)}")
+        lines.append(f"{name:<7}{''.join(f'{value:>12}' for value in gains)}")
     if axis.accepted and (said := _answer(done)):
-        print(said)
+        lines.append(said)
     if axis.accepted and rule is not None:
-        print(f"J {axis.proof:.3f}, {100.0 * axis.proof / rule:.0f} % of the fitted rule's {rule:.3f}; "
-              f"{certified.hardware_seconds:.1f} s of drive time, trials stopped: {certified.aborts}")  # fmt: skip
+        lines.append(
+            f"J {axis.proof:.3f}, {100.0 * axis.proof / rule:.0f} % of the fitted rule's {rule:.3f}; "
+            f"{certified.hardware_seconds:.1f} s of drive time, trials stopped: {certified.aborts}"
+        )
     for loop in certified.frequency_responses:
         if loop.tuned:
             margins = {n: f"{value:.3g}" if math.isfinite(value) else "not seen" for n, value in loop.margins.items()}
-            print(f"{loop.name}: {', '.join(f'{name} {text}' for name, text in margins.items())}")
+            lines.append(f"{loop.name}: {', '.join(f'{name} {text}' for name, text in margins.items())}")
     if axis.accepted:
-        print(axis.verdict)
-    for reservation in axis.reservations:
-        print(f"reservation: {reservation}")
-    for note in axis.notes:
-        print(note)
-    for line in refused:
-        print(line)
+        lines.append(axis.verdict)
+    lines += [f"reservation: {reservation}" for reservation in axis.reservations]
+    lines += [*axis.notes, *refused]
     if not refused:
-        print("the drive keeps the new gains over a power cycle" if result.kept else "the drive has the new gains "
-              "until it is switched off")  # fmt: skip
+        lines.append(
+            "the drive keeps the new gains over a power cycle"
+            if result.kept
+            else "the drive has the new gains until it is switched off"
+        )
+    print_lines(lines)
 
 
 def _answer(done: Run) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drive_env.tools.options import Json, ending_by, fail, print_json
+from drive_env.tools.tables import print_lines
 
 if TYPE_CHECKING:
     from drive_env.faults.table import Row
@@ -86,7 +87,7 @@ def _print_table(as_json: bool) -> None:
         for key, parameter in row.parameters.items():
             unit = "" if parameter.unit == "1" else f" {parameter.unit}"
             limits = f"{parameter.low:g}...{parameter.high:g}{unit}, default {parameter.default:g}"
-            print(f"    {key}: {parameter.meaning} ({limits})")
+            print_lines([f"    {key}: {parameter.meaning} ({limits})"])
 
 
 def _row(row: Row) -> dict[str, Any]:
@@ -102,4 +103,4 @@ def _print_status(faults: list[dict[str, Any]], as_json: bool) -> None:
         given = "".join(f" {key}={value:g}" for key, value in one["parameters"].items())
         lasts = "for ever" if one["duration"] is None else f"for {one['duration']:g} s"
         state = "is there" if one["active"] else "is to come"
-        print(f"{one['number']}: {one['name']}{where}{given}, {lasts}, {state}")
+        print_lines([f"{one['number']}: {one['name']}{where}{given}, {lasts}, {state}"])

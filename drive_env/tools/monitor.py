@@ -24,6 +24,7 @@ from drive_env.tools.options import (
     object_name,
     print_json,
 )
+from drive_env.tools.tables import Column, tables
 
 DEFAULT = ("6041", "6061", "6064", "606C", "6077")
 # Statusword: mask, value and state (CiA 402, state coding).
@@ -102,23 +103,25 @@ def _table(drives: Any, entries: list[Any], period: float, end: float) -> None:
             for message in drives.emergencies():
                 when = time.strftime("%H:%M:%S")
                 emergencies.append(f"{when}  {axis_name(drives, message.axis)}: {message.code:04X}h {message.name}")
-            live.update(_draw(drives, entries, _look(drives, entries), increments, emergencies[-5:]), refresh=True)
+            live.update(
+                _draw(drives, entries, _look(drives, entries), increments, emergencies[-5:], live.console.width),
+                refresh=True,
+            )
             if time.monotonic() + period > end:
                 return
             time.sleep(period)
 
 
-def _draw(drives: Any, entries: list[Any], values: Any, increments: list[float | None], emergencies: list[str]) -> Any:
-    from rich import box
+def _draw(
+    drives: Any, entries: list[Any], values: Any, increments: list[float | None], emergencies: list[str], width: int
+) -> Any:
     from rich.console import Group
-    from rich.table import Table
+    from rich.text import Text
 
     from drive_env.master.quantities import show
 
-    table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("object")
-    for axis in range(drives.num_axes):
-        table.add_column(axis_name(drives, axis), justify="right")
+    columns = [Column("object", "text"), *(Column(axis_name(drives, axis), "text") for axis in range(drives.num_axes))]
+    rows = []
     for entry in entries:
         cells = []
         for axis, value in enumerate(values[entry]):
@@ -129,5 +132,5 @@ def _draw(drives: Any, entries: list[Any], values: Any, increments: list[float |
                 cells.append(str(value))
             else:
                 cells.append(show(int(value), entry, increments[axis]))
-        table.add_row(entry.label, *cells)
-    return Group(table, *emergencies)
+        rows.append((entry.label, *cells))
+    return Group(*tables(columns, rows, width), *map(Text, emergencies))

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from drive_env.tools.options import Json, errors_as_exit_codes, print_json
+from drive_env.tools.tables import print_names
 
 KINDS = ("devices", "motors", "loads")
 
@@ -33,17 +34,4 @@ def list_names(
         if json:
             print_json(chosen)
         else:
-            _print(chosen)
-
-
-def _print(tables: dict[str, dict[str, str]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console()
-    for title, rows in tables.items():
-        table = Table(title=title, title_justify="left", box=None, show_header=False, pad_edge=False)
-        for name, meaning in rows.items():
-            table.add_row(name, meaning.replace("[", "\\["))
-        console.print(table)
-        console.print()
+            print_names(chosen)

@@ -31,6 +31,7 @@ from drive_env.tools.options import (
     look_first,
     print_json,
 )
+from drive_env.tools.tables import Column, print_table
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
@@ -391,16 +392,8 @@ def _print(differences: Iterable[Any], found: str, wanted: str, scale: float | N
     if not rows:
         print(f"no difference between {found} and {wanted}")
         return
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD)
-    for column in ("object", found, wanted):
-        table.add_column(column)
-    for row in rows:
-        table.add_row(row["object"], row["found text"], row["wanted text"])
-    Console().print(table)
+    columns = [Column(title, "text") for title in ("object", found, wanted)]
+    print_table(columns, [(row["object"], row["found text"], row["wanted text"]) for row in rows])
 
 
 def _row(difference: Any, scale: float | None) -> dict[str, Any]:

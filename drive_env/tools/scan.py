@@ -17,6 +17,7 @@ from drive_env.tools.options import (
     fail,
     print_json,
 )
+from drive_env.tools.tables import print_lines
 
 NOTHING_FOUND = 1
 GAP = 0.001  # between two requests [s]: 127 at once would overrun small controllers
@@ -132,11 +133,11 @@ def _print(found: list[dict[str, Any]], timeout: float) -> None:
         late = f"no answer to {late} within {timeout:g} s; try a longer --timeout" if late else ""
         if "device type" not in row:
             why = late if late and row["state"] != "stopped" else "no SDO answer"  # of a stopped node none comes
-            print(f"node {row['node']}  {why}" + (f" ({row['state']})" if row["state"] else ""))
+            print_lines([f"node {row['node']}  {why}" + (f" ({row['state']})" if row["state"] else "")])
             continue
         profile = row["device type"] & 0xFFFF
         facts = [row["device"] or "unknown device, give its --eds", row.get("name", "")]
         facts += [f"{name} {row[name]}" for name in ("hardware", "software") if name in row]
         facts += [f"{name} {row[name]:X}h" for name in ("vendor", "product", "revision", "serial") if name in row]
         facts += [f"CiA {profile}" if profile else "no profile", row["state"], late]
-        print(f"node {row['node']}  " + "  ".join(fact for fact in facts if fact))
+        print_lines([f"node {row['node']}  " + "  ".join(fact for fact in facts if fact)])

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from drive_env.tools.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     INTERRUPTED,
     REFUSED,
@@ -108,22 +109,18 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         files = {"snapshot": str(result.file)} | {what: str(folder / name) for what, name in names.items()}
         print_json({"axes": rows} | summary | files)
         return
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD)
-    heads = ("axis", "", "torque P, I", "velocity P, I", "position P", "velocity\nloop", "position\nloop")
-    for title in heads:
-        table.add_column(title, no_wrap=True)
+    columns = (
+        Column("axis"), Column("", "name"), Column("torque\nP, I", "name"), Column("velocity\nP, I", "name"),
+        Column("position\nP", "name"), Column("velocity\nloop", "name"), Column("position\nloop", "name"),
+    )  # fmt: skip
+    rows = []
     for k, axis in enumerate(result.axes):
         for name, gains in (("before", axis.before), ("after", axis.after)):
             told = name == "after" and axis.accepted
             margins = [_margins(axis, loop) if told else "" for loop in ("velocity", "position")]
             pairs = f"{gains.torque_p}, {gains.torque_i}", f"{gains.velocity_p}, {gains.velocity_i}"
-            table.add_row(str(k) if name == "before" else "", name, *pairs, str(gains.position_p), *margins)
-    console = Console()
-    console.print(table)
+            rows.append((str(k), name, *pairs, str(gains.position_p), *margins))
+    print_table(columns, rows)
     lines = []
     for k, axis in enumerate(result.axes):
         if not axis.accepted and axis.identified is None and result.drive_seconds[k] == 0.0:  # refused at the outset
@@ -141,7 +138,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
     lines.append(f"written to {folder}: before.toml, certificate.json, report.html")
     if target.bus:
         lines.append(f"drive-tune restore {result.file} brings back what was")
-    console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+    print_lines(lines)
 
 
 def _margins(axis: AxisRun, loop: str) -> str:

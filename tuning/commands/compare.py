@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from drive_env.tools.tables import Column, print_lines, print_names, print_table
 from tuning.commands.options import (
     INTERRUPTED,
     Json,
@@ -124,29 +125,17 @@ def _compare(
 
 
 def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
     from tuning.rivals import all_rivals
 
-    console = Console()
     machines = comparison.tuners[0].machines
-    table = Table(
-        title=f"Hidden J over the fitted rule's on {machines} machines",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        pad_edge=False,
-    )
-    table.add_column("tuner", no_wrap=True)
-    for title in ("median", "p95", "> 5 %\nworse", "time\n\\[s]", "moves", "stops", "vio-\nlations", "gave\nup"):
-        table.add_column(title, justify="right", no_wrap=True)
-    for row in comparison.tuners:
-        table.add_row(
-            row.tuner, f"{row.median:.3f}", f"{row.p95:.2f}", f"{100.0 * row.worse:.0f} %", f"{row.drive_seconds:.2f}",
-            f"{row.moves:.0f}", str(row.aborts), str(row.violations), str(row.failed),
-        )  # fmt: skip
-    console.print(table)
+    titles = ("median", "p95", "> 5 %\nworse", "time\n[s]", "moves", "stops", "violations", "gave\nup")
+    rows = [
+        (row.tuner, f"{row.median:.3f}", f"{row.p95:.2f}", f"{100.0 * row.worse:.0f} %", f"{row.drive_seconds:.2f}",
+         f"{row.moves:.0f}", str(row.aborts), str(row.violations), str(row.failed))
+        for row in comparison.tuners
+    ]  # fmt: skip
+    title = f"Hidden J over the fitted rule's on {machines} machines"
+    print_table([Column("tuner", "name"), *map(Column, titles)], rows, title)
     lines = ["Drive time and moves: median of a machine; stops, violations, gave up: all machines."]
     for row in all_rivals(comparison):
         lines.append(
@@ -157,24 +146,16 @@ def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
     failures = {(row.tuner, row.note) for row in comparison.rows if row.failed}
     lines += [f"{tuner} failed: {note}" for tuner, note in sorted(failures)]
     lines.append(f"written to {folder}: tuners.csv, rivals.csv, machines.csv, comparison.png, settings.toml")
-    console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+    print_lines(lines)
 
 
 def _list() -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     from tuning.suite import load_suite, suite_names
     from tuning.tuners import tuner_rows
 
-    console = Console()
-    tables = {
-        "tuners": [(row.name, row.meaning + (" (slow)" if row.slow else "")) for row in tuner_rows().values()],
-        "suites": [(name, f"{len(load_suite(name))} machines") for name in suite_names()],
-    }
-    for title, rows in tables.items():
-        table = Table(title=title, title_justify="left", box=None, show_header=False, pad_edge=False)
-        for name, meaning in rows:
-            table.add_row(name, meaning)
-        console.print(table)
-        console.print()
+    print_names(
+        {
+            "tuners": {row.name: row.meaning + (" (slow)" if row.slow else "") for row in tuner_rows().values()},
+            "suites": {name: f"{len(load_suite(name))} machines" for name in suite_names()},
+        }
+    )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drive_env.tools.options import check_free, check_writable
+from drive_env.tools.tables import Column, print_table
 from tuning.commands.options import (
     REFUSED,
     Json,
@@ -94,24 +95,17 @@ def row(found: Identification) -> dict[str, Any]:
 
 
 def _print(found: list[Identification]) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console()
+    columns = (Column("", "text"), Column("value"), Column("95 % interval", "text"), Column("unit", "name"))
     for axis, one in enumerate(found):
-        title = f"axis {axis}: " if len(found) > 1 else ""
-        table = Table(box=box.SIMPLE_HEAD, title=f"{title}{one.drive_time:.1f} s of drive time", title_justify="left")
-        for column in ("", "value", "95 % interval", "unit"):
-            table.add_column(column, justify="right" if column == "value" else "left")
+        head = f"axis {axis}: " if len(found) > 1 else ""
+        rows = []
         said = ""
         for name, estimate in one.estimates.items():
             if estimate.is_known:
-                table.add_row(
-                    TITLES[name], f"{estimate.value:.4g}", f"{estimate.low:.4g} to {estimate.high:.4g}",
-                    "" if estimate.unit == "1" else estimate.unit,
-                )  # fmt: skip
+                unit = "" if estimate.unit == "1" else estimate.unit
+                interval = f"{estimate.low:.4g} to {estimate.high:.4g}"
+                rows.append((TITLES[name], f"{estimate.value:.4g}", interval, unit))
             else:
-                table.add_row(TITLES[name], "-", "as above" if estimate.reason == said else estimate.reason, "")
+                rows.append((TITLES[name], "-", "as above" if estimate.reason == said else estimate.reason, ""))
                 said = estimate.reason
-        console.print(table)
+        print_table(columns, rows, f"{head}{one.drive_time:.1f} s of drive time")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from drive_env.tools.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
@@ -102,7 +104,7 @@ def optimise(
 
     What oscillates is stopped within 50 ms and gets the last good gains back. Afterwards the drive has the best gains;
     trials.csv, trials.png and settings.toml are written, from which `drive-tune optimise --config settings.toml`
-    repeats the search; on a bus also <out>-before.toml, from which drive-tune restore brings back what was.
+    repeats the search; on a bus also OUT-before.toml, from which drive-tune restore brings back what was.
     """
     with errors_as_exit_codes():
         check_seed(drive.seed)
@@ -274,37 +276,31 @@ def _report(
 
 def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: str) -> None:
     import numpy as np
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
 
     from drive_env.gains import Gains
     from tuning.optimise import COST
+    from tuning.trials_files import TITLES
 
-    console = Console()
     searches = sorted({row.search for row in found.rows})
     axes = len(found.gains) // max(len(searches), 1)
     kind = "Axis" if before is not None else "Search"
+    several = settings.objectives != (COST,)
+    shown = (COST, *(name for name in settings.objectives if name != COST))
+    titles = [name.replace("_", "\n") for name in Gains._fields] + [_on_two_lines(TITLES[name]) for name in shown]
+    columns = [Column("", "name"), *map(Column, titles)]
     for search in searches:
-        rows = found.front(settings.objectives, search)[:10] if settings.objectives != (COST,) else []
-        table = Table(
-            title=f"{kind} {search} of {where}" if len(searches) > 1 else f"Gains of {where}",
-            title_justify="left",
-            box=box.SIMPLE_HEAD,
-            padding=(0, 1, 0, 0),
-            pad_edge=False,
-        )
-        table.add_column("", no_wrap=True)
-        for name in (*Gains._fields, "ln J"):
-            table.add_column(name.replace("_", "\n"), justify="right", no_wrap=True)
-        first = next((row for row in found.rows if row.search == search), None)
-        if first is not None:
-            _add(table, "safe start" if settings.safe else "fitted rule", first.gains, first.cost)
-        for row in rows:
-            _add(table, f"front, trial {row.number}", row.gains, row.cost)
+        own = [row for row in found.rows if row.search == search]
+        rows = []
+        if own:
+            rows += _cells("safe start" if settings.safe else "the rule", own[0].gains, _told(own[0], shown, found.t_0))
+        for row in found.front(settings.objectives, search)[:10] if several else []:
+            rows += _cells(f"trial {row.number}", row.gains, _told(row, shown, found.t_0))
+        best = found.gains[search * axes : (search + 1) * axes]
         cost = found.cost[search if len(found.cost) == len(searches) else 0]
-        _add(table, "[bold]best", found.gains[search * axes : (search + 1) * axes], cost)
-        console.print(table)
+        row = next((row for row in own if row.cost == cost and np.array_equal(row.gains, best)), None)
+        rows += _cells("best", best, [""] * len(shown) if row is None else _told(row, shown, found.t_0))
+        title = f"{kind} {search} of {where}" if len(searches) > 1 else f"Gains of {where}"
+        print_table(columns, rows, title + ", with the trials that none beats in every objective" * several)
     stopped = sum(row.aborted for row in found.rows)
     lines = [f"{len(found.rows)} trials, {stopped} of them stopped, in {found.drive_seconds:.1f} s of drive time."]
     lines += sorted({note for note in found.notes if note})
@@ -313,11 +309,23 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
     lines.append(f"written to {folder}: trials.csv, trials.png, settings.toml")
     if before is not None:
         lines.append(f"drive-tune restore {before} brings back what the drives had")
-    console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+    print_lines(lines)
 
 
-def _add(table: Any, name: str, gains: Any, cost: float) -> None:
-    """Add the gains of a machine, a row for each of its axes."""
-    for axis, row in enumerate(gains):
-        title = name if axis == 0 else f"  axis {axis}"
-        table.add_row(title, *map(str, row), f"{cost:.2f}" if axis == 0 else "")
+def _on_two_lines(title: str) -> str:
+    """Return a title with its unit, or its second half, below."""
+    return title.replace(" [", "\n[").replace(" over ", "\nover ")
+
+
+def _told(row: Any, objectives: Sequence[str], t_0: float) -> list[str]:
+    from tuning.trials_files import figures
+
+    return [f"{value:.3g}" for value in figures(row, objectives, t_0)]
+
+
+def _cells(name: str, gains: Any, told: list[str]) -> list[tuple[str, ...]]:
+    """Return the rows of a machine's gains, one for each of its axes; what it reached stands in the first."""
+    return [
+        (name if axis == 0 else f"  axis {axis}", *map(str, row), *(told if axis == 0 else [""] * len(told)))
+        for axis, row in enumerate(gains)
+    ]

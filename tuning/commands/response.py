@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from drive_env.tools.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     REFUSED,
     Json,
@@ -145,29 +146,29 @@ def _plant(measured: MeasuredLoop, axis: int) -> dict[str, Any] | None:
 
 
 def _print(measured: MeasuredLoop, out: Path | None) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console()
-    table = Table(title=f"{measured.loop} loop", title_justify="left", box=box.SIMPLE_HEAD)
-    titles = ("axis", "phase margin\ndeg", "gain margin\ndB", "crossover\nHz", "bandwidth\nHz", "Ms", "coherent\n%")
-    for title in titles:
-        table.add_column(title, justify="right")
+    titles = (
+        "phase\nmargin\n[deg]", "at\n[Hz]", "gain\nmargin\n[dB]", "at\n[Hz]", "crossover\n[Hz]", "bandwidth\n[Hz]",
+        "\nMs", "coherent\n[%]",
+    )  # fmt: skip
+    rows = []
     for axis in _axes(measured):
+        found = measured.margins(axis)
         coherent = 100.0 * float(measured.trusted[~measured.traced, axis].mean())
-        figures = (*measured.margins(axis), coherent)
-        table.add_row(str(axis), *(_text(x, "{:.2f}" if k == 4 else "{:.1f}") for k, x in enumerate(figures)))
-    console.print(table)
+        figures = (
+            found.phase_deg, found.phase_hz, found.gain_db, found.gain_hz, found.crossover_hz, found.bandwidth_hz,
+            found.ms, coherent,
+        )  # fmt: skip
+        rows.append((str(axis), *(_text(x, "{:.2f}" if x is found.ms else "{:.1f}") for x in figures)))
+    print_table([Column("axis"), *map(Column, titles)], rows, f"{measured.loop} loop")
+    lines = []
     for axis in _axes(measured):
         if measured.fits[axis] is not None:
             for name, e in measured.estimates(axis).items():
                 said = e.reason if e.reason else f"{e.value:.4g} {e.unit} ({e.low:.4g} ... {e.high:.4g})"
-                console.print(f"axis {axis}: {name} {said}", highlight=False, markup=False, soft_wrap=True)
-        for note in measured.notes[axis]:
-            console.print(f"axis {axis}: {note}", highlight=False, markup=False, soft_wrap=True)
+                lines.append(f"axis {axis}: {name} {said}")
+        lines += [f"axis {axis}: {note}" for note in measured.notes[axis]]
     written = "" if out is None else f"; written to {out}"
-    console.print(f"{measured.drive_time:.2f} s of drive time{written}", highlight=False, markup=False, soft_wrap=True)
+    print_lines([*lines, f"{measured.drive_time:.2f} s of drive time{written}"])
 
 
 def _text(value: float, form: str) -> str:

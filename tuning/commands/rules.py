@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from drive_env.tools.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     REFUSED,
     Json,
@@ -192,39 +193,30 @@ def _as_json(target: Target, axis: _Axis) -> dict[str, Any]:
 
 
 def _print(target: Target, shown: _Axis, axis: int | None) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
     head, plant, rows = "" if axis is None else f"axis {axis}: ", shown.plant, shown.rows
-    console = Console()
     if isinstance(plant, str):
-        console.print(f"{head}{plant}", highlight=False, markup=False, soft_wrap=True)
+        print_lines([f"{head}{plant}"])
         return
     pair = f", resonances at {plant.anti_resonance:.0f} and {plant.resonance:.0f} Hz" if plant.is_elastic else ", rigid"
     title = f"{head}inertia {plant.inertia:.3g} kg m^2{pair}"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for title in ("rule", "2041h\nP", "I", "2042h\nP", "I", "2043h\nP", "cross\nHz", "phase\ndeg", "gain\ndB"):
-        table.add_column(title, justify="left" if title == "rule" else "right", no_wrap=True)
+    titles = ("2041h\nP", "\nI", "2042h\nP", "\nI", "2043h\nP", "cross\nHz", "phase\ndeg", "gain\ndB")
+    cells = []
     for name, proposal in rows.items():
         found = _margins(target, plant, proposal)
         figures = (found.crossover_hz, found.phase_deg, found.gain_db)
         shown_figures = (f"{figure:.0f}" if math.isfinite(figure) else "-" for figure in figures)
-        table.add_row(name, *map(str, proposal.gains), *shown_figures)
-    console.print(table)
+        cells.append((name, *map(str, proposal.gains), *shown_figures))
+    print_table([Column("rule", "name"), *map(Column, titles)], cells, title)
+    lines = []
     if plant.is_elastic and plant.damping == type(plant).damping:
-        console.print(
+        lines.append(
             "How much the resonance is damped is not identified: margins are computed with a ratio of "
-            f"{plant.damping:g}, hardly any; `drive-tune response` measures them.",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
+            f"{plant.damping:g}, hardly any; `drive-tune response` measures them."
         )
-    for name, proposal in rows.items():
-        for note in proposal.notes:
-            console.print(f"{name}: {note}", highlight=False, markup=False, soft_wrap=True)
+    lines += [f"{name}: {note}" for name, proposal in rows.items() for note in proposal.notes]
     if shown.unswung:
-        console.print(f"{MEASURED}: nothing: {shown.unswung}", highlight=False, markup=False, soft_wrap=True)
+        lines.append(f"{MEASURED}: nothing: {shown.unswung}")
+    print_lines(lines)
 
 
 def _apply(

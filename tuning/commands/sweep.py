@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from drive_env.tools.tables import Column, print_lines, print_names, print_table
 from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
@@ -99,7 +100,7 @@ def _sweep(
             result = _run_with_progress(experiment, console, pool if elsewhere else None, log, folder)
     result.save(folder)
     unfinished.discard(folder)
-    _print_result(console, result, folder)
+    _print_result(result, folder)
 
 
 def _note(console: Any, text: str) -> None:
@@ -146,10 +147,10 @@ def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folde
         signal.signal(signal.SIGINT, before)
 
 
-def _print_result(console: Any, result: Any, folder: Path) -> None:
+def _print_result(result: Any, folder: Path) -> None:
     usable = int((result.score < float("inf")).sum())
     if usable:
-        console.print(_best_table(result, min(BEST_ROWS, usable)))
+        _print_best(result, min(BEST_ROWS, usable))
     counts = ", ".join(
         f"{int(result.columns[flag].sum())} {word}"
         for flag, word in (("oscillates", "oscillate"), ("fault", "end in fault"), ("diverged", "diverge"))
@@ -164,27 +165,22 @@ def _print_result(console: Any, result: Any, folder: Path) -> None:
             f"{result.simulated / result.wall:.0f} x real time"
         )
     lines.append(f"written to {folder}: results.csv, heatmap.png, best_response.png, settings.toml")
-    console.print("\n".join(lines), highlight=False, markup=False, soft_wrap=True)
+    print_lines(lines)
 
 
-def _best_table(result: Any, count: int) -> Any:
-    from rich import box
-    from rich.table import Table
-
+def _print_best(result: Any, count: int) -> None:
     metric = result.experiment.metric.name
     figures = [name for name in TABLE_FIGURES if not name.startswith(f"{metric} [")]
     # Seven columns fit a terminal of 80 characters.
-    columns = [*result.objects, result.score_column, *figures[: max(0, 6 - len(result.objects))]]
-    table = Table(title=f"The best {count} of {len(result.order)} points by {metric}", box=box.SIMPLE_HEAD)
-    table.add_column("#", justify="right")
-    for name in columns:
-        # Seconds are read as milliseconds; a bracket would be taken for markup.
-        text = name.replace("score", metric).replace("[s]", "[ms]").replace(" [", "\n\\[")
-        table.add_column(text, justify="right", no_wrap=True)
+    shown = [*result.objects, result.score_column, *figures[: max(0, 6 - len(result.objects))]]
+    # Seconds are read as milliseconds.
+    titles = [name.replace("score", metric).replace("[s]", "[ms]").replace(" [", "\n[") for name in shown]
+    rows = []
     for row in result.best(count):
-        cells = (1e3 * row[name] if name.endswith("[s]") else row[name] for name in columns)
-        table.add_row(str(row["rank"]), *(str(cell) if isinstance(cell, int) else f"{cell:.4g}" for cell in cells))
-    return table
+        cells = (1e3 * row[name] if name.endswith("[s]") else row[name] for name in shown)
+        rows.append([str(row["rank"]), *(str(cell) if isinstance(cell, int) else f"{cell:.4g}" for cell in cells)])
+    title = f"The best {count} of {len(result.order)} points by {metric}"
+    print_table([Column("#"), *map(Column, titles)], rows, title)
 
 
 def _show_config(config: Path | None, overrides: dict[str, Any]) -> None:
@@ -199,9 +195,6 @@ def _show_config(config: Path | None, overrides: dict[str, Any]) -> None:
 
 
 def _list_names() -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     from drive_env.devices import device_names, find_device
     from drive_env.motors import MOTORS
     from mechanics.loads import LOADS
@@ -211,20 +204,15 @@ def _list_names() -> None:
     devices = [find_device(name) for name in device_names()]
     gains = [(device, entry) for device in devices for entry in gain_objects(device, device.new_dictionary())]
     combined = f"{TRACKING.meaning} (weights {', '.join(TRACKING.weights)})"
-    tables = {
-        "devices": [(device.name, device.title) for device in devices],
-        "gains to sweep": [
-            (f"{e.index:04X}h:{e.sub:02X}", f"{e.name}, {e.low}...{e.high} ({d.name})") for d, e in gains
-        ],
-        "motors": [(motor.name, motor.title) for motor in MOTORS.values()],
-        "loads": [(load.name, load.meaning) for load in LOADS.values()],
-        "metrics": [(f"{TRACKING.name} [{TRACKING.unit}]", combined)]
-        + [(f"{row.name} [{row.unit}]", row.meaning) for row in METRICS.values()],
-    }
-    console = Console()
-    for title, rows in tables.items():
-        table = Table(title=title, title_justify="left", box=None, show_header=False, pad_edge=False)
-        for name, meaning in rows:
-            table.add_row(name.replace("[", "\\["), meaning)
-        console.print(table)
-        console.print()
+    print_names(
+        {
+            "devices": {device.name: device.title for device in devices},
+            "gains to sweep": {
+                f"{e.index:04X}h:{e.sub:02X}": f"{e.name}, {e.low}...{e.high} ({d.name})" for d, e in gains
+            },
+            "motors": {motor.name: motor.title for motor in MOTORS.values()},
+            "loads": {load.name: load.meaning for load in LOADS.values()},
+            "metrics": {f"{TRACKING.name} [{TRACKING.unit}]": combined}
+            | {f"{row.name} [{row.unit}]": row.meaning for row in METRICS.values()},
+        }
+    )

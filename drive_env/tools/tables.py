@@ -1,0 +1,126 @@
+"""Tables and lines of all commands, readable in a terminal of 80 characters: no cell is cut, no word is broken."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+GAP = 2  # characters between two columns
+
+
+class Column(NamedTuple):
+    """A column: its title, which may have several lines, and how its cells are set."""
+
+    title: str
+    kind: str = (
+        "figure"  # figure: on the right; name: on the left; text: on the left, on several lines where it is long
+    )
+
+
+def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], title: str = "") -> None:
+    """Print a table; one that is wider than the terminal as several, each with the first column."""
+    from rich.console import Console
+
+    console = Console()
+    if title:
+        print_lines([title])
+    for table in tables(columns, list(rows), console.width):
+        console.print(table)
+        console.print()
+
+
+def tables(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int) -> list[Table]:
+    """Return a table no wider than so many characters, or as many as it takes; each has the first column."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    narrow, wide = _widths(columns, rows)
+    found = []
+    for group in _groups(narrow, width):
+        cut = _cut({k: wide[k] for k in group}, narrow, width)
+        table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), pad_edge=False)
+        for k in group:
+            column = columns[k]
+            side = "right" if column.kind == "figure" else "left"
+            table.add_column(Text(column.title), justify=side, width=cut[k], overflow="fold")
+        for row in rows:
+            table.add_row(*(Text(row[k]) for k in group))
+        found.append(table)
+    return found
+
+
+def print_names(lists: Mapping[str, Mapping[str, str]]) -> None:
+    """Print what there is by its names, with what each means, under titles."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console()
+    for title, rows in lists.items():
+        table = Table(title=title, title_justify="left", box=None, show_header=False, pad_edge=False)
+        table.add_column(no_wrap=True)
+        table.add_column()
+        for name, meaning in rows.items():
+            table.add_row(Text(name), Text(meaning))
+        console.print(table)
+        console.print()
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines; a terminal gets long ones broken between words, a file or another program gets them whole."""
+    width = terminal_width()
+    for line in lines:
+        indent = " " * (len(line) - len(line.lstrip()) + GAP)
+        print(
+            line
+            if width is None
+            else textwrap.fill(line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+        )
+    sys.stdout.flush()
+
+
+def terminal_width() -> int | None:
+    """Return how many characters a line of the terminal has; None where output goes elsewhere."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+
+
+def _widths(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> tuple[list[int], list[int]]:
+    """Return the least width of each column, at which no word is broken, and the one it would like."""
+    from rich.cells import cell_len
+
+    narrow, wide = [], []
+    for k, column in enumerate(columns):
+        cells = [*column.title.split("\n"), *(row[k] for row in rows)]
+        wide.append(max(map(cell_len, cells)))
+        words = [word for cell in cells for word in cell.split()] if column.kind == "text" else cells
+        narrow.append(max(map(cell_len, words), default=0))
+    return narrow, wide
+
+
+def _groups(narrow: Sequence[int], width: int) -> list[list[int]]:
+    """Return which columns stand side by side: the first, and as many others as there is room for."""
+    groups = [[0]]
+    for k in range(1, len(narrow)):
+        taken = sum(narrow[j] + GAP for j in groups[-1]) + narrow[k]
+        if taken > width and len(groups[-1]) > 1:
+            groups.append([0])
+        groups[-1].append(k)
+    return groups
+
+
+def _cut(widths: dict[int, int], narrow: Sequence[int], width: int) -> dict[int, int]:
+    """Return widths that fit beside each other: of the columns that can, the widest gives way first."""
+    cut = dict(widths)
+    while sum(cut.values()) + GAP * (len(cut) - 1) > width:
+        able = [k for k in cut if cut[k] > narrow[k]]
+        if not able:
+            break
+        cut[max(able, key=lambda k: cut[k])] -= 1
+    return cut
