@@ -415,9 +415,7 @@ def test_a_node_that_boots_has_forgotten_the_transfer(drive, bus, monkeypatch):
         assert drives.read(0x60FF) == [0]
         assert transcript(bus).count("601  40 FF 60 00 00 00 00 00") == 2
         boots_at_the_next_request(drive, monkeypatch)
-        with pytest.raises(
-            NoAnswerError, match="node 1 has restarted during the write of 7 to 60FFh"
-        ):
+        with pytest.raises(NoAnswerError, match="node 1 has restarted during the write of 7 to 60FFh"):
             drives.write(0x60FF, 7)
 
 
