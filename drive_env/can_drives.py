@@ -114,6 +114,7 @@ class CanDrives:
         self._port, self._sdo = self._connect(dry_run, bus, interface, channel, options)
         self._dry = bool(dry_run)
         self._network = Network(self._port, self.nodes)
+        self._network.on_boot = lambda node: self._sdo[self.nodes.index(node)].forget()
         self._pdos = [PdoConfiguration(n, s, self._description) for n, s in zip(self.nodes, self._sdo, strict=True)]
         self._process = ProcessData(self._description, self._pdos)
         self._cycle_runner = CycleRunner(

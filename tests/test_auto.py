@@ -18,6 +18,7 @@ from drive_env.safety.envelope import SafetyError
 from drive_env.score import HiddenScore
 from tuning import auto as auto_module
 from tuning import auto_margins, auto_search, auto_trials, provenance
+from tuning import proving as proving_module
 from tuning.auto import BUDGET, auto
 from tuning.auto_certificate import certificate
 from tuning.auto_checks import SENSITIVITY, sound_gains, unsafe_gains
@@ -287,6 +288,7 @@ def test_a_lively_loop_is_calmed_and_the_calmed_gains_are_tried_again(quick, mon
         return run(self, gains, where)
 
     monkeypatch.setattr(ProvingGround, "run", seen)
+    monkeypatch.setattr(proving_module, "RESTLESS", 1.0)  # or it would be slowed before
     monkeypatch.setattr(auto_margins, "LEAST_LINES", 1)
     monkeypatch.setattr(auto_margins, "SOFTER", (1.0, 0.5))
     measured, full = auto_margins._margins, []

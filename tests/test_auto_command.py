@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from drive_env.gains import RAW_MAX
 from tuning import auto_search, auto_settings
+from tuning.auto_moves import OVERTIME
 from tuning.certificate import is_unchanged
 from tuning.cli import app
 from tuning.snapshot import load_snapshot
@@ -83,7 +84,10 @@ def test_auto_leaves_the_way_back_a_certificate_and_a_report(tmp_path, monkeypat
     (axis,) = said["axes"]
     assert axis["accepted"]
     assert axis["before"] != axis["after"]
-    assert 0.0 < said["drive seconds"][0] < 10.0
+    # What shakes at rest has some time more than the ten seconds.
+    # What shakes at rest has some time more than the ten seconds.
+    was_eased = any("slowed to" in note for note in axis["notes"])
+    assert 0.0 < said["drive seconds"][0] < 10.0 + OVERTIME * was_eased
     assert sorted(path.name for path in out.iterdir()) == ["before.toml", "certificate.json", "report.html"]
     assert is_unchanged(out / "certificate.json")
     assert load_snapshot(out / "before.toml").axes[0][0x2042, 1] == axis["before"]["velocity_p"]

@@ -394,6 +394,31 @@ def test_a_reset_waits_for_the_boot_up_and_a_missing_one_is_told(drives, drive, 
         drives.reset_node()
 
 
+def boots_at_the_next_request(drive, monkeypatch):
+    """Have the drive boot in place of its next answer."""
+    answer, is_up = drive.receive, []
+
+    def receive(can_id, data, *rest):
+        if can_id != 0x601 or is_up:
+            return answer(can_id, data, *rest)
+        is_up.append(True)
+        return [(0x701, b"\0")]
+
+    monkeypatch.setattr(drive, "receive", receive)
+
+
+def test_a_node_that_boots_has_forgotten_the_transfer(drive, bus, monkeypatch):
+    """It is not waited for: a read is asked once more, a write is told."""
+    with CanDrives(bus=bus, pace="lockstep", safety=False, timeout=3600.0) as drives:
+        bus.log.clear()
+        boots_at_the_next_request(drive, monkeypatch)
+        assert drives.read(0x60FF) == [0]
+        assert transcript(bus).count("601  40 FF 60 00 00 00 00 00") == 2
+        boots_at_the_next_request(drive, monkeypatch)
+        with pytest.raises(NoAnswerError, match="node 1 has restarted during the write of 7 to 60FFh"):
+            drives.write(0x60FF, 7)
+
+
 def test_closed_drives_say_so(bus):
     drives = CanDrives(bus=bus, pace="lockstep")
     drives.close()

@@ -191,7 +191,7 @@ def test_default_loads_with_friction_follow_rk4(load, bound):
 
 
 @pytest.mark.parametrize("resonance", [130, 450])
-def test_error_falls_with_the_square_of_the_step(resonance):
+def test_the_step_of_an_elastic_axis_is_exact_at_every_size(resonance):
     k, d = shaft(resonance)
     # Steps on a grid that all step sizes share, so that every one sees the same torque.
     torque = excitation("steps at window starts", resonance)
@@ -204,8 +204,7 @@ def test_error_falls_with_the_square_of_the_step(resonance):
             load.plant, np.repeat(window_means(torque), parts), np.zeros(len(torque) // TICKS * parts), WINDOW / parts
         )
         errors.append(largest_error(found[parts - 1 :: parts, 1], oracle))
-    orders = np.log2(np.array(errors[:-1]) / errors[1:])
-    assert np.all(orders > 1.8), errors
+    assert max(errors) < 1e-4, errors  # per cent: what the oracle's own steps leave
 
 
 # --- closed loop ------------------------------------------------------------------------------------------------------

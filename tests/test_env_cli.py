@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import uuid
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import can
 import canopen
@@ -487,11 +487,18 @@ def mappings(channel):
     try:
         client = network.add_node(1, canopen.ObjectDictionary()).sdo
         client.RESPONSE_TIMEOUT = 20.0
+
+        def upload(index, sub):
+            for _ in range(20):  # answers to the other master may still be under way
+                with suppress(canopen.SdoCommunicationError):
+                    return client.upload(index, sub)
+            raise AssertionError(f"{index:04X}h:{sub:02X} has no answer of its own")
+
         found = []
         for number in range(4):
-            found.append(client.upload(0x1800 + number, 1))
-            count = client.upload(0x1A00 + number, 0)[0]
-            found += [client.upload(0x1A00 + number, k) for k in range(count + 1)]
+            found.append(upload(0x1800 + number, 1))
+            count = upload(0x1A00 + number, 0)[0]
+            found += [upload(0x1A00 + number, k) for k in range(count + 1)]
         return found
     finally:
         network.disconnect()

@@ -2,13 +2,11 @@
 
 import dataclasses
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from mechanics import loads
 from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
@@ -21,7 +19,7 @@ LEAD = 0.005 / (2 * math.pi)
 G = 9.81
 
 
-@cached(Path(loads.__file__).parent)
+@cached()
 def step_plant(plant, torque, moment, h, theta, omega, qvel):
     """Step one copy of one axis through torques and their first moments, (n, 1); write angle, speed and every qvel."""
     rows = np.zeros((2, 1))

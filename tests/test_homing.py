@@ -349,7 +349,7 @@ def test_disabled_while_homing_nothing_goes_on_after_enabling(belt):
 def test_methods_that_table_209_does_not_list_are_refused(belt, method):
     with pytest.raises(ObjectAccessError) as refused:
         belt.write(0x6098, method)
-    assert refused.value.abort_code == 0x06090030
+    assert refused.value.abort_code == (0x06090032 if method < 0 else 0x06090031 if method > 35 else 0x06090030)
 
 
 @pytest.mark.parametrize("missing", ["method 0", "fast", "slow", "acceleration", "factory"])

@@ -89,7 +89,7 @@ def pp(drives):
     motion.start_move(drives, -TURN, relative=True)  # replans under way
     yield watch(drives, 0.35)
     motion.move_to(drives, 0)
-    yield watch(drives, 0.02)
+    yield watch(drives, 0.1)  # an axis that is still turning would be braked by the envelope before its voltage goes
     motion.disable(drives)
     yield watch(drives, 0.02)
 

@@ -522,7 +522,11 @@ class Session:
                 drives.record([0x6041], 0.02, play={0x6040: [6] * 10 + [15] * 10})
             elif kind == "command":
                 drives.write(0x60FF, 300_000)
+            booted = []
+            other.subscribe(0x701, lambda data: booted.append(data) if data == b"\0" else None)
             for command in FOREIGN.get(kind, ()):
+                if command == 0x01:  # a node that still boots is deaf
+                    assert other.wait(lambda: booted, 10.0)
                 other.send(0x000, bytes((command, 1)))
             for _ in range(2 * (kind in FOREIGN)):  # the program is told, once
                 with contextlib.suppress(BusError, SafetyError):

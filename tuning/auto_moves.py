@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
 from tuning.auto_run import MOVE_TIME, TRIAL_TIME
-from tuning.auto_trials import faster
+from tuning.auto_trials import SCALED, faster
 from tuning.load_step import SWING, load_step
 from tuning.proving import RESTLESS
 
@@ -23,7 +23,10 @@ Mask = NDArray[np.bool_]
 SHOWINGS, AT_THE_EDGE = 3, 0.6  # moves for the record until one passes, and the factor of the gains between them
 CALMING = 0.5  # s after a load step that did not end, with gains that hold
 OVERTIME = 2.5  # s beyond the budget for axes that still shake: so near to the end they are not given up
-EASED, EASINGS = 0.8, 3  # the factor of gains with which an axis shook at rest, and how often they are eased
+# How often the gains of an axis that shook at rest are eased, and the least and greatest factor of its bandwidth. The
+# noise of the encoder goes into the current by velocity P, so that it falls as the bandwidth does.
+# What swings by more than LIMIT_CYCLE is no noise, and may swing more with less gain.
+EASINGS, EASED_LEAST, EASED, EASED_TO, LIMIT_CYCLE = 3, 0.5, 0.8, 0.9, 0.2
 
 
 def show(run: Run, where: Mask | None = None) -> None:
@@ -47,7 +50,8 @@ def show(run: Run, where: Mask | None = None) -> None:
         later = run.response_time + TRIAL_TIME + MOVE_TIME + run.look_back_time
         again = going & ~failed & shown.restless & ~eased & run.affordable(MOVE_TIME + later) & (where is None)
         for k in map(int, np.flatnonzero(again)):
-            _ease(run, k, _shook(float(shown.swing[k]), "at rest"))
+            swing = float(shown.swing[k])
+            _ease(run, k, swing, _shook(swing, "at rest"))
         eased |= again
         for k in map(int, np.flatnonzero(failed)):
             axis, why = run.axes[k], shown.reason[k]
@@ -58,6 +62,9 @@ def show(run: Run, where: Mask | None = None) -> None:
             if run.spare[k].any():
                 run.gains[k], run.spare[k] = run.spare[k], 0
                 axis.notes.append(f"the second best of the trial: with the best, in one more move {why}")
+            elif axis.eased and not np.array_equal(run.gains[k], run.reference[k]):
+                run.gains[k] = run.reference[k]
+                axis.notes.append(f"the gains of the fitted rule: with the eased ones, in one more move {why}")
             else:
                 run.gains[k] = faster(run.gains[k], AT_THE_EDGE)
                 axis.notes.append(f"slowed to {100.0 * AT_THE_EDGE:.0f} % after the trial: in one more move {why}")
@@ -69,19 +76,27 @@ def show(run: Run, where: Mask | None = None) -> None:
     run.drop_faults("it moved with the new gains")
 
 
-def _ease(run: Run, k: int, why: str) -> None:
-    """Take calmer gains for an axis that shook: what was second best, the same slowed down, or the fitted rule's."""
+def _ease(run: Run, k: int, swing: float, why: str) -> None:
+    """Take calmer gains for an axis that shook: the same, slowed by as much as it shook, or the fitted rule's.
+
+    Args:
+        run: The run.
+        k: The axis.
+        swing: Of its current over the rated one, RMS.
+        why: What it did, in words.
+    """
     axis, rule = run.axes[k], run.reference[k]
-    was_rule = np.array_equal(run.gains[k], rule)
-    if run.spare[k].any():
-        run.gains[k], run.spare[k] = run.spare[k], 0
-        axis.notes.append(f"the second best of the trial: with the best, {why}")
-    elif not axis.eased or was_rule:
-        run.gains[k] = faster(run.gains[k], EASED)
-        axis.notes.append(f"slowed to {100.0 * EASED:.0f} %: {why}")
-    else:
+    factor = float(np.clip(EASED_TO * RESTLESS / swing, EASED_LEAST, EASED))
+    slowed = faster(run.gains[k], factor)
+    is_rule = np.array_equal(run.gains[k], rule)
+    is_slow = bool(np.all(slowed[SCALED] <= rule[SCALED]))
+    if not is_rule and (swing > LIMIT_CYCLE or axis.eased == EASINGS - 1 or is_slow):
         run.gains[k] = rule
         axis.notes.append(f"the gains of the fitted rule: with faster ones {why}")
+    else:
+        run.gains[k] = slowed
+        axis.notes.append(f"slowed to {100.0 * factor:.0f} %: {why}")
+    run.spare[k] = 0  # about as fast as the best, which shook
     axis.eased += 1
 
 
@@ -101,24 +116,27 @@ def stand(run: Run, target: Target) -> None:
         shaking = _shaking(run, target)
         last = attempt == EASINGS
         again = np.zeros(run.target.num_axes, bool)
-        for k, why in shaking.items():
+        for k, (swing, why) in shaking.items():
             axis = run.axes[k]
             if last or axis.is_kept or not run.affordable(MOVE_TIME - OVERTIME)[k]:
                 axis.reason = f"it shakes at rest: {why}"
             else:
-                _ease(run, k, why)
+                _ease(run, k, swing, why)
                 again[k] = True
         if not again.any():
             return
         show(run, again & run.going)
 
 
-def _shaking(run: Run, target: Target) -> dict[int, str]:
-    """Return the axes that do not stand still, and what they did."""
+def _shaking(run: Run, target: Target) -> dict[int, tuple[float, str]]:
+    """Return the axes that do not stand still: by how much their current swings over the rated one, and in words."""
     going, shown = run.going, run.shown
     if shown is None or not going.any():
         return {}
-    found = {k: _shook(float(shown.swing[k]), "at rest") for k in np.flatnonzero(going & shown.restless).tolist()}
+    found = {}
+    for k in np.flatnonzero(going & shown.restless).tolist():
+        swing = float(shown.swing[k])
+        found[k] = swing, _shook(swing, "at rest")
     if target.drives.machine is not None:
         still = run.whole_machines(going & ~shown.restless)
         write_gains(target.drives, run.gains, still)
@@ -126,7 +144,7 @@ def _shaking(run: Run, target: Target) -> dict[int, str]:
         for k in np.flatnonzero(still).tolist():
             swing = 0.01 * run.loaded[k].figures[SWING]
             if swing > RESTLESS:
-                found[k] = _shook(swing, "after a load step of 0.3 of the rated torque")
+                found[k] = swing, _shook(swing, "after a load step of 0.3 of the rated torque")
         shook = run.whole_machines(~np.isin(np.arange(run.target.num_axes), list(found)))
         if not shook[still].all():
             # What the load step has set swinging says nothing of the next gains.

@@ -31,6 +31,8 @@ SWING = "current at rest afterwards, RMS over rated [%]"
 def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     """Return what a load step does to emulated axes with the gains they have; those that were off are off again.
 
+    What is drawn is the first of two, against each other; the swing is the worst after these and after their ends.
+
     Args:
         target: Emulated machines.
         where: Axes, shape (num_axes,); only those of machines all of whose axes are chosen take part.
@@ -51,19 +53,24 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     drives.advance(REST)
     try:
         rest = drives.record([POSITION, CURRENT], BEFORE)
-        drives.machine.load_torque = np.where(machines, -SHARE * target.motor.rated_torque / lever, 0.0)
-        loaded = drives.record([POSITION, CURRENT], AFTER)
+        windows = []
+        # Both ways, and what it does when the load is gone: loose gears swing one way and stand the other.
+        for share in (-SHARE, 0.0, SHARE, 0.0):
+            drives.machine.load_torque = np.where(machines, share * target.motor.rated_torque / lever, 0.0)
+            windows.append(drives.record([POSITION, CURRENT], AFTER))
     finally:
         drives.machine.load_torque = 0.0
         drives.advance(REST)
         if off.any():
             motion.disable(drives, where=off)
+    loaded = windows[0]
     raw = np.concatenate([rest[POSITION], loaded[POSITION]])
     angle = wrapped(raw - raw[0]) / target.increments()
     current = np.concatenate([rest[CURRENT], loaded[CURRENT]]) * 1e-3
     t = np.arange(len(angle), dtype=np.float64) * CYCLE
     # An integrator that is still on its way is no swing.
-    swing = detrend(current[-round(LOOKED_AT / CYCLE) :], axis=0).std(axis=0) / target.motor.rated_current
+    ends = [detrend(1e-3 * window[CURRENT][-round(LOOKED_AT / CYCLE) :], axis=0).std(axis=0) for window in windows]
+    swing = np.max(ends, axis=0) / target.motor.rated_current
     found = response.disturbance_metrics(t, angle, np.zeros(target.num_axes), t_load=BEFORE)
     return {
         axis: StepResponse(

@@ -41,6 +41,7 @@ class Network:
         self._emergencies: list[Emergency] = []
         self._booted: set[int] = set()
         self._resets = False
+        self.on_boot: Callable[[int], None] = lambda node: None
         self.on_restart: Callable[[int], None] = lambda node: None  # of a node that nobody here has reset
         self.on_error_control: Callable[[int, bytes], None] | None = None
         for node in self._nodes:
@@ -97,6 +98,7 @@ class Network:
             self.on_error_control(node, data)
         if data == bytes((BOOT_UP,)):
             self._booted.add(node)
+            self.on_boot(node)
             if not self._resets:
                 self.on_restart(node)
 

@@ -1,7 +1,7 @@
 """The SDO client of one node: python-canopen's transfers on our port, with a time-out for each.
 
 What differs from python-canopen's client: the thread that waits also receives; answers that belong to an earlier
-transfer are passed over; an abort names its object.
+transfer are passed over; a transfer ends when its node boots, which has forgotten it; an abort names its object.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._node = node
         self._alive = alive
         self._answers: list[bytes] = []
+        self._has_booted = False  # since the transfer under way began
         self._object = (0, 0)
         self._timeout = 0.5
         self._turn = threading.RLock()  # one transfer at a time: the supervisor's thread looks at the drive, too
@@ -104,6 +105,10 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         """
         self.send_request(struct.pack("<BHB", 0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0"))
 
+    def forget(self) -> None:
+        """End the transfer that is under way: the node has booted, and knows nothing of it."""
+        self._has_booted = True
+
     def guard(self) -> None:
         """Ask the node for its life (node guarding, CiA 301)."""
         self._port.send(ERROR_CONTROL + self._node, remote=True, length=1)
@@ -118,6 +123,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         where = f"node {self._node}"
         self._port.drain()
         self._answers.clear()
+        self._has_booted = False
         try:
             if data is None:
                 return bytes(self.upload(index, sub))
@@ -128,6 +134,10 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         except SdoCommunicationError as error:
             if "No SDO response" not in str(error):
                 raise BusError(f"{where} answered {what} wrongly: {error}; is another master on the bus?") from None
+            if self._has_booted:
+                raise NoAnswerError(
+                    f"{where} has restarted during {what}; check its power, and for another master that resets it"
+                ) from None
             raise NoAnswerError(
                 f"{where} did not answer {what} within {timeout:g} s; check power, bit rate and node-ID "
                 "(`drive-env scan`), and that the node is not stopped; a slow object takes a longer --timeout "
@@ -158,6 +168,8 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
                     if answer[0] == _ABORT:
                         raise SdoAbortedError(struct.unpack_from("<L", answer, 4)[0])
                     return answer
+            if self._has_booted:
+                raise SdoCommunicationError("No SDO response received")
             left = deadline - time.monotonic()
             if left <= 0.0 and not self._port.receive(done=self._answered):
                 raise SdoCommunicationError("No SDO response received")
@@ -166,7 +178,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             self._alive()
 
     def _answered(self) -> bool:
-        return bool(self._answers)
+        return bool(self._answers) or self._has_booted
 
     def abort(self, abort_code: int = 0x08000000) -> None:
         """Abort the transfer."""
