@@ -8,11 +8,14 @@ run goes on, since nothing in a folder proves who wrote it. What a file says of 
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import pickle
 import random
 import zipfile
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,7 @@ from mechanics.untrusted import MOST_TEXT, parse_json, read_member
 MOST_UNPACKED = 16_000_000_000  # bytes of a replay buffer: a million observations of a thousand entries, twice
 # What the JSON of a run has besides: it is read before anybody is trusted.
 _OF_A_RUN = {"algorithm": str, "environment": str, "configuration": dict, "timesteps": int, "run": dict}
+PLAIN = "data"  # what a file of Stable-Baselines3 says of its model, as JSON with pickles in it
 RUN, NORMALISER, BUFFER, RANDOM = "drive_agent.json", "normaliser.pkl", "replay_buffer.pkl", "random_states.pkl"
 
 
@@ -76,6 +80,46 @@ def check_trust(path: Path, trust: bool) -> None:
             "network, the drives). If it is yours, or of somebody whom you would let run a program here, say --trust "
             "(in Python trust=True); an agent.npz runs nothing and needs no trust"
         )
+
+
+def is_plain(path: Path) -> bool:
+    """Return whether a file is Stable-Baselines3's alone, without what drive-agent adds."""
+    if not zipfile.is_zipfile(path):
+        return False
+    names = _names(path)
+    return PLAIN in names and RUN not in names
+
+
+def load_plain(path: Path, *, trust: bool = False) -> Any:
+    """Return the model of a file of Stable-Baselines3's alone, whichever algorithm of its packages it is of.
+
+    Raises:
+        CheckpointError: If none of them has the policy's class; UntrustedError without `trust`.
+    """
+    check_trust(path, trust)
+    try:
+        said: Any = parse_json(_read(path, PLAIN))
+        module = said["policy_class"]["__module__"]
+    except (ValueError, TypeError, KeyError) as error:
+        raise CheckpointError(f"{path} is no file of Stable-Baselines3: {error}") from None
+    kinds = [kind for kind in _algorithms() if module in {one.__module__ for one in kind.policy_aliases.values()}]
+    if not kinds:
+        raise CheckpointError(
+            f"{path} has a policy of {module}, which no algorithm of Stable-Baselines3 has by itself; wrap it in a "
+            "function and give that (module:function)"
+        )
+    # Some share their policies: the one is meant of whose options the file tells most.
+    kind = max(kinds, key=lambda one: len(set(inspect.signature(one).parameters) & set(said)))
+    return kind.load(path, device="cpu")
+
+
+def _algorithms() -> list[Any]:
+    """Return the algorithms of Stable-Baselines3 and, if it is installed, of its contributions."""
+    found = []
+    for name in ("stable_baselines3", "sb3_contrib"):
+        with suppress(ImportError):
+            found += [kind for kind in vars(import_module(name)).values() if hasattr(kind, "policy_aliases")]
+    return found
 
 
 def load(path: Path, env: Any = None, *, trust: bool = False) -> tuple[Any, Any]:
@@ -145,5 +189,5 @@ def _read(path: Path, name: str) -> bytes:
     except KeyError:
         raise CheckpointError(
             f"{path} is no checkpoint of drive-agent: it holds no {name}. A bare file of Stable-Baselines3 lacks the "
-            "environment and the normaliser; wrap it in a function and give that (module:function)"
+            "environment and the normaliser: `drive-agent evaluate` reads it with --environment"
         ) from None

@@ -1,7 +1,7 @@
 """Any policy as something that acts: our bundle, a checkpoint of Stable-Baselines3, ONNX, or a Python callable.
 
-How it is written says what it is: the name of an agent that ships, agent.npz, checkpoint.zip, agent.onnx, or
-module:function.
+How it is written says what it is: the name of an agent that ships, agent.npz, checkpoint.zip (ours, or what
+Stable-Baselines3's `save` writes), agent.onnx, or module:function.
 """
 
 from __future__ import annotations
@@ -142,11 +142,15 @@ def is_checkpoint(text: str) -> bool:
 def described_checkpoint(text: str) -> LoadedPolicy:
     """Return what is known of a checkpoint, its policy None: nothing of its writer is run.
 
+    A file of Stable-Baselines3's own says nothing of its environment.
+
     Raises:
         CheckpointError: If the file is none.
     """
     from agents import checkpoint
 
+    if checkpoint.is_plain(Path(text)):
+        return LoadedPolicy(text, None)
     run = checkpoint.read_run(Path(text))
     card = {"trained": f"{run['algorithm']}, {run['timesteps']} steps", "seeds": {"training": run["run"]["seed"]}}
     return LoadedPolicy(text, None, run["environment"], run["configuration"], card)
@@ -156,6 +160,8 @@ def _checkpoint(text: str, trust: bool) -> LoadedPolicy:
     from agents import checkpoint
 
     described = described_checkpoint(text)
+    if checkpoint.is_plain(Path(text)):
+        return replace(described, policy=ModelPolicy(checkpoint.load_plain(Path(text), trust=trust), None))
     model, normaliser = checkpoint.load(Path(text), trust=trust)
     return replace(described, policy=ModelPolicy(model, normaliser))
 

@@ -13,7 +13,7 @@ import inspect
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +23,7 @@ import numpy as np
 from agents import checkpoint
 from agents.bundle import Bundle, plain
 from agents.hyperparameters import RUN_KEYS, HyperparameterError, schedule
+from agents.learning_curve import draw_learning_curve
 from agents.networks import bundle_of
 from agents.tasks import ENVIRONMENTS, configuration_of, environment_name, make_lanes
 from agents.training_lanes import CountedLanes
@@ -36,7 +37,7 @@ ALGORITHMS = {
     "sac": "stable_baselines3:SAC",
     "recurrent_ppo": "sb3_contrib:RecurrentPPO",
 }
-CHECKPOINT, AGENT, TABLE = "checkpoint.zip", "agent.npz", "training.csv"
+CHECKPOINT, AGENT, TABLE, CURVE = "checkpoint.zip", "agent.npz", "training.csv", "learning_curve.png"
 ROWS = 200  # of the table, about
 IMITATION = 1_000_000  # a segment's number that no run has, for seeds
 EPISODES_PER_SEGMENT = 3  # of every lane, at least
@@ -113,7 +114,9 @@ Report = Callable[[Progress], None]
 def train(
     run: Run, folder: str | Path, *, report: Report | None = None, resume: bool = False, trust: bool = False
 ) -> Bundle:
-    """Train an agent and return it; the folder gets agent.npz, checkpoint.zip, training.csv and TensorBoard's files.
+    """Train an agent and return it.
+
+    The folder gets agent.npz, checkpoint.zip, training.csv, its picture learning_curve.png, and TensorBoard's files.
 
     Args:
         run: What is trained; with `resume` None of it is used but the folder's own.
@@ -176,6 +179,15 @@ def train(
     finally:
         torch.set_num_threads(threads)
         env.close()
+
+
+def clear(folder: str | Path) -> None:
+    """Delete what a run has written that was ended before its first checkpoint: nothing can go on with it."""
+    folder = Path(folder)
+    for path in (folder / TABLE, *folder.glob("events.out.tfevents.*")):
+        path.unlink(missing_ok=True)
+    with suppress(OSError):  # not there, or something of the user's in it
+        folder.rmdir()
 
 
 def run_to_resume(folder: str | Path) -> Run:
@@ -424,6 +436,7 @@ def _segments_class() -> Any:
             elif self.num_timesteps // self._length > self._segment:
                 self._segment = self.num_timesteps // self._length
                 self._save()
+                self._draw()
                 self._begin_segment()
             if self.num_timesteps >= self._next_row:
                 self._next_row = self.num_timesteps + self._row_length
@@ -437,6 +450,11 @@ def _segments_class() -> Any:
             self._save()
             if self.num_timesteps and self._lanes.steps > self._row_steps:
                 self._tell()
+            self._draw()
+
+        def _draw(self) -> None:
+            title = f"{self._run.environment}, {self._run.algorithm}, {self._run.preset}, seed {self._run.seed}"
+            draw_learning_curve(self._folder / TABLE, self._folder / CURVE, title)
 
         def _save(self) -> None:
             checkpoint.save(

@@ -167,7 +167,13 @@ def reset_fault(drives: Drives, where: Mask | None = None, timeout: float = 1.0)
 def start_move(
     drives: Drives, position: ArrayLike, *, relative: bool = False, where: Mask | None = None, timeout: float = 1.0
 ) -> None:
-    """Start a move in pp to a position [inc], with the set-point handshake of bits 4 and 12."""
+    """Start a move in pp to a position [inc], with the set-point handshake of bits 4 and 12.
+
+    Raises:
+        RuntimeError: If an axis is not enabled, or not in pp; nothing is written.
+        TimeoutError: If the drive does not take the set-point within `timeout` [s].
+    """
+    _check_can_move(drives, where)
     word = 0x4F if relative else 0x0F
     drives.write(0x607A, position, where=where)
     drives.write(0x6040, word | 0x10, where=where)
@@ -182,10 +188,25 @@ def move_to(
     """Move in pp to a position [inc] and wait until it is reached.
 
     Raises:
+        RuntimeError: If an axis is not enabled, or not in pp; nothing is written.
         TimeoutError: If the target is not reached within `timeout` [s].
     """
     start_move(drives, position, relative=relative, where=where)
     wait_for(drives, TARGET_REACHED, timeout, "target reached", where)
+
+
+def _check_can_move(drives: Drives, where: Mask | None) -> None:
+    axes = np.ones(drives.num_axes, bool) if where is None else where
+    status, mode = drives.read(0x6041), drives.read(0x6061)
+    off = axes & (status & OPERATION_ENABLED[0] != OPERATION_ENABLED[1])
+    other = axes & (mode != MODES["pp"])
+    for wrong, what in ((off, "is not enabled"), (other, "is not in pp")):
+        if wrong.any():
+            axis = int(np.flatnonzero(wrong)[0])
+            raise RuntimeError(
+                f"axis {axis} {what} and cannot move: statusword {status[axis]:04X}h, mode {mode[axis]}; "
+                'motion.enable(drives, mode="pp") first'
+            )
 
 
 def home(drives: Drives, where: Mask | None = None, timeout: float = 60.0) -> None:

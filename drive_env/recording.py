@@ -72,6 +72,7 @@ class Recorder:
         self._rows: list[Floats] = []
         self._joints: list[Floats] = []
         self._load_torque: list[float] = []
+        self._wanted: list[Floats] = []  # position and velocity that a master follows, (2, A), nan where it has none
         self._events: list[tuple[float, str]] = []
 
     @property
@@ -100,9 +101,17 @@ class Recorder:
             self._load_torque.append(float(self.drives.machine.load_torque[self._machine]))
             trace = self.drives.record(_RECORDED, CYCLE)
             self._rows.append(np.array([trace[name][0, self._axes] for name in _RECORDED], np.float64))
+            self._wanted.append(np.full((2, self._axes.stop - self._axes.start), np.nan))
 
-    def look(self) -> None:
-        """Remember how things stand now, once per period, while someone else lets time pass."""
+    def look(self, wanted: tuple[Floats, Floats] | None = None) -> None:
+        """Remember how things stand now, once per period, while someone else lets time pass.
+
+        Args:
+            wanted: What a master follows that sends the drives something else: position [inc] and velocity [inc/s],
+                (num_axes,) each.
+        """
+        none = np.full(self.num_axes, np.nan)
+        self._wanted.append(np.stack([part[self._axes] for part in (wanted or (none, none))]))
         self._joints.append(self.drives.machine.joint_positions[self._machine])
         self._load_torque.append(float(self.drives.machine.load_torque[self._machine]))
         self._rows.append(np.array([self.drives.read(name)[self._axes] for name in _RECORDED], np.float64))
@@ -127,9 +136,11 @@ class Recorder:
         # From one millisecond to the next, across the end of the counter too.
         slope = units.wrap(np.diff(k[POSITION_DEMAND], axis=0, prepend=k[POSITION_DEMAND][:1]))
         profiled = from_raw(drives, POSITION_DEMAND, slope, self._axes) / self._period
-        none = np.full_like(mode, np.nan)
+        wanted = np.stack(self._wanted)
+        followed = from_raw(drives, POSITION_DEMAND, wanted[:, 0], self._axes)
+        followed_velocity = from_raw(drives, TARGET_VELOCITY, wanted[:, 1], self._axes)
         velocity_demand = np.where(mode == _CSV, si[TARGET_VELOCITY], np.where(np.isin(mode, _PROFILED_MODES), profiled,
-                                                                               none))  # fmt: skip
+                                                                               followed_velocity))  # fmt: skip
         from mechanics.shaft import way
 
         found = way(drives._groups[0].load)
@@ -140,11 +151,11 @@ class Recorder:
             linear=found.linear,
             t=np.arange(len(raw), dtype=np.float64) * self._period,
             joints=np.stack(self._joints),
-            position_demand=np.where(np.isin(mode, _PROFILED_MODES[::2]), si[POSITION_DEMAND], none),
+            position_demand=np.where(np.isin(mode, _PROFILED_MODES[::2]), si[POSITION_DEMAND], followed),
             position=si[POSITION],
             velocity_demand=velocity_demand,
             velocity=si[VELOCITY],
-            current_demand=np.where(mode == _CST, si[TARGET_CURRENT], none),
+            current_demand=np.where(mode == _CST, si[TARGET_CURRENT], np.nan),
             current=si[CURRENT],
             load_torque=np.array(self._load_torque),
             events=tuple(self._events),

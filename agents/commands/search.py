@@ -22,7 +22,7 @@ def search(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", help="Folder of the study; one that is there is gone on with.", show_default="runs/search-…"
+            "--out", help="Folder of the study; one that is there is gone on with.", show_default="a new one in runs/"
         ),
     ] = None,
 ) -> None:

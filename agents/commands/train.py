@@ -50,12 +50,13 @@ def train(
 ) -> None:
     """Train an agent with Stable-Baselines3 (pip install 'drive-env[agents]').
 
-    Writes agent.npz (the agent, its normaliser and its card), checkpoint.zip, training.csv and TensorBoard's files. The
-    same seed gives the same agent on the same machine, also when the run was interrupted and resumed.
+    Writes agent.npz (the agent, its normaliser and its card), checkpoint.zip, training.csv, learning_curve.png and
+    TensorBoard's files. The same seed gives the same agent on the same machine, also when the run was interrupted and
+    resumed.
     """
     with errors_as_exit_codes():
         from agents.tasks import ENVIRONMENTS
-        from agents.training import AGENT, CHECKPOINT, Run, run_to_resume, with_figures
+        from agents.training import AGENT, CHECKPOINT, CURVE, Run, clear, run_to_resume, with_figures
         from agents.training import train as run_training
 
         if resume is None:
@@ -79,7 +80,9 @@ def train(
                 bundle = run_training(run, folder, report=report, resume=resume is not None, trust=trust)
         except KeyboardInterrupt:
             if not (folder / CHECKPOINT).is_file():
-                raise
+                clear(folder)
+                fail("interrupted before the first checkpoint: there is nothing to go on with, and nothing is left",
+                     INTERRUPTED)  # fmt: skip
             fail(f"interrupted; go on with: drive-agent train --resume {folder} --trust", INTERRUPTED)
         print(f"judging it in {EPISODES} episodes with seeds that it has not seen", file=sys.stderr)
         evaluation = judge(bundle)
@@ -89,7 +92,7 @@ def train(
         for name in evaluation.values:
             found = evaluation.interval(name)
             print(f"{name}: {found.mean:.4g} (95 % of {found.low:.4g} to {found.high:.4g}), median {found.median:.4g}")
-        print(f"written to {folder / AGENT}")
+        print(f"written to {folder}: {AGENT}, {CHECKPOINT}, {CURVE}")
 
 
 def given_options(context: typer.Context) -> list[str]:

@@ -5,9 +5,15 @@ Each has a file with its vector environment, a class of `lanes.Lanes`; the singl
 
 from __future__ import annotations
 
-from typing import Any
+import importlib
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
+
+from mechanics.near_names import did_you_mean
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
 
 # Name -> file and class of the vector environment.
 ENVIRONMENTS = {
@@ -26,6 +32,31 @@ def register() -> None:
                 entry_point=f"drive_env.envs:make_{module}",
                 vector_entry_point=f"drive_env.envs.{module}:{kind}",
             )
+
+
+def make_vec_env(name: str, num_envs: int = 8, **options: Any) -> VecEnv:
+    """Return lanes of an environment as Stable-Baselines3 takes them, with the episodes' returns for its log.
+
+    Args:
+        name: As it is registered, e.g. "ServoDrive/Tracking-v0".
+        num_envs: Lanes.
+        options: Of the environment.
+
+    Raises:
+        ValueError: For a name that is none; ImportError without Stable-Baselines3 (the extra `agents`).
+    """
+    if name not in ENVIRONMENTS:
+        near = did_you_mean(name, ENVIRONMENTS)
+        raise ValueError(f"there is no environment {name!r}{near}; there are {', '.join(ENVIRONMENTS)}")
+    try:
+        from stable_baselines3.common.vec_env import VecMonitor
+
+        from drive_env.envs.stable_baselines import LanesVecEnv
+    except ImportError as error:
+        raise ImportError(f"make_vec_env needs Stable-Baselines3 ({error}): pip install 'drive-env[agents]'") from None
+    module, kind = ENVIRONMENTS[name]
+    lanes = getattr(importlib.import_module(f"drive_env.envs.{module}"), kind)
+    return VecMonitor(LanesVecEnv(lanes(num_envs, autoreset_mode="SameStep", **options)))
 
 
 def make_gain_tuning(**options: Any) -> gymnasium.Env[Any, Any]:

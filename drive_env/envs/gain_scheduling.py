@@ -17,7 +17,7 @@ from drive_env import motion
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.changing_payload import PayloadChanges, find_payload
 from drive_env.envs.configuration import configured
-from drive_env.envs.lanes import Info, Lanes, Stepped, check_choice
+from drive_env.envs.lanes import Info, Lanes, Reward, Stepped, check_choice
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
@@ -175,7 +175,7 @@ class GainScheduling(Lanes):
         config: A `GainSchedulingConfig`, a table like it, or a TOML file.
         drives: Drives to act on, `num_envs` machines of the configured load; emulated ones of the configuration by
             default. On a bus an episode begins with a fault reset and a move back to the start.
-        autoreset_mode, render_mode: As `Lanes` takes them.
+        autoreset_mode, render_mode, reward: As `Lanes` takes them.
         options: Fields of the configuration that replace its own.
 
     Raises:
@@ -190,6 +190,7 @@ class GainScheduling(Lanes):
         drives: Any = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        reward: Reward | None = None,
         **options: Any,
     ) -> None:
         self.config = configured(GainSchedulingConfig, config, options)
@@ -204,6 +205,7 @@ class GainScheduling(Lanes):
             Box(-1.0, 1.0, (self._axes * width,), np.float32),
             autoreset_mode=autoreset_mode,
             render_mode=render_mode,
+            reward=reward,
         )
         self._cycles = round(self.config.step / CYCLE)
         self._steps = round(self.config.duration / self.config.step)

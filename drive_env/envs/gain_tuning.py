@@ -25,7 +25,7 @@ from drive_env.envs.gain_observation import (
     true_entries,
 )
 from drive_env.envs.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
-from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Stepped, check_choice
+from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Reward, Stepped, check_choice
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
 from drive_env.gains import GAIN_OBJECTS, RAW_MAX, Gains, rule_gains, small_time_constants
@@ -166,7 +166,7 @@ class GainTuning(Lanes):
             trial, which stops the lane alone.
         reach: How far each rotor of given drives may turn from where it stands, with its sign [rad], shape
             (num_axes,); by the configuration's load or travel if not given.
-        autoreset_mode, render_mode: As `Lanes` takes them.
+        autoreset_mode, render_mode, reward: As `Lanes` takes them.
         options: Fields of the configuration that replace its own.
 
     Raises:
@@ -182,6 +182,7 @@ class GainTuning(Lanes):
         reach: ArrayLike | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        reward: Reward | None = None,
         **options: Any,
     ) -> None:
         self.config = configured(GainTuningConfig, config, options)
@@ -202,7 +203,9 @@ class GainTuning(Lanes):
                     raise ValueError("reach is of given drives; give travel in the configuration, or leave it out")
             elif self.config.distributions is not None or self.config.privileged:
                 raise ValueError("given drives are taken as they are: leave distributions and privileged out")
-            super().__init__(num_envs, *self._spaces(), autoreset_mode=autoreset_mode, render_mode=render_mode)
+            super().__init__(
+                num_envs, *self._spaces(), autoreset_mode=autoreset_mode, render_mode=render_mode, reward=reward
+            )
             if render_mode:
                 self._pictures = Pictures(self.drives, render_mode)
             self._prepare(reach)

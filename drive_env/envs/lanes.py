@@ -7,7 +7,7 @@ that it is the same among 1, 8 or 64 lanes and under any number of threads.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drive_env.envs.randomisation import Curriculum
 
@@ -24,6 +24,8 @@ Mask = NDArray[np.bool_]
 Info = dict[str, Any]
 Observation = Any  # an array with lanes first, or a dict of such arrays
 Stepped = tuple[Observation, Floats, Mask, Mask, Info]
+# Observations that come of a step, its actions, and its info, of all lanes -> rewards, shape (num_envs,).
+Reward = Callable[[Observation, Any, Info], ArrayLike]
 
 RENDER_MODES = ("rgb_array", "human")
 
@@ -44,9 +46,13 @@ class Lanes(VectorEnv[Any, Any, Any]):
         autoreset_mode: When an ended lane begins anew: "NextStep", "SameStep", or "Disabled": by
             `reset(options={"reset_mask": ...})` alone.
         render_mode: None, "rgb_array" or "human".
+        reward: Called after every step with the observations, the actions and the info of all lanes, of which
+            info["reward_terms"] are the environment's own terms, (num_envs,) each; returns the rewards, (num_envs,),
+            in place of the environment's.
 
     Raises:
-        ValueError: For a mode that is none, or less than one lane.
+        ValueError: For a mode that is none, or less than one lane; in a step for a reward of another shape, or one
+            that is no number.
     """
 
     config: Any
@@ -59,7 +65,10 @@ class Lanes(VectorEnv[Any, Any, Any]):
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        reward: Reward | None = None,
     ) -> None:
+        if reward is not None and not callable(reward):
+            raise ValueError(f"reward is a function of observations, actions and info, not {reward!r}")
         if num_envs < 1:
             raise ValueError(f"num_envs must be 1 or more, not {num_envs}")
         check_choice("render_mode", render_mode, (None, *RENDER_MODES))
@@ -70,6 +79,7 @@ class Lanes(VectorEnv[Any, Any, Any]):
         self.action_space = batch_space(action_space, num_envs)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.render_mode = render_mode
+        self.reward_function = reward
         self.metadata = {"render_modes": list(RENDER_MODES), "autoreset_mode": self.autoreset_mode}
         self.rngs = [seeding.np_random()[0] for _ in range(num_envs)]
         self._ended: Mask = np.zeros(num_envs, bool)
@@ -92,8 +102,18 @@ class Lanes(VectorEnv[Any, Any, Any]):
 
     def _step_alone(self, action: Any) -> tuple[Observation, float, bool, bool, Info]:
         """Act in the only lane there is, whose action this is; return what `gymnasium.Env.step` does."""
-        observation, reward, terminated, truncated, info = self._step_lanes(_batch_of_one(action))
+        observation, reward, terminated, truncated, info = self._step_rewarded(_batch_of_one(action))
         return one_of(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), one_of(info)
+
+    def _step_rewarded(self, action: Any) -> Stepped:
+        """Act in every lane; return what `_step_lanes` does, with the rewards of the user's function if he gave one."""
+        observation, reward, terminated, truncated, info = self._step_lanes(action)
+        if self.reward_function is None:
+            return observation, reward, terminated, truncated, info
+        own = np.asarray(self.reward_function(observation, action, info), float)
+        if own.shape != (self.num_envs,) or not np.isfinite(own).all():
+            raise ValueError(f"reward returned {own!r}; it must return {self.num_envs} numbers, one for each lane")
+        return observation, own.copy(), terminated, truncated, info
 
     def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
         raise NotImplementedError
@@ -161,7 +181,7 @@ class Lanes(VectorEnv[Any, Any, Any]):
             )
         if not _are_finite(actions):
             actions = _finite_actions(actions, before)
-        observation, reward, terminated, truncated, info = self._step_lanes(actions)
+        observation, reward, terminated, truncated, info = self._step_rewarded(actions)
         if self._some_ended:
             begun, told = self._reset_lanes(before, {})
             observation = merge(begun, observation, before)
@@ -253,7 +273,8 @@ class OneLane(gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded("the episode has ended or none has begun; call reset()")
         if not _are_finite(action):
             _finite_actions(_batch_of_one(action), np.zeros(1, bool))
-        stepped = lanes._step_alone(action)
+        # A user's reward is of all lanes' arrays; without one there is a way with less overhead.
+        stepped = lanes._step_alone(action) if lanes.reward_function is None else Lanes._step_alone(lanes, action)
         if stepped[2] or stepped[3]:
             lanes._ended = np.ones(1, bool)
             lanes._some_ended = True

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from drive_env.render import Picture
     from drive_env.window import Window
 
+Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
@@ -50,15 +51,15 @@ class Pictures:
         return bool(self._recorders)
 
     def begin(self, lanes: Mask) -> None:
-        """Begin a new recording of the lanes where the mask is true, of those that are shown."""
-        shown = {0} if self._window is not None else set(self._recorders)
+        """Begin a new recording of the lanes where the mask is true; a window shows lane 0 alone."""
+        shown = [0] if self._window is not None else range(len(lanes))
         for lane in [lane for lane in shown if lanes[lane]]:
             self._record(lane)
 
-    def look(self) -> None:
-        """Remember where the lanes that are shown are now."""
+    def look(self, wanted: tuple[Floats, Floats] | None = None) -> None:
+        """Remember where the lanes that are shown are now, and what is wanted of them, as `Recorder.look` takes it."""
         for recorder in self._recorders.values():
-            recorder.look()
+            recorder.look(wanted)
         if self._window is not None and self._recorders:
             self._looks += 1
             if self._looks * self._period >= FRAME - 1e-9:

@@ -16,7 +16,7 @@ from drive_env import motion
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
-from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Observation, Stepped, check_choice
+from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Observation, Reward, Stepped, check_choice
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines
 from drive_env.envs.trajectories import TRAJECTORIES, draw
@@ -181,7 +181,7 @@ class Tracking(Lanes):
         drives: Drives to act on, `num_envs` machines; emulated ones of the configuration by default. Without machine
             (on a bus) an episode begins with a fault reset and a move back to the start.
         sensor: Returns the pendulum's angle of each lane [rad], shape (num_envs,); needed on a bus alone.
-        autoreset_mode, render_mode: As `Lanes` takes them.
+        autoreset_mode, render_mode, reward: As `Lanes` takes them.
         options: Fields of the configuration that replace its own.
 
     Raises:
@@ -197,13 +197,16 @@ class Tracking(Lanes):
         sensor: Callable[[], ArrayLike] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        reward: Reward | None = None,
         **options: Any,
     ) -> None:
         self.config = configured(TrackingConfig, config, options)
         self._owned = drives is None
         self.drives = self._new_drives(num_envs) if drives is None else drives
         try:
-            super().__init__(num_envs, *self._spaces(num_envs), autoreset_mode=autoreset_mode, render_mode=render_mode)
+            super().__init__(
+                num_envs, *self._spaces(num_envs), autoreset_mode=autoreset_mode, render_mode=render_mode, reward=reward
+            )
             self._prepare(sensor)
         except BaseException:
             self._close_lanes()
@@ -341,8 +344,15 @@ class Tracking(Lanes):
             own.angles[:] = self._sensor()
         self._exchange.run()
         if self._pictures is not None:
-            self._pictures.look()
+            self._pictures.look(self._followed())
         return bool(own.ended[0].any())
+
+    def _followed(self) -> tuple[Floats, Floats]:
+        """Return the reference for how the drives stand now: position [inc] and velocity [inc/s], (num_axes,) each."""
+        own = self._episodes
+        at = np.clip(own.lanes["step"] * self.config.cycles, 0, own.reference.shape[2] - 1)
+        position, velocity = np.repeat(own.reference[np.arange(self.num_envs), :2, at], self._axes, axis=0).T
+        return own.origin + position, velocity
 
     def _step_lanes(self, action: Any) -> Stepped:
         some, own = self._act(action), self._episodes

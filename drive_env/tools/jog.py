@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
 
 from drive_env.tools.options import (
+    REFUSED,
     Bitrate,
     Channel,
     DeviceName,
@@ -17,6 +20,7 @@ from drive_env.tools.options import (
     WouldDo,
     connect,
     errors_as_exit_codes,
+    fail,
     increments_per_revolution,
     look_first,
     print_json,
@@ -25,6 +29,9 @@ from drive_env.tools.options import (
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 TARGET_VELOCITY, PROFILE_VELOCITY, TARGET_POSITION, POSITION = 0x60FF, 0x6081, 0x607A, 0x6064
 ACCELERATION, STATUSWORD = 0x6083, 0x6041
+INTERNAL_LIMIT = 0x0800  # bit 11 of the statusword
+LOOK, STANDS = 0.2, 0.05  # s between two looks, and the share of the speed asked for below which an axis stands
+LEAST, ENOUGH = 0.01, 0.9  # of the way asked for: less is no movement, and less with an emergency was stopped by that
 
 
 def jog(
@@ -47,7 +54,7 @@ def jog(
     """Enable an axis, turn it for a while or by a distance, and switch it off again.
 
     The safety envelope is on: Ctrl-C, a passed limit and a dead process all end in a quick stop. A negative speed
-    turns back: drive-env jog -- '-100 rpm'.
+    turns back: drive-env jog -- '-100 rpm'. Ends with 1 where something stopped it, or nothing moved.
     """
     with errors_as_exit_codes():
         from drive_env import motion
@@ -83,20 +90,62 @@ def jog(
             if dry_run:
                 _tell_plan(motion, drives, speed, by, duration, start, scale, json=json)
                 return
-            if distance is None:
-                _turn(motion, drives, velocity, round(duration, 3))
-            else:
-                _go(motion, drives, abs(velocity), distance)
-            motion.disable(drives)
+            reasons: list[str] = []
+            with _what_stops(reasons):
+                if distance is None:
+                    _turn(motion, drives, velocity, round(duration, 3))
+                else:
+                    _go(motion, drives, abs(velocity), distance)
+            with _what_stops([]):
+                motion.disable(drives)
             drives.advance(0.1)
             moved = int(drives.read(POSITION)[0]) - start
             emergencies = [message._asdict() for message in drives.emergencies()]
+        stopped = _verdict(moved, velocity * duration if distance is None else distance, reasons, emergencies)
         if json:
-            print_json({"moved": moved, "start": start, "emergencies": emergencies})
+            print_json({"moved": moved, "start": start, "emergencies": emergencies, "stopped": stopped})
         else:
             print(f"node {node} moved by {quantities.show(moved, known.find(POSITION), scale)}")
             for message in emergencies:
-                print(f"emergency {message['code']:04X}h {message['name']}")
+                print(f"emergency {_told(message)}")
+        if stopped:
+            fail(stopped, REFUSED)
+
+
+@contextlib.contextmanager
+def _what_stops(reasons: list[str]) -> Iterator[None]:
+    """Note what ends a movement early, in words of this command; what the bus says is none of it."""
+    from drive_env.master.errors import BusError
+    from drive_env.safety.envelope import SafetyError
+
+    try:
+        yield
+    except BusError:
+        raise
+    except SafetyError as error:
+        reasons.append(str(error).replace("Limits(current=...)", "--max-current").partition(", or set Limits(")[0])
+    except (RuntimeError, TimeoutError) as error:  # motion's, whose remedies are Python's
+        reasons.append(str(error).partition(";")[0])
+
+
+def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dict[str, Any]]) -> str:
+    """Return why a movement was not what was asked for; "" where it was."""
+    share = moved / asked
+    told = [_told(message) for message in emergencies if message["code"]]
+    if told and (reasons or share < ENOUGH):
+        return f"it was stopped: emergency {', '.join(dict.fromkeys(told))}{''.join(f'; {one}' for one in reasons)}"
+    if reasons:
+        return "; ".join(reasons)
+    if share < LEAST:
+        return (
+            "it hardly moved, and the drive names no reason: look for a brake, a load that is stuck, a limit of "
+            "current (--max-current, 2003h) or a small profile acceleration (6083h)"
+        )
+    return ""
+
+
+def _told(message: dict[str, Any]) -> str:
+    return f"{message['code']:04X}h {message['name'].replace('_', ' ')}"
 
 
 def _tell_plan(
@@ -145,6 +194,30 @@ def _go(motion: Any, drives: Any, velocity: int, distance: int) -> None:
     drives.write(PROFILE_VELOCITY, velocity)
     try:
         motion.enable(drives, mode="pp")
-        motion.move_to(drives, distance, relative=True, timeout=10.0 + 2.0 * abs(distance) / velocity)
+        motion.start_move(drives, distance, relative=True)
+        _arrive(motion, drives, velocity, 10.0 + 2.0 * abs(distance) / velocity)
     finally:
         drives.write(PROFILE_VELOCITY, before)
+
+
+def _arrive(motion: Any, drives: Any, velocity: int, timeout: float) -> None:
+    """Wait until the target is reached; RuntimeError for an axis that stands at a limit."""
+    from drive_env.master.errors import BusError
+
+    waited, before = 0.0, int(drives.read(POSITION)[0])
+    while True:
+        try:
+            motion.wait_for(drives, motion.TARGET_REACHED, LOOK, "its target")
+        except BusError:
+            raise
+        except TimeoutError:
+            waited += LOOK
+            here = int(drives.read(POSITION)[0])
+            is_still = abs(here - before) < STANDS * velocity * LOOK
+            if is_still and int(drives.read(STATUSWORD)[0]) & INTERNAL_LIMIT:
+                raise RuntimeError("it stands at a limit switch, or at a limit of position") from None
+            if waited >= timeout:
+                raise TimeoutError(f"it was not where it should be after {waited:.1f} s") from None
+            before = here
+        else:
+            return

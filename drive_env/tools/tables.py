@@ -6,7 +6,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -18,9 +18,8 @@ class Column(NamedTuple):
     """A column: its title, which may have several lines, and how its cells are set."""
 
     title: str
-    kind: str = (
-        "figure"  # figure: on the right; name: on the left; text: on the left, on several lines where it is long
-    )
+    # figure: on the right; name: on the left; text: on the left, on several lines where it is long
+    kind: Literal["figure", "name", "text"] = "figure"
 
 
 def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], title: str = "") -> None:
@@ -48,7 +47,7 @@ def tables(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int)
         table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), pad_edge=False)
         for k in group:
             column = columns[k]
-            side = "right" if column.kind == "figure" else "left"
+            side: Literal["right", "left"] = "right" if column.kind == "figure" else "left"
             table.add_column(Text(column.title), justify=side, width=cut[k], overflow="fold")
         for row in rows:
             table.add_row(*(Text(row[k]) for k in group))

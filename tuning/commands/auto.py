@@ -113,14 +113,14 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         Column("axis"), Column("", "name"), Column("torque\nP, I", "name"), Column("velocity\nP, I", "name"),
         Column("position\nP", "name"), Column("velocity\nloop", "name"), Column("position\nloop", "name"),
     )  # fmt: skip
-    rows = []
+    cells = []
     for k, axis in enumerate(result.axes):
         for name, gains in (("before", axis.before), ("after", axis.after)):
             told = name == "after" and axis.accepted
             margins = [_margins(axis, loop) if told else "" for loop in ("velocity", "position")]
             pairs = f"{gains.torque_p}, {gains.torque_i}", f"{gains.velocity_p}, {gains.velocity_i}"
-            rows.append((str(k), name, *pairs, str(gains.position_p), *margins))
-    print_table(columns, rows)
+            cells.append((str(k), name, *pairs, str(gains.position_p), *margins))
+    print_table(columns, cells)
     lines = []
     for k, axis in enumerate(result.axes):
         if not axis.accepted and axis.identified is None and result.drive_seconds[k] == 0.0:  # refused at the outset

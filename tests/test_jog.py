@@ -1,0 +1,62 @@
+"""`drive-env jog` ends with 1 where something stopped the axis, or nothing moved, and says what."""
+
+from __future__ import annotations
+
+import json
+import uuid
+
+import can
+import pytest
+from typer.testing import CliRunner
+
+import drive_env.cli
+from drive_env import EmulatedDrives
+from drive_env.bus.can_port import CanPort
+from drive_env.bus.server import Server
+from drive_env.bus.world import World
+
+TURN = 65536
+
+
+@pytest.fixture
+def jog(monkeypatch):
+    """A command on a belt axis with limit switches; and the axis."""
+    world = World(lockstep=False)
+    drives = EmulatedDrives(load="belt", num_threads=1)
+    world.add(drives, [1])
+    channel = str(uuid.uuid4())
+    for name, value in {"INTERFACE": "virtual", "CHANNEL": channel, "TIMEOUT": "20"}.items():
+        monkeypatch.setenv(f"DRIVE_ENV_{name}", value)
+    with Server(world, CanPort(can.Bus(interface="virtual", channel=channel))):
+        yield lambda *words: CliRunner().invoke(drive_env.cli.app, ["jog", *words]), drives
+    world.close()
+
+
+def is_off(drives):
+    return drives.read(0x6041)[0] & 0x4F == 0x40
+
+
+@pytest.mark.parametrize("words", [("2000 rpm", "--by", "-50 rev"), ("--for", "2", "--", "-2000 rpm")])
+def test_a_limit_switch_ends_it_and_is_named(jog, words):
+    run, drives = jog
+    found = run(*words)
+    assert found.exit_code == 1, found.output
+    assert "drive-env: it was stopped: emergency FF01h negative limit switch" in found.stderr
+    at_the_switch = drives.read(0x6064)[0]
+    assert at_the_switch < -4 * TURN and is_off(drives)
+    found = run("300 rpm", "--by", "-1 rev", "--json")
+    assert found.exit_code == 1 and "negative limit switch" in json.loads(found.stdout)["stopped"]
+    assert abs(drives.read(0x6064)[0] - at_the_switch) < TURN // 4
+    found = run("300 rpm", "--by", "1 rev", "--json")  # away from it: it is told, and stops nothing
+    assert found.exit_code == 0 and json.loads(found.stdout)["stopped"] == "", found.output
+    assert is_off(drives)
+
+
+def test_an_axis_that_does_not_move_is_told(jog):
+    run, drives = jog
+    slow = CliRunner().invoke(drive_env.cli.app, ["set", "6083", "1", "--yes"])  # increments per second and second
+    assert slow.exit_code == 0, slow.output
+    found = run("300 rpm", "--for", "0.2")
+    assert found.exit_code == 1, found.output
+    assert "it hardly moved, and the drive names no reason: look for a brake" in found.stderr
+    assert "Limits(" not in found.output and is_off(drives)
