@@ -172,7 +172,7 @@ def test_figures_keep_their_line_and_a_text_gives_way_between_words():
     rows = [("resistance, a phase", "0.35", "the excitation was too weak to tell it from nothing"), ("x", "-", "")]
     lines = printed(columns, rows, 50).splitlines()
     assert lines[0].split() == ["name", "value", "why"]
-    assert lines[2] == "resistance, a phase   0.35  the excitation was    "
+    assert lines[2] == "resistance, a phase   0.35  the excitation was too"
     assert max(map(len, lines)) <= 50
 
 

@@ -164,7 +164,8 @@ def _print(measured: MeasuredLoop, out: Path | None) -> None:
     for axis in _axes(measured):
         if measured.fits[axis] is not None:
             for name, e in measured.estimates(axis).items():
-                said = e.reason if e.reason else f"{e.value:.4g} {e.unit} ({e.low:.4g} ... {e.high:.4g})"
+                unit = "" if e.unit == "1" else f" {e.unit}"
+                said = e.reason if e.reason else f"{e.value:.4g}{unit} ({e.low:.4g} ... {e.high:.4g})"
                 lines.append(f"axis {axis}: {name} {said}")
         lines += [f"axis {axis}: {note}" for note in measured.notes[axis]]
     written = "" if out is None else f"; written to {out}"
