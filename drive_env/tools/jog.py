@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -23,12 +24,18 @@ from drive_env.tools.options import (
     fail,
     increments_per_revolution,
     look_first,
+    object_name,
     print_json,
 )
+from drive_env.tools.scope import DEFAULT, draw, new_files, write_table
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 TARGET_VELOCITY, PROFILE_VELOCITY, TARGET_POSITION, POSITION = 0x60FF, 0x6081, 0x607A, 0x6064
-ACCELERATION, STATUSWORD = 0x6083, 0x6041
+ACCELERATION, STATUSWORD, CONTROLWORD = 0x6083, 0x6041, 0x6040
+DEFAULT_KEYS = [(int(name, 16), 0) for name in DEFAULT]
+CYCLE = 0.001  # s between two samples
+FIRST, LAST = 20, 500  # samples at rest before a movement that is recorded, and besides the time that it should take
+RELATIVE, NEW_SET_POINT = 0x4F, 0x10  # controlword: enabled, targets are relative; and bit 4
 INTERNAL_LIMIT = 0x0800  # bit 11 of the statusword
 LOOK, STANDS = 0.2, 0.05  # s between two looks, and the share of the speed asked for below which an axis stands
 LEAST, ENOUGH = 0.01, 0.9  # of the way asked for: less is no movement, and less with an emergency was stopped by that
@@ -47,6 +54,10 @@ def jog(
     timeout: Timeout = None,
     max_current: Annotated[
         str | None, typer.Option(help="Limit of the current, which the drive holds; by default the drive's own.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Record the movement, as scope does: new files OUT.csv and OUT.png."),
     ] = None,
     json: Json = False,
     dry_run: WouldDo = False,
@@ -69,6 +80,7 @@ def jog(
             raise ValueError(f"--max-current {max_current} must be above 0 A; leave it out for the drive's own limit")
         if not 0.001 <= duration <= 3600.0:
             raise ValueError(f"--for {duration:g} s must be at least 0.001 s and at most an hour")
+        files = None if out is None else new_files(out)
         options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout}
         if dry_run:
             look_first(interface, channel, [node], bitrate, device, eds, timeout)
@@ -91,16 +103,22 @@ def jog(
                 _tell_plan(motion, drives, speed, by, duration, start, scale, json=json)
                 return
             reasons: list[str] = []
+            trace: Any = None
             with _what_stops(reasons):
                 if distance is None:
-                    _turn(motion, drives, velocity, round(duration, 3))
+                    trace = _turn(motion, drives, velocity, round(duration, 3), files is not None)
                 else:
-                    _go(motion, drives, abs(velocity), distance)
+                    trace = _go(motion, drives, abs(velocity), distance, files is not None)
             with _what_stops([]):
                 motion.disable(drives)
             drives.advance(0.1)
             moved = int(drives.read(POSITION)[0]) - start
             emergencies = [message._asdict() for message in drives.emergencies()]
+            if files is not None and trace is not None:
+                entries = [known.find(object_name(name)) for name in DEFAULT]
+                rows = {entry: trace[entry.index, entry.sub] for entry in entries}
+                write_table(files[0], entries, [""], trace.t, rows)
+                draw(files[1], entries, [""], [scale], trace.t, rows)
         stopped = _verdict(moved, velocity * duration if distance is None else distance, reasons, emergencies)
         if json:
             print_json({"moved": moved, "start": start, "emergencies": emergencies, "stopped": stopped})
@@ -108,6 +126,8 @@ def jog(
             print(f"node {node} moved by {quantities.show(moved, known.find(POSITION), scale)}")
             for message in emergencies:
                 print(f"emergency {_told(message)}")
+            if files is not None:
+                print("nothing was recorded" if trace is None else f"recorded in {files[0]} and {files[1]}")
         if stopped:
             fail(stopped, REFUSED)
 
@@ -177,27 +197,41 @@ def _tell_plan(
     )
 
 
-def _turn(motion: Any, drives: Any, velocity: int, duration: float) -> None:
-    """Turn in pv, then let the drive brake with its own deceleration."""
+def _turn(motion: Any, drives: Any, velocity: int, duration: float, is_recorded: bool) -> Any:
+    """Turn in pv, then let the drive brake with its own deceleration; return the samples that were wanted of it."""
     motion.enable(drives, mode="pv")
-    drives.write(TARGET_VELOCITY, velocity)
-    drives.advance(duration)
+    trace = None
+    if is_recorded:
+        rows = [0] * FIRST + [velocity] * round(duration / CYCLE) + [0] * LAST
+        trace = drives.record(DEFAULT_KEYS, len(rows) * CYCLE, play={TARGET_VELOCITY: rows})
+    else:
+        drives.write(TARGET_VELOCITY, velocity)
+        drives.advance(duration)
     drives.write(TARGET_VELOCITY, 0)
     # Bit 10 in pv tells that the ramp has ended.
     motion.wait_for(drives, motion.TARGET_REACHED, 10.0, "standstill")
     drives.advance(0.05)
+    return trace
 
 
-def _go(motion: Any, drives: Any, velocity: int, distance: int) -> None:
-    """Move in pp, and give the drive its profile velocity back."""
+def _go(motion: Any, drives: Any, velocity: int, distance: int, is_recorded: bool) -> Any:
+    """Move in pp, and give the drive its profile velocity back; return the samples that were wanted of it."""
+    trace = None
     before = int(drives.read(PROFILE_VELOCITY)[0])
     drives.write(PROFILE_VELOCITY, velocity)
     try:
         motion.enable(drives, mode="pp")
-        motion.start_move(drives, distance, relative=True)
+        if is_recorded:
+            count = FIRST + round(abs(distance) / velocity / CYCLE) + LAST
+            words = [RELATIVE] * FIRST + [RELATIVE | NEW_SET_POINT] * FIRST + [RELATIVE] * (count - 2 * FIRST)
+            play = {TARGET_POSITION: [distance] * count, CONTROLWORD: words}
+            trace = drives.record(DEFAULT_KEYS, count * CYCLE, play=play)
+        else:
+            motion.start_move(drives, distance, relative=True)
         _arrive(motion, drives, velocity, 10.0 + 2.0 * abs(distance) / velocity)
     finally:
         drives.write(PROFILE_VELOCITY, before)
+    return trace
 
 
 def _arrive(motion: Any, drives: Any, velocity: int, timeout: float) -> None:

@@ -78,12 +78,7 @@ def scope(
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     with errors_as_exit_codes():
         _check_times(duration=duration, before=before, wait=wait, period=period)
-        if not out.parent.is_dir():
-            raise ValueError(f"there is no folder {out.parent}; choose another --out")
-        table, picture = out.with_suffix(".csv"), out.with_suffix(".png")
-        for file in (table, picture):
-            check_free(file, "choose another --out")
-        check_writable(table)
+        table, picture = new_files(out)
         _listen(interface, channel, node, bitrate)
         with connect(interface, channel, node, device, eds, **options) as drives:
             known = drives.description.dictionary
@@ -97,8 +92,8 @@ def scope(
             raise broken
         every = round(period / 0.001)
         t, rows = _thin(rows, start, every)
-        _write_csv(table, entries, labels, t, rows)
-        _draw(picture, entries, labels, scales, t, rows)
+        write_table(table, entries, labels, t, rows)
+        draw(picture, entries, labels, scales, t, rows)
         summary = {"samples": len(t), "csv": str(table), "png": str(picture), "complete": broken is None}
         if json:
             print_json(summary | {"late": late, "worst lateness": worst})
@@ -109,6 +104,17 @@ def scope(
         if broken is not None:
             why, code = (str(broken), REFUSED) if isinstance(broken, Exception) else ("interrupted", INTERRUPTED)
             fail(f"{why}; the {len(t)} samples that came until then are in {table} and {picture}", code)
+
+
+def new_files(out: Path) -> tuple[Path, Path]:
+    """Return where table and picture go; ValueError where they cannot be written, or are there."""
+    if not out.parent.is_dir():
+        raise ValueError(f"there is no folder {out.parent}; choose another --out")
+    table, picture = out.with_suffix(".csv"), out.with_suffix(".png")
+    for file in (table, picture):
+        check_free(file, "choose another --out")
+    check_writable(table)
+    return table, picture
 
 
 def _listen(interface: str | None, channel: str | None, nodes: list[int] | None, bitrate: int | None) -> None:
@@ -228,7 +234,8 @@ def _thin(rows: dict[Any, Any], start: int, every: int) -> tuple[Any, dict[Any, 
     return (chosen - start) * 0.001, {entry: values[chosen] for entry, values in rows.items()}
 
 
-def _write_csv(path: Path, entries: list[Any], labels: list[str], t: Any, rows: dict[Any, Any]) -> None:
+def write_table(path: Path, entries: list[Any], labels: list[str], t: Any, rows: dict[Any, Any]) -> None:
+    """Write samples as CSV: times [s], then integers of each entry and axis, rows of shape (n, axes)."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         header = ["t [s]"]
@@ -240,9 +247,10 @@ def _write_csv(path: Path, entries: list[Any], labels: list[str], t: Any, rows: 
             writer.writerow([f"{time:.3f}", *(int(v) for entry in entries for v in rows[entry][k])])
 
 
-def _draw(
+def draw(
     path: Path, entries: list[Any], labels: list[str], scales: list[float | None], t: Any, rows: dict[Any, Any]
 ) -> None:
+    """Draw samples as PNG, a panel for each entry, in units where the scale of positions [inc/rev] is known."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
