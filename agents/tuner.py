@@ -174,7 +174,7 @@ NOT_OF_DRIVES = ("distributions", "privileged", "stage", "load", "motor", "devic
 
 
 def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
-    """Tune a target with the agent that ships, as `drive-tune compare` wants it (entry point `drive_env.tuners`)."""
+    """Tune a target with the agent that ships, as `drive-tune rank` wants it (entry point `drive_env.tuners`)."""
     from tuning.target import timed
     from tuning.tuners import Outcome
 

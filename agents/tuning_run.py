@@ -48,7 +48,7 @@ def run(
     Args:
         target: The drives.
         policy: A policy for GainTuning.
-        file: Where the state before is left, for `drive-tune restore`.
+        file: Where the state before is left, for `drive-tune undo`.
         name: Of the agent, for the certificate.
         keep: Whether drives on a bus keep the gains over a power cycle.
         show: Called after every trial.

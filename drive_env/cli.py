@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from drive_env.tools.compare import compare
+from drive_env.tools.check_model import check_model
 from drive_env.tools.compiling import compile_kernels
 from drive_env.tools.fault import fault
 from drive_env.tools.get import get, set_object
@@ -42,7 +42,7 @@ PANELS = {
     "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
     "This installation": (("list", list_names), ("compile", compile_kernels)),
     "Frames": (("log", log), ("replay", replay)),
-    "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("compare", compare)),
+    "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("check-model", check_model)),
 }
 for panel, commands in PANELS.items():
     for name, function in commands:

@@ -54,6 +54,7 @@ def test_the_envelope_withstands_many():
 
 
 # --- the adversary is one -------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_without_the_envelope_it_wins():
     problems = []
     with eds_read_once(), quiet():
@@ -78,6 +79,7 @@ def test_an_episode_is_the_same_again():
     assert other.diary != first.diary
 
 
+@pytest.mark.slow
 def test_every_action_is_taken_and_every_kind_of_object_written():
     taken = set()
     with eds_read_once(), quiet():

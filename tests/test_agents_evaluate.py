@@ -261,6 +261,7 @@ class Acting(Gentle):
         return np.clip(observation @ self._weights[: observation.shape[1]], -0.7, 0.7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("environment", "options", "actions", "score"),
     [
@@ -299,6 +300,7 @@ def test_a_machine_that_cannot_be_judged_is_missing_on_both_sides():
     assert both.inside.seeds == both.bus.seeds == [0, 1]
 
 
+@pytest.mark.slow
 def test_in_real_time_machines_are_served_by_processes_of_their_own(tmp_path):
     """How large the gap is a busy computer may say as it likes; that both sides are the same machine it may not."""
     both = on_both_sides(Gentle(), "tracking", SHORT, machines=1, seed=3, guard=GuardLimits(saturation=None, stall=30))

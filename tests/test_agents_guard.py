@@ -152,6 +152,7 @@ def test_a_first_answer_may_take_its_time():
     assert len(found.seeds) == 1
 
 
+@pytest.mark.slow
 def test_the_command_ends_though_the_policy_never_does(tmp_path):
     (tmp_path / "hangs.py").write_text(
         "import numpy as np\nasked = 0\n\n\ndef policy(observation):\n    global asked\n    asked += 1\n"

@@ -88,6 +88,7 @@ def test_for_programs_as_json():
     assert [0x1010, 1] not in [row["key"] for row in found["writes"]]
 
 
+@pytest.mark.slow
 def test_a_run_writes_nothing_that_was_not_told(tmp_path, monkeypatch):
     written = set()
     write = SdoClient.write

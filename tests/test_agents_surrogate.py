@@ -84,6 +84,7 @@ def test_trials_of_rounds_with_fewer_are_joined_and_the_missing_count_for_nothin
         np.testing.assert_array_equal(array, again[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_the_networks_are_torchs(bundle, policy):
     torch = pytest.importorskip("torch")
     from agents.surrogate_fit import SurrogateNetwork
@@ -175,6 +176,7 @@ def test_curiosity_seeks_what_is_not_known(bundle, monkeypatch):
     assert reached[2.0] > HIGH[2] - 0.1
 
 
+@pytest.mark.slow
 def test_it_finds_what_only_trials_tell(policy):
     """Machines of the kind that was trained on, in five trials: each says where to look next."""
     best = np.random.default_rng(6).uniform(-1.0, 1.0, (30, 1, G))[:, 0]

@@ -269,6 +269,7 @@ def test_the_residuals_beat_the_cascade_at_equal_current(name):
     assert abs(found[CURRENT].median - told[CURRENT]["median"]) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_a_shipped_controller_acts_the_same_over_can_in_lockstep(name):
     """Machines that are drawn, each in this process and behind its own hub."""

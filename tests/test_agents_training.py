@@ -48,6 +48,7 @@ def weights(bundle):
 
 
 # --- one seed, one agent ----------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_one_seed_gives_the_same_agent(algorithm, tmp_path):
     one, two = (train(tiny(algorithm=algorithm), tmp_path / name) for name in "ab")
@@ -65,6 +66,7 @@ class StoppedError(Exception):
     pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_resumed_run_equals_an_uninterrupted_one(algorithm, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "ROWS", 1000)  # a row for each of the few rollouts
@@ -133,6 +135,7 @@ def test_the_bundle_acts_as_the_model(algorithm, tmp_path):
         assert np.allclose(ours.act(rows), model.act(rows), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_policy_begins_as_what_it_imitates(tmp_path):
     small = {
         "timesteps": 64,
@@ -175,6 +178,7 @@ class Constant:
         pass
 
 
+@pytest.mark.slow
 def test_an_asymmetric_critic_learns_from_the_machine_while_the_actor_imitates():
     teacher = Constant(np.float32([0.3, -0.2, 0.1]))
     run = tiny("gain_tuning")

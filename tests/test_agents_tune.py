@@ -91,6 +91,7 @@ def test_it_tunes_an_emulated_drive_over_its_bus_and_certifies_it(tmp_path):
     assert (tmp_path / "run" / "report.html").is_file()
 
 
+@pytest.mark.slow
 def test_a_channel_of_the_environment_alone_moves_no_motor(tmp_path, monkeypatch):
     monkeypatch.setenv("DRIVE_ENV_CHANNEL", "socket://127.0.0.1:1")
     result = CliRunner().invoke(app, ["tune", "--trials", "1", "--load", "inertia", "--out", str(tmp_path / "run")])
@@ -106,6 +107,7 @@ def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkey
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_json_for_programs(tmp_path):
     code, out, _ = command("--trials", 1, "--load", "inertia", "--json", "--out", tmp_path / "run")
     found = json.loads(out)
@@ -143,6 +145,7 @@ def test_a_policy_that_gives_no_number_leaves_the_drive_as_it_was_and_disabled(t
         assert not is_enabled(target).any()
 
 
+@pytest.mark.slow
 def test_a_tuner_that_never_returns_ends_the_run_and_leaves_the_drive_of_a_bus_as_it_was(tmp_path):
     class Hanging(Broken):
         def act(self, observation):
@@ -249,6 +252,7 @@ def test_a_wrong_wiring_ends_the_run_before_any_trial_with_code_1_and_the_reason
     assert "keeps the new gains" not in out
 
 
+@pytest.mark.slow
 def test_gains_are_all_that_a_run_changes(tmp_path):
     with emulated("tmcm1636", "two_mass", "qbl4208", num_machines=2) as target:
         before = settings(target)

@@ -211,6 +211,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(auto_search, "OTHER_GENERATIONS", 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["compute", "prove", "show", "measure", "look_back"])
 def test_whatever_ends_it_the_gains_before_are_back(quick, monkeypatch, tmp_path, stage):
     def interrupted(run):
@@ -226,6 +227,7 @@ def test_whatever_ends_it_the_gains_before_are_back(quick, monkeypatch, tmp_path
         assert np.all(target.drives.read(0x6041) & 0x4F == 0x40)
 
 
+@pytest.mark.slow
 def test_gains_that_fail_every_trial_are_rolled_back_with_the_last_reason(quick, monkeypatch, tmp_path):
     def shaky(device, motor, plant):
         return propose("margin_55", device, motor, plant)._replace(gains=Gains(4021, 1573, 32767, 32767, 32767))
@@ -309,6 +311,7 @@ def test_a_lively_loop_is_calmed_and_the_calmed_gains_are_tried_again(quick, mon
     assert 2.0 in earlier
 
 
+@pytest.mark.slow
 def test_too_few_coherent_lines_are_said_and_what_was_verified_instead(quick, monkeypatch, tmp_path):
     answers(monkeypatch, lambda response: replace(response, coherence=0.1 * response.coherence))
     with emulated(load="inertia", num_threads=1) as target:
@@ -325,6 +328,7 @@ def test_too_few_coherent_lines_are_said_and_what_was_verified_instead(quick, mo
     assert all(np.isnan(value) for value in shown.margins.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stays", [False, True])
 def test_a_drive_that_is_shaken_into_a_fault_moves_again_or_is_rolled_back(quick, monkeypatch, tmp_path, stays):
     """Shaking brakes, and a supply may not take that back."""

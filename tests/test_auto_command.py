@@ -31,6 +31,7 @@ def test_rules_show_gains_margins_and_what_a_relay_measured():
     assert axis["proposals"]["margin_45"]["velocity_margins"]["phase_deg"] == pytest.approx(45.0, abs=1.5)
 
 
+@pytest.mark.slow
 def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
     done = drive_tune("rules", "simc", "--load", "two_mass", "--relay", "--json")
     assert done.exit_code == 0, done.output

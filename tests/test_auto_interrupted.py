@@ -60,6 +60,7 @@ def known(target, where):
         return standing_in(same)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("how", ["in process", "calls", "hub"])
 def test_the_gains_before_are_back_and_the_drive_is_off(monkeypatch, tmp_path, how):
@@ -106,7 +107,7 @@ def test_a_second_ctrl_c_waits_until_everything_is_back(monkeypatch, tmp_path):
         ("Transaction", "interrupted; nothing was changed"),
         ("prove", "interrupted; the drives are disabled and have the gains from before"),
         ("Run.result", "interrupted; the drives are disabled and have the gains from before"),
-        ("Transaction.__exit__", "interrupted; the drives are disabled and have the new gains: drive-tune restore"),
+        ("Transaction.__exit__", "interrupted; the drives are disabled and have the new gains: drive-tune undo"),
     ],
 )
 def test_the_command_ends_with_130_and_says_what_the_drives_have(monkeypatch, tmp_path, stage, words):

@@ -102,6 +102,7 @@ def test_a_fault_with_the_gains_before_is_theirs_and_is_reset(axes, monkeypatch,
     assert not any(axis.is_kept for axis in result.axes)
 
 
+@pytest.mark.slow
 def test_where_one_more_move_fails_the_second_best_of_the_trials_is_taken(axes, monkeypatch, tmp_path):
     target, good = axes
     finds(monkeypatch, np.stack([faster(good, 0.8), good]))

@@ -224,6 +224,7 @@ def drives():
         yield made
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:machine .* left the range of physics")
 @settings(max_examples=200, deadline=None)
 @given(st.lists(FRAMES | st.integers(1, 20), max_size=40))

@@ -328,6 +328,7 @@ while True:
 KILLS = 200
 
 
+@pytest.mark.slow
 def test_200_kills_lose_nothing(tmp_path):
     path = tmp_path / "memory.json"
     dice = random.Random(1636)

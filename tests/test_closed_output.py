@@ -39,6 +39,7 @@ def broken():
     os.close(write)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_closed_output_ends_quietly(name, unbuffered, broken):

@@ -284,6 +284,7 @@ def predicted_and_true(load, **parameters):
     return out
 
 
+@pytest.mark.slow
 def test_prediction_is_exact_with_a_rigid_inertia():
     theta, omega, theta_true, omega_true = predicted_and_true(
         "inertia", **{"load.coulomb": 0.0, "load.breakaway": 0.0, "load.viscous": 0.0}

@@ -63,6 +63,7 @@ def tune(program, bus, out):
     return CliRunner().invoke(program, [*name, *bus, "--travel", "-5:5", "--yes", "--out", str(out), "--json"])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("program", [drive_tune, drive_agent], ids=["auto", "agent"])
 @pytest.mark.parametrize("file", ["certificate.json", "report.html", "before.toml"])
@@ -83,7 +84,7 @@ def test_a_tuning_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, 
         assert (done.exit_code, done.stdout.count("{")) == (2, 0), done.output
         said = done.stderr.strip().splitlines()[-1]
         assert f"{out / file}: " in said and SAID in said
-        assert f"; the drives have what they had before; if ever not, drive-tune restore {out / 'before.toml'}" in said
+        assert f"; the drives have what they had before; if ever not, drive-tune undo {out / 'before.toml'}" in said
         assert status_is(machine, SWITCH_ON_DISABLED)
         assert gains(machine) == before == [load_snapshot(out / "before.toml").axes[0][key] for key in GAIN_OBJECTS]
         with CanDrives(interface="slcan", channel=bus[3], pace="lockstep", safety=False) as drives:
@@ -151,6 +152,7 @@ drive_tune()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_a_tuning_that_is_killed_before_its_files_are_written_is_undone_by_one_command(tmp_path):
     out = tmp_path / "run"
@@ -163,10 +165,11 @@ def test_a_tuning_that_is_killed_before_its_files_are_written_is_undone_by_one_c
         assert done.returncode == -signal.SIGKILL, done.stderr
         assert gains(machine) == NEW[0].tolist()
         assert [path.name for path in out.iterdir()] == ["before.toml"]
-        again = CliRunner().invoke(drive_tune, ["restore", str(out / "before.toml"), "--yes"])
+        again = CliRunner().invoke(drive_tune, ["undo", str(out / "before.toml"), "--yes"])
         assert (again.exit_code, gains(machine)) == (0, before), again.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["trials.csv", "settings.toml", "trials.png"])
 def test_a_search_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, monkeypatch, file):
     out, way_back = tmp_path / "searched", tmp_path / "searched-before.toml"
@@ -185,7 +188,7 @@ def test_a_search_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, 
              "random"],
         )  # fmt: skip
         assert done.exit_code == 2, done.output
-        said = f"{out / file}: {SAID}; the drives have what they had before; if ever not, drive-tune restore {way_back}"
+        said = f"{out / file}: {SAID}; the drives have what they had before; if ever not, drive-tune undo {way_back}"
         assert said in done.stderr
         assert gains(machine) == before
     assert sorted(path.name for path in tmp_path.iterdir()) == [way_back.name]
@@ -278,10 +281,11 @@ def test_a_real_disk_that_holds_the_way_back_and_no_report(tmp_path, monkeypatch
         assert SAID in done.stderr and "the drives have what they had before" in done.stderr
         assert [path.name for path in (disk / "run").iterdir()] == ["before.toml"]
         machine.write(GAIN_OBJECTS[2], 77)
-        again = CliRunner().invoke(drive_tune, ["restore", str(disk / "run" / "before.toml"), "--yes"])
+        again = CliRunner().invoke(drive_tune, ["undo", str(disk / "run" / "before.toml"), "--yes"])
         assert (again.exit_code, gains(machine)) == (0, before), again.output
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="tmpfs")
 def test_a_journal_that_finds_no_room_ends_a_search_and_is_named(tmp_path):
     with tiny_disk(tmp_path / "disk", 16) as disk, node() as (machine, bus):

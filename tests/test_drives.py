@@ -172,6 +172,7 @@ def test_the_example_of_one_drive_runs():
     assert "positions reached [inc]: [" in done.stdout
 
 
+@pytest.mark.slow
 def test_the_example_that_tunes_a_drive_runs_and_leaves_the_way_back(tmp_path):
     script = Path(__file__).parent.parent / "examples" / "tune_a_drive.py"
     assert len(script.read_text(encoding="utf-8").splitlines()) < 40

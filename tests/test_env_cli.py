@@ -245,7 +245,7 @@ def test_a_dry_run_reads_what_is_says_what_would_be_and_changes_nothing(run, sha
         (["scope", "--duration", "0.01", "--out", "was"], "was.csv", "choose another --out"),
         (["scope", "--duration", "0.01", "--out", "was"], "was.png", "choose another --out"),
         (["render", "--load", "inertia", "--out", "was.gif"], "was.gif", "choose another --out"),
-        (["compare", "log.csv", "--fit", "load.inertia", "--out", "was.toml"], "was.toml", "choose another --out"),
+        (["check-model", "log.csv", "--fit", "load.inertia", "--out", "was.toml"], "was.toml", "choose another --out"),
     ],
 )
 def test_no_command_replaces_a_file(run, tmp_path, monkeypatch, arguments, name, remedy):
@@ -262,7 +262,7 @@ def test_no_command_replaces_a_file(run, tmp_path, monkeypatch, arguments, name,
 def test_a_picture_is_no_log_to_compare_with(run, tmp_path):
     path = tmp_path / "scope.png"
     path.write_bytes(b"\x89PNG\r\n\x1a\n")
-    code, _, error = run("compare", path)
+    code, _, error = run("check-model", path)
     assert (code, error) == (
         USER_ERROR, f"drive-env: {path} is no text; give the CSV that drive-env scope writes\n",
     )  # fmt: skip
@@ -420,6 +420,7 @@ def test_scope_writes_a_table_and_a_picture(run, tmp_path):
     assert out.with_suffix(".png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+@pytest.mark.slow
 def test_scope_waits_for_its_trigger(run, shared, tmp_path):
     out = tmp_path / "edge"
     code, _, error = run("scope", "6064", "--trigger", "606C > 100 rpm", "--wait", 0.2, "--out", out)

@@ -210,6 +210,7 @@ def test_the_docstring_has_a_row_for_every_entry_of_the_spaces(kind, options, le
 
 
 # --- the same seed, the same episode ----------------------------------------------------------------------------------
+@pytest.mark.slow
 @EVERY_KIND
 def test_an_episode_is_the_same_among_1_8_and_64_lanes_and_under_2_threads(kind):
     """An autoreset is within. 72 machines are two groups, each with a thread of its own; 70 is in the second."""

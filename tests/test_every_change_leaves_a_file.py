@@ -134,6 +134,7 @@ def killed(machine, command, bus, folder):
     return file
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_run_that_is_killed_is_undone_by_one_command(tmp_path, command):
@@ -149,7 +150,7 @@ def test_a_run_that_is_killed_is_undone_by_one_command(tmp_path, command):
         if command in ("identify", "rules"):
             assert {COMMUTATION, RAMP, CURRENT_LIMIT} <= differences(machine, file)
             assert differences(machine, file) & set(GAIN_OBJECTS)
-        done = CliRunner().invoke(drive_tune, ["restore", str(file), "--yes"])
+        done = CliRunner().invoke(drive_tune, ["undo", str(file), "--yes"])
         assert done.exit_code == 0, done.output
         assert parameters(bus) == before
 
@@ -164,7 +165,7 @@ def test_a_node_in_real_time_switches_itself_off_and_is_restored(tmp_path, monke
         file = killed(machine, "identify", bus, tmp_path)
         assert {COMMUTATION, RAMP, CURRENT_LIMIT} <= differences(machine, file)
         wait_until(lambda: status_is(machine, *OFF))
-        done = CliRunner().invoke(drive_tune, ["restore", str(file), "--yes"])
+        done = CliRunner().invoke(drive_tune, ["undo", str(file), "--yes"])
         assert done.exit_code == 0, done.output
         assert parameters(bus) == before
 
@@ -192,12 +193,12 @@ def test_what_rules_apply_stays_and_is_undone_by_the_file(tmp_path):
             drive_tune, ["rules", "chain", *TUNING, *bus, "--apply", "chain", "--snapshot", "mine.toml"]
         )
         assert done.exit_code == 0, done.output
-        assert "written; drive-tune restore mine.toml brings back what was" in done.stdout
+        assert "written; drive-tune undo mine.toml brings back what was" in done.stdout
         assert set() < differences(machine, "mine.toml") <= set(GAIN_OBJECTS)
         again = CliRunner().invoke(drive_tune, ["rules", "chain", *TUNING, *bus, "--snapshot", "mine.toml"])
         assert again.exit_code == 2
         assert "mine.toml is there already, and may hold the state before an earlier run" in again.stderr
-        CliRunner().invoke(drive_tune, ["restore", "mine.toml", "--yes"])
+        CliRunner().invoke(drive_tune, ["undo", "mine.toml", "--yes"])
         assert differences(machine, "mine.toml") == set()
 
 

@@ -64,6 +64,7 @@ def wait_until(condition, what):
         time.sleep(0.02)
 
 
+@pytest.mark.slow
 def test_a_fault_is_given_to_a_running_server_listed_and_cleared():
     with served("tmcm1636", "--load", "inertia", "--control", 0) as (process, channel, control):
         with CanDrives("tmcm1636", interface="slcan", channel=channel, nodes=[1]) as drives:
@@ -126,6 +127,7 @@ def _answers(drives):
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arguments", "message"), [
     (["--fault", "encoder_stuk"], "drive-env: --fault: no fault is named 'encoder_stuk'; there are "),
     (["--fault", "jam torque=1e9"], "drive-env: --fault: fault jam: torque=1e+09 must lie in 0...1000 rated torque"),

@@ -129,6 +129,7 @@ def faults_in_real_time(emulated, name, each, seed):
     return [(str(fault), problems(run_real_time(emulated, SESSIONS[name], fault)[0])) for fault in faults]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SESSIONS)
 def test_a_fault_at_a_frame_in_real_time_leaves_no_axis_running(emulated, name):
     assert worst_of(faults_in_real_time(emulated, name, 1, 0)) == ""
@@ -184,6 +185,7 @@ def cases(emulated, name, numbers, each, seed):
 posix_only = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="signals, fork and /proc")
 
 
+@pytest.mark.slow
 @posix_only
 @pytest.mark.parametrize(("name", "numbers"), [
     ("pp_move", ("SIGINT", "SIGKILL", "SIGSTOP")),

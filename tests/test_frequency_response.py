@@ -45,6 +45,7 @@ def measured():
 
 
 # --- margins ----------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("load", ["inertia", "two_mass"])
 def test_measured_margins_are_those_of_the_linear_model(measured, load):
     target, plants, gains, response = measured[load]
@@ -162,6 +163,7 @@ def test_a_rigid_axis_has_no_resonance_and_says_so(measured):
 
 
 # --- over the bus -----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize(("interpolation", "high"), [(16.0, 400.0), (1.0, 200.0)])
 def test_over_a_bus_nine_lines_in_ten_are_coherent_in_two_seconds(interpolation, high):
     motor = find_motor("qbl4208")
@@ -342,6 +344,7 @@ def test_what_cannot_be_confirmed_is_refused(looked_at):
     assert "does not confirm it" in fit(seen(), seen(noise=1.5)).estimates["resonance"].reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead_time", [100e-9, 600e-9])
 def test_dead_time_is_not_taken_for_a_slower_velocity_filter(dead_time):
     """A small motor, whose current loop dead time slows down: without knowing, 400 Hz look like 280."""

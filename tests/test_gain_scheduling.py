@@ -62,6 +62,7 @@ def test_a_stiffer_position_loop_lags_less_and_is_rewarded():
 
 
 # --- the programme and the payload ------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("excitation", EXCITATIONS)
 def test_a_programme_stays_within_its_reach_and_is_smooth(excitation):
     reach = Reach(np.array([10.0, 4.0]), np.array([50.0, 50.0]), np.array([900.0, 900.0]))

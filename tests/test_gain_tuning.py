@@ -402,6 +402,7 @@ def test_given_drives_of_two_kinds_say_the_same_as_long_as_they_are_the_same():
 
 
 # The envelope would stop the whole bus where the trial's own watch stops a lane.
+@pytest.mark.slow
 @pytest.mark.parametrize("safety", [False, Limits(oscillation=False)], ids=["no envelope", "envelope"])
 def test_over_can_in_lockstep_the_observations_are_the_same(safety):
     inside, outside = (

@@ -476,6 +476,7 @@ def test_who_goes_makes_room_for_who_comes(monkeypatch, caplog):
 
 
 # --- clients that do not read ---------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("say", [b"V\r", b"xyz\r"], ids=["answers", "bells"])
 def test_who_asks_and_does_not_read_is_dropped_at_a_bounded_cost(hub, caplog, say):
     tracemalloc.start()
@@ -565,6 +566,7 @@ def transfers_per_second(bus, seconds=0.5):
     return count / (time.perf_counter() - start)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lockstep", [True, False], ids=["lockstep", "real time"])
 @pytest.mark.parametrize("what", [FRAME, b"xyz\r" * 5], ids=["frames", "rubbish"])
 def test_a_flood_leaves_a_master_a_third_of_its_transfers(lockstep, what):
@@ -610,6 +612,7 @@ def test_a_client_has_few_frames_on_their_way_to_the_bus():
         hub.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", [FRAME, b"t" * 1_000, b"\r" * 1_000, b"t7FF8112233", bytes(range(256))])
 def test_no_flood_makes_it_grow(what):
     """Frames for a bus of 10 kbit/s, lines without end, empty lines, lines cut short, rubbish."""

@@ -232,6 +232,7 @@ def test_without_a_response_the_inertia_of_two_moves_is_a_guess(monkeypatch):
 
 
 # --- values, further --------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_of_two_springs_in_a_row_the_first_resonance_is_told():
     target = emulated(load="three_mass", num_threads=1)
     found, true = identify(target)[0], truth(target.drives, 0, 0.0)
@@ -239,6 +240,7 @@ def test_of_two_springs_in_a_row_the_first_resonance_is_told():
     assert found.value("anti_resonance") == pytest.approx(true["anti_resonance"], rel=0.03)
 
 
+@pytest.mark.slow
 def test_with_backlash_a_resonance_is_refused_with_that_reason():
     target = emulated(load="geared_joint", motor="ec_45_flat", parameters={"load.backlash": 2e-3}, num_threads=1)
     resonance = identify(target)[0].estimates["resonance"]
@@ -446,6 +448,7 @@ class Watched(EmulatedDrives):
         return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("load", "low", "high"), [
     ("vertical_screw", -0.3, 0.3), ("vertical_screw", -0.15, 0.15), ("inertia", -0.15, 0.15), ("belt", -0.15, 0.3),
 ])  # fmt: skip
@@ -462,6 +465,7 @@ def test_travel_speed_and_current_are_respected(load, low, high):
     assert drives.hardest <= 1.1 * 3.0  # the loop's overshoot
 
 
+@pytest.mark.slow
 def test_axes_that_pull_at_one_thing_move_together():
     """A gantry's two ends: each drive moves its half of the bridge."""
     target = emulated(load="gantry", num_threads=1)

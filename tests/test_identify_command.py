@@ -25,6 +25,7 @@ def drive_tune(*arguments, cwd):
     )
 
 
+@pytest.mark.slow
 def test_values_intervals_and_reasons_are_shown_and_written(tmp_path):
     done = drive_tune("identify", "--load", "inertia", "--out", "found.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -37,6 +38,7 @@ def test_values_intervals_and_reasons_are_shown_and_written(tmp_path):
     assert rows[0]["drive_time"] < 20.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arguments", "text"), [
     (("--motor", "nema17"), "no motor is named 'nema17'"),
     (("--travel", "0.1"), "--travel 0.1 must be LOW:HIGH"),

@@ -78,6 +78,7 @@ def test_another_program_finds_the_kernels_of_this_one(cache):
     assert (found.stdout, found.stderr) == ("compiled 0 kept 1\n", "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_file_is_told_removed_and_written_anew(cache, tmp_path, damage):
     copy = Path(shutil.copytree(cache, tmp_path / "cache"))
@@ -117,6 +118,7 @@ def test_files_of_another_kind_do_not_matter(cache, tmp_path):
     assert found.stdout == "compiled 1 kept 0\n"
 
 
+@pytest.mark.slow
 def test_two_programs_at_once_share_what_they_compile(tmp_path):
     """Both begin with an empty cache; each file that they leave is whole."""
     both = [

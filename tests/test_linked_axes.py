@@ -37,6 +37,7 @@ def test_axes_under_gravity_hold_their_places_while_another_one_is_shaken():
     assert np.all(response.peak_current < 1.2 * target.current), response.peak_current  # A: what falls takes them all
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("were_on", [False, True])
 def test_axes_that_pull_at_one_thing_run_along(were_on):
     with emulated(load="gantry") as target:

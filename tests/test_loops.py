@@ -350,6 +350,7 @@ def test_the_torque_integrator_stops_at_the_voltages_limit():
     assert drives.read("Torque actual value")[0] == pytest.approx(1000, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_duty_is_applied_one_pwm_period_after_the_samples_it_comes_from():
     """Tick 0 samples, tick 1 holds: the current is still 0 at the end of tick 0, on the closed form after tick 1."""
     drives = EmulatedDrives(load="inertia", ideal=True, num_threads=1)
@@ -463,6 +464,7 @@ def test_tables_torque_gains_give_1_khz():
 DESIGNS = [(row, hz) for row in TABLE for hz in TABLE[row][6]]
 
 
+@pytest.mark.slow
 def test_tables_velocity_gains_give_50_100_and_200_hz():
     """Whole loop and own loop: all eight designs of the table at once, each with seven frequencies about its own."""
     multiples = np.array([0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3])

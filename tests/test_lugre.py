@@ -321,6 +321,7 @@ def mean_force(u, z, h, row):
     return s_0 * mean + s_1 * (end - z) / h + viscous * u + drag * abs(u) * u, end
 
 
+@pytest.mark.slow
 @settings(max_examples=1500, deadline=None, derandomize=True)
 @given(
     v=st.floats(-1e4, 1e4) | st.floats(-1.0, 1.0) | st.floats(-1e-4, 1e-4),

@@ -136,6 +136,7 @@ def test_resonances_seen_through_the_drive(factor):
     assert extremum(sweep[24:], gain[24:], True) == pytest.approx(resonance, rel=0.01)
 
 
+@pytest.mark.slow
 def test_damping_sets_the_decay():
     """Free ringing of the shaft: the envelope falls with exp(-zeta w t), zeta w = d (1/J_m + 1/J_L) / 2."""
     load = machines("two_mass", 2, damping=np.array([DAMPING, 2 * DAMPING]))

@@ -323,6 +323,7 @@ def test_another_masters_pre_operational_and_then_death(emulated):
         turned(world, SLOW)
 
 
+@pytest.mark.slow
 @linux_only
 def test_of_two_programs_on_one_bus_one_dies(programs):
     with EmulatedDrives(load="inertia", num_machines=2, num_threads=1) as two, served(two, (1, 2)) as (world, channel):
@@ -596,6 +597,7 @@ def test_the_power_goes_off_when_the_axis_is_slow(emulated, end):
         assert omega[off].max() < 0.1 * omega.max()
 
 
+@pytest.mark.slow
 def test_a_vertical_axis_does_not_fall_after_a_trip():
     """While the program lives something holds it; without power this one falls by several turns."""
     with EmulatedDrives(load="vertical_screw", num_threads=1) as vertical, bench(vertical) as (world, bus):

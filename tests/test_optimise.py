@@ -494,7 +494,7 @@ def test_ctrl_c_on_a_bus_says_what_the_drives_have_and_what_is_kept(node, monkey
     code, error = drive_tune(*arguments, *more)
     assert code == 130
     assert error.splitlines() == [
-        "drive-tune: the drives have what they had before; if ever not, drive-tune restore obus-before.toml brings it "
+        "drive-tune: the drives have what they had before; if ever not, drive-tune undo obus-before.toml brings it "
         "back",
         f"drive-tune: interrupted; {says}",
     ]
@@ -507,7 +507,7 @@ def test_the_way_back_of_an_earlier_search_is_not_replaced(node, monkeypatch, tm
     is_interrupted(monkeypatch)
     (tmp_path / "obus-before.toml").write_text("the only copy", encoding="utf-8")
     _, error = drive_tune(*arguments)
-    assert "drive-tune restore obus-before-2.toml brings it back" in error
+    assert "drive-tune undo obus-before-2.toml brings it back" in error
     assert (tmp_path / "obus-before.toml").read_text(encoding="utf-8") == "the only copy"
 
 

@@ -258,6 +258,7 @@ def test_a_drive_turns_a_tendon(file):
         assert turn / x == pytest.approx((0.1 / 2e-3) / (1 / 2.0), rel=0.02)
 
 
+@pytest.mark.slow
 def test_friction_loss_of_the_file_is_dry_friction_of_ours(file):
     """At the joint, held and slid as friction.py says; the solver has none of it."""
     load = packed(Load(file(PLAIN)))

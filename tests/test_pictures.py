@@ -42,6 +42,7 @@ def machine_of(picture):
 
 
 # --- rgb_array --------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @needs_gl
 @EVERY_KIND
 def test_a_picture_shows_the_machine_and_the_scope(kind):
@@ -66,6 +67,7 @@ def test_a_picture_shows_the_machine_and_the_scope(kind):
     lanes.close()
 
 
+@pytest.mark.slow
 @needs_gl
 @EVERY_KIND
 def test_the_single_environment_renders_and_who_looks_changes_nothing(kind):
@@ -127,6 +129,7 @@ class FakeWindow:
         self.is_open, self.closed = False, True
 
 
+@pytest.mark.slow
 @needs_gl
 @EVERY_KIND
 def test_human_shows_lane_0_while_time_passes(kind, monkeypatch):

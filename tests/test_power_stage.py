@@ -72,6 +72,7 @@ def turn(angle, alpha, beta):
 
 
 # --- the winding, exact -------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("saliency", [1.0, 1.7])
 def test_locked_rotor_is_the_closed_form_to_1e_12_of_the_final_current(saliency):
     angles = np.linspace(0.0, 2.0, LANES)  # rad, electrical

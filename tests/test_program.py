@@ -49,7 +49,7 @@ def run(program, *arguments, **environment):
 
 @pytest.mark.parametrize(("program", "begun", "commands"), [
     ("drive-env", "sc", {"scan", "scope"}),
-    ("drive-tune", "r", {"response", "rules", "restore"}),
+    ("drive-tune", "r", {"response", "rules", "rank"}),
     ("drive-agent", "ev", {"evaluate"}),
 ])  # fmt: skip
 def test_a_shell_completes_commands(program, begun, commands):

@@ -387,6 +387,7 @@ def test_pace(duration, slow, expected):
     assert render.pace(duration, PictureFormat(slow=slow)) == expected
 
 
+@pytest.mark.slow
 @needs_gl
 def test_frames_show_the_machine_beside_the_scope(belt_run):
     frames = list(render.frames(belt_run, SMALL))
@@ -411,6 +412,7 @@ def test_a_picture_draws_any_machine_again_and_again(arm):
         assert alike(picture.frame(run, 0), first)
 
 
+@pytest.mark.slow
 @needs_gl
 @pytest.mark.parametrize("name", ["run.gif", "run.webp", "run.apng", "run.png"])
 def test_animations_last_as_long_as_they_tell(tmp_path, name):

@@ -305,6 +305,7 @@ def test_who_may_obey(frames, nodes):
 
 
 # --- an emulated drive in real time, and the program that a user starts -------------------------------------------
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_motor_that_runs_by_replayed_frames_is_at_rest_and_off_after_a_signal(tmp_path, how):

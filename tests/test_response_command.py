@@ -16,6 +16,7 @@ def run(tmp_path_factory):
     return folder, drive_tune("response", "--load", "inertia", "--high", "200", "--out", "out", cwd=folder)
 
 
+@pytest.mark.slow
 def test_it_prints_margins_plant_and_drive_time(run):
     _, done = run
     assert done.returncode == 0, done.stderr

@@ -106,6 +106,7 @@ def test_a_counterexample_can_be_read():
     ]
 
 
+@pytest.mark.slow
 def test_no_counterexample_is_left_with_any_one_trouble():
     result = explore(OURS, Assumptions(troubles=1))
     assert result.states > 10_000

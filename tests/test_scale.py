@@ -144,6 +144,7 @@ def test_any_cut_gives_the_digits_of_any_other(experiment, whole, tmp_path):
         assert sorted(log.done) == [*range(0, 640, 64), *range(1152, 2304, 64)]
 
 
+@pytest.mark.slow
 def test_only_what_is_not_done_is_simulated(experiment, whole, tmp_path, monkeypatch):
     with ShardLog(tmp_path / "shards", "x") as log:
         sweep.run(experiment, log=log)
@@ -229,6 +230,7 @@ def test_an_unfinished_run_is_not_overwritten_and_one_without_results_leaves_not
 
 
 # --- pools --------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [None, 2])
 def test_a_pool_gives_every_result_with_its_number(workers):
     with open_pool(workers) as pool:
@@ -255,6 +257,7 @@ def test_a_pool_that_cannot_be_says_why(options, error, message, monkeypatch):
         pass
 
 
+@pytest.mark.slow
 def test_worker_processes_give_the_digits_of_one_process_and_go_on_from_what_is_done(experiment, whole, tmp_path):
     first = sweep.simulate(sweep.shards(experiment)[0])
     with open_pool(2) as pool, ShardLog(tmp_path / "shards", "x") as log:
@@ -522,6 +525,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_bytes(long, tmp_path, more):
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_an_interrupt_says_what_is_kept_and_the_run_goes_on_from_its_own_settings(long, tmp_path):
     config, expected = long

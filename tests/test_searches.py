@@ -58,6 +58,7 @@ def test_searches_are_the_search_with_one_seed_after_the_other(tmp_path):
     assert len(together.rows) == 8 and together.cost.shape == (2,)
 
 
+@pytest.mark.slow
 def test_searches_on_workers_and_resumed_are_the_searches_of_one_process(tmp_path):
     parts = searches.searches(MACHINE, FEW, 3)
     whole = found(parts, None, tmp_path / "whole")

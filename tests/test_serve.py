@@ -109,6 +109,7 @@ def test_what_is_open_to_the_network_is_said(monkeypatch):
     assert "Token and frames travel as plain text; where others listen, serve on 127.0.0.1 and use an" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_with_code_0_and_one_line(tmp_path, number):
@@ -182,6 +183,7 @@ def test_a_mistake_ends_with_code_2_and_one_clear_line(tmp_path, monkeypatch, ar
         assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_port_that_is_taken_is_named_with_the_remedy(tmp_path):
     with served(cwd=tmp_path) as (_, channel):
         port = channel.rpartition(":")[2]

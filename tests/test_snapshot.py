@@ -121,7 +121,7 @@ def test_a_rollback_that_fails_names_the_file_that_helps(target, tmp_path, monke
 
     monkeypatch.setattr(target.drives, "write", refuse)
     with (
-        pytest.raises(BusError, match=r"cable is out.*drive-tune restore .*before\.toml brings back"),
+        pytest.raises(BusError, match=r"cable is out.*drive-tune undo .*before\.toml brings back"),
         Transaction(target, tmp_path / "before.toml"),
     ):
         change(target.drives)
@@ -151,7 +151,7 @@ def test_what_ends_with_an_error_is_put_back_and_says_where_the_file_is(target, 
         change(target.drives)
         raise ValueError("no")
     assert take(target) == before == load_snapshot(file)
-    said = f"the drives have what they had before; if ever not, drive-tune restore {file} brings it back"
+    said = f"the drives have what they had before; if ever not, drive-tune undo {file} brings it back"
     assert capsys.readouterr().err == f"drive-tune: {said}\n"
 
 
@@ -161,7 +161,7 @@ def test_an_error_after_a_commit_says_that_the_drives_are_others(target, tmp_pat
         change(target.drives)
         transaction.commit()
         raise ValueError("no")
-    assert capsys.readouterr().err == f"drive-tune: drive-tune restore {file} brings back what was\n"
+    assert capsys.readouterr().err == f"drive-tune: drive-tune undo {file} brings back what was\n"
 
 
 # --- the file -----------------------------------------------------------------------------------------------------
@@ -170,7 +170,7 @@ def test_a_snapshot_reads_back_equal_and_says_what_its_numbers_are(target, tmp_p
     path = before.save(tmp_path / "before.toml")
     assert load_snapshot(path) == before
     text = path.read_text(encoding="utf-8")
-    assert "drive-tune restore before.toml" in text
+    assert "drive-tune undo before.toml" in text
     assert '"2003:00" = 7000  # Maximum Current\n' in text
     keys = set(before.axes[0])
     assert {*GAIN_OBJECTS, CURRENT_LIMIT, PROFILE_VELOCITY} <= keys
@@ -268,13 +268,13 @@ def test_one_command_brings_back_what_a_program_left_behind_that_was_killed(tmp_
         assert load_snapshot(transaction.path).bus == {
             "interface": "virtual", "channel": channel, "nodes": [1, 2], "pace": "lockstep",
         }  # fmt: skip
-        done = drive_tune("restore", transaction.path, "--yes")
+        done = drive_tune("undo", transaction.path, "--yes")
         assert done.exit_code == 0, done.output
         assert "axis 1: 2003h:00 Maximum Current: 1234 -> 7000" in done.stdout
         assert re.search(r"^12 parameters restored, \d{3} verified by a second reading$", done.stdout, re.MULTILINE)
         assert [gains(machine).tolist() for machine in machines] == before
         assert [int(machine.read(CURRENT_LIMIT)[0]) for machine in machines] == [7000, 7000]
-        again = drive_tune("restore", transaction.path, "--yes", "--json")
+        again = drive_tune("undo", transaction.path, "--yes", "--json")
         assert re.fullmatch(r'\{"changed": \[\], "verified": \d{3}, "stored": false\}\n', again.stdout)
 
 
@@ -321,7 +321,7 @@ def test_a_change_that_the_drives_keep_is_undone_for_good(tmp_path, monkeypatch)
                 transaction.commit()
             target.drives.reset_node()
             assert gains(target.drives).tolist() == np.repeat(TRIED, 2, axis=0).tolist()
-        done = drive_tune("restore", transaction.path, "--yes")
+        done = drive_tune("undo", transaction.path, "--yes")
         assert re.search(r"^10 parameters restored, \d+ verified .*; the drives keep them$", done.stdout, re.MULTILINE)
         with opened(channel) as target:
             target.drives.reset_node()
@@ -336,7 +336,7 @@ def test_an_enabled_axis_is_left_alone(tmp_path, monkeypatch):
         machines[0].write(CURRENT_LIMIT, 1234)
         for word in (0x06, 0x07, 0x0F):
             machines[0].write(0x6040, word)
-        done = drive_tune("restore", path, "--yes")
+        done = drive_tune("undo", path, "--yes")
         assert done.exit_code == 1
         assert "disable it first" in done.stderr
         assert machines[0].read(CURRENT_LIMIT) == [1234]
@@ -350,7 +350,7 @@ def test_a_run_that_is_killed_between_its_store_and_its_end_is_undone_for_good(t
             transaction = Transaction(target, tmp_path / "before.toml").__enter__()  # and no exit
             write_gains(target.drives, np.repeat(TRIED, 2, axis=0))
             assert transaction.store()
-        assert drive_tune("restore", transaction.path, "--yes").exit_code == 0
+        assert drive_tune("undo", transaction.path, "--yes").exit_code == 0
         with opened(channel) as target:
             target.drives.reset_node()
         assert [gains(machine).tolist() for machine in machines] == before
@@ -384,7 +384,7 @@ def test_a_disk_that_is_full_when_drives_are_to_keep_a_change_gives_them_back_wh
         assert caught.value.filename == str(file)
         assert caught.value.strerror == (
             "the state before cannot be written: No space left on device; choose another place; the drives have what "
-            f"they had before; if ever not, drive-tune restore {file} brings it back"
+            f"they had before; if ever not, drive-tune undo {file} brings it back"
         )
         assert [gains(machine).tolist() for machine in machines] == before
         target.drives.reset_node()
@@ -417,11 +417,11 @@ def test_restore_refuses_a_file_that_is_not_as_it_was_written(tmp_path, monkeypa
             path = take(target).save(tmp_path / "before.toml")
         machines[1].write(CURRENT_LIMIT, 1234)
         path.write_text(spoil(path.read_text(encoding="utf-8")), encoding="utf-8")
-        done = drive_tune("restore", path, "--yes")
+        done = drive_tune("undo", path, "--yes")
         assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
         assert done.stderr.startswith(f"drive-tune: {path} {words}")
         assert machines[1].read(CURRENT_LIMIT) == [1234]
-        assert drive_tune("restore", path, "--yes", "--unchecked").exit_code == unchecked
+        assert drive_tune("undo", path, "--yes", "--unchecked").exit_code == unchecked
 
 
 def test_a_snapshot_says_of_which_drives_it_is_and_is_not_written_to_others(tmp_path, monkeypatch):
@@ -442,10 +442,10 @@ def test_a_snapshot_says_of_which_drives_it_is_and_is_not_written_to_others(tmp_
         assert (one.serial, two.serial, two.node, two.product, two.name) == (4712, 4713, 2, 1636, "TMCM-1636")
         machines[1].write(CURRENT_LIMIT, 1234)
         serial["now"] = 50
-        done = drive_tune("restore", path, "--yes")
+        done = drive_tune("undo", path, "--yes")
         assert (done.exit_code, machines[1].read(CURRENT_LIMIT)) == (2, [1234])
         assert "it was read from serial number 4712, and here is 51. Nothing was written" in done.stderr
-        assert drive_tune("restore", path, "--yes", "--other-drive").exit_code == 0
+        assert drive_tune("undo", path, "--yes", "--other-drive").exit_code == 0
         assert machines[1].read(CURRENT_LIMIT) == [7000]
 
 
@@ -458,7 +458,7 @@ def test_no_axis_is_written_where_a_later_one_may_turn(tmp_path, monkeypatch):
             machine.write(CURRENT_LIMIT, 1234)
         for word in (0x06, 0x07, 0x0F):
             machines[1].write(0x6040, word)
-        done = drive_tune("restore", path, "--yes")
+        done = drive_tune("undo", path, "--yes")
         assert (done.exit_code, "disable it first" in done.stderr) == (1, True)
         assert [int(machine.read(CURRENT_LIMIT)[0]) for machine in machines] == [1234, 1234]
 
@@ -470,16 +470,16 @@ def test_the_writer_of_a_restore_is_not_believed(tmp_path, monkeypatch):
         with opened(channel) as target:
             path = take(target).save(tmp_path / "before.toml")
         machines[1].write(CURRENT_LIMIT, 1234)
-        done = drive_tune("restore", path, "--yes")
+        done = drive_tune("undo", path, "--yes")
         assert (done.exit_code, done.stdout) == (1, "")
         assert "axis 1 does not hold what was written, as a second reading shows: 2003h:00" in done.stderr
 
 
 @pytest.mark.parametrize(("arguments", "code", "message"), [
-    (["restore", "none.toml"], 2, "drive-tune: cannot read none.toml: No such file"),
-    (["restore", "emulated.toml"], 2, "was taken from emulated drives, which ended with their program"),
-    (["restore", "bus.toml"], 2, "drive-tune: Restore node 1, 2, 3 on x? Nobody is there to ask; say --yes"),
-    (["restore", "bus.toml", "--yes", "--interface", "none"], 2, "cannot open interface 'none'"),
+    (["undo", "none.toml"], 2, "drive-tune: cannot read none.toml: No such file"),
+    (["undo", "emulated.toml"], 2, "was taken from emulated drives, which ended with their program"),
+    (["undo", "bus.toml"], 2, "drive-tune: Restore node 1, 2, 3 on x? Nobody is there to ask; say --yes"),
+    (["undo", "bus.toml", "--yes", "--interface", "none"], 2, "cannot open interface 'none'"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line(target, tmp_path, monkeypatch, arguments, code, message):
     monkeypatch.chdir(tmp_path)

@@ -214,6 +214,7 @@ def soak(load, seconds, seed):
     return run
 
 
+@pytest.mark.slow
 def test_a_few_seconds_under_faults():
     run = soak("two_mass", 3.0, 1)
     assert sum(run.given.values()) > 50

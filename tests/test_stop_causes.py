@@ -25,6 +25,7 @@ def test_each_axis_has_its_causes_once_and_in_their_order():
     assert stop_causes(drives) == ["no emergency told why", "Over voltage (3210h), Following error (8611h)"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motor", ["class_750w", "class_1kw"])
 def test_large_motors_are_shaken_no_more_than_the_dc_link_bears(motor):
     with emulated(load="two_mass", motor=motor, num_threads=1) as target:

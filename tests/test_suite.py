@@ -127,6 +127,7 @@ def test_a_seed_adds_machines_that_depend_on_it_and_their_number_alone(small):
     assert more[:3] == first
 
 
+@pytest.mark.slow
 def test_drawn_machines_are_sound():
     drawn = load_suite(seed=5)[len(load_suite()) :]
     assert len(drawn) >= 20

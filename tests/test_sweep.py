@@ -96,6 +96,7 @@ def test_the_gains_that_can_be_swept_are_the_writable_ones_of_2041h_to_2043h():
 
 
 # --- every point is the machine it would be alone -------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_row_of_the_grid_equals_a_run_of_that_pair_alone_bit_for_bit(small):
     points = small.experiment.points()
     for k in range(len(points)):

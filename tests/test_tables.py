@@ -57,14 +57,14 @@ def given(monkeypatch):
 
     for module in ("drive_env.tools.tables", "drive_env.tools.monitor"):
         monkeypatch.setattr(f"{module}.tables", note_tables)
-    for module in ("drive_env.tools.names", "tuning.commands.compare", "tuning.commands.sweep"):
+    for module in ("drive_env.tools.names", "tuning.commands.rank", "tuning.commands.sweep"):
         monkeypatch.setattr(f"{module}.print_names", note_names)
     for module in (
         "drive_env.tools.fault",
         "drive_env.tools.scan",
         "agents.commands.evaluate",
         "agents.commands.tune",
-        *(f"tuning.commands.{name}" for name in ("auto", "compare", "optimise", "response", "rules", "sweep")),
+        *(f"tuning.commands.{name}" for name in ("auto", "rank", "optimise", "response", "rules", "sweep")),
     ):
         monkeypatch.setattr(f"{module}.print_lines", note_lines)
     monkeypatch.setattr("drive_env.tools.tables.terminal_width", lambda: WIDTH)
@@ -86,7 +86,7 @@ EMULATED = [
     ("drive-env", "list"),
     ("drive-env", "fault", "--list"),
     ("drive-tune", "sweep", "--list"),
-    ("drive-tune", "compare", "--list"),
+    ("drive-tune", "rank", "--list"),
     ("drive-tune", "rules", "--load", "inertia"),
     ("drive-tune", "response", "--load", "gantry"),
     ("drive-tune", "optimise", "--load", "gantry", "--trials", "3", "--lanes", "3", "--objective", "speed",
@@ -96,7 +96,7 @@ SLOW = [
     ("drive-tune", "identify", "--load", "gantry"),
     ("drive-tune", "auto", "--load", "gantry", "--out", "found"),
     ("drive-tune", "sweep", "--out", "found"),
-    ("drive-tune", "compare", "-t", "fitted", "-t", "symmetrical_optimum", "--count", "2", "--out", "found"),
+    ("drive-tune", "rank", "-t", "fitted", "-t", "symmetrical_optimum", "--count", "2", "--out", "found"),
     ("drive-agent", "tune", "--load", "belt", "--out", "found"),
     ("drive-agent", "evaluate", "gain_tuning", "--episodes", "2", "--out", "found"),
 ]

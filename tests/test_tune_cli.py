@@ -55,6 +55,7 @@ def rows(path):
     return list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
 
 
+@pytest.mark.slow
 def test_a_sweep_prints_the_best_ten_and_how_fast_it_was(run):
     folder, done = run
     best = sorted(rows(folder / "out/run/results.csv"), key=lambda row: int(row["rank"]))[:10]
@@ -87,6 +88,7 @@ def test_pictures_are_pictures(run, name):
     assert len(np.unique((picture[ink] * 255).astype(int), axis=0)) > 20
 
 
+@pytest.mark.slow
 def test_a_run_repeats_from_its_settings_byte_by_byte(run):
     folder, _ = run
     done = drive_tune("sweep", "--config", "out/run/settings.toml", "--out", "again", cwd=folder)
@@ -95,6 +97,7 @@ def test_a_run_repeats_from_its_settings_byte_by_byte(run):
     assert (folder / "again/results.csv").read_bytes() == (folder / "out/run/results.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_other_versions_are_told(run):
     folder, _ = run
     settings = (folder / "out/run/settings.toml").read_text(encoding="utf-8")
@@ -105,6 +108,7 @@ def test_other_versions_are_told(run):
     assert f"note: the run was made with numpy 0.9, this is {np.__version__}" in done.stdout.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_without_out_results_go_to_a_folder_named_after_the_time(run):
     folder, _ = run
     (folder / "one.toml").write_text(SMALL.replace("count = 4", "count = 1"), encoding="utf-8")
@@ -119,7 +123,7 @@ def test_without_out_results_go_to_a_folder_named_after_the_time(run):
 def test_help_is_quick_and_names_the_options(tmp_path):
     done = drive_tune("--help", cwd=tmp_path)
     assert done.returncode == 0
-    for command in ("identify", "response", "rules", "optimise", "auto", "sweep", "compare", "verify", "restore"):
+    for command in ("identify", "response", "rules", "optimise", "auto", "sweep", "rank", "verify", "undo"):
         assert f"│ {command} " in done.stdout
     options = drive_tune("sweep", "--help", cwd=tmp_path).stdout
     for option in ("--config", "--device", "--motor", "--load", "--seed", "--out", "--show-config", "--list",
@@ -143,6 +147,7 @@ def test_list_names_what_there_is(tmp_path):
     assert "2042h:03" not in done.stdout
 
 
+@pytest.mark.slow
 def test_show_config_prints_the_experiment_with_its_comments_and_reads_back(tmp_path):
     done = drive_tune("sweep", "--show-config", cwd=tmp_path)
     assert done.stdout == DEFAULT.read_text(encoding="utf-8")
@@ -179,6 +184,7 @@ def test_a_mistake_ends_with_code_2_and_a_line_that_helps(tmp_path, arguments, m
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full"]
 
 
+@pytest.mark.slow
 def test_a_grid_without_a_usable_pair_says_so(tmp_path):
     text = SMALL.replace("low = 60\n", "low = 4000\n").replace("count = 4", "count = 1")
     (tmp_path / "wild.toml").write_text(text, encoding="utf-8")
@@ -213,6 +219,7 @@ def test_an_interrupt_ends_with_code_130_and_writes_nothing(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["long.toml"]
 
 
+@pytest.mark.slow
 def test_a_travel_that_is_too_short_is_told_in_turns_with_its_remedy(tmp_path):
     done = drive_tune("auto", "--load", "inertia", "--travel=-0.01:0.01", "--out", "run", cwd=tmp_path)
     assert done.returncode == 1
@@ -259,6 +266,7 @@ def test_a_foreign_package_in_the_way_is_named(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_the_example_runs(tmp_path):
     done = subprocess.run(
         [sys.executable, str(ROOT / "examples" / "gain_sweep.py"), "--points", "4", "--out", "run"],

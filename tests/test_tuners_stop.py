@@ -89,6 +89,7 @@ def test_a_tuner_that_is_told_to_end_brakes_before_it_cleans_up(tmp_path, comman
         assert machine.read(0x2058)[0] == TURN
 
 
+@pytest.mark.slow
 def test_a_trip_inside_an_identification_is_not_cut_short_by_its_clean_up():
     """The axis leaves its limits: what follows is the ramp to rest, whatever the tuner puts back meanwhile."""
     with EmulatedDrives(load="inertia", num_threads=1) as machine:

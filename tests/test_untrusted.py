@@ -102,7 +102,7 @@ COMMANDS = {
     "serve": (env_app, ("serve", "--config", "deep.toml", "--duration", "0.1")),
     "render": (env_app, ("render", "--config", "deep.toml", "--show-config")),
     "sweep": (tune_app, ("sweep", "--config", "deep.toml", "--show-config")),
-    "compare": (tune_app, ("compare", "--suite", "deep.toml")),
+    "compare": (tune_app, ("rank", "--suite", "deep.toml")),
     "optimise": (tune_app, ("optimise", "--config", "deep.toml")),
     "verify": (tune_app, ("verify", "deep.json")),
     "evaluate": (agent_app, ("evaluate", "tracking_two_mass", "--config", "deep.toml")),

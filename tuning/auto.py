@@ -157,7 +157,7 @@ def tell_of_lateness(run: Run) -> None:
 
 
 def tune(target: Target, rng: np.random.Generator) -> Outcome:
-    """Tune a target as `drive-tune compare` wants it."""
+    """Tune a target as `drive-tune rank` wants it."""
     from tuning.tuners import Outcome
 
     with tempfile.TemporaryDirectory() as folder:

@@ -6,14 +6,14 @@ import typer
 
 from drive_env.tools.program import Quiet, Verbose, Version, say_as_much
 from tuning.commands.auto import auto
-from tuning.commands.compare import compare
 from tuning.commands.identify import identify
 from tuning.commands.optimise import optimise
 from tuning.commands.options import interrupted
+from tuning.commands.rank import rank
 from tuning.commands.response import response
-from tuning.commands.restore import restore
 from tuning.commands.rules import rules
 from tuning.commands.sweep import sweep
+from tuning.commands.undo import undo
 from tuning.commands.verify import verify
 
 app = typer.Typer(
@@ -26,8 +26,8 @@ app = typer.Typer(
 
 PANELS = {
     "A drive, emulated or on a bus": (identify, response, rules, optimise, auto),
-    "Many emulated machines": (sweep, compare),
-    "What a change leaves": (verify, restore),
+    "Many emulated machines": (sweep, rank),
+    "What a change leaves": (verify, undo),
 }
 for panel, commands in PANELS.items():
     for command in commands:

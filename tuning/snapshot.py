@@ -1,7 +1,7 @@
 """The parameters of drives before they are changed: a file, and the way back.
 
 A `Transaction` writes the file before anything else happens, so that even a process that is killed leaves it behind;
-`drive-tune restore FILE` brings the drives back to it. Axes that are not committed are rolled back at the end.
+`drive-tune undo FILE` brings the drives back to it. Axes that are not committed are rolled back at the end.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Snapshot:
     def _toml(self, name: str) -> str:
         dictionary = describe(self.device, None).dictionary
         lines = [
-            f"# Parameters of {len(self.axes)} axes before a change: drive-tune restore {name} brings them back.",
+            f"# Parameters of {len(self.axes)} axes before a change: drive-tune undo {name} brings them back.",
             "# The check sum at the end shows whether this file was changed.",
             "",
             f"format = {FORMAT}",
@@ -291,14 +291,14 @@ def put_back(target: Target, file: Path, program: str) -> Iterator[Transaction]:
             yield transaction
     except BaseException as error:
         if file.exists() and str(file) not in str(error):  # no line for a file that could not be written
-            way = f"drive-tune restore {file} brings back what was" if transaction.changed else what_is_left(file)
+            way = f"drive-tune undo {file} brings back what was" if transaction.changed else what_is_left(file)
             print(f"{program}: {way}", file=sys.stderr)
         raise
 
 
 def what_is_left(file: Path) -> str:
     """Return what a run says that has put everything back."""
-    return f"the drives have what they had before; if ever not, drive-tune restore {file} brings it back"
+    return f"the drives have what they had before; if ever not, drive-tune undo {file} brings it back"
 
 
 class Transaction:
@@ -344,7 +344,7 @@ class Transaction:
                     store(self._target.drives, left & self._stored)
         except (BusError, ObjectAccessError, RuntimeError, TimeoutError) as failure:
             raise BusError(
-                f"{failure}; the drives may hold what was tried: drive-tune restore {self.path} brings back what was"
+                f"{failure}; the drives may hold what was tried: drive-tune undo {self.path} brings back what was"
             ) from (error or failure)
         if isinstance(error, OSError) and error.filename and not self.changed:  # a disk that is full, a folder gone
             raise OSError(error.errno, f"{error.strerror}; {what_is_left(self.path)}", error.filename) from error

@@ -110,7 +110,7 @@ def evaluate(
 
     On a bus it acts inside the safety envelope; a policy that gives no number, sticks at its limit, stalls or never
     returns is stopped, and the drives are left at rest and disabled. Their parameters are in a file for
-    `drive-tune restore` meanwhile, beside --out or in runs/, and back at the end. `--out` keeps report.json,
+    `drive-tune undo` meanwhile, beside --out or in runs/, and back at the end. `--out` keeps report.json,
     episodes.npz and pictures. In real time other programs disturb: on Linux, `chrt -f 10 drive-agent evaluate ...` goes
     before them.
     """

@@ -70,7 +70,7 @@ def tune(
     """Let a trained agent tune a drive, trial by trial, inside the safety envelope; PyTorch is not needed.
 
     Without an option of a bus an emulated drive is served as a CANopen node and reached as a real one would be.
-    Writes before.toml, from which `drive-tune restore` brings back what was, certificate.json and report.html.
+    Writes before.toml, from which `drive-tune undo` brings back what was, certificate.json and report.html.
     """
     with errors_as_exit_codes():
         from agents.policy import load_policy
@@ -260,7 +260,7 @@ def _report(done: Run, folder: Path, json: bool, bus: bool) -> None:
         )  # fmt: skip
     else:
         _print(done, refused, rule)
-        way_back = ", before.toml for `drive-tune restore`" if bus else ""  # an emulated drive ended with this program
+        way_back = ", before.toml for `drive-tune undo`" if bus else ""  # an emulated drive ended with this program
         print_lines([f"written to {folder}: report.html to read, certificate.json{way_back}"])
     if refused:
         raise typer.Exit(REFUSED)

@@ -40,7 +40,7 @@ def auto(
     """Tune a drive: check, identify, compute, try, verify, write and keep; what fails a check is rolled back.
 
     A motor turns, for about 10 s in all. The verdict is accepted, accepted with reservations, which are named, or
-    rejected. Writes before.toml, from which `drive-tune restore` brings back what was, certificate.json and
+    rejected. Writes before.toml, from which `drive-tune undo` brings back what was, certificate.json and
     report.html. Exit code 1 if an axis was rejected; why is said.
     """
     with errors_as_exit_codes():
@@ -83,9 +83,9 @@ def _left_behind(target: Target, file: Path) -> str:
     if all(np.array_equal(target.drives.read(key), [axis[key] for axis in before.axes]) for key in GAIN_OBJECTS):
         return (
             "the drives are disabled and have the gains from before; if ever not, "
-            f"drive-tune restore {file} brings them back"
+            f"drive-tune undo {file} brings them back"
         )
-    return f"the drives are disabled and have the new gains: drive-tune restore {file} brings back what was"
+    return f"the drives are disabled and have the new gains: drive-tune undo {file} brings back what was"
 
 
 def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
@@ -137,7 +137,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
     lines.append(f"{result.drive_seconds.max():.1f} s of drive time, {trials}{kept}")
     lines.append(f"written to {folder}: before.toml, certificate.json, report.html")
     if target.bus:
-        lines.append(f"drive-tune restore {result.file} brings back what was")
+        lines.append(f"drive-tune undo {result.file} brings back what was")
     print_lines(lines)
 
 

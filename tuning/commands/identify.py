@@ -54,7 +54,7 @@ def identify(
 
     The motor turns: there and back within --travel, up to its rated current and 0.7 of its rated speed. Every value
     has a 95 % interval; what cannot be told is refused with its reason. Afterwards the drive is off and has its own
-    parameters; those of a bus are in a file for `drive-tune restore`, too, beside --out or in runs/.
+    parameters; those of a bus are in a file for `drive-tune undo`, too, beside --out or in runs/.
     """
     with errors_as_exit_codes():
         if out is not None and not out.parent.is_dir():

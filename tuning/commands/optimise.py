@@ -104,7 +104,7 @@ def optimise(
 
     What oscillates is stopped within 50 ms and gets the last good gains back. Afterwards the drive has the best gains;
     trials.csv, trials.png and settings.toml are written, from which `drive-tune optimise --config settings.toml`
-    repeats the search; on a bus also OUT-before.toml, from which drive-tune restore brings back what was.
+    repeats the search; on a bus also OUT-before.toml, from which drive-tune undo brings back what was.
     """
     with errors_as_exit_codes():
         check_seed(drive.seed)
@@ -308,7 +308,7 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
         lines.append(f"search {int(np.nanargmin(found.cost))} found the best gains")
     lines.append(f"written to {folder}: trials.csv, trials.png, settings.toml")
     if before is not None:
-        lines.append(f"drive-tune restore {before} brings back what the drives had")
+        lines.append(f"drive-tune undo {before} brings back what the drives had")
     print_lines(lines)
 
 

@@ -56,7 +56,7 @@ def response(
 
     The axes run there and back at a steady speed, for about two seconds, and end where they began. With --out, a
     picture and a CSV of each axis are written. What is not coherent is grey, and no margin is read from it. The
-    parameters of drives on a bus are in a file for `drive-tune restore` meanwhile, beside --out or in runs/.
+    parameters of drives on a bus are in a file for `drive-tune undo` meanwhile, beside --out or in runs/.
     """
     with errors_as_exit_codes():
         from tuning import provenance

@@ -242,7 +242,5 @@ def _apply(
         write_gains(target.drives, np.array([proposal.gains for proposal in proposals], np.int64))
         kept = store and transaction.store()
         transaction.commit()
-    way_back = (
-        f"drive-tune restore {file} brings back what was" if target.bus else "emulated drives end with the program"
-    )
+    way_back = f"drive-tune undo {file} brings back what was" if target.bus else "emulated drives end with the program"
     print(f"written{', and kept by the drive' if kept else ''}; {way_back}")

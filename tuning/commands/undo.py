@@ -1,4 +1,4 @@
-"""`drive-tune restore`: drives as they were before a change."""
+"""`drive-tune undo`: drives as they were before a change."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tuning.snapshot import Snapshot
 
 
-def restore(
+def undo(
     file: Annotated[Path, typer.Argument(help="The file that a change left (TOML).")],
     interface: Interface = None,
     channel: Channel = None,

@@ -1,4 +1,4 @@
-"""The command `drive-env compare`: what it says of a log, what it fits, and how it ends."""
+"""The command `drive-env check-model`: what it says of a log, what it fits, and how it ends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drive_env import motion
 from drive_env.cli import app
 from drive_env.envs.randomisation import Distributions
 from drive_env.replay import Difference, Log
-from drive_env.tools.compare import _print
+from drive_env.tools.check_model import _print
 
 DONE, USER_ERROR = 0, 2
 
@@ -27,7 +27,7 @@ def log(tmp_path_factory):
 
 
 def run(*arguments):
-    result = CliRunner().invoke(app, ["compare", *(str(argument) for argument in arguments)])
+    result = CliRunner().invoke(app, ["check-model", *(str(argument) for argument in arguments)])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result.exit_code, result.stdout, result.stderr
 

@@ -1,4 +1,4 @@
-"""`drive-tune compare`: every tuner on the same machines."""
+"""`drive-tune rank`: every tuner on the same machines."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tuning.commands.options import (
 )
 
 
-def compare(
+def rank(
     suite: Annotated[str, typer.Option(help="Machines: a suite by name, or a TOML file like one.")] = "public",
     tuners: Annotated[
         list[str] | None,
@@ -61,7 +61,7 @@ def compare(
             raise ValueError("--resume needs --out: the folder into which the comparison was to write")
         from tuning import provenance
 
-        folder = provenance.run_folder("compare") if out is None else out
+        folder = provenance.run_folder("rank") if out is None else out
         try:
             _compare(suite, tuners, seed, drawn, count, trials, folder, slow, resume, json)
         except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""`drive-env compare`: a recorded move against emulated machines, and the machines that would respond like it."""
+"""`drive-env check-model`: a recorded move against emulated machines, and the machines that would respond like it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 LEAST = 16  # machines that a fit needs
 
 
-def compare(
+def check_model(
     log: Annotated[Path, typer.Argument(help="Log of a move from rest, as `scope` writes it (CSV).")],
     device: DeviceName = "tmcm1636",
     motor: Annotated[str, typer.Option(help="Motor by name.")] = "qbl4208",

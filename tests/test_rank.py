@@ -318,31 +318,32 @@ def run(*arguments):
     return result
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_table_and_writes_the_folder(tmp_path):
     folder = tmp_path / "out"
-    result = run("compare", "-t", "factory", "-t", "fitted", "--count", 3, "--out", folder)
+    result = run("rank", "-t", "factory", "-t", "fitted", "--count", 3, "--out", folder)
     assert result.exit_code == 0
     assert "Hidden J over the fitted rule's on 3 machines" in result.output
     names = {path.name for path in folder.iterdir()}
     assert names == {"tuners.csv", "rivals.csv", "machines.csv", "comparison.png", "settings.toml"}
-    told = run("compare", "-t", "fitted", "--count", 3, "--json", "--out", tmp_path / "again")
+    told = run("rank", "-t", "fitted", "--count", 3, "--json", "--out", tmp_path / "again")
     first = list(csv.DictReader((folder / "tuners.csv").open(encoding="utf-8")))
     (row,) = json.loads(told.stdout)["tuners"]
     assert f"{row['median']:.6g}" == next(line["median"] for line in first if line["tuner"] == "fitted")
 
 
 def test_the_command_lists_tuners_and_suites():
-    output = run("compare", "--list").output
+    output = run("rank", "--list").output
     assert "cmaes" in output and "public" in output and "51 machines" in output
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("compare", "-t", "luck"), "no tuner is named 'luck'"),
-        (("compare", "--suite", "secret"), "no suite is named 'secret'"),
-        (("compare", "--count", "0"), "count must be 1 or more"),
-        (("compare", "--seed", "-1"), "--seed must be 0 or more, not -1"),
+        (("rank", "-t", "luck"), "no tuner is named 'luck'"),
+        (("rank", "--suite", "secret"), "no suite is named 'secret'"),
+        (("rank", "--count", "0"), "count must be 1 or more"),
+        (("rank", "--seed", "-1"), "--seed must be 0 or more, not -1"),
         (("optimise", "--sampler", "luck"), "no sampler is named 'luck'"),
         (("optimise", "--sampler", "cmaes", "--objective", "speed", "--objective", "current"), "CMA-ES knows one"),
         (("optimise", "--lanes", "0"), "--lanes must be 1 or more"),

@@ -1,0 +1,95 @@
+"""README's commands and programs, as they stand, one after the other, as a reader would type them."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README, re.M | re.S)
+PROGRAMS = [text for kind, text in BLOCKS if kind == "python"]
+SHELLS = [text for kind, text in BLOCKS if not kind]
+# What wants hardware, another place, or more time than a test has; every other line of the shell is run.
+LEFT_OUT = ("pip install", "socketcan", "drive-agent train", "runs/…", "chrt ")
+PORT = 29636  # that of `serve`
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where the reader is: with the examples."""
+    path = tmp_path_factory.mktemp("reader")
+    (path / "examples").symlink_to(ROOT / "examples")
+    return path
+
+
+def environment():
+    programs = str(Path(sys.executable).parent)
+    return os.environ | {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}", "PYTHONUNBUFFERED": "1"}
+
+
+def run(command, folder, wanted=0):
+    done = subprocess.run(
+        command, cwd=folder, env=environment(), capture_output=True, text=True, timeout=900, check=False
+    )
+    assert done.returncode == wanted, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def lines(text):
+    return [line for line in text.splitlines() if line and not any(word in line for word in LEFT_OUT)]
+
+
+@pytest.fixture(scope="module")
+def served(folder):
+    """The block that serves a drive, in a terminal of its own."""
+    with socket.socket() as probe:
+        if probe.connect_ex(("127.0.0.1", PORT)) == 0:
+            pytest.skip(f"port {PORT} is taken")
+    (block,) = [text for text in SHELLS if text.startswith("drive-env serve")]
+    with subprocess.Popen(
+        ["bash", "-c", f"exec {block}"], cwd=folder, env=environment(), stdout=subprocess.PIPE, text=True
+    ) as process:
+        while "29636" not in process.stdout.readline():
+            assert process.poll() is None, "it ended"
+        yield
+        process.terminate()
+        process.wait(60)
+
+
+@pytest.mark.slow
+def test_the_commands_of_a_bus_do_what_they_say_one_after_the_other(folder, served):
+    (export,) = [line for text in SHELLS for line in lines(text) if line.startswith("export ")]
+    on_the_bus = [text for text in SHELLS if "DRIVE_ENV_CHANNEL" in text]
+    assert len(on_the_bus) == 2
+    for text in on_the_bus:
+        for line in lines(text):
+            if line != export:
+                run(["bash", "-ec", f"{export}\n{line}"], folder)
+    (program,) = [text for text in PROGRAMS if "CanDrives(" in text]
+    run([sys.executable, "-c", program], folder)
+    assert {"scope.csv", "scope.png", "move.csv", "move.png", "drive.toml"} <= {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.slow
+def test_the_commands_of_emulated_drives_do_what_they_say(folder):
+    left = [line for text in SHELLS for line in lines(text) if "DRIVE_ENV_CHANNEL" not in line and "serve" not in line
+            and not line.startswith(("drive-env", "python", "drive-tune verify", "drive-tune undo"))]  # fmt: skip
+    assert len(left) >= 2, left
+    for line in left:
+        run(["bash", "-ec", line], folder)
+
+
+@pytest.mark.slow
+def test_the_programs_run(folder):
+    """Those before and after the bus, in one file each; what a program goes on with stands before it."""
+    (first,) = [text for text in PROGRAMS if "EmulatedDrives(" in text and "num_machines=64" in text]
+    for text in PROGRAMS:
+        if "CanDrives(" not in text:
+            run([sys.executable, "-c", text if "import" in text and "Load(" not in text else first + text], folder)
