@@ -378,7 +378,7 @@ def test_optimise_prints_and_writes_what_it_found(tmp_path):
             "optimise", "--load", "inertia", "--trials", 6, "--lanes", 3, "--safe", "--json", "--out", tmp_path / "b"
         ).stdout
     )
-    best = min((row for row in rows if row["stopped"] == "False"), key=lambda row: float(row["cost"]))
+    best = min((row for row in rows if row["stopped"] == "False"), key=lambda row: float(row["J"]))
     assert told["gains"][0][2:] == [int(best[name]) for name in ("velocity_p", "velocity_i", "position_p")]
 
 
@@ -399,10 +399,10 @@ def test_a_search_repeats_from_its_settings_and_what_is_said_besides_takes_their
 def test_the_picture_shows_the_trials_of_every_search():
     rows = [row(search, number, cost) for search, cost in ((0, 2.0), (1, 1.0)) for number in range(3)]
     found = Optimised(np.ones((2, 5), int), np.ones((2, 5), int), np.array([2.0, 1.0]), tuple(rows), 0.0,
-                      np.zeros(2, int), np.zeros(2, int), ("", ""))  # fmt: skip
+                      np.zeros(2, int), np.zeros(2, int), ("", ""), 0.01)  # fmt: skip
     axes = trials_figure(found, Settings()).axes[0]
     assert len(axes.collections[0].get_offsets()) == 6
-    assert [line.get_ydata().tolist() for line in axes.lines] == [[2.0] * 3, [1.0] * 3]
+    assert [line.get_ydata().tolist() for line in axes.lines] == pytest.approx(np.exp([[2.0] * 3, [1.0] * 3]))
 
 
 def row(search, number, cost):

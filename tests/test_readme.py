@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pty
 import re
 import socket
 import subprocess
@@ -35,9 +36,16 @@ def environment():
 
 
 def run(command, folder, wanted=0):
-    done = subprocess.run(
-        command, cwd=folder, env=environment(), capture_output=True, text=True, timeout=900, check=False
-    )
+    keyboard, terminal = pty.openpty()  # who is asked whether the way is clear says yes
+    os.write(keyboard, b"y\n")
+    try:
+        done = subprocess.run(
+            command, cwd=folder, env=environment(), stdin=terminal, capture_output=True, text=True, timeout=900,
+            check=False,
+        )  # fmt: skip
+    finally:
+        os.close(keyboard)
+        os.close(terminal)
     assert done.returncode == wanted, f"{command}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 

@@ -7,7 +7,7 @@ from drive_env import EmulatedDrives, motion
 from drive_env.dictionary.entries import Entry
 from drive_env.envs.randomisation import Distributions
 from drive_env.replay import Log, command_of, compare, fit, read_log, replay
-from drive_env.tools.scope import _write_csv
+from drive_env.tools.scope import write_table
 
 TURN = 65536  # increments
 TRUTH = {"load.inertia": 2.4e-5, "load.coulomb": 4e-3}
@@ -172,7 +172,7 @@ def written(path, log, labels=("node 1",)):
     entries = [known.find(name) for name in log.objects]
     assert all(isinstance(entry, Entry) for entry in entries)
     rows = {entry: log.objects[name] for entry, name in zip(entries, log.objects, strict=True)}
-    _write_csv(path, entries, list(labels), log.t, rows)
+    write_table(path, entries, list(labels), log.t, rows)
 
 
 def test_what_scope_writes_is_read_back(log, tmp_path):

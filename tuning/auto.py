@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tuning.auto_choice import choose
 from tuning.auto_margins import judge, measure
 from tuning.auto_moves import look_back, show, stand
 from tuning.auto_run import Run
@@ -122,6 +123,7 @@ def prove_found(
         show(run)
         say("measuring the frequency response", 0.85)
         measure(run)
+        choose(run)
         say("comparing with the gains before", 0.93)
         look_back(run)
         stand(run, target)

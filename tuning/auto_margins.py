@@ -156,6 +156,12 @@ def _margins(run: Run, response: MeasuredLoop, gains: Integers, k: int) -> dict[
     return {loop: one if math.isfinite(one.gain_db) else one._replace(gain_db=math.nan) for loop, one in found.items()}
 
 
+def sensitivity(run: Run, response: MeasuredLoop, gains: Integers, k: int) -> float:
+    """Return Ms of the outer loops of an axis by its measured velocity loop, the greater."""
+    found = _margins(run, response, gains, k)
+    return max(found[loop].ms for loop in _loops(run))
+
+
 def judge(run: Run) -> None:
     """Say which margins the gains have that are to stay: as measured, or what they are at least."""
     response = run.response
