@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +19,7 @@ import pytest
 
 from tuning import pools, provenance, sweep
 from tuning.experiment import load_experiment
-from tuning.pools import PoolError, in_order, open_pool
+from tuning.pools import PoolError, in_order, open_pool, parse_cluster
 from tuning.shard_log import ShardLog, ShardLogError
 from tuning.unfinished import SHARDS, shard_log, unfinished_folder
 
@@ -571,3 +573,46 @@ def test_resume_needs_a_folder():
     )  # fmt: skip
     assert done.returncode == 2
     assert done.stderr.startswith("drive-tune: --resume needs --out")
+
+
+@pytest.fixture
+def certificates(tmp_path):
+    """A certificate that vouches for itself, and its key: (folder, the query of an address)."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl, which makes the certificate, is not installed")
+    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "1", "-subj", "/CN=127.0.0.1",
+         "-keyout", str(key), "-out", str(cert)], check=True, capture_output=True,
+    )  # fmt: skip
+    return cert, key
+
+
+@pytest.mark.slow
+def test_a_cluster_over_tls_takes_certificates(certificates):
+    distributed = pytest.importorskip("distributed")
+    cert, key = map(str, certificates)
+    roles = {f"tls_{role}_{part}": path for role in ("scheduler", "worker", "client")
+             for part, path in (("cert", cert), ("key", key))}  # fmt: skip
+    security = distributed.Security(require_encryption=True, tls_ca_file=cert, **roles)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tls", host="127.0.0.1",
+        dashboard_address="127.0.0.1:0", security=security, silence_logs="CRITICAL",
+    ) as cluster:  # fmt: skip
+        address = cluster.scheduler_address
+        assert address.startswith("tls://")
+        with open_pool(cluster=f"{address}?ca={cert}&cert={cert}&key={key}") as pool:
+            assert sorted(pool.unordered(abs, [-1, 2, -3])) == [(0, 1), (1, 2), (2, 3)]
+        with pytest.raises(PoolError, match="needs certificates: tls://"), open_pool(cluster=address):
+            pass
+
+
+@pytest.mark.parametrize(("text", "says"), [
+    ("somewhere", "must be the address of a Dask scheduler, as tcp://host:port, or tls://host:port"),
+    ("tcp://host:1?ca=a&cert=b&key=c", "and of other protocols nothing"),
+    ("tls://host:1?ca=a", "stand the files ca, cert, key, each with its path"),
+    ("tls://host:1?ca=none.pem&cert=none.pem&key=none.pem", "there is no file none.pem, which ca names"),
+])  # fmt: skip
+def test_what_is_no_address_of_a_cluster_is_told(text, says):
+    with pytest.raises(ValueError, match=re.escape(says)):
+        parse_cluster(text)

@@ -20,7 +20,9 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
+from urllib.parse import parse_qsl
 
 from tuning import provenance
 
@@ -30,6 +32,8 @@ Result = TypeVar("Result")
 
 CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
 FIRST_RESULT = "waiting for the first result (a worker that never ran before compiles for half a minute)"
+# Files of a tls:// address, and what Dask's security calls them.
+TLS_FILES = {"ca": "tls_ca_file", "cert": "tls_client_cert", "key": "tls_client_key"}
 WORKERS_PERIOD = 3.0  # s, between two looks at whether a cluster has workers
 
 logger = logging.getLogger(__name__)
@@ -76,7 +80,7 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
 
     Args:
         workers: Processes of this machine; None for this process itself.
-        cluster: Address of the scheduler of a running Dask cluster, tcp://host:port.
+        cluster: Address of the scheduler of a running Dask cluster, as `parse_cluster` reads it.
 
     Raises:
         ValueError: For both, or fewer than one worker.
@@ -235,16 +239,46 @@ class _Dask:
         return sorted(lines)
 
 
+def parse_cluster(text: str) -> tuple[str, dict[str, Any]]:
+    """Return the address of a scheduler, and of tls:// the files that `?ca=...&cert=...&key=...` names.
+
+    Without them Dask's own configuration counts (distributed.comm.tls).
+
+    Raises:
+        ValueError: For what is no address, or a file that is not there.
+    """
+    address, _, query = text.partition("?")
+    if not re.fullmatch(r"[a-z]+://.+:\d+", address):
+        raise ValueError(
+            f"--cluster {text} must be the address of a Dask scheduler, as tcp://host:port, or "
+            f"tls://host:port?{'&'.join(f'{name}=FILE' for name in TLS_FILES)}"
+        )
+    if not query:
+        return address, {}
+    given = dict(parse_qsl(query, keep_blank_values=True))
+    if not address.startswith("tls://") or set(given) != set(TLS_FILES):
+        raise ValueError(
+            f"--cluster {text}: after the ? of tls:// stand the files {', '.join(TLS_FILES)}, each with its path, and "
+            "of other protocols nothing"
+        )
+    for name, path in given.items():
+        if not Path(path).is_file():
+            raise ValueError(f"--cluster {text}: there is no file {path}, which {name} names")
+    return address, {"require_encryption": True} | {TLS_FILES[name]: path for name, path in given.items()}
+
+
 @contextmanager
 def _cluster(address: str) -> Iterator[Pool]:
     try:
         from distributed import Client
     except ImportError:
         raise PoolError('--cluster needs dask.distributed; pip install "drive-env[cluster]"') from None
-    if not re.fullmatch(r"[a-z]+://.+:\d+", address):
-        raise ValueError(f"--cluster {address} must be the address of a Dask scheduler, as tcp://host:port")
+    address, certificates = parse_cluster(address)
     try:
-        client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
+        client = Client(address, security=certificates or None, timeout=CONNECT_TIMEOUT, set_as_default=False)
+    except TypeError:  # Dask's, of tls:// without any
+        files = "&".join(f"{name}=FILE" for name in TLS_FILES)
+        raise PoolError(f"--cluster {address} needs certificates: {address}?{files}") from None
     except (OSError, TimeoutError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise PoolError(

@@ -77,7 +77,11 @@ Workers = Annotated[
     typer.Option("--workers", help="Processes of this machine.", show_default="this process, with a thread per core"),
 ]
 Cluster = Annotated[
-    str | None, typer.Option("--cluster", help="Dask scheduler on whose workers to run: tcp://host:port.")
+    str | None,
+    typer.Option(
+        "--cluster",
+        help="Dask scheduler on whose workers to run: tcp://host:port, or tls://host:port?ca=FILE&cert=FILE&key=FILE.",
+    ),
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Go on with what a run into this --out left when it was stopped.")
