@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from drive_env import motion
 from drive_env.envs.randomisation import BESIDE, Distributions, Law
+from mechanics.near_names import did_you_mean
 from mechanics.untrusted import MOST_RECORDING, check_size
 
 if TYPE_CHECKING:
@@ -228,6 +229,11 @@ def compare(log: Log, found: Mapping[Key, Integers], num_machines: int = 1) -> d
     return report
 
 
+def fittable(laws: Distributions) -> list[str]:
+    """Return which parameters of a set of laws can be fitted: those that are drawn from a range."""
+    return [name for name, law in laws.laws.items() if name not in BESIDE and law.law != "choice"]
+
+
 def fit(
     drives: EmulatedDrives,
     log: Log,
@@ -265,10 +271,11 @@ def fit(
     machine = drives.machine
     nominal = {name: values.copy() for name, values in machine.parameters.items()}
     candidates = drives.num_machines
+    known = fittable(laws)
     for name in parameters:
-        if name not in laws.laws or name in BESIDE or laws.laws[name].law == "choice":
-            known = [n for n, law in laws.laws.items() if n not in BESIDE and law.law != "choice"]
-            raise ValueError(f"{name!r} cannot be fitted; there are {', '.join(known)}")
+        if name not in known:
+            near = did_you_mean(name, known)
+            raise ValueError(f"{name!r} cannot be fitted{near}; there are {', '.join(known)}")
     if candidates < 16 or not parameters:
         raise ValueError(f"a fit needs at least 16 machines and one parameter, not {candidates} and {len(parameters)}")
     rng = np.random.default_rng(seed)

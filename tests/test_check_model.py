@@ -58,6 +58,16 @@ def test_a_fit_finds_the_machine_and_writes_laws_that_environments_take(log, tmp
     assert all(laws[name] != prior[name] for name in TRUTH)
 
 
+def test_what_can_be_fitted_is_listed(log):
+    code, text, _ = run(log, "--load", "two_mass", "--fit", "?")
+    assert code == 0 and text.startswith("two_mass has ") and "load.inertia" in text and "load.stiffness" in text
+    code, text, _ = run(log, "--load", "two_mass", "--fit", "?", "--json")
+    names = json.loads(text)["parameters"]
+    assert code == 0 and "load.stiffness" in names and "load" not in names
+    code, _, error = run(log, "--fit", "load.inertai")
+    assert code == 2 and "did you mean 'load.inertia'" in error
+
+
 def test_a_fit_as_json(log):
     code, text, _ = run(log, "--fit", "load.inertia", "--machines", 16, "--rounds", 1, "--json")
     told = json.loads(text)["fit"]
@@ -102,7 +112,7 @@ def test_late_and_early_are_told(capsys, shift, says):
         (["--load", "crane"], "no load is named 'crane'; there are arm"),
         (["--load", "gantry"], "the log is of 1 axes, a machine of load 'gantry' has 2"),
         (["--motor", "big"], "qbl4208"),
-        (["--fit", "load.weight"], "'load.weight' cannot be fitted; there are motor.R_s"),
+        (["--fit", "load.weight"], "'load.weight' cannot be fitted"),
         (["--fit", "load.inertia", "--machines", "4"], "--machines 4 is too few for a fit; give 16 or more"),
         (["--fit", "load.inertia", "--distributions", "sand"], "no set of distributions is named 'sand'"),
         (["--out", "laws.toml"], "name what to fit with --fit"),

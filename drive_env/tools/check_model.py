@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drive_env.tools.options import DeviceName, Json, check_free, errors_as_exit_codes, print_json
+from drive_env.tools.tables import print_lines
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectDictionary
@@ -28,7 +29,10 @@ def check_model(
     fit: Annotated[
         list[str] | None,
         typer.Option(
-            "--fit", "-f", help="Parameter to fit to the log: load.inertia, motor.coulomb, ...; may be repeated."
+            "--fit",
+            "-f",
+            help="Parameter to fit to the log: load.inertia, motor.coulomb, ...; may be repeated. '?' lists "
+            "those that the load has.",
         ),
     ] = None,
     distributions: Annotated[
@@ -65,11 +69,15 @@ def check_model(
         from drive_env.envs.randomisation import Distributions
         from drive_env.replay import compare as differences
         from drive_env.replay import fit as fitted
-        from drive_env.replay import replay
+        from drive_env.replay import fittable, replay
         from drive_env.tools.parameters import load_parameters
         from drive_env.whole_file import write_whole
 
         laws = Distributions.load(distributions or load) if fit else None
+        if laws is not None and "?" in (fit or ()):
+            names = fittable(laws)
+            print_json({"parameters": names}) if json else print_lines([f"{load} has {', '.join(names)}"])
+            return
         with EmulatedDrives(device, load, motor, machines if fit else 1, seed) as drives:
             dictionary = drives.device.new_dictionary()
             given = None if settings is None else load_parameters(settings, dictionary)
