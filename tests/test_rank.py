@@ -19,6 +19,7 @@ from tuning import tuners
 from tuning.cli import app
 from tuning.compare import compare, save
 from tuning.optimise import Optimised, Row, Settings
+from tuning.pools import open_pool
 from tuning.shard_log import ShardLog
 from tuning.suite import load_suite, open_group
 from tuning.trial_bench import read_gains
@@ -188,6 +189,16 @@ def test_a_comparison_that_was_killed_goes_on_to_the_same_figures(tmp_path):
         resumed = compare(machines, names, seed=3, log=log)
     assert resumed == whole
     assert calls == [("a", "inertia"), ("b", "inertia"), ("a", "belt"), ("b", "belt")]  # none of them twice
+
+
+@pytest.mark.slow
+def test_on_processes_it_is_the_same_comparison(tmp_path):
+    machines, names = [*RIGID[:2], *SHORT], ("factory", "simc", "random")
+    whole = compare(machines, {name: find_tuner(name, 2) for name in names}, seed=3)
+    with open_pool(workers=2) as pool, ShardLog(tmp_path / "log", "x") as log:
+        apart = compare(machines, {name: find_tuner(name, 2) for name in names}, seed=3, log=log, pool=pool, trials=2)
+        assert sorted(log.done) == list(range(6))
+    assert apart == whole
 
 
 # --- machines of several axes -------------------------------------------------------------------------------------

@@ -11,8 +11,8 @@ import csv
 import json
 import warnings
 import zlib
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,15 +26,16 @@ from drive_env.score import HiddenScore
 from mechanics.untrusted import parse_json
 from tuning.meter import KINDS, MeteredDrives
 from tuning.moved_inertia import moved_inertia
-from tuning.shard_log import Arrays, ShardLog
+from tuning.shard_log import ShardLog
 from tuning.suite import Machine, groups, open_group
 from tuning.target import Target
 from tuning.toml_tables import toml
 from tuning.trial_bench import read_gains
-from tuning.tuners import Outcome, RuleTuner, Tuner, identify_all
+from tuning.tuners import Outcome, RuleTuner, Tuner, find_tuner, identify_all
 
 if TYPE_CHECKING:
     from tuning.identification import Identification
+    from tuning.pools import Pool
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -114,6 +115,8 @@ def compare(
     num_threads: int | None = None,
     log: ShardLog | None = None,
     progress: Progress = lambda what, share: None,
+    pool: Pool | None = None,
+    trials: int | None = None,
 ) -> Comparison:
     """Have every tuner tune every machine.
 
@@ -124,36 +127,94 @@ def compare(
         num_threads: As `EmulatedDrives` takes it.
         log: What tuners made of machines already, and where what is to come is kept.
         progress: Called with what is under way and the share that is done.
+        pool: Where else it runs, which changes no digit; there the tuners are found by their names and `trials`.
+        trials: As `find_tuner` takes it.
     """
     tasks = [(indices, name) for indices in groups(machines) for name in tuners]
-    logged = {} if log is None else {k: _rows_of(arrays) for k, arrays in log.done.items()}
-    done, total = 0, max(len(machines) * len(tuners), 1)
-    found: dict[tuple[str, int], MachineRow] = {}
-    with ExitStack() as open_now:
-        yardstick: Yardstick | None = None
-        for k, (indices, name) in enumerate(tasks):
-            group = [machines[index] for index in indices]
-            progress(f"{name} on {group[0].load}, {group[0].motor}", done / total)
-            if k % len(tuners) == 0:
-                open_now.close()
-                yardstick = None
-            if k not in logged:
-                if yardstick is None:
-                    yardstick, bench = Yardstick(group, num_threads), _Bench(group, seed, num_threads)
-                    open_now.callback(yardstick.close)
-                logged[k] = _rows(name, group, bench.tune(name, tuners[name]), yardstick)
-                if log is not None:
-                    log.append(k, {"rows": np.array(json.dumps([asdict(row) for row in logged[k]]))})
-            found.update({(name, index): row for index, row in zip(indices, logged[k], strict=True)})
-            done += len(group)
+    done = {} if log is None else {k: _rows_of(str(arrays["rows"])) for k, arrays in log.done.items()}
+    left = [k for k in range(len(tasks)) if k not in done]
+
+    def say(k: int) -> None:
+        machine = machines[tasks[k][0][0]]
+        progress(f"{tasks[k][1]} on {machine.load}, {machine.motor}", len(done) / len(tasks))
+
+    if pool is None:
+        fresh = _here(machines, tuners, tasks, left, seed, num_threads, say)
+    else:
+        fresh = _elsewhere(machines, tasks, left, seed, trials, pool, say)
+    for k, rows in fresh:
+        done[k] = rows
+        if log is not None:
+            log.append(k, {"rows": np.array(_text_of(rows))})
     progress("", 1.0)
-    rows = tuple(found[name, k] for name in tuners for k in range(len(machines)))
-    summaries = [_summary(name, [row for row in rows if row.tuner == name]) for name in tuners]
-    return Comparison(rows, tuple(sorted(summaries, key=lambda row: (row.median, row.tuner))))
+    found = {(tasks[k][1], i): row for k, own in done.items() for i, row in zip(tasks[k][0], own, strict=True)}
+    ordered = tuple(found[name, i] for name in tuners for i in range(len(machines)))
+    summaries = [_summary(name, [row for row in ordered if row.tuner == name]) for name in tuners]
+    return Comparison(ordered, tuple(sorted(summaries, key=lambda row: (row.median, row.tuner))))
 
 
-def _rows_of(arrays: Arrays) -> list[MachineRow]:
-    return [MachineRow(**row) for row in parse_json(str(arrays["rows"]))]
+class _Task(NamedTuple):
+    """A tuner on the machines of a group, for another process."""
+
+    group: list[Machine]
+    tuner: str
+    trials: int | None
+    seed: int
+
+
+def _run(task: _Task) -> str:
+    """Return what a tuner makes of the machines of a group, as text."""
+    with closing(Yardstick(task.group, 1)) as yardstick:
+        tuned = _Bench(task.group, task.seed, 1).tune(task.tuner, find_tuner(task.tuner, task.trials))
+        return _text_of(_rows(task.tuner, task.group, tuned, yardstick))
+
+
+def _here(
+    machines: Sequence[Machine],
+    tuners: Mapping[str, Tuner],
+    tasks: Sequence[tuple[Sequence[int], str]],
+    left: Sequence[int],
+    seed: int,
+    num_threads: int | None,
+    say: Callable[[int], None],
+) -> Iterator[tuple[int, list[MachineRow]]]:
+    """Give the number and the rows of each task as it is done, group by group: what a group needs is made once."""
+    with ExitStack() as open_now:
+        indices: Sequence[int] = ()
+        for k in left:
+            if tasks[k][0] is not indices:
+                open_now.close()
+                indices = tasks[k][0]
+                group = [machines[index] for index in indices]
+                yardstick, bench = Yardstick(group, num_threads), _Bench(group, seed, num_threads)
+                open_now.callback(yardstick.close)
+            name = tasks[k][1]
+            say(k)
+            yield k, _rows(name, group, bench.tune(name, tuners[name]), yardstick)
+
+
+def _elsewhere(
+    machines: Sequence[Machine],
+    tasks: Sequence[tuple[Sequence[int], str]],
+    left: Sequence[int],
+    seed: int,
+    trials: int | None,
+    pool: Pool,
+    say: Callable[[int], None],
+) -> Iterator[tuple[int, list[MachineRow]]]:
+    """Give the number and the rows of each task as it comes back."""
+    items = [_Task([machines[i] for i in tasks[k][0]], tasks[k][1], trials, seed) for k in left]
+    for place, text in pool.unordered(_run, items):
+        say(left[place])
+        yield left[place], _rows_of(text)
+
+
+def _text_of(rows: Sequence[MachineRow]) -> str:
+    return json.dumps([asdict(row) for row in rows])
+
+
+def _rows_of(text: str) -> list[MachineRow]:
+    return [MachineRow(**row) for row in parse_json(text)]
 
 
 class Yardstick:

@@ -11,8 +11,10 @@ import typer
 from drive_env.tools.tables import Column, print_lines, print_names, print_table
 from tuning.commands.options import (
     INTERRUPTED,
+    Cluster,
     Json,
     Resume,
+    Workers,
     check_seed,
     errors_as_exit_codes,
     fail,
@@ -41,6 +43,8 @@ def rank(
     trials: Annotated[
         int | None, typer.Option(help="Trials of every search by trials.", show_default="each tuner's own: 12 or 20")
     ] = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     slow: Annotated[bool, typer.Option("--slow", help="Compare the slow tuners, too.")] = False,
     show: Annotated[bool, typer.Option("--list", help="List tuners and suites, and stop.")] = False,
     resume: Resume = False,
@@ -51,7 +55,7 @@ def rank(
     Hidden J counts speed, stiffness, noise, overshoot and robustness; it is given relative to that of the fitted rule
     with the true inertia, and machine by machine to that of the best other tuner. Writes tuners.csv, rivals.csv,
     machines.csv, comparison.png and settings.toml. Stopped at any point, it goes on with --out and --resume, to the
-    same digits.
+    same digits; with --workers and --cluster, too.
     """
     with errors_as_exit_codes():
         if show:
@@ -63,7 +67,7 @@ def rank(
 
         folder = provenance.run_folder("rank") if out is None else out
         try:
-            _compare(suite, tuners, seed, drawn, count, trials, folder, slow, resume, json)
+            _compare(suite, tuners, seed, drawn, count, trials, folder, slow, resume, json, workers, cluster)
         except KeyboardInterrupt:
             fail(what_an_interrupt_leaves(folder), INTERRUPTED)
 
@@ -79,6 +83,8 @@ def _compare(
     slow: bool,
     resume: bool,
     json: bool,
+    workers: int | None,
+    cluster: str | None,
 ) -> None:
     import hashlib
     from dataclasses import asdict
@@ -86,6 +92,7 @@ def _compare(
     from tuning import provenance, unfinished
     from tuning.compare import compare as run
     from tuning.compare import save, settings_text
+    from tuning.pools import open_pool
     from tuning.rivals import all_rivals
     from tuning.suite import groups, load_suite
     from tuning.tuners import MissingTunerError, find_tuner, tuner_rows
@@ -112,8 +119,15 @@ def _compare(
         if log.done:
             print(f"note: goes on from {len(log.done)} of {len(tuners) * len(groups(machines))} steps that are done",
                   file=sys.stderr)  # fmt: skip
-        with progress_bar(f"{len(tuners)} tuners on {len(machines)} machines") as show:
-            comparison = run(machines, tuners, seed=seed, log=log, progress=lambda what, share: show(share))
+        with open_pool(workers, cluster) as pool:
+            for line in pool.differences():
+                print(f"note: {line}", file=sys.stderr)
+            elsewhere = workers is not None or cluster is not None
+            with progress_bar(f"{len(tuners)} tuners on {len(machines)} machines") as show:
+                comparison = run(
+                    machines, tuners, seed=seed, log=log, progress=lambda what, share: show(share),
+                    pool=pool if elsewhere else None, trials=trials,
+                )  # fmt: skip
     with provenance.new_folder(folder) as partial:
         save(comparison, partial, settings)
     unfinished.discard(folder)
