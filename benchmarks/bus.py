@@ -33,7 +33,7 @@ print("it floods", flush=True)
 while True:
     connection.sendall(b"t7FF81122334455667788\\r" * 500)
 """
-SERVE = "import typer; from drive_env.tools.serve import serve; typer.run(serve)"
+SERVE = "import typer; from drive_env.commands.serve import serve; typer.run(serve)"
 
 
 def sdo_in_process() -> float:
@@ -182,15 +182,15 @@ def policy_loop() -> dict[str, float]:
 
     A step is an action within a deadline, the envelope, an RPDO, SYNC, two TPDOs, observation and reward.
     """
-    from agents.guard import PATIENT, GuardedPolicy
-    from agents.on_the_bus import drives_for
-    from agents.policy import load_policy
-    from agents.served import in_real_time
+    from agents.evaluation.on_the_bus import drives_for
+    from agents.evaluation.served import in_real_time
+    from agents.policies.guard import PATIENT, GuardedPolicy
+    from agents.policies.policy import load_policy
     from agents.shipped import shipped
     from drive_env import motion
     from drive_env.bus.config import Machine
     from drive_env.envs.tracking import Tracking
-    from drive_env.undisturbed import undisturbed
+    from drive_env.master.realtime_section import undisturbed
 
     policy = load_policy(shipped("tracking_two_mass"))
     options = {

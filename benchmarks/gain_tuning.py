@@ -6,8 +6,8 @@ import time
 
 import numpy as np
 
-from drive_env.envs.gain_trial import PHASES
 from drive_env.envs.gain_tuning import GainTuning
+from drive_env.trials.gain_trial import PHASES
 
 LANES, STEPS = 64, 12
 

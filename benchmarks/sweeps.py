@@ -7,10 +7,10 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from tuning import sweep
-from tuning.experiment import Experiment, SweptObject, load_experiment
-from tuning.pools import open_pool
-from tuning.shard_log import ShardLog
+from tuning.runs import sweep
+from tuning.runs.experiment import Experiment, SweptObject, load_experiment
+from tuning.runs.pools import open_pool
+from tuning.runs.shard_log import ShardLog
 
 SIDE, DURATION = 100, 0.25  # points along each of two gains; s
 REPETITIONS = 3

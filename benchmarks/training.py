@@ -16,8 +16,8 @@ CORES = 2
 
 def training(environment: str, section: str | None, rollouts: int) -> dict[str, float]:
     """Return steps/s of the fastest rollout with its update, and the share of its time that the environment took."""
-    from agents import hyperparameters
-    from agents.training import Progress, Run, train
+    from agents.training import hyperparameters
+    from agents.training.train import Progress, Run, train
 
     given = hyperparameters.load(environment, "ppo", "quick", section=section)
     given["n_timesteps"] = rollouts * given["n_envs"] * given["n_steps"]

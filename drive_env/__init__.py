@@ -7,23 +7,23 @@ from typing import TYPE_CHECKING, Any
 from drive_env.envs import register
 
 if TYPE_CHECKING:
-    from drive_env import motion as motion
-    from drive_env.can_drives import CanDrives as CanDrives
     from drive_env.dictionary.access import ObjectAccessError as ObjectAccessError
-    from drive_env.drives import EmulatedDrives as EmulatedDrives
+    from drive_env.drives import motion as motion
+    from drive_env.drives.trace import Trace as Trace
+    from drive_env.emulator.emulated_drives import EmulatedDrives as EmulatedDrives
+    from drive_env.master.can_drives import CanDrives as CanDrives
     from drive_env.safety.envelope import SafetyError as SafetyError
     from drive_env.safety.limits import Limits as Limits
-    from drive_env.trace import Trace as Trace
 
 __all__ = ["CanDrives", "EmulatedDrives", "Limits", "ObjectAccessError", "SafetyError", "Trace", "motion"]
 
 _HOMES = {
-    "CanDrives": "can_drives",
-    "EmulatedDrives": "drives",
+    "CanDrives": "master.can_drives",
+    "EmulatedDrives": "emulator.emulated_drives",
     "Limits": "safety.limits",
     "ObjectAccessError": "dictionary.access",
     "SafetyError": "safety.envelope",
-    "Trace": "trace",
+    "Trace": "drives.trace",
 }
 
 register()
@@ -34,7 +34,7 @@ def __getattr__(name: str) -> Any:
     import importlib
 
     if name == "motion":
-        return importlib.import_module("drive_env.motion")
+        return importlib.import_module("drive_env.drives.motion")
     if name in _HOMES:
         return getattr(importlib.import_module(f"drive_env.{_HOMES[name]}"), name)
     raise AttributeError(f"module 'drive_env' has no attribute {name!r}")

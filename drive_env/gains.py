@@ -148,8 +148,8 @@ class Rule(NamedTuple):
     position: float
 
 
-# The best of 150 sets of constants by mean ln hidden J (drive_env/score.py) over random machines of six loads, 48 each:
-# `python -m tuning.fit_rule --seed 4`. Median hidden J on as many others: inertia 2.2, two_mass 3.5, three_mass 3.4,
+# The best of 150 sets of constants by mean ln hidden J (trials/score.py) over random machines of six loads, 48 each:
+# `python -m research.fit_rule --seed 4`. Median hidden J on as many others: inertia 2.2, two_mass 3.5, three_mass 3.4,
 # belt 2.8, ball_screw 2.3, geared_joint 2.7; the worst twentieth of the elastic ones 16...30, where a resonance lies
 # that the rule knows nothing of. A position share of 1 is the end of the range that was searched: three fits before
 # this one, over other ranges, loads and seeds, went beyond and oscillated on elastic loads (median 13...17 on
@@ -198,7 +198,7 @@ def small_time_constants(device: Device, velocity_filter: ArrayLike, current_hz:
         velocity_filter: Corner frequency of the velocity filter [Hz].
         current_hz: Bandwidth of the current loop [Hz].
     """
-    from drive_env.parameters import VELOCITY_FILTER_DAMPING  # the compiler comes with it
+    from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING  # the compiler comes with it
 
     filters = 2.0 * VELOCITY_FILTER_DAMPING / (2.0 * math.pi * np.asarray(velocity_filter, float))
     return np.asarray(1.0 / (2.0 * math.pi * current_hz) + 1.5 / device.current_rate + filters

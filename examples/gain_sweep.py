@@ -9,7 +9,7 @@ import argparse
 from dataclasses import dataclass, replace
 
 from drive_env.motors import MOTORS
-from tuning import sweep
+from tuning.runs import sweep
 
 
 @dataclass

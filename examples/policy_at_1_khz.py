@@ -4,8 +4,8 @@ python examples/policy_at_1_khz.py                                         emula
 python examples/policy_at_1_khz.py --channel socket://127.0.0.1:29636      the emulator served by `drive-env serve`
 python examples/policy_at_1_khz.py --interface socketcan --channel can0    a real drive: know what its motor turns!
 
-Of drive-agent only agents/policy.py is needed, which needs NumPy alone: `--agent agent.npz` takes one that was trained
-on a velocity error. Without one a PI law acts.
+Of drive-agent only agents/policies/policy.py is needed, which needs NumPy alone: `--agent agent.npz` takes one that was
+trained on a velocity error. Without one a PI law acts.
 """
 
 import argparse
@@ -13,7 +13,7 @@ import contextlib
 
 import numpy as np
 
-from agents.policy import load_policy
+from agents.policies.policy import load_policy
 from drive_env import CanDrives, EmulatedDrives, Limits, motion
 
 TURN = 65536  # increments of a revolution

@@ -11,9 +11,9 @@ import warnings
 import numpy as np
 import pytest
 
-from agents import policy as runtime
-from agents.bundle import ABOUT, Bundle, BundleError, plain
-from agents.policy import ACTIVATIONS, PolicyError, load_policy, measure_latency, policy_of
+from agents.policies import policy as runtime
+from agents.policies.agent_file import ABOUT, Bundle, BundleError, plain
+from agents.policies.policy import ACTIVATIONS, PolicyError, load_policy, measure_latency, policy_of
 
 ENTRIES, ACTIONS = 6, 2
 
@@ -269,7 +269,7 @@ class Echo:
 def test_acting_needs_numpy_alone(tmp_path):
     path = bundle().save(tmp_path / "agent.npz")
     program = (
-        "import sys; from agents.policy import load_policy; import numpy as np;"
+        "import sys; from agents.policies.policy import load_policy; import numpy as np;"
         f"action = load_policy({str(path)!r}).act(np.zeros({ENTRIES}));"
         "heavy = {'torch', 'gymnasium', 'mujoco', 'numba', 'scipy', 'yaml', 'stable_baselines3', 'can', 'drive_env'};"
         "print(len(action), sorted(heavy & {name.partition('.')[0] for name in sys.modules}))"

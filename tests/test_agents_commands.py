@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 pytest.importorskip("stable_baselines3")
 
-from agents.bundle import Bundle
-from agents.cli import app
 from agents.commands import train as train_command
+from agents.commands.cli import app
+from agents.policies.agent_file import Bundle
 
 
 def run(*arguments):

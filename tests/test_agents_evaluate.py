@@ -12,18 +12,18 @@ from test_agents_bundle import ENTRIES, bundle, observations
 from test_parity import WorldBus
 from typer.testing import CliRunner
 
-from agents import episode_log, evaluation_plots, gap
-from agents.both_sides import HIDDEN, on_both_sides
-from agents.bundle import Bundle, BundleError
-from agents.cli import app
-from agents.evaluation import AsOnABus, Evaluation, evaluate
-from agents.guard import GuardLimits
-from agents.on_the_bus import target_for
-from agents.policies import PolicyNotFoundError, open_policy
-from agents.policy import PolicyError, policy_of
-from agents.scores import interval
-from agents.served import draw_machines, emulated
-from agents.tasks import make_lanes
+from agents.commands.cli import app
+from agents.evaluation import episode_log, evaluation_plots, gap
+from agents.evaluation.evaluation import AsOnABus, Evaluation, evaluate
+from agents.evaluation.on_the_bus import target_for
+from agents.evaluation.scores import interval
+from agents.evaluation.served import draw_machines, emulated
+from agents.evaluation.sim_versus_bus import HIDDEN, on_both_sides
+from agents.policies.agent_file import Bundle, BundleError
+from agents.policies.guard import GuardLimits
+from agents.policies.open_policy import PolicyNotFoundError, open_policy
+from agents.policies.policy import PolicyError, policy_of
+from agents.training.tasks import make_lanes
 from drive_env import CanDrives, EmulatedDrives, Limits, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
@@ -101,7 +101,7 @@ def test_the_score_is_what_the_episodes_show():
 
 def test_an_episode_is_the_same_among_others_and_in_a_later_round(monkeypatch):
     whole = evaluate(Gentle(), "tracking", SHORT | {"distributions": "two_mass"}, episodes=5)
-    monkeypatch.setattr("agents.evaluation.LANES", 2)
+    monkeypatch.setattr("agents.evaluation.evaluation.LANES", 2)
     rounds = evaluate(Gentle(), "tracking", SHORT | {"distributions": "two_mass"}, episodes=5)
     assert rounds.values == whole.values
 
@@ -115,7 +115,7 @@ def test_an_episode_ends_where_its_pole_falls_though_others_still_stand(monkeypa
     together = evaluate(Lean(), "tracking", options, episodes=3)
     lengths = [len(episode.actions) for episode in together.episodes]
     assert len(set(lengths)) > 1 and max(lengths) < 500
-    monkeypatch.setattr("agents.evaluation.LANES", 1)
+    monkeypatch.setattr("agents.evaluation.evaluation.LANES", 1)
     alone = evaluate(Lean(), "tracking", options, episodes=3)
     assert [len(episode.actions) for episode in alone.episodes] == lengths
     assert [len(episode.observations) for episode in alone.episodes] == [length + 1 for length in lengths]
@@ -215,7 +215,7 @@ def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkey
     assert (found.exit_code, found.stderr) == (
         2, "drive-agent: The motor of node 3 will turn. Is its way clear? Nobody is there to ask; say --yes\n",
     )  # fmt: skip
-    monkeypatch.setattr("drive_env.tools.options.sys", SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True)))
+    monkeypatch.setattr("drive_env.commands.options.sys", SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True)))
     monkeypatch.setattr("typer.confirm", lambda question: False)
     found = run("evaluate", "tracking_two_mass", "--channel", "socket://127.0.0.1:1", "--node", 3)
     assert (found.exit_code, found.stderr) == (1, "drive-agent: nothing was changed\n")
@@ -496,7 +496,7 @@ def test_the_gap_as_a_command(tmp_path):
                                                     ("silu", "tanh"), ("leaky_relu", "clip")])  # fmt: skip
 def test_an_export_acts_as_the_original(kind, activation, output, tmp_path):
     pytest.importorskip("onnxruntime")
-    from agents.onnx_export import TOLERANCE, compare, export
+    from agents.policies.onnx_export import TOLERANCE, compare, export
 
     made = bundle(kind, activation, output)
     assert export(made, tmp_path / "agent.onnx") <= TOLERANCE
@@ -508,8 +508,8 @@ def test_an_export_acts_as_the_original(kind, activation, output, tmp_path):
 
 def test_an_onnx_policy_refuses_what_is_no_number(tmp_path):
     pytest.importorskip("onnxruntime")
-    from agents.onnx_export import export
-    from agents.onnx_policy import OnnxPolicy
+    from agents.policies.onnx_export import export
+    from agents.policies.onnx_policy import OnnxPolicy
 
     export(bundle(), tmp_path / "agent.onnx")
     policy = OnnxPolicy(tmp_path / "agent.onnx")

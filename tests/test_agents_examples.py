@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.bundle import Bundle
+from agents.policies.agent_file import Bundle
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 RUNS = {

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from test_parity import WorldBus
 
-from agents.deadline import Deadline, DeadlineError
-from agents.evaluation import AsOnABus, evaluate
-from agents.guard import KEPT, GuardedPolicy, GuardLimits, PolicyStoppedError, stop
-from agents.policy import PolicyError
+from agents.evaluation.evaluation import AsOnABus, evaluate
+from agents.policies.deadline import Deadline, DeadlineError
+from agents.policies.guard import KEPT, GuardedPolicy, GuardLimits, PolicyStoppedError, stop
+from agents.policies.policy import PolicyError
 from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
@@ -167,7 +167,11 @@ def test_the_command_ends_though_the_policy_never_does(tmp_path):
         command = ("evaluate", "hangs:policy", "-e", "tracking", "--config", "tracking.toml", "--lockstep", "--stall",
                    "2", "--interface", "slcan", "--channel", hub.channel)  # fmt: skip
         ended = subprocess.run(
-            [sys.executable, "-m", "agents.cli", *command], cwd=tmp_path, capture_output=True, text=True, timeout=300
+            [sys.executable, "-m", "agents.commands.cli", *command],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=300,
         )
     assert ended.returncode == 1, ended.stderr
     assert "drive-agent: the policy gave no answer for 2000 ms" in ended.stderr and "Traceback" not in ended.stderr
@@ -318,7 +322,7 @@ def test_an_answer_that_takes_just_the_limit_is_late():
 
 def test_an_answer_that_is_taken_late_is_late_whoever_was_slow(monkeypatch):
     clock = iter([0.0, 0.099, 1.0, 1.1])
-    monkeypatch.setattr("agents.guard.time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr("agents.policies.guard.time", SimpleNamespace(perf_counter=lambda: next(clock)))
     policy = GuardedPolicy(Scripted(None, after=9), LOW[:1], HIGH[:1], 0.001, GuardLimits(stall=0.1))
     monkeypatch.setattr(policy._deadline, "call", lambda function, argument, within: function(argument))
     policy.act(OBSERVATION)

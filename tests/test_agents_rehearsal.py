@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from agents.cli import app
-from agents.policy import load_policy
-from agents.rehearsal import NO, rehearse
+from agents.commands.cli import app
+from agents.policies.policy import load_policy
 from agents.shipped import shipped
-from agents.tuning_run import run
+from agents.tuner.rehearsal import NO, rehearse
+from agents.tuner.tuning_run import run
 from drive_env import EmulatedDrives, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from agents import scores
-from agents.scores import Episode
+from agents.evaluation import scores
+from agents.evaluation.scores import Episode
 
 STEPS = 40
 

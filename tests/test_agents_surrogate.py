@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from agents import surrogate_training as training
-from agents.bundle import MAX_BYTES, Bundle
-from agents.policy import PolicyError, load_policy, policy_of
+from agents.policies.agent_file import MAX_BYTES, Bundle
+from agents.policies.policy import PolicyError, load_policy, policy_of
 from agents.shipped import find_agent, shipped, shipped_names
-from agents.surrogate import CONTEXT, IDENTIFIED, SHOWN, SurrogatePolicy
+from agents.tuner.surrogate import CONTEXT, IDENTIFIED, SHOWN, SurrogatePolicy
+from research import surrogate_training as training
 
 G = len(training.GAINS)
 ENTRIES = IDENTIFIED + 2 * G + 2 * SHOWN
@@ -20,7 +20,7 @@ LOW, HIGH = np.array(training.LOW), np.array(training.HIGH)
 
 def trials(machines=1_000, count=6, seed=0):
     """Trials of machines whose best gains nothing tells but a trial, the rule's excepted: it shows how far they are."""
-    from agents.surrogate_fit import Trials
+    from research.surrogate_fit import Trials
 
     rng = np.random.default_rng(seed)
     best = rng.uniform(-1.0, 1.0, (machines, 1, G))
@@ -34,7 +34,7 @@ def trials(machines=1_000, count=6, seed=0):
 
 @pytest.fixture(scope="module")
 def bundle():
-    fitting = pytest.importorskip("agents.surrogate_fit", reason="fitting takes torch", exc_type=ImportError)
+    fitting = pytest.importorskip("research.surrogate_fit", reason="fitting takes torch", exc_type=ImportError)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fitting, "BATCH", 32)  # many steps for little data
         patch.setattr(fitting, "EPOCHS", 30)
@@ -69,7 +69,7 @@ def says(median, scale=lambda gains: 0.0 * gains[..., 0]):
 
 # --- the network ------------------------------------------------------------------------------------------------------
 def test_trials_of_rounds_with_fewer_are_joined_and_the_missing_count_for_nothing():
-    fitting = pytest.importorskip("agents.surrogate_fit", reason="fitting takes torch", exc_type=ImportError)
+    fitting = pytest.importorskip("research.surrogate_fit", reason="fitting takes torch", exc_type=ImportError)
     long, short = trials(40, 6, seed=1), trials(30, 4, seed=2)
     joined = fitting.join([long, short])
     assert joined.worth.shape == (70, 6) and joined.gains.shape == (70, 6, G)
@@ -87,7 +87,7 @@ def test_trials_of_rounds_with_fewer_are_joined_and_the_missing_count_for_nothin
 @pytest.mark.slow
 def test_the_networks_are_torchs(bundle, policy):
     torch = pytest.importorskip("torch")
-    from agents.surrogate_fit import SurrogateNetwork
+    from research.surrogate_fit import SurrogateNetwork
 
     rng = np.random.default_rng(2)
     machines, tried, asked = 5, 4, 7

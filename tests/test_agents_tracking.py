@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from test_agents_bundle import bundle as untrained
 
-from agents import refinement, tracking_comparison
-from agents.baselines import Law, baseline, feed_forward
-from agents.both_sides import on_both_sides
-from agents.bundle import Bundle
-from agents.evaluation import evaluate
-from agents.guard import GuardLimits
-from agents.policy import policy_of
-from agents.refinement import ENVIRONMENT, Played, Search, refine
+from agents.evaluation.evaluation import evaluate
+from agents.evaluation.sim_versus_bus import on_both_sides
+from agents.policies.agent_file import Bundle
+from agents.policies.baselines import Law, baseline, feed_forward
+from agents.policies.guard import GuardLimits
+from agents.policies.policy import policy_of
 from agents.shipped import shipped, shipped_names
-from agents.tasks import make_lanes
-from agents.tracking_comparison import RIVALS, compare, identified_lags, ratio
+from agents.training.tasks import make_lanes
 from drive_env.envs.tracking import TASKS, TrackingConfig
+from research import refinement, tracking_comparison
+from research.refinement import ENVIRONMENT, Played, Search, refine
+from research.tracking_comparison import RIVALS, compare, identified_lags, ratio
 
 CONTROLLERS = [name for name in shipped_names() if name.startswith("tracking_")]
 RESIDUAL = ("tracking_gantry", "tracking_two_mass")

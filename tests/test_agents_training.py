@@ -12,17 +12,18 @@ import pytest
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
-from agents import checkpoint, hyperparameters, search, training
-from agents.baselines import baseline
-from agents.bundle import Bundle
-from agents.evaluation import evaluate
-from agents.hyperparameters import ALGORITHMS, HyperparameterError, read_value
-from agents.imitation import imitate
-from agents.policies import open_policy
-from agents.policy import policy_of
+from agents.evaluation.evaluation import evaluate
+from agents.policies.agent_file import Bundle
+from agents.policies.baselines import baseline
+from agents.policies.open_policy import open_policy
+from agents.policies.policy import policy_of
 from agents.shipped import TUNER, shipped
-from agents.tasks import ENVIRONMENTS, environment_name, make_lanes
-from agents.training import AGENT, CHECKPOINT, TABLE, DivergedError, Run, train
+from agents.training import checkpoint, hyperparameters, search
+from agents.training import train as training
+from agents.training.hyperparameters import ALGORITHMS, HyperparameterError, read_value
+from agents.training.imitation import imitate
+from agents.training.tasks import ENVIRONMENTS, environment_name, make_lanes
+from agents.training.train import AGENT, CHECKPOINT, TABLE, DivergedError, Run, train
 
 TINY = {"ServoDrive/Tracking-v0": {"duration": 0.01}, "ServoDrive/GainScheduling-v0": {"duration": 0.02},
         "ServoDrive/GainTuning-v0": {"trials": 1}}  # fmt: skip
@@ -206,7 +207,7 @@ def test_the_shipped_tuner_is_a_baseline_of_its_own_gains():
 
 # --- rewards ----------------------------------------------------------------------------------------------------------
 def both(environment, options, wrapper):
-    """Lanes as they are, and the same behind a reward of agents.rewards."""
+    """Lanes as they are, and the same behind a reward of agents.training.rewards."""
     plain = make_lanes(environment, 4, {**options, "num_threads": 1}, autoreset_mode="SameStep")
     name = environment_name(environment)
     settings = {"n_envs": 4, "env_kwargs": {**options, "num_threads": 1}, "vec_env_wrapper": wrapper}
@@ -216,7 +217,7 @@ def both(environment, options, wrapper):
 
 
 def test_each_trial_earns_its_own_hidden_j_over_the_rules():
-    lanes, (_, told), env, _ = both("gain_tuning", {"trials": 2}, {"agents.rewards:EachTrial": {"limit": 0.4}})
+    lanes, (_, told), env, _ = both("gain_tuning", {"trials": 2}, {"agents.training.rewards:EachTrial": {"limit": 0.4}})
     rng, rule, limited = np.random.default_rng(0), told["hidden"], 0
     for _ in range(4):  # two episodes: the second one's machines have other rules
         action = rng.uniform(-0.7, 0.7, (4, 3)).astype(np.float32)
@@ -232,7 +233,7 @@ def test_each_trial_earns_its_own_hidden_j_over_the_rules():
 
 def test_small_errors_cost_thousandths_of_the_amplitude():
     settings = {"error": 0.002, "effort": 3.0, "smoothness": 5.0}
-    lanes, (rows, _), env, _ = both("tracking", {"duration": 0.004}, {"agents.rewards:SmallErrors": settings})
+    lanes, (rows, _), env, _ = both("tracking", {"duration": 0.004}, {"agents.training.rewards:SmallErrors": settings})
     rng = np.random.default_rng(0)
     for step in range(8):
         action, before = rng.uniform(-0.3, 0.3, (4, 1)).astype(np.float32), rows[:, 7]
@@ -337,9 +338,12 @@ def test_hyperparameters_that_the_algorithm_does_not_take_are_told(tmp_path):
     [
         ({"n_steps": 0}, "ppo does not take these hyper-parameters: .*n_steps=0"),
         ({"normalize": {"norm_foo": 1}}, "normalize does not take these hyper-parameters: .*'norm_foo'"),
-        ({"vec_env_wrapper": {"agents.rewards:SmallErrors": {"foo": 1}}}, "SmallErrors does not take .*'foo'"),
+        ({"vec_env_wrapper": {"agents.training.rewards:SmallErrors": {"foo": 1}}}, "SmallErrors does not take .*'foo'"),
         ({"imitate": {"nothing": {"stepz": 1}}}, "imitate nothing does not take these hyper-parameters: .*'stepz'"),
-        ({"policy": "agents.asymmetric:AsymmetricPolicy"}, "needs an observation with 'observation' first .*MlpPolicy"),
+        (
+            {"policy": "agents.training.asymmetric:AsymmetricPolicy"},
+            "needs an observation with 'observation' first .*MlpPolicy",
+        ),
         ({"policy_kwargs": {"activation_fn": "nn.Sigmoid"}}, "Sigmoid between its layers; a bundle holds one of Tanh"),
         ({"learning_rate": 1e6}, "the training diverged: .*Use a smaller learning_rate"),
     ],

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from agents import checkpoint
-from agents.checkpoint import CheckpointError, UntrustedError
-from agents.cli import app
 from agents.commands import evaluate
-from agents.policies import open_policy
-from agents.training import bundle_of_checkpoint, run_to_resume
-from agents.training import train as run_training
+from agents.commands.cli import app
+from agents.policies.open_policy import open_policy
+from agents.training import checkpoint
+from agents.training.checkpoint import CheckpointError, UntrustedError
+from agents.training.train import bundle_of_checkpoint, run_to_resume
+from agents.training.train import train as run_training
 
 RUN = {"algorithm": "ppo", "environment": "ServoDrive/Tracking-v0", "configuration": {}, "timesteps": 640,
        "run": {"environment": "tracking", "algorithm": "ppo", "seed": 3,

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from agents.cli import app
+from agents.commands.cli import app
 from agents.commands.tune import _emulated_node
-from agents.guard import PolicyStoppedError
-from agents.policy import PolicyError, load_policy
+from agents.policies.guard import PolicyStoppedError
+from agents.policies.policy import PolicyError, load_policy
 from agents.shipped import shipped
-from agents.tuner import surrogate, tune_target
-from agents.tuning_run import run as run_agent
-from drive_env.envs.gain_trial import Trials
+from agents.tuner.tune_target import surrogate, tune_target
+from agents.tuner.tuning_run import run as run_agent
+from drive_env.drives.motion import OPERATION_ENABLED
 from drive_env.gains import GAIN_OBJECTS
-from drive_env.motion import OPERATION_ENABLED
-from tuning.certificate import load_certificate
-from tuning.meter import KINDS, MeteredDrives
+from drive_env.trials.gain_trial import Trials
+from tuning.certificate.certificate import load_certificate
+from tuning.drive_audit import KINDS, MeteredDrives
 from tuning.snapshot import load_snapshot
 from tuning.target import emulated
 
@@ -246,7 +246,7 @@ def test_a_wrong_wiring_ends_the_run_before_any_trial_with_code_1_and_the_reason
         done = run_agent(target, Contrary(), tmp_path / "before.toml", name="contrary")
         assert done.trials == () and "encoder counts against the motor" in done.result.axes[0].reason
         assert np.array_equal(gains(target), before) and not is_enabled(target).any()
-    monkeypatch.setattr("agents.tuning_run.run", lambda *_, **__: done)
+    monkeypatch.setattr("agents.tuner.tuning_run.run", lambda *_, **__: done)
     code, out, _ = command("--load", "inertia", "--out", tmp_path / "run")
     assert code == 1 and "axis 0 was rolled back: the encoder counts against the motor" in out
     assert "keeps the new gains" not in out

@@ -13,24 +13,27 @@ from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.gains import GAIN_OBJECTS, Gains, rule_gains, write_gains
 from drive_env.motors import find_motor
-from drive_env.positioning import plan_move
 from drive_env.safety.envelope import SafetyError
-from drive_env.score import HiddenScore
-from tuning import auto as auto_module
-from tuning import auto_margins, auto_search, auto_trials, provenance
-from tuning import proving as proving_module
-from tuning.auto import BUDGET, auto
-from tuning.auto_certificate import certificate
-from tuning.auto_checks import SENSITIVITY, sound_gains, unsafe_gains
-from tuning.auto_moves import OVERTIME
-from tuning.brief import identify_briefly
-from tuning.linear_model import Plant, position_open_loop
-from tuning.margins import margins
-from tuning.moved_inertia import moved_inertia
-from tuning.proving import ProvingGround
-from tuning.rules import propose
+from drive_env.trials.positioning import plan_move
+from drive_env.trials.score import HiddenScore
+from tuning.auto import loop_margins as auto_margins
+from tuning.auto import one_button as auto_module
+from tuning.auto import proving as proving_module
+from tuning.auto import search as auto_search
+from tuning.auto import trials as auto_trials
+from tuning.auto.certify import certificate
+from tuning.auto.checks import SENSITIVITY, sound_gains, unsafe_gains
+from tuning.auto.moves import OVERTIME
+from tuning.auto.one_button import BUDGET, auto
+from tuning.auto.proving import ProvingGround
+from tuning.compare.suite import load_suite, open_machines
+from tuning.identify.moved_inertia import moved_inertia
+from tuning.identify.quick_identification import identify_briefly
+from tuning.response.linear_model import Plant, position_open_loop
+from tuning.response.margins import margins
+from tuning.rules.rules_by_name import propose
+from tuning.runs import provenance
 from tuning.snapshot import load_snapshot, restore
-from tuning.suite import load_suite, open_machines
 from tuning.target import Target, emulated
 
 NORMAL, EMPTY, WILD, REVERSED, SHORT = range(5)  # axes of `five`
@@ -188,7 +191,7 @@ def test_gains_are_lowered_until_the_outer_loops_are_sound_by_the_model(position
 # --- rolling back -----------------------------------------------------------------------------------------------------
 def standing_in(target, where=None):
     """Return the identification of drives whose truth is known: what the search needs, at no cost."""
-    from tuning.identification import Estimate, Identification, refused
+    from tuning.identify.identification import Estimate, Identification, refused
 
     found = []
     for axis in range(target.num_axes):
@@ -268,7 +271,7 @@ def test_a_drive_fresh_from_the_factory_is_commissioned_first(tmp_path):
 
 def answers(monkeypatch, change):
     """Have what the frequency response measures changed."""
-    import tuning.frequency_response as module
+    import tuning.response.frequency_response as module
 
     measure = module.measure
     called = []

@@ -8,10 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 from drive_env.gains import RAW_MAX
-from tuning import auto_search, auto_settings
-from tuning.auto_moves import OVERTIME
-from tuning.certificate import is_unchanged
-from tuning.cli import app
+from tuning.auto import search as auto_search
+from tuning.auto import settings as auto_settings
+from tuning.auto.moves import OVERTIME
+from tuning.certificate.certificate import is_unchanged
+from tuning.commands.cli import app
 from tuning.snapshot import load_snapshot
 
 

@@ -18,9 +18,9 @@ from test_serve import served as served_process
 from drive_env import CanDrives, motion
 from drive_env.devices import find_device
 from drive_env.motors import find_motor
-from tuning import auto as auto_module
-from tuning import auto_trials
-from tuning.auto import auto
+from tuning.auto import one_button as auto_module
+from tuning.auto import trials as auto_trials
+from tuning.auto.one_button import auto
 from tuning.snapshot import Transaction
 from tuning.target import Target, emulated
 
@@ -135,7 +135,7 @@ def test_a_real_signal_over_a_served_bus(tmp_path, how):
         with CanDrives("tmcm1636", **bus) as drives:
             before = gains(drives)
         command = [
-            sys.executable, "-c", "from drive_env.commands import drive_tune; drive_tune()", "auto", "--bus",
+            sys.executable, "-c", "from drive_env.programs import drive_tune; drive_tune()", "auto", "--bus",
             "--interface", "slcan", "--channel", channel, "--travel", "-5:5", "--lockstep", "--yes", "--out", str(out),
         ]  # fmt: skip
         process = subprocess.Popen(

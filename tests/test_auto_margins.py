@@ -10,13 +10,14 @@ import pytest
 
 from drive_env import motion
 from drive_env.gains import Gains, write_gains
-from drive_env.positioning import POSITION
-from tuning import auto_margins, frequency_response
-from tuning.auto_result import AxisRun
-from tuning.auto_run import Run
-from tuning.linear_model import OPEN_LOOPS, Plant
-from tuning.margins import Margins, margins
-from tuning.measured_loop import AtLeast
+from drive_env.trials.positioning import POSITION
+from tuning.auto import loop_margins as auto_margins
+from tuning.auto.result import AxisRun
+from tuning.auto.run import Run
+from tuning.response import frequency_response
+from tuning.response.linear_model import OPEN_LOOPS, Plant
+from tuning.response.margins import Margins, margins
+from tuning.response.measured_loop import AtLeast
 from tuning.target import emulated, timed
 
 TURN = 2.0 * np.pi

@@ -12,24 +12,25 @@ from test_auto import gains, standing_in
 from drive_env import motion
 from drive_env.gains import Gains, rule_gains, write_gains
 from drive_env.master.pace import Timing
-from drive_env.positioning import CURRENT, WATCH
-from tuning import auto as auto_module
-from tuning import auto_moves, auto_search
-from tuning import proving as proving_module
-from tuning.auto import auto, tell_of_lateness
-from tuning.auto_certificate import certificate
-from tuning.auto_moves import _ease, _keep_what_is_better
-from tuning.auto_result import AxisRun
-from tuning.auto_run import Run as AutoRun
-from tuning.auto_search import calm_gains
-from tuning.auto_trials import faster
-from tuning.identification import Estimate, Identification, refused
-from tuning.linear_model import Plant
-from tuning.moved_inertia import moved_inertia
-from tuning.proving import RESTLESS, ProvingGround, Shown
-from tuning.rules import propose
+from drive_env.trials.positioning import CURRENT, WATCH
+from tuning.auto import moves as auto_moves
+from tuning.auto import one_button as auto_module
+from tuning.auto import proving as proving_module
+from tuning.auto import search as auto_search
+from tuning.auto.certify import certificate
+from tuning.auto.moves import _ease, _keep_what_is_better
+from tuning.auto.one_button import auto, tell_of_lateness
+from tuning.auto.proving import RESTLESS, ProvingGround, Shown
+from tuning.auto.result import AxisRun
+from tuning.auto.run import Run as AutoRun
+from tuning.auto.search import calm_gains
+from tuning.auto.trials import faster
+from tuning.auto.twin import Optimum
+from tuning.identify.identification import Estimate, Identification, refused
+from tuning.identify.moved_inertia import moved_inertia
+from tuning.response.linear_model import Plant
+from tuning.rules.rules_by_name import propose
 from tuning.target import emulated
-from tuning.twin import Optimum
 
 
 def finds(monkeypatch, wanted):

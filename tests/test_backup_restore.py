@@ -10,7 +10,7 @@ from scripted_drive import ScriptedBus, ScriptedDrive
 from typer.testing import CliRunner
 
 from drive_env import CanDrives
-from drive_env.cli import app
+from drive_env.commands.cli import app
 from drive_env.devices import find_device
 from drive_env.master import parameters
 from drive_env.master.description import CIA_402
@@ -32,7 +32,7 @@ def drive(monkeypatch):
         made.buses.append(ScriptedBus(made))
         return made.buses[-1]
 
-    monkeypatch.setattr("drive_env.can_drives.open_bus", opened)
+    monkeypatch.setattr("drive_env.master.can_drives.open_bus", opened)
     monkeypatch.setattr("drive_env.master.port.open_bus", opened)
     return made
 

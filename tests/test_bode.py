@@ -7,8 +7,8 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.image import imread
 
-from tuning.bode import GREY, MEASURED, TRACED, bode_figure, write_bode
-from tuning.frequency_response import measure
+from tuning.response.bode import GREY, MEASURED, TRACED, bode_figure, write_bode
+from tuning.response.frequency_response import measure
 from tuning.target import emulated
 
 

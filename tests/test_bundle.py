@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
-from drive_env.exchange import Exchange, Hooks, exchange
+from drive_env.emulator.cyclic_control import Exchange, Hooks, exchange
 from mechanics.bundle import Bundle, Cube, Matrix, Numbers, Vector, reader
 from mechanics.compiled import cached
 

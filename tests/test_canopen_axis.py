@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
-from drive_env.axis import Axis
 from drive_env.canopen.frames import Frame
 from drive_env.devices import AxisOffset, find_device
 from drive_env.dictionary import units
 from drive_env.firmware.record import FIELDS, set_lanes
+from drive_env.node.axis import Axis
 
 DEVICE = find_device("tmcm1636")
 ENTRIES = list(DEVICE.new_dictionary())
@@ -200,7 +200,7 @@ def several_axes(folder, num_axes, history=0):
 def two(tmp_path, monkeypatch):
     """A node of two axes, and an axis beside it that is none of its."""
     device = several_axes(tmp_path, 2, history=3)
-    monkeypatch.setattr("drive_env.drives.find_device", lambda name: device)
+    monkeypatch.setattr("drive_env.emulator.emulated_drives.find_device", lambda name: device)
     with EmulatedDrives(load="inertia", num_machines=3, num_threads=1) as drives:
         yield Wire(drives, first_axis=1)
 

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from drive_env.devices import find_device
 from drive_env.gains import Gains, bandwidths_from_gains, gains_in_si
 from drive_env.motors import find_motor
-from tuning.certificate import (
+from tuning.certificate.certificate import (
     AxisCertificate,
     Certificate,
     CertificateError,
@@ -32,12 +32,12 @@ from tuning.certificate import (
     load_certificate,
     si_gains,
 )
-from tuning.certificate_pictures import AFTER, BEFORE, DOUBTFUL, bode_picture, step_picture
-from tuning.cli import app
-from tuning.identification import Estimate, Identification, refused
-from tuning.margins import Margins, margins
-from tuning.measured_loop import AtLeast
-from tuning.report import to_html
+from tuning.certificate.certificate_pictures import AFTER, BEFORE, DOUBTFUL, bode_picture, step_picture
+from tuning.certificate.report import to_html
+from tuning.commands.cli import app
+from tuning.identify.identification import Estimate, Identification, refused
+from tuning.response.margins import Margins, margins
+from tuning.response.measured_loop import AtLeast
 
 DEVICE = find_device("tmcm1636")
 BEFORE_GAINS, AFTER_GAINS = Gains(4021, 2359, 445, 823, 0), Gains(4021, 2359, 1400, 2000, 500)

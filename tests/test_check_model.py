@@ -10,10 +10,10 @@ from test_replay import CURRENT, POSITION, TARGET, TORQUE, TRUTH, VELOCITY, a_mo
 from typer.testing import CliRunner
 
 from drive_env import motion
-from drive_env.cli import app
+from drive_env.commands.check_model import _print
+from drive_env.commands.cli import app
 from drive_env.envs.randomisation import Distributions
-from drive_env.replay import Difference, Log
-from drive_env.tools.check_model import _print
+from drive_env.trials.replay import Difference, Log
 
 DONE, USER_ERROR = 0, 2
 

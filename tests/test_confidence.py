@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tuning.confidence import gain_error, interval, t_quantile
+from tuning.identify.confidence import gain_error, interval, t_quantile
 
 WORST = 0.02
 DEVICE = SimpleNamespace(stage={"adc_gain_error_a": SimpleNamespace(low=-WORST, high=WORST)})

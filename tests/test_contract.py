@@ -21,9 +21,9 @@ import pytest
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import device_names, find_device
+from drive_env.emulator.inertia_check import MAX_INERTIA_RATIO, MisfitWarning
 from drive_env.firmware.modes import MODES
 from drive_env.firmware.record import get_lanes
-from drive_env.misfit import MAX_INERTIA_RATIO, MisfitWarning
 from drive_env.motors import MOTORS
 from mechanics.loads import LOADS, find_load
 from mechanics.model import read_model

@@ -60,7 +60,7 @@ def test_the_affinity_counts(machine, monkeypatch):
 
 
 def test_drives_have_a_thread_for_each(monkeypatch):
-    monkeypatch.setattr("drive_env.drives.usable_cores", lambda: 3)
+    monkeypatch.setattr("drive_env.emulator.emulated_drives.usable_cores", lambda: 3)
     with EmulatedDrives(load="inertia", num_machines=2) as drives:
         assert drives._threads == 3
     with EmulatedDrives(load="inertia", num_machines=2, num_threads=1) as drives:

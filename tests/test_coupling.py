@@ -7,9 +7,10 @@ resonance of 150 Hz and 0.3 % up to 450 Hz.
 import numpy as np
 import pytest
 
-from drive_env import EmulatedDrives, motion, response
+from drive_env import EmulatedDrives, motion
 from drive_env.firmware import cycle
 from drive_env.firmware.record import LANES, get_lanes
+from drive_env.trials import response
 from mechanics import stepping
 from mechanics.compiled import cached
 from mechanics.loads import LOADS

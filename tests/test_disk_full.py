@@ -16,16 +16,16 @@ from test_every_change_leaves_a_file import node, status_is
 from test_serve import environment
 from typer.testing import CliRunner
 
-from agents import tuning_run
-from agents.cli import app as drive_agent
+from agents.commands.cli import app as drive_agent
+from agents.tuner import tuning_run
 from drive_env import CanDrives
-from drive_env.cli import app as drive_env
+from drive_env.commands.cli import app as drive_env
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.whole_file import files_to_be, write_whole
-from tuning import auto as auto_module
-from tuning import trials_files
-from tuning.auto_run import Run
-from tuning.cli import app as drive_tune
+from tuning.auto import one_button as auto_module
+from tuning.auto.run import Run
+from tuning.commands.cli import app as drive_tune
+from tuning.search import trials_files
 from tuning.snapshot import load_snapshot
 
 SAID = "No space left on device"
@@ -141,9 +141,9 @@ def test_with_room_it_keeps_them(tmp_path):
 KILLED = """
 import os, signal
 import numpy as np
-from drive_env.commands import drive_tune
-from tuning import auto
-from tuning.auto_run import Run
+from drive_env.programs import drive_tune
+from tuning.auto import one_button as auto
+from tuning.auto.run import Run
 auto.identify = lambda run, experiments: None
 auto.compute = auto.prove = auto.show = auto.measure = auto.look_back = lambda run: None
 auto.prepare = lambda run: setattr(run, "gains", np.array([[1000, 900, 800, 700, 600]]))

@@ -15,10 +15,10 @@ import pytest
 from numba import njit
 
 from drive_env import EmulatedDrives, motion
+from drive_env.emulator.group import rates_of
 from drive_env.firmware.cycle import mechanics_window, start_window, supervise, tick
 from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
 from drive_env.firmware.thermal import warm
-from drive_env.group import rates_of
 from drive_env.motors import MOTORS
 from mechanics.compiled import OPTIONS
 

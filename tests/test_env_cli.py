@@ -21,11 +21,11 @@ from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.cli import PANELS, app
+from drive_env.commands import scan
+from drive_env.commands.cli import PANELS, app
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.replay import command_of, read_log
-from drive_env.tools import scan
+from drive_env.trials.replay import command_of, read_log
 
 DONE, REFUSED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 
@@ -657,5 +657,7 @@ def test_every_command_explains_itself(command):
 
 
 def test_help_is_quick_to_import():
-    code = "import sys, drive_env.cli; sys.exit(any(name in sys.modules for name in ('numba', 'mujoco', 'can')))"
+    code = (
+        "import sys, drive_env.commands.cli; sys.exit(any(name in sys.modules for name in ('numba', 'mujoco', 'can')))"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -14,7 +14,7 @@ import pytest
 from test_serve import environment
 from typer.testing import CliRunner
 
-from agents.cli import app as drive_agent
+from agents.commands.cli import app as drive_agent
 from drive_env import CanDrives, EmulatedDrives, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
@@ -22,7 +22,7 @@ from drive_env.bus.world import World
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.master.description import Description
 from drive_env.master.parameters import read_parameters
-from tuning.cli import app as drive_tune
+from tuning.commands.cli import app as drive_tune
 from tuning.snapshot import load_snapshot
 
 PATIENCE = 120.0  # s until a run has come so far; it is never this long
@@ -121,7 +121,7 @@ def killed(machine, command, bus, folder):
     program = "drive_agent" if app is drive_agent else "drive_tune"
     with standing_still_once(machine, is_under_way) as reached:
         process = subprocess.Popen(
-            [sys.executable, "-c", f"from drive_env.commands import {program} as run; run()", *arguments, *bus],
+            [sys.executable, "-c", f"from drive_env.programs import {program} as run; run()", *arguments, *bus],
             cwd=folder, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         try:

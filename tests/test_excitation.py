@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tuning.excitation import Lines, dimension, peak, periodic, plan_lines
+from tuning.response.excitation import Lines, dimension, peak, periodic, plan_lines
 
 LINES = plan_lines(5.0, 400.0, 5.0, 1000.0)
 FLAT = np.ones((80, 1))

@@ -18,14 +18,14 @@ import pytest
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, motion
-from drive_env.cli import app
+from drive_env.commands.cli import app
+from drive_env.commands.fault import CONTROL_PORT
 from drive_env.faults.control import PORT, Control, ControlError, ask
 from drive_env.faults.table import FAULTS
 from drive_env.master.errors import NoAnswerError
-from drive_env.tools.fault import CONTROL_PORT
 
 ROOT = Path(__file__).parent.parent
-SERVE = "import typer; from drive_env.tools.serve import serve; typer.run(serve)"
+SERVE = "import typer; from drive_env.commands.serve import serve; typer.run(serve)"
 PATIENCE = 30.0  # s that a busy machine may take
 
 

@@ -13,8 +13,8 @@ import can
 import pytest
 from typer.testing import CliRunner
 
-from drive_env.cli import app
-from drive_env.tools.frame_files import FrameFile
+from drive_env.commands.cli import app
+from drive_env.commands.frame_files import FrameFile
 
 FRAMES = {
     "data": can.Message(timestamp=1.5, arbitration_id=0x181, data=b"\x37\x02", is_extended_id=False),

@@ -11,12 +11,12 @@ from test_parity import served
 from drive_env.devices import find_device
 from drive_env.gains import FITTED_RULE, rule_gains, write_gains
 from drive_env.motors import find_motor
-from tuning.frequency_response import measure
-from tuning.held_samples import seen_by_bus
-from tuning.linear_model import Plant, position_open_loop, velocity_open_loop
-from tuning.margins import margins
-from tuning.measured_loop import COHERENT
-from tuning.plant_fit import Seen, fit_plant
+from tuning.response.frequency_response import measure
+from tuning.response.held_samples import seen_by_bus
+from tuning.response.linear_model import Plant, position_open_loop, velocity_open_loop
+from tuning.response.margins import margins
+from tuning.response.measured_loop import COHERENT
+from tuning.response.plant_fit import Seen, fit_plant
 from tuning.target import Target, emulated
 
 SOFT = FITTED_RULE._replace(speed=0.1)  # crossover at about 20 Hz

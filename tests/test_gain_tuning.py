@@ -8,11 +8,11 @@ import pytest
 from test_parity import served
 
 from drive_env import EmulatedDrives, Limits, motion
-from drive_env.envs import gain_trial
-from drive_env.envs.gain_trial import Trials, measured_cost, softness
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.gains import GAIN_OBJECTS, Gains, rule_gains, small_time_constants
-from drive_env.positioning import plan_move, power_up, reach
+from drive_env.trials import gain_trial
+from drive_env.trials.gain_trial import Trials, measured_cost, softness
+from drive_env.trials.positioning import plan_move, power_up, reach
 from mechanics.shaft import way
 
 P = Gains._fields.index("velocity_p")

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import freqz, lfilter
 
 from drive_env.devices import find_device
-from tuning.held_samples import seen_by_bus, split, unhold
+from tuning.response.held_samples import seen_by_bus, split, unhold
 
 DEVICE = find_device("tmcm1636")
 B, A = [0.02, 0.05], [1.0, -1.4, 0.5]  # a loop at 5 kHz with much left above 500 Hz

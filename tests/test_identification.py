@@ -1,7 +1,7 @@
 """Identification against machines whose truth is known: values, intervals, refusals, and how drives are left.
 
 The truth is computed here from the machines' parameters: inertia and viscous friction from the linear model's
-eigenvectors (tuning/true_plant.py), dry friction from every bearing, guide and gear.
+eigenvectors (tuning/identify/true_plant.py), dry friction from every bearing, guide and gear.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ import pytest
 from test_parity import served
 
 from drive_env import motion
-from drive_env.drives import EmulatedDrives
+from drive_env.emulator.emulated_drives import EmulatedDrives
+from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.gains import GAIN_OBJECTS, write_gains
-from drive_env.misfit import MisfitWarning
 from mechanics.shaft import way
-from tuning import identification
-from tuning.brief import identify_briefly
-from tuning.identification import NAMES, identify
-from tuning.suite import load_suite, open_group, open_machines
+from tuning.compare.suite import load_suite, open_group, open_machines
+from tuning.identify import identification
+from tuning.identify.identification import NAMES, identify
+from tuning.identify.quick_identification import identify_briefly
+from tuning.identify.true_plant import true_plant
+from tuning.identify.working_state import CHANGED
 from tuning.target import Target, emulated
-from tuning.true_plant import true_plant
-from tuning.working_state import CHANGED
 
 TURN = 2.0 * math.pi
 # How far a value may be off, as a share of it.
@@ -226,7 +226,7 @@ def test_without_a_response_the_inertia_of_two_moves_is_a_guess(monkeypatch):
         n = target.num_axes
         return SimpleNamespace(fits=[None] * n, notes=[["the shaking was stopped"]] * n)
 
-    monkeypatch.setattr("tuning.brief.measure", nothing)
+    monkeypatch.setattr("tuning.identify.quick_identification.measure", nothing)
     one = identify_briefly(emulated(load="inertia", num_threads=1))[0]
     assert one.estimates["inertia"].is_known
     for name in ("inertia", "resonance", "velocity_filter"):
@@ -413,7 +413,7 @@ def test_an_error_on_the_way_leaves_the_drive_as_it_was(monkeypatch):
     def fails(*_):
         raise RuntimeError("out of paper")
 
-    monkeypatch.setattr("tuning.experiments.identify_winding", fails)
+    monkeypatch.setattr("tuning.identify.experiments.identify_winding", fails)
     with pytest.raises(RuntimeError, match="out of paper"):
         identify(target)
     assert [int(target.drives.read(name)[0]) for name in GAIN_OBJECTS] == WILD[0].tolist()
@@ -548,7 +548,7 @@ class Clock:
 @pytest.mark.parametrize(("step", "told"), [(0.001, True), (0.0016, False)])
 def test_reads_out_of_step_with_the_drive_give_no_inductance(monkeypatch, step, told):
     clock = Clock()
-    monkeypatch.setattr("tuning.winding.time", clock)
+    monkeypatch.setattr("tuning.identify.winding.time", clock)
     own = emulated(load="inertia", num_threads=1)
     drives = Late(own.drives, clock, step)
     found = identify(replace(own, drives=drives))[0]

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 
 def drive_tune(*arguments, cwd):
     return subprocess.run(
-        [sys.executable, "-m", "tuning.cli", *map(str, arguments)],
+        [sys.executable, "-m", "tuning.commands.cli", *map(str, arguments)],
         cwd=cwd,
         env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "140", "NO_COLOR": "1"},
         capture_output=True,

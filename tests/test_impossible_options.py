@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from agents.cli import app as agent_app
+from agents.commands.cli import app as agent_app
 from drive_env import EmulatedDrives
 from drive_env.bus.faults import Faults
-from drive_env.cli import app as env_app
+from drive_env.commands.cli import app as env_app
 from drive_env.devices import find_device
 from drive_env.master.description import KINDS, check_timeout, describe
-from drive_env.replay import read_log
-from tuning.cli import app as tune_app
+from drive_env.trials.replay import read_log
+from tuning.commands.cli import app as tune_app
 from tuning.target import emulated
 
 HUGE = "1" + "0" * 29

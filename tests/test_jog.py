@@ -9,7 +9,7 @@ import can
 import pytest
 from typer.testing import CliRunner
 
-import drive_env.cli
+import drive_env.commands.cli
 from drive_env import EmulatedDrives
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
@@ -28,7 +28,7 @@ def jog(monkeypatch):
     for name, value in {"INTERFACE": "virtual", "CHANNEL": channel, "TIMEOUT": "20"}.items():
         monkeypatch.setenv(f"DRIVE_ENV_{name}", value)
     with Server(world, CanPort(can.Bus(interface="virtual", channel=channel))):
-        yield lambda *words: CliRunner().invoke(drive_env.cli.app, ["jog", *words]), drives
+        yield lambda *words: CliRunner().invoke(drive_env.commands.cli.app, ["jog", *words]), drives
     world.close()
 
 
@@ -54,7 +54,9 @@ def test_a_limit_switch_ends_it_and_is_named(jog, words):
 
 def test_an_axis_that_does_not_move_is_told(jog):
     run, drives = jog
-    slow = CliRunner().invoke(drive_env.cli.app, ["set", "6083", "1", "--yes"])  # increments per second and second
+    slow = CliRunner().invoke(
+        drive_env.commands.cli.app, ["set", "6083", "1", "--yes"]
+    )  # increments per second and second
     assert slow.exit_code == 0, slow.output
     found = run("300 rpm", "--for", "0.2")
     assert found.exit_code == 1, found.output

@@ -9,11 +9,11 @@ from scipy.linalg import expm
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.emulator.loop_trace import trace_loops
 from drive_env.gains import Gains, gains_from_bandwidths, write_gains
-from drive_env.loop_trace import trace_loops
 from drive_env.motors import find_motor
-from tuning.identification import Estimate, Identification, refused
-from tuning.linear_model import (
+from tuning.identify.identification import Estimate, Identification, refused
+from tuning.response.linear_model import (
     Plant,
     current_open_loop,
     exponential,

@@ -8,8 +8,8 @@ import pytest
 from drive_env import motion
 from mechanics.loads import LOADS, find_load
 from mechanics.shaft import one
-from tuning.frequency_response import measure
-from tuning.linked_axes import are_linked
+from tuning.identify.linked_axes import are_linked
+from tuning.response.frequency_response import measure
 from tuning.target import emulated
 
 STATUS, CURRENT, MODE = 0x6041, 0x6077, 0x6060

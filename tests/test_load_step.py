@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drive_env.gains import Gains, gains_in_si, write_gains
-from tuning.load_step import BEFORE, NAME, load_step
+from tuning.auto.load_step import BEFORE, NAME, load_step
 from tuning.target import emulated
 
 SOFT, STIFF = Gains(4021, 1573, 600, 1200, 300), Gains(4021, 1573, 900, 1800, 500)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
+from drive_env.emulator.loop_trace import SIGNALS, trace_loops
 from drive_env.firmware.record import RECORD
-from drive_env.loop_trace import SIGNALS, trace_loops
 
 FIELDS = [name for name in RECORD.names if name != "padding"]
 

@@ -19,6 +19,7 @@ from numba import njit, typeof
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.emulator.group import rates_of
 from drive_env.firmware.cycle import mechanics_window, window
 from drive_env.firmware.derived import derive
 from drive_env.firmware.loops import current_loop, motion_loops
@@ -26,7 +27,6 @@ from drive_env.firmware.power_stage import convert_energy, power_stage, refresh_
 from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
 from drive_env.firmware.sensors import measure_angle, measure_currents, measure_motion
 from drive_env.gains import gains_from_bandwidths
-from drive_env.group import rates_of
 from drive_env.motors import MOTORS
 from mechanics.compiled import OPTIONS
 

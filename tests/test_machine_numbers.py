@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drive_env.machine_numbers import machine_numbers
+from drive_env.emulator.machine_numbers import machine_numbers
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2**32 - 1, 2**32, 2**40 + 5, 2**96, 2**130 + 17])

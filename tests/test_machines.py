@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from drive_env.misfit import MisfitWarning
+from drive_env.emulator.inertia_check import MisfitWarning
 from mechanics.compiled import cached
 from mechanics.load import Friction, Load
 from mechanics.loads import LOADS, find_load

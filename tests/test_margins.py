@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tuning.margins import margins
+from tuning.response.margins import margins
 
 F = np.geomspace(1.0, 1000.0, 2000)
 S = 2j * math.pi * F

@@ -9,7 +9,7 @@ import pytest
 from mechanics.loads import find_load
 from mechanics.packed import PackedLoad
 from mechanics.shaft import shaft_load, way
-from tuning.moved_inertia import moved_inertia
+from tuning.identify.moved_inertia import moved_inertia
 
 
 def packed(name):

@@ -5,11 +5,11 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from agents.bundle import BundleError
-from agents.cli import app
-from agents.onnx_export import export
-from agents.onnx_policy import METADATA, OnnxPolicy
-from agents.policy import load_policy
+from agents.commands.cli import app
+from agents.policies.agent_file import BundleError
+from agents.policies.onnx_export import export
+from agents.policies.onnx_policy import METADATA, OnnxPolicy
+from agents.policies.policy import load_policy
 from agents.shipped import shipped
 
 pytest.importorskip("onnxruntime")

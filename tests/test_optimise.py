@@ -14,17 +14,17 @@ from drive_env import EmulatedDrives, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.envs.gain_trial import Trials, measured_cost, softness
 from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
 from drive_env.motors import find_motor
-from tuning import optimise as optimise_module
-from tuning import trial_bench
-from tuning.cli import app
-from tuning.meter import KINDS, MeteredDrives
-from tuning.optimise import SAFE_STEP, Settings, objective_values, optimise, pareto
-from tuning.suite import load_suite, open_group
+from drive_env.trials.gain_trial import Trials, measured_cost, softness
+from tuning.commands.cli import app
+from tuning.compare.suite import load_suite, open_group
+from tuning.drive_audit import KINDS, MeteredDrives
+from tuning.search import optimise as optimise_module
+from tuning.search import trial_bench
+from tuning.search.optimise import SAFE_STEP, Settings, objective_values, optimise, pareto
+from tuning.search.trial_bench import OBJECTIVES, TrialBench, first_gains, read_gains
 from tuning.target import Target, emulated
-from tuning.trial_bench import OBJECTIVES, TrialBench, first_gains, read_gains
 
 WILD = np.array([4021, 1573, 30_000, 3000, 30_000])
 FEW = Settings(sampler="tpe", trials=8)
@@ -532,7 +532,7 @@ def test_what_an_emulated_search_keeps_in_its_journal_is_told(tmp_path, monkeypa
     def pressed(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tuning.searches.run", pressed)
+    monkeypatch.setattr("tuning.search.searches.run", pressed)
     search = ("optimise", "--load", "inertia", "--out", "run")
     assert drive_tune(*search) == (130, "drive-tune: interrupted; nothing was written")
     assert drive_tune(*search, "--journal", "kept.log") == (

@@ -7,9 +7,9 @@ import pytest
 
 from drive_env import motion
 from drive_env.dictionary.entries import ObjectDictionary
+from drive_env.drives.trace import Trace
 from drive_env.gains import GAIN_OBJECTS, write_gains
-from drive_env.trace import Trace
-from tuning.identification import NAMES, identify
+from tuning.identify.identification import NAMES, identify
 from tuning.oscillation_watch import OscillationError, WatchedDrives, shaken
 from tuning.target import emulated
 

@@ -16,7 +16,7 @@ from mechanics.model import CONSTRAINED_PACKING_BOUND, compile_packed, copies_pe
 from mechanics.packed import PackedLoad
 from mechanics.stepping import step
 
-pytestmark = pytest.mark.filterwarnings("ignore::drive_env.misfit.MisfitWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::drive_env.emulator.inertia_check.MisfitWarning")
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 TURN = 65536

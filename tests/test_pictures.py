@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from test_render import needs_gl
 
-from drive_env import EmulatedDrives, opengl, window
+from drive_env import EmulatedDrives
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.tracking import Tracking
-from drive_env.opengl import OpenGLError, has_display
-from drive_env.scene import Scene
-from drive_env.scope_picture import COLORS
+from drive_env.pictures import opengl, window
+from drive_env.pictures.opengl import OpenGLError, has_display
+from drive_env.pictures.scene import Scene
+from drive_env.pictures.scope_picture import COLORS
 from mechanics.loads import LOADS
 
 KINDS = {

@@ -16,11 +16,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from test_render import needs_gl
 from typer.testing import CliRunner
 
-import agents.training
-from agents.checkpoint import CheckpointError, UntrustedError
-from agents.cli import app
-from agents.learning_curve import draw_learning_curve
-from agents.policies import open_policy
+import agents.training.train
+from agents.commands.cli import app
+from agents.policies.open_policy import open_policy
+from agents.training.checkpoint import CheckpointError, UntrustedError
+from agents.training.learning_curve import draw_learning_curve
 from drive_env import EmulatedDrives, motion
 from drive_env.envs import make_vec_env
 from drive_env.envs.pictures import Pictures
@@ -190,12 +190,12 @@ def interrupted(*_, **__):
 
 
 def test_a_training_interrupted_before_its_first_checkpoint_leaves_nothing(tmp_path, monkeypatch):
-    real = agents.training.train
+    real = agents.training.train.train
 
     def train(run, folder, *, report=None, **options):
         return real(run, folder, report=interrupted, **options)
 
-    monkeypatch.setattr(agents.training, "train", train)
+    monkeypatch.setattr(agents.training.train, "train", train)
     out = tmp_path / "run"
     told = CliRunner().invoke(app, ["train", "tracking", "--load", "inertia", "--steps", "100000", "--out", str(out)])
     assert told.exit_code == 130

@@ -15,14 +15,18 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-import agents.cli
-import drive_env.cli
-import tuning.cli
-from drive_env.tools import compiling
-from drive_env.tools.program import Quiet, Verbose, say_as_much
+import agents.commands.cli
+import drive_env.commands.cli
+import tuning.commands.cli
+from drive_env.commands import compiling
+from drive_env.commands.program import Quiet, Verbose, say_as_much
 from mechanics import kernel_files
 
-APPS = {"drive-env": drive_env.cli.app, "drive-tune": tuning.cli.app, "drive-agent": agents.cli.app}
+APPS = {
+    "drive-env": drive_env.commands.cli.app,
+    "drive-tune": tuning.commands.cli.app,
+    "drive-agent": agents.commands.cli.app,
+}
 
 
 @pytest.mark.parametrize("name", APPS)
@@ -63,16 +67,16 @@ def test_a_shell_completes_commands(program, begun, commands):
     (("motors",), ("qbl4208",), ("tmcm1636", "two_mass")),
 ])  # fmt: skip
 def test_what_there_is_is_listed(more, there, absent):
-    result = CliRunner().invoke(drive_env.cli.app, ["list", *more], env={"COLUMNS": "80"})
+    result = CliRunner().invoke(drive_env.commands.cli.app, ["list", *more], env={"COLUMNS": "80"})
     assert result.exit_code == 0
     names = {line.split()[0] for line in result.stdout.splitlines() if line.strip()}
     assert set(there) <= names and not set(absent) & names
-    data = json.loads(CliRunner().invoke(drive_env.cli.app, ["list", *more, "--json"]).stdout)
+    data = json.loads(CliRunner().invoke(drive_env.commands.cli.app, ["list", *more, "--json"]).stdout)
     assert {name for rows in data.values() for name in rows} >= set(there)
 
 
 def test_a_kind_of_names_that_there_is_not_is_answered_with_those_that_there_are():
-    result = CliRunner().invoke(drive_env.cli.app, ["list", "motor"])
+    result = CliRunner().invoke(drive_env.commands.cli.app, ["list", "motor"])
     assert result.exit_code == 2
     assert "there are devices, motors, loads, not 'motor'; did you mean 'motors'?" in result.stderr
 
@@ -89,7 +93,7 @@ def test_quiet_shows_errors_and_no_progress_bar():
 def test_quiet_hides_bars_and_warnings(capfd):
     from rich.console import Console
 
-    from drive_env.tools.options import progress_on
+    from drive_env.commands.options import progress_on
 
     app = typer.Typer()
 
@@ -115,10 +119,10 @@ def test_quiet_hides_bars_and_warnings(capfd):
 
 
 def test_kernels_are_compiled_ahead_and_once():
-    first, second = (CliRunner().invoke(drive_env.cli.app, ["compile", "--json"]) for _ in range(2))
+    first, second = (CliRunner().invoke(drive_env.commands.cli.app, ["compile", "--json"]) for _ in range(2))
     assert (first.exit_code, second.exit_code) == (0, 0), first.output
     assert json.loads(second.stdout)["compiled"] == 0
-    again = CliRunner().invoke(drive_env.cli.app, ["compile"])
+    again = CliRunner().invoke(drive_env.commands.cli.app, ["compile"])
     assert again.stdout.strip().startswith("nothing to compile: the kernels of these sources are in ")
 
 
@@ -135,7 +139,7 @@ def test_after_that_drives_and_environments_compile_nothing(tmp_path):
 def test_kernels_that_cannot_be_kept_are_told(tmp_path, monkeypatch):
     monkeypatch.setattr(compiling, "STEPS", {})
     monkeypatch.setenv("DRIVE_ENV_CACHE", str(tmp_path / "none"))
-    result = CliRunner().invoke(drive_env.cli.app, ["compile"])
+    result = CliRunner().invoke(drive_env.commands.cli.app, ["compile"])
     assert result.exit_code == 2
     assert f"no kernel could be kept in {tmp_path / 'none'}; name a folder" in result.stderr
 

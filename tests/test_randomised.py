@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from drive_env.misfit import MisfitWarning
+from drive_env.emulator.inertia_check import MisfitWarning
 from mechanics.loads import LOADS
 
 MOVE = 2 * 65536  # increments

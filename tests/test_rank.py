@@ -12,19 +12,19 @@ import pytest
 from typer.testing import CliRunner
 
 from drive_env.gains import rule_gains, write_gains
-from drive_env.positioning import plan_move
-from drive_env.score import HiddenScore
-from tuning import compare as compare_module
-from tuning import tuners
-from tuning.cli import app
-from tuning.compare import compare, save
-from tuning.optimise import Optimised, Row, Settings
-from tuning.pools import open_pool
-from tuning.shard_log import ShardLog
-from tuning.suite import load_suite, open_group
-from tuning.trial_bench import read_gains
-from tuning.trials_files import trials_figure
-from tuning.tuners import MissingTunerError, Outcome, find_tuner, search_tuner, tuner_rows
+from drive_env.trials.positioning import plan_move
+from drive_env.trials.score import HiddenScore
+from tuning.commands.cli import app
+from tuning.compare import comparison as compare_module
+from tuning.compare import tuners
+from tuning.compare.comparison import compare, save
+from tuning.compare.suite import load_suite, open_group
+from tuning.compare.tuners import MissingTunerError, Outcome, find_tuner, search_tuner, tuner_rows
+from tuning.runs.pools import open_pool
+from tuning.runs.shard_log import ShardLog
+from tuning.search.optimise import Optimised, Row, Settings
+from tuning.search.trial_bench import read_gains
+from tuning.search.trials_files import trials_figure
 
 RIGID = [m for m in load_suite() if m.load == "inertia" and m.motor == "qbl4208"]
 SHORT = [m for m in load_suite() if m.load == "belt"][-1:]
@@ -223,7 +223,7 @@ def test_machines_of_several_axes_are_tuned_by_everybody(load, name):
 def test_the_tuners_of_the_issue_are_there():
     names = set(tuner_rows())
     assert {"factory", "fitted", "auto", "random", "grid", "tpe", "cmaes", "gp"} <= names
-    from tuning.rules import RULES
+    from tuning.rules.rules_by_name import RULES
 
     assert set(RULES) <= names
 

@@ -7,15 +7,15 @@ import math
 import numpy as np
 import pytest
 
+from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.gains import gains_in_si, write_gains
-from drive_env.misfit import MisfitWarning
-from drive_env.positioning import CYCLE
-from tuning.lags import velocity_lag
-from tuning.linear_model import Plant
-from tuning.margins import margins
-from tuning.optima import take_current
-from tuning.proposal import Workbench
-from tuning.relay import (
+from drive_env.trials.positioning import CYCLE
+from tuning.response.linear_model import Plant
+from tuning.response.margins import margins
+from tuning.rules.lags import velocity_lag
+from tuning.rules.optima import take_current
+from tuning.rules.proposal import Workbench
+from tuning.rules.relay import (
     HELD,
     evaluate,
     fundamental,

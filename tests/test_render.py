@@ -16,14 +16,21 @@ import typer
 from PIL import Image
 from typer.testing import CliRunner
 
-from drive_env import EmulatedDrives, motion, opengl, picture_files, render
-from drive_env.demonstration import Demonstration, DemonstrationError, PictureFormat, load_demonstration, perform
-from drive_env.opengl import OpenGLError
-from drive_env.picture_files import PictureFileError, write_film
-from drive_env.recording import Recorder, Recording
-from drive_env.scene import Scene, load_model
-from drive_env.scope_picture import ScopePicture, panels
-from drive_env.tools.render import render as render_command
+from drive_env import EmulatedDrives, motion
+from drive_env.commands.render import render as render_command
+from drive_env.pictures import opengl, picture_files, render
+from drive_env.pictures.demonstration import (
+    Demonstration,
+    DemonstrationError,
+    PictureFormat,
+    load_demonstration,
+    perform,
+)
+from drive_env.pictures.opengl import OpenGLError
+from drive_env.pictures.picture_files import PictureFileError, write_film
+from drive_env.pictures.recording import Recorder, Recording
+from drive_env.pictures.scene import Scene, load_model
+from drive_env.pictures.scope_picture import ScopePicture, panels
 from mechanics.load import Load, Switch
 from mechanics.loads import LOADS, find_load
 from mechanics.shaft import one, way

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
+from drive_env.commands.scope import write_table
 from drive_env.dictionary.entries import Entry
 from drive_env.envs.randomisation import Distributions
-from drive_env.replay import Log, command_of, compare, fit, read_log, replay
-from drive_env.tools.scope import write_table
+from drive_env.trials.replay import Log, command_of, compare, fit, read_log, replay
 
 TURN = 65536  # increments
 TRUTH = {"load.inertia": 2.4e-5, "load.coulomb": 4e-3}

@@ -17,9 +17,9 @@ from test_every_change_leaves_a_file import node, wait_until
 from test_serve import environment
 from typer.testing import CliRunner
 
-from drive_env.cli import app
-from drive_env.tools import replayed_motors
-from drive_env.tools.replayed_motors import nodes_spoken_to
+from drive_env.commands import replayed_motors
+from drive_env.commands.cli import app
+from drive_env.commands.replayed_motors import nodes_spoken_to
 
 DONE, REFUSED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 OFF, ENABLED, QUICK_STOP = 0x0240, 0x0637, 0x0607
@@ -316,7 +316,7 @@ def test_a_motor_that_runs_by_replayed_frames_is_at_rest_and_off_after_a_signal(
     log = recorded(tmp_path / "move.log", frames, every=0.05, pause=120.0)
     with node(lockstep=False) as (machine, bus):
         process = subprocess.Popen(
-            [sys.executable, "-c", "from drive_env.commands import drive_env; drive_env()", "replay", log, *bus,
+            [sys.executable, "-c", "from drive_env.programs import drive_env; drive_env()", "replay", log, *bus,
              "--timeout", "5"],
             cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drive_env.response import current_metrics, disturbance_metrics, oscillation, step_metrics
+from drive_env.trials.response import current_metrics, disturbance_metrics, oscillation, step_metrics
 
 DT = 1e-3
 TAU = 0.02

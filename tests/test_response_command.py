@@ -7,7 +7,7 @@ import pytest
 from test_tune_cli import drive_tune
 from typer.testing import CliRunner
 
-from tuning.cli import app
+from tuning.commands.cli import app
 
 
 @pytest.fixture(scope="module")

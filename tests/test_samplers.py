@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuning import samplers
-from tuning.samplers import check_installed, new_proposer
+from tuning.search import samplers
+from tuning.search.samplers import check_installed, new_proposer
 
 LOW, HIGH = np.array([-1.0, -2.0]), np.array([1.0, 2.0])
 BEST = np.array([0.3, -0.7])

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tuning import pools, provenance, sweep
-from tuning.experiment import load_experiment
-from tuning.pools import PoolError, in_order, open_pool, parse_cluster
-from tuning.shard_log import ShardLog, ShardLogError
-from tuning.unfinished import SHARDS, shard_log, unfinished_folder
+from tuning.runs import pools, provenance, sweep
+from tuning.runs.experiment import load_experiment
+from tuning.runs.pools import PoolError, in_order, open_pool, parse_cluster
+from tuning.runs.shard_log import ShardLog, ShardLogError
+from tuning.runs.unfinished import SHARDS, shard_log, unfinished_folder
 
 ROOT = Path(__file__).parent.parent
 PATIENCE = 300.0  # s, for a computer that stands still for minutes
@@ -254,7 +254,7 @@ def test_a_worker_that_dies_is_told_with_the_remedy():
     ({"cluster": "nonsense"}, ValueError, "--cluster nonsense must be the address of a Dask scheduler, as tcp://host:port"),
 ])  # fmt: skip
 def test_a_pool_that_cannot_be_says_why(options, error, message, monkeypatch):
-    monkeypatch.setattr("tuning.pools.CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr("tuning.runs.pools.CONNECT_TIMEOUT", 0.5)
     with pytest.raises(error, match=message), open_pool(**options):
         pass
 
@@ -468,7 +468,17 @@ def test_results_of_other_sources_are_not_gone_on_with(tmp_path, monkeypatch):
 
 # --- the command --------------------------------------------------------------------------------------------------
 def arguments(config, out, *more):
-    return [sys.executable, "-m", "tuning.cli", "sweep", "--config", str(config), "--out", str(out), *map(str, more)]
+    return [
+        sys.executable,
+        "-m",
+        "tuning.commands.cli",
+        "sweep",
+        "--config",
+        str(config),
+        "--out",
+        str(out),
+        *map(str, more),
+    ]
 
 
 def environment():
@@ -539,7 +549,7 @@ def test_an_interrupt_says_what_is_kept_and_the_run_goes_on_from_its_own_setting
     assert "what is done is kept; go on with --out" in errors
     assert "Traceback" not in errors
     done = subprocess.run(
-        [sys.executable, "-m", "tuning.cli", "sweep", "--out", str(out), "--resume"],
+        [sys.executable, "-m", "tuning.commands.cli", "sweep", "--out", str(out), "--resume"],
         env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -568,7 +578,7 @@ def test_a_mistake_is_one_line(config, tmp_path, more, code, message):
 
 def test_resume_needs_a_folder():
     done = subprocess.run(
-        [sys.executable, "-m", "tuning.cli", "sweep", "--resume"],
+        [sys.executable, "-m", "tuning.commands.cli", "sweep", "--resume"],
         env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert done.returncode == 2

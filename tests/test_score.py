@@ -16,9 +16,9 @@ from drive_env.gains import (
     small_time_constants,
 )
 from drive_env.motors import MOTORS
-from drive_env.positioning import PROFILE, SETTLED, TRIAL, Move, move_terms, plan_move, reach, swing, wrapped
-from drive_env.score import VARIANTS, HiddenScore, Terms, cost, hidden_cost
-from tuning import fit_rule
+from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, Move, move_terms, plan_move, reach, swing, wrapped
+from drive_env.trials.score import VARIANTS, HiddenScore, Terms, cost, hidden_cost
+from research import fit_rule
 
 DEVICE, MOTOR = find_device("tmcm1636"), MOTORS["qbl4208"]
 P = Gains._fields.index("velocity_p")

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from tuning import searches
-from tuning.optimise import Settings, optimise
-from tuning.pools import open_pool
-from tuning.shard_log import ShardLog, ShardLogError
+from tuning.runs.pools import open_pool
+from tuning.runs.shard_log import ShardLog, ShardLogError
+from tuning.runs.unfinished import unfinished_folder
+from tuning.search import searches
+from tuning.search.optimise import Settings, optimise
+from tuning.search.trial_bench import TrialBench
 from tuning.target import emulated
-from tuning.trial_bench import TrialBench
-from tuning.unfinished import unfinished_folder
 
 ROOT = Path(__file__).parent.parent
 PATIENCE = 300.0  # s, for a computer that stands still for minutes
@@ -162,7 +162,7 @@ SEARCH = ("optimise", "--load", "inertia", "--sampler", "tpe", "--trials", 40, "
 def begun(*arguments):
     environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "100", "NO_COLOR": "1"}
     return subprocess.Popen(
-        [sys.executable, "-m", "tuning.cli", *map(str, arguments)],
+        [sys.executable, "-m", "tuning.commands.cli", *map(str, arguments)],
         env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 

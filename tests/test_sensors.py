@@ -10,10 +10,10 @@ from numba import njit
 from scipy import signal, stats
 
 from drive_env import EmulatedDrives, motion
+from drive_env.emulator.parameters import velocity_filter
 from drive_env.firmware.derived import derive
 from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
 from drive_env.firmware.sensors import measure_angle, measure_currents, measure_motion
-from drive_env.parameters import velocity_filter
 from mechanics.compiled import OPTIONS
 
 TWO_PI = 2.0 * math.pi

@@ -18,14 +18,14 @@ from drive_env.bus.config import Bus, BusConfigError, Machine, build_world, load
 from drive_env.bus.faults import Faults
 from drive_env.bus.hub import Hub
 from drive_env.canopen.frames import Frame
+from drive_env.commands.serve import serve
 from drive_env.master.errors import OpenError
 from drive_env.master.port import open_bus
-from drive_env.tools.serve import serve
 
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / "examples" / "bus.toml"
 # The command alone, so that a mistake in another command does not show here.
-APP = "import typer; from drive_env.tools.serve import serve; typer.run(serve)"
+APP = "import typer; from drive_env.commands.serve import serve; typer.run(serve)"
 
 
 def command(*arguments):

@@ -6,7 +6,7 @@ import pytest
 from scripted_drive import ScriptedBus, ScriptedDrive
 from typer.testing import CliRunner
 
-from drive_env.cli import app
+from drive_env.commands.cli import app
 
 DONE, REFUSED, USER_ERROR = 0, 1, 2
 OFF, ENABLED, QUICK_STOP, FAULT_REACTION, FAULT = 0x0240, 0x0637, 0x0607, 0x060F, 0x0608
@@ -21,7 +21,7 @@ def drive(monkeypatch):
         made.buses.append(ScriptedBus(made))
         return made.buses[-1]
 
-    monkeypatch.setattr("drive_env.can_drives.open_bus", opened)
+    monkeypatch.setattr("drive_env.master.can_drives.open_bus", opened)
     monkeypatch.setattr("drive_env.master.port.open_bus", opened)
     return made
 
@@ -99,7 +99,7 @@ def test_any_other_write_to_a_live_axis_asks_first_and_says_why(drive, name, val
 
 def test_a_user_who_says_no_has_changed_nothing(drive, monkeypatch):
     monkeypatch.setattr("typer.testing._NamedTextIOWrapper.isatty", lambda self: True, raising=False)
-    monkeypatch.setattr("drive_env.tools.options.typer.confirm", lambda question: False)
+    monkeypatch.setattr("drive_env.commands.options.typer.confirm", lambda question: False)
     drive.set(0x6041, ENABLED)
     code, _, error = put("60FF", 1000)
     assert (code, error, drive.get(0x60FF)) == (REFUSED, "drive-env: nothing was changed\n", 0)

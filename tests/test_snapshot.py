@@ -22,7 +22,7 @@ from drive_env.gains import GAIN_OBJECTS, write_gains
 from drive_env.master.errors import BusError
 from drive_env.master.sdo import SdoClient
 from drive_env.safety.envelope import SafetyError
-from tuning.cli import app
+from tuning.commands.cli import app
 from tuning.snapshot import (
     SnapshotError,
     Transaction,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_parity import served
 
-from tuning.identification import identify
-from tuning.standstill import standstill_resistances
+from tuning.identify.identification import identify
+from tuning.identify.standstill import standstill_resistances
+from tuning.identify.working_state import COMMUTATION, OPEN_LOOP_CURRENT, working_state
 from tuning.target import Target, emulated
-from tuning.working_state import COMMUTATION, OPEN_LOOP_CURRENT, working_state
 
 
 def at_rest(target):
@@ -86,7 +86,7 @@ def test_over_a_bus_in_real_time_resistance_is_told_and_inductance_refused(monke
     with served("calls", load="inertia", seed=seed, randomise=["stage", "motor"]) as bus:
         own = emulated(load="inertia", seed=seed, randomise=["stage", "motor"], num_threads=1)
         drives = Uneven(bus)
-        monkeypatch.setattr("tuning.winding.time", drives)
+        monkeypatch.setattr("tuning.identify.winding.time", drives)
         target = Target(drives, own.device, own.motor, own.supply, own.low, own.high, own.speed, own.current)
         found = identify(replace(target))[0]
         true = float(own.drives.machine.parameters["motor.R_s"][0])

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drive_env.emergency import EmergencyMessage
-from tuning.frequency_response import measure
-from tuning.identification import identify
+from drive_env.drives.emergency import EmergencyMessage
+from tuning.identify.identification import identify
+from tuning.response.frequency_response import measure
 from tuning.stop_causes import stop_causes
 from tuning.target import emulated
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from drive_env import motion
-from drive_env.misfit import MisfitWarning
+from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.motors import MOTORS
 from mechanics.shaft import shaft_load
-from tuning.suite import SHIPPED, groups, load_suite, open_group, open_machines
+from tuning.compare.suite import SHIPPED, groups, load_suite, open_group, open_machines
 from tuning.toml_tables import ExperimentError
 
 SMALL = """

@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drive_env import EmulatedDrives, motion, response
+from drive_env import EmulatedDrives, motion
 from drive_env.own_packages import ForeignPackageError, check_own
-from tuning import metrics, plots, provenance, sweep
-from tuning.experiment import (
+from drive_env.trials import response
+from tuning.runs import metrics, plots, provenance, sweep
+from tuning.runs.experiment import (
     DEFAULT,
     Excitation,
     Experiment,
@@ -24,7 +25,7 @@ from tuning.experiment import (
     load_experiment,
     resolve,
 )
-from tuning.metrics import METRICS, TRACKING, Recording
+from tuning.runs.metrics import METRICS, TRACKING, Recording
 
 P, I, TORQUE_P = "2042h:01", "2042h:02", "2041h:01"
 SHORT = Excitation(

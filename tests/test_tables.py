@@ -11,16 +11,20 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-import agents.cli
-import drive_env.cli
-import tuning.cli
+import agents.commands.cli
+import drive_env.commands.cli
+import tuning.commands.cli
 from drive_env import EmulatedDrives
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.tools import tables
+from drive_env.commands import tables
 
-APPS = {"drive-env": drive_env.cli.app, "drive-tune": tuning.cli.app, "drive-agent": agents.cli.app}
+APPS = {
+    "drive-env": drive_env.commands.cli.app,
+    "drive-tune": tuning.commands.cli.app,
+    "drive-agent": agents.commands.cli.app,
+}
 WIDTH = 80
 
 
@@ -55,19 +59,19 @@ def given(monkeypatch):
         texts.extend(lines := list(lines))
         real_lines(lines)
 
-    for module in ("drive_env.tools.tables", "drive_env.tools.monitor"):
+    for module in ("drive_env.commands.tables", "drive_env.commands.monitor"):
         monkeypatch.setattr(f"{module}.tables", note_tables)
-    for module in ("drive_env.tools.names", "tuning.commands.rank", "tuning.commands.sweep"):
+    for module in ("drive_env.commands.names", "tuning.commands.rank", "tuning.commands.sweep"):
         monkeypatch.setattr(f"{module}.print_names", note_names)
     for module in (
-        "drive_env.tools.fault",
-        "drive_env.tools.scan",
+        "drive_env.commands.fault",
+        "drive_env.commands.scan",
         "agents.commands.evaluate",
         "agents.commands.tune",
         *(f"tuning.commands.{name}" for name in ("auto", "rank", "optimise", "response", "rules", "sweep")),
     ):
         monkeypatch.setattr(f"{module}.print_lines", note_lines)
-    monkeypatch.setattr("drive_env.tools.tables.terminal_width", lambda: WIDTH)
+    monkeypatch.setattr("drive_env.commands.tables.terminal_width", lambda: WIDTH)
     for name, value in {"COLUMNS": str(WIDTH), "NO_COLOR": "1"}.items():
         monkeypatch.setenv(name, value)
     return texts
@@ -182,6 +186,6 @@ def test_figures_keep_their_line_and_a_text_gives_way_between_words():
     (8, ["  a line", "    that", "    goes", "    on", "    beyond", "    the", "    end"]),
 ])  # fmt: skip
 def test_a_terminal_gets_long_lines_broken_between_words(capsys, monkeypatch, width, lines):
-    monkeypatch.setattr("drive_env.tools.tables.terminal_width", lambda: width)
+    monkeypatch.setattr("drive_env.commands.tables.terminal_width", lambda: width)
     tables.print_lines(["  a line that goes on beyond the end"])
     assert capsys.readouterr().out.splitlines() == lines

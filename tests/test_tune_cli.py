@@ -16,9 +16,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from tuning.compare import Comparison, MachineRow, TunerRow
-from tuning.comparison_picture import WORSE, draw
-from tuning.experiment import DEFAULT
+from tuning.compare.comparison import Comparison, MachineRow, TunerRow
+from tuning.compare.comparison_picture import WORSE, draw
+from tuning.runs.experiment import DEFAULT
 
 ROOT = Path(__file__).parent.parent
 SMALL = (
@@ -31,7 +31,7 @@ SMALL = (
 
 def drive_tune(*arguments, cwd, **environment):
     return subprocess.run(
-        [sys.executable, "-m", "tuning.cli", *map(str, arguments)],
+        [sys.executable, "-m", "tuning.commands.cli", *map(str, arguments)],
         cwd=cwd,
         env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "100", "NO_COLOR": "1"} | environment,
         capture_output=True,
@@ -133,7 +133,7 @@ def test_help_is_quick_and_names_the_options(tmp_path):
 
 def test_help_imports_nothing_heavy(tmp_path):
     heavy = {"numba", "mujoco", "matplotlib", "canopen", "scipy", "optuna", "torch", "distributed"}
-    code = f"import sys, tuning.cli; print(sorted({heavy} & set(sys.modules)))"
+    code = f"import sys, tuning.commands.cli; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -201,7 +201,7 @@ def test_an_interrupt_ends_with_code_130_and_writes_nothing(tmp_path):
     text = DEFAULT.read_text(encoding="utf-8").replace("duration = 0.4", "duration = 40.0")
     (tmp_path / "long.toml").write_text(text, encoding="utf-8")
     process = subprocess.Popen(
-        [sys.executable, "-m", "tuning.cli", "sweep", "--config", "long.toml", "--out", "run"],
+        [sys.executable, "-m", "tuning.commands.cli", "sweep", "--config", "long.toml", "--out", "run"],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,

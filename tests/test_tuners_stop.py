@@ -20,7 +20,7 @@ from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.firmware.fsa import State
 from drive_env.gains import GAIN_OBJECTS
-from tuning.identification import identify
+from tuning.identify.identification import identify
 from tuning.target import on_bus
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -28,9 +28,9 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 FAST = 10.0 * 2.0 * np.pi  # rad/s at which the program is told to end
 SLOW = 2.0 * 2.0 * np.pi  # rad/s that a ramp's end and a cycle of 1 ms leave
 COMMANDS = {
-    "auto": ("tuning.cli", ("auto", "--bus")),
-    "identify": ("tuning.cli", ("identify", "--bus")),
-    "agent tune": ("agents.cli", ("tune",)),
+    "auto": ("tuning.commands.cli", ("auto", "--bus")),
+    "identify": ("tuning.commands.cli", ("identify", "--bus")),
+    "agent tune": ("agents.commands.cli", ("tune",)),
 }
 
 
@@ -42,7 +42,7 @@ def start(command, channel, out):
     module, words = COMMANDS[command]
     entry = "drive_agent" if module.startswith("agents") else "drive_tune"
     return subprocess.Popen(
-        [sys.executable, "-c", f"from drive_env.commands import *; import sys; sys.argv[0] = 'x'; {entry}()", *words,
+        [sys.executable, "-c", f"from drive_env.programs import *; import sys; sys.argv[0] = 'x'; {entry}()", *words,
          "--channel", channel, "--node", "1", "--motor", "qbl4208", "--travel", "-3:3", "--yes", "--out", str(out)],
         env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip

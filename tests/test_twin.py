@@ -11,13 +11,13 @@ import pytest
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.dictionary.units import RPM
-from drive_env.envs.gain_trial import OSCILLATION
 from drive_env.gains import Gains, rule_gains
 from drive_env.motors import find_motor
-from tuning import twin
-from tuning.identification import Estimate, Identification, refused
-from tuning.linear_model import Plant
-from tuning.twin import LEAST, WORLDS, Friction, Known, Spread, Twins, World, known_of, search, twin_parameters
+from drive_env.trials.gain_trial import OSCILLATION
+from tuning.auto import twin
+from tuning.auto.twin import LEAST, WORLDS, Friction, Known, Spread, Twins, World, known_of, search, twin_parameters
+from tuning.identify.identification import Estimate, Identification, refused
+from tuning.response.linear_model import Plant
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(DEVICE, MOTOR, 22.0, 2e-5, R=0.41, L=5.5e-4, velocity_filter=260.0)

@@ -15,23 +15,25 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from agents import episode_log, hyperparameters
-from agents.bundle import Bundle, BundleError
-from agents.cli import app as agent_app
+from agents.commands.cli import app as agent_app
+from agents.evaluation import episode_log
+from agents.policies.agent_file import Bundle, BundleError
+from agents.training import hyperparameters
 from drive_env.bus.config import BusConfigError, load_bus
 from drive_env.canopen.store import Store
-from drive_env.cli import app as env_app
-from drive_env.demonstration import DemonstrationError, load_demonstration
+from drive_env.commands.cli import app as env_app
 from drive_env.envs.configuration import configured
 from drive_env.envs.randomisation import Distributions
 from drive_env.envs.tracking import TrackingConfig
+from drive_env.pictures.demonstration import DemonstrationError, load_demonstration
 from mechanics import untrusted
 from mechanics.untrusted import UntrustedFileError, parse_json, parse_toml, read_arrays, read_bytes, read_toml
-from tuning import certificate, trials_files
-from tuning.cli import app as tune_app
-from tuning.experiment import ExperimentError, load_experiment
-from tuning.shard_log import ShardLog, ShardLogError
-from tuning.suite import load_suite
+from tuning.certificate import certificate
+from tuning.commands.cli import app as tune_app
+from tuning.compare.suite import load_suite
+from tuning.runs.experiment import ExperimentError, load_experiment
+from tuning.runs.shard_log import ShardLog, ShardLogError
+from tuning.search import trials_files
 
 DEEP = 100_000
 DEEP_TOML = "a = " + "[" * DEEP + "]" * DEEP
@@ -332,7 +334,7 @@ def test_a_device_without_end_is_no_file_of_anybody(tmp_path):
     """In a process of its own: today's code takes all the memory there is."""
     if not Path("/dev/zero").exists():
         pytest.skip("no such device here")
-    program = "from drive_env.commands import drive_env; drive_env()"
+    program = "from drive_env.programs import drive_env; drive_env()"
     found = subprocess.run(
         [sys.executable, "-c", program, "serve", "--config", "/dev/zero"], capture_output=True, text=True, timeout=60
     )

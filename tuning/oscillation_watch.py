@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import motion
-from drive_env.envs.gain_trial import OSCILLATION
+from drive_env.drives.trace import Trace
 from drive_env.gains import write_gains
-from drive_env.positioning import CURRENT, WATCH
-from drive_env.trace import Trace
+from drive_env.trials.gain_trial import OSCILLATION
+from drive_env.trials.positioning import CURRENT, WATCH
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -36,12 +36,12 @@ from drive_env.master.parameters import (
 from drive_env.safety.envelope import SafetyError
 from drive_env.whole_file import FORMAT, check_seal, sealed, write_whole
 from mechanics.untrusted import read_toml
-from tuning.provenance import nearest_place, run_folder
+from tuning.runs.provenance import nearest_place, run_folder
 from tuning.toml_tables import toml
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
     from drive_env.dictionary.entries import Entry
+    from drive_env.master.can_drives import CanDrives
     from tuning.target import Target
 
 Mask = NDArray[np.bool_]

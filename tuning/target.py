@@ -157,7 +157,7 @@ def emulated(
     """
     from drive_env import EmulatedDrives
     from mechanics.shaft import one, way
-    from tuning.linked_axes import are_linked
+    from tuning.identify.linked_axes import are_linked
 
     if factory_fresh and motor != EmulatedDrives.DEFAULT_MOTOR:
         raise ValueError(

@@ -25,8 +25,8 @@ from agents.commands.options import (
     print_json,
     progress_bar,
 )
-from drive_env.tools.options import Yes, was_typed
-from drive_env.tools.tables import print_lines
+from drive_env.commands.options import Yes, was_typed
+from drive_env.commands.tables import print_lines
 from tuning.commands.options import ask_to_turn
 
 EMULATOR = "emulator"
@@ -178,9 +178,9 @@ def _open(
     """Return the policy, its environment filled in (`otherwise` if nobody says it), and the environment's options."""
     import tomllib
 
-    from agents.baselines import BASELINES, baseline
-    from agents.policies import LoadedPolicy, open_policy
-    from agents.tasks import environment_name, make_lanes
+    from agents.policies.baselines import BASELINES, baseline
+    from agents.policies.open_policy import LoadedPolicy, open_policy
+    from agents.training.tasks import environment_name, make_lanes
     from drive_env.envs.randomisation import shipped as shipped_distributions
     from mechanics.untrusted import read_toml
 
@@ -216,8 +216,8 @@ def _against(
     loaded: Any, configuration: dict[str, Any], options: dict[str, Any], against: str, found: Any
 ) -> list[str]:
     """Return the gap of what was found to the emulator, or to an earlier report."""
-    from agents import gap
-    from agents.evaluation import Evaluation
+    from agents.evaluation import gap
+    from agents.evaluation.evaluation import Evaluation
 
     other = (
         _on_emulator(loaded, configuration, options, as_on_a_bus=True)
@@ -238,8 +238,8 @@ def _both_sides(
     json: bool,
 ) -> None:
     """Judge a policy on machines in this process and over their bus, and tell the gap."""
-    from agents import evaluation_plots, gap
-    from agents.both_sides import on_both_sides
+    from agents.evaluation import evaluation_plots, gap
+    from agents.evaluation.sim_versus_bus import on_both_sides
 
     with progress_bar(f"{machines} machines, in this process and over CAN") as show:
         both = on_both_sides(
@@ -264,15 +264,15 @@ def _both_sides(
 
 
 def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, Any], as_on_a_bus: bool = False) -> Any:
-    from agents.evaluation import AsOnABus
-    from agents.evaluation import evaluate as run
+    from agents.evaluation.evaluation import AsOnABus
+    from agents.evaluation.evaluation import evaluate as run
 
     title = f"{loaded.name} on the emulator"
     if not as_on_a_bus:
         with progress_bar(title) as show:
             return run(loaded.policy, loaded.environment, configuration, **{**options, "guard": None}, told=show)
-    from agents.tasks import make_lanes
-    from drive_env.drives import EmulatedDrives
+    from agents.training.tasks import make_lanes
+    from drive_env.emulator.emulated_drives import EmulatedDrives
 
     lanes: Any = make_lanes(loaded.environment, 1, configuration)
     config = lanes.config
@@ -298,9 +298,9 @@ def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, 
 def _on_bus(
     loaded: Any, configuration: dict[str, Any], options: dict[str, Any], sensor: str | None, before: Path, **where: Any
 ) -> Any:
-    from agents.evaluation import evaluate as run
-    from agents.on_the_bus import target_for
-    from agents.policies import find_object
+    from agents.evaluation.evaluation import evaluate as run
+    from agents.evaluation.on_the_bus import target_for
+    from agents.policies.open_policy import find_object
     from tuning.snapshot import put_back
 
     function = None if sensor is None else find_object(sensor)
@@ -316,7 +316,7 @@ def _on_bus(
 
 
 def _recording(path: Path) -> Any:
-    from agents import episode_log
+    from agents.evaluation import episode_log
 
     return episode_log.load(path)
 
@@ -326,7 +326,7 @@ def _replay(loaded: Any, configuration: dict[str, Any], path: Path, recording: A
     if recording is None:
         _replay_move(configuration, path, json)
         return
-    from agents import episode_log
+    from agents.evaluation import episode_log
 
     if recording.environment != loaded.environment:
         raise ValueError(f"{path} was recorded in {recording.environment}, and {loaded.name} acts in "
@@ -343,9 +343,9 @@ def _replay(loaded: Any, configuration: dict[str, Any], path: Path, recording: A
 
 
 def _replay_move(configuration: dict[str, Any], path: Path, json: bool) -> None:
-    from drive_env.drives import EmulatedDrives
-    from drive_env.replay import compare, read_log
-    from drive_env.replay import replay as repeat_move
+    from drive_env.emulator.emulated_drives import EmulatedDrives
+    from drive_env.trials.replay import compare, read_log
+    from drive_env.trials.replay import replay as repeat_move
 
     log = read_log(path)
     options = {key: configuration[key] for key in ("device", "load", "motor", "friction") if key in configuration}
@@ -366,7 +366,7 @@ def _guard(environment: str, stall: float | None, saturation: float | None) -> A
     """Return the limits of a policy on given drives: the environment's own, but what the user says."""
     from dataclasses import replace
 
-    from agents.guard import LIMITS
+    from agents.policies.guard import LIMITS
 
     given = {"stall": stall, "saturation": saturation}
     return replace(LIMITS[environment], **{name: value or None for name, value in given.items() if value is not None})
@@ -413,7 +413,7 @@ def _tell(
 
 
 def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
-    from agents import episode_log, evaluation_plots
+    from agents.evaluation import episode_log, evaluation_plots
 
     folder.mkdir(parents=True, exist_ok=True)
     found.save(folder / "report.json")
@@ -427,7 +427,7 @@ def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
 
 def _tell_card(text: str, json: bool) -> None:
     """Print how an agent was trained and what it reaches."""
-    from agents.policies import described_checkpoint, is_checkpoint, open_policy
+    from agents.policies.open_policy import described_checkpoint, is_checkpoint, open_policy
 
     loaded = described_checkpoint(text) if is_checkpoint(text) else open_policy(text)
     about = {"environment": loaded.environment, **loaded.card}

@@ -18,15 +18,15 @@ def export(
 ) -> None:
     """Write an agent as ONNX, its normaliser inside, and check it against the original to 1e-5 of an action's range.
 
-    Prints the latency of the NumPy runtime (which needs no torch: agents/policy.py) and of onnxruntime. A checkpoint is
-    compared with Stable-Baselines3's own network, too, and its .npz is written beside the .onnx.
+    Prints the latency of the NumPy runtime (which needs no torch: agents/policies/policy.py) and of onnxruntime. A
+    checkpoint is compared with Stable-Baselines3's own network, too, and its .npz is written beside the .onnx.
     """
     with errors_as_exit_codes():
-        from agents.onnx_export import TOLERANCE, compare, trial_observations
-        from agents.onnx_export import export as write_onnx
-        from agents.onnx_policy import OnnxPolicy
-        from agents.policies import open_policy
-        from agents.policy import measure_latency, policy_of
+        from agents.policies.onnx_export import TOLERANCE, compare, trial_observations
+        from agents.policies.onnx_export import export as write_onnx
+        from agents.policies.onnx_policy import OnnxPolicy
+        from agents.policies.open_policy import open_policy
+        from agents.policies.policy import measure_latency, policy_of
         from agents.shipped import shipped_names
 
         if agent not in shipped_names() and not agent.lower().endswith((".npz", ".zip")):
@@ -38,7 +38,7 @@ def export(
         original = open_policy(agent, trust=trust)
         found: dict[str, object] = {"file": str(path)}
         if agent.lower().endswith(".zip"):
-            from agents.training import bundle_of_checkpoint
+            from agents.training.train import bundle_of_checkpoint
 
             bundle = bundle_of_checkpoint(agent, trust=trust)
             bundle.save(path.with_suffix(".npz"))

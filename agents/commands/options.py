@@ -10,17 +10,17 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from drive_env.tools.options import INTERRUPTED as INTERRUPTED
-from drive_env.tools.options import REFUSED as REFUSED
-from drive_env.tools.options import USER_ERROR as USER_ERROR
-from drive_env.tools.options import Bitrate as Bitrate
-from drive_env.tools.options import Channel as Channel
-from drive_env.tools.options import Interface as Interface
-from drive_env.tools.options import Json as Json
-from drive_env.tools.options import Nodes as Nodes
-from drive_env.tools.options import ending_by
-from drive_env.tools.options import print_json as print_json
-from tuning.provenance import run_folder
+from drive_env.commands.options import INTERRUPTED as INTERRUPTED
+from drive_env.commands.options import REFUSED as REFUSED
+from drive_env.commands.options import USER_ERROR as USER_ERROR
+from drive_env.commands.options import Bitrate as Bitrate
+from drive_env.commands.options import Channel as Channel
+from drive_env.commands.options import Interface as Interface
+from drive_env.commands.options import Json as Json
+from drive_env.commands.options import Nodes as Nodes
+from drive_env.commands.options import ending_by
+from drive_env.commands.options import print_json as print_json
+from tuning.runs.provenance import run_folder
 
 # Whatever takes long to import (torch, the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
 
@@ -74,7 +74,7 @@ def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: 1 for what drive, bus or the watch say, 2 for the user's mistake, 130 for Ctrl-C."""
-    from agents.policy import PolicyError
+    from agents.policies.policy import PolicyError
     from drive_env.master.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError
 

@@ -32,9 +32,9 @@ def search(
     """
     with errors_as_exit_codes():
         from agents.commands.train import with_load
-        from agents.search import BEST, Trial
-        from agents.search import search as run_search
-        from agents.tasks import ENVIRONMENTS, environment_name
+        from agents.training.search import BEST, Trial
+        from agents.training.search import search as run_search
+        from agents.training.tasks import ENVIRONMENTS, environment_name
 
         for name, value in (("--trials", trials), ("--steps", steps)):
             if value is not None and value < 1:

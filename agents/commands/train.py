@@ -27,7 +27,7 @@ from agents.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from agents.training import Progress, Report
+    from agents.training.train import Progress, Report
 
 EPISODES = 64  # for the card
 LINES = 10  # of progress where nobody watches a terminal
@@ -55,9 +55,9 @@ def train(
     resumed.
     """
     with errors_as_exit_codes():
-        from agents.tasks import ENVIRONMENTS
-        from agents.training import AGENT, CHECKPOINT, CURVE, Run, clear, run_to_resume, with_figures
-        from agents.training import train as run_training
+        from agents.training.tasks import ENVIRONMENTS
+        from agents.training.train import AGENT, CHECKPOINT, CURVE, Run, clear, run_to_resume, with_figures
+        from agents.training.train import train as run_training
 
         if resume is None:
             if trust:
@@ -103,8 +103,8 @@ def given_options(context: typer.Context) -> list[str]:
 
 def judge(bundle: Any) -> Any:
     """Return the evaluation of a bundle on emulated machines."""
-    from agents.evaluation import evaluate
-    from agents.policy import policy_of
+    from agents.evaluation.evaluation import evaluate
+    from agents.policies.policy import policy_of
 
     return evaluate(policy_of(bundle), bundle.environment, bundle.configuration, episodes=EPISODES)
 
@@ -113,7 +113,7 @@ def with_load(
     environment: str, algorithm: str, preset: str, load: str | None, config: Path | None = None
 ) -> dict[str, Any]:
     """Return hyper-parameters for a load: with the section that is named after it, where there is one."""
-    from agents import hyperparameters
+    from agents.training import hyperparameters
 
     section = load if load in hyperparameters.sections(environment, algorithm, config) else None
     given = hyperparameters.load(environment, algorithm, preset, path=config, section=section)

@@ -24,16 +24,16 @@ from agents.commands.options import (
     new_folder,
     print_json,
 )
-from drive_env.tools.options import DeviceName, Yes, look_first, names_a_bus
-from drive_env.tools.tables import print_lines
+from drive_env.commands.options import DeviceName, Yes, look_first, names_a_bus
+from drive_env.commands.tables import print_lines
 from tuning.commands.options import MotorName, Supply, TravelRange, ask_to_turn
 
 MOST_TRIALS = 10_000
 PATIENCE = 30.0  # s, for a node in this process: one that is slow says that the computer is busy, not that it is gone
 
 if TYPE_CHECKING:
-    from agents.tuner import TrialShown
-    from agents.tuning_run import Run
+    from agents.tuner.tune_target import TrialShown
+    from agents.tuner.tuning_run import Run
     from tuning.target import Target
 
 
@@ -73,7 +73,7 @@ def tune(
     Writes before.toml, from which `drive-tune undo` brings back what was, certificate.json and report.html.
     """
     with errors_as_exit_codes():
-        from agents.policy import load_policy
+        from agents.policies.policy import load_policy
         from agents.shipped import find_agent
 
         bus = names_a_bus(context)
@@ -172,7 +172,7 @@ def _on_bus(
 
 def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:
     """Print what was found and what a run would do; the drive is read, and nothing else. Return whether it would."""
-    from agents.rehearsal import rehearse
+    from agents.tuner.rehearsal import rehearse
 
     found = rehearse(target, keep=keep)
     trials = policy.bundle.configuration["trials"]
@@ -212,7 +212,7 @@ def _what_is_written(group: list[Any]) -> str:
 
 
 def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, json: bool) -> Run:
-    from agents.tuning_run import run
+    from agents.tuner.tuning_run import run
 
     def show(trial: TrialShown) -> None:
         if json:
@@ -300,7 +300,7 @@ def _print(done: Run, refused: list[str], rule: float | None) -> None:
 
 def _answer(done: Run) -> str:
     """Return which trial the agent stays with, and why where another one measured better; "" if it is none of them."""
-    from agents.tuner import best_unstopped
+    from agents.tuner.tune_target import best_unstopped
 
     after = tuple(done.result.axes[0].after)
     own = next((trial for trial in done.trials if tuple(trial.gains[0]) == after), None)

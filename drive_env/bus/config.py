@@ -82,7 +82,7 @@ def build_world(bus: Bus, *, lockstep: bool, own_wire: bool = True) -> World:
     Raises:
         BusConfigError: If it cannot be.
     """
-    from drive_env.drives import EmulatedDrives
+    from drive_env.emulator.emulated_drives import EmulatedDrives
 
     if bus.seed < 0:
         raise BusConfigError(f"seed = {bus.seed} must be 0 or more")

@@ -6,11 +6,11 @@ from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from drive_env.axis import Port
 from drive_env.bus.wire import Transmission, Wire
 from drive_env.canopen.frames import IDENTIFIER, SYNC, Frame
 from drive_env.canopen.node import Node
-from drive_env.drives import EmulatedDrives
+from drive_env.emulator.emulated_drives import EmulatedDrives
+from drive_env.node.axis import Port
 
 CYCLE = 0.001  # s: the communication cycle
 SYNC_OBJECT = (0x1005, 0)

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from drive_env.axis import Axis, QueuedEmergency
 from drive_env.canopen import communication, frames, nmt
 from drive_env.canopen.communication import ModuleObjects, known_bit_rate, signed_command
 from drive_env.canopen.emergency import CONDITIONS, EPSILON, Condition, EmergencyProducer, ErrorHistory
@@ -33,8 +32,9 @@ from drive_env.dictionary.access import (
     ObjectAccessError,
     check_limits,
 )
-from drive_env.drives import EmulatedDrives
+from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.firmware.protection import CAUSES, CUT, STOP
+from drive_env.node.axis import Axis, QueuedEmergency
 
 logger = logging.getLogger(__name__)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drive_env.axis import Axis, Port
 from drive_env.canopen.communication import ModuleObjects
 from drive_env.devices import Device
 from drive_env.dictionary.entries import Entry, ObjectDictionary
+from drive_env.node.axis import Axis, Port
 
 
 class NodeDictionary:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from drive_env.axis import Port
 from drive_env.canopen import frames, mapping
 from drive_env.canopen.communication import TO_MAPPING, ModuleObjects
 from drive_env.dictionary.access import ObjectAccessError
+from drive_env.node.axis import Port
 
 LAST_SYNCHRONOUS = 240  # transmission types 0...240; 254 and 255 are driven by events
 EPSILON = 1e-6  # s: times are sums of cycles

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drive_env.axis import Port
 from drive_env.dictionary.access import (
     PROTOCOL_TIMED_OUT,
     TOGGLE_NOT_ALTERNATED,
@@ -21,6 +20,7 @@ from drive_env.dictionary.access import (
     check_writable,
 )
 from drive_env.dictionary.entries import Entry
+from drive_env.node.axis import Port
 
 # Client command specifiers, bits 7...5 of the first byte.
 DOWNLOAD_SEGMENT, INITIATE_DOWNLOAD, INITIATE_UPLOAD, UPLOAD_SEGMENT, ABORT, BLOCK_UPLOAD, BLOCK_DOWNLOAD = range(7)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drive_env.envs.lanes import check_choice
 
 if TYPE_CHECKING:
-    from drive_env.machine import Machines
+    from drive_env.emulator.machine import Machines
     from mechanics.load import Load
 
 Floats = NDArray[np.float64]

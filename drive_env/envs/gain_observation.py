@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.envs.gain_trial import PHASES, Identified, Trial
 from drive_env.gains import RAW_MAX
 from drive_env.motors import Motor
+from drive_env.trials.gain_trial import PHASES, Identified, Trial
 
 Floats = NDArray[np.float64]
 

@@ -285,7 +285,7 @@ class GainScheduling(Lanes):
 
     # --- construction ---------------------------------------------------------------------------------------------
     def _new_drives(self) -> Any:
-        from drive_env.drives import EmulatedDrives
+        from drive_env.emulator.emulated_drives import EmulatedDrives
 
         c = self.config
         return EmulatedDrives(c.device, c.load, c.motor, self.num_envs, friction=c.friction, num_threads=c.num_threads)

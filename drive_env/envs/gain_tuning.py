@@ -24,14 +24,14 @@ from drive_env.envs.gain_observation import (
     tried_entries,
     true_entries,
 )
-from drive_env.envs.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
 from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Reward, Stepped, check_choice
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
 from drive_env.gains import GAIN_OBJECTS, RAW_MAX, Gains, rule_gains, small_time_constants
 from drive_env.motors import find_motor
-from drive_env.positioning import TRIAL, plan_move, power_up, reach
-from drive_env.score import HiddenScore
+from drive_env.trials.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
+from drive_env.trials.positioning import TRIAL, plan_move, power_up, reach
+from drive_env.trials.score import HiddenScore
 
 Integers = NDArray[np.int64]
 
@@ -147,8 +147,8 @@ class GainTuning(Lanes):
     With `privileged` it is a dict of "observation" and "privileged": each true parameter's difference from its default
     over the default's size (where that is 0, the parameter itself), in the order of `info["parameters"]`, -100...100.
 
-    The reward is the decrease of the incumbent's ln hidden J (drive_env/score.py), meant for a discount of 1, less
-    `abort_cost` for a trial that was stopped. On given drives there is no hidden J; it is that of ln J by measured
+    The reward is the decrease of the incumbent's ln hidden J (drive_env/trials/score.py), meant for a discount of 1,
+    less `abort_cost` for a trial that was stopped. On given drives there is no hidden J; it is that of ln J by measured
     terms. The episode is `truncated` when its trials are used up, `terminated` if a given drive cannot be cleared.
 
     `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (lanes, axes, 5) raw integers in the order of
@@ -215,7 +215,7 @@ class GainTuning(Lanes):
 
     # --- construction ---------------------------------------------------------------------------------------------
     def _new_drives(self, num_envs: int) -> Any:
-        from drive_env.drives import EmulatedDrives
+        from drive_env.emulator.emulated_drives import EmulatedDrives
 
         c = self.config
         return EmulatedDrives(

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from drive_env.recording import Recorder
-    from drive_env.render import Picture
-    from drive_env.window import Window
+    from drive_env.pictures.recording import Recorder
+    from drive_env.pictures.render import Picture
+    from drive_env.pictures.window import Window
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -88,21 +88,21 @@ class Pictures:
         self._recorders.clear()
 
     def _open_window(self) -> None:
-        from drive_env.demonstration import PictureFormat
-        from drive_env.window import Window
+        from drive_env.pictures.demonstration import PictureFormat
+        from drive_env.pictures.window import Window
 
         form = PictureFormat()
         self._window = Window(form.width, form.height, f"drive-env: {self._drives.load.name}")
 
     def _drawn(self) -> Picture:
         if self._picture is None:
-            from drive_env.render import Picture
+            from drive_env.pictures.render import Picture
 
             self._picture = Picture(self._drives.load)
         return self._picture
 
     def _record(self, lane: int) -> None:
-        from drive_env.recording import Recorder
+        from drive_env.pictures.recording import Recorder
 
         self._recorders[lane] = Recorder(self._drives, lane, self._period)
         self._recorders[lane].look()

@@ -26,7 +26,7 @@ from drive_env.faults.table import FAULTS, names_of
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
-    from drive_env.drives import EmulatedDrives
+    from drive_env.emulator.emulated_drives import EmulatedDrives
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import motion
+from drive_env.emulator.cyclic_control import Hooks, exchange
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
@@ -20,7 +21,6 @@ from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Observation, Reward,
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines
 from drive_env.envs.trajectories import TRAJECTORIES, draw
-from drive_env.exchange import Hooks, exchange
 
 CYCLE = 0.001  # s, one communication cycle
 
@@ -214,7 +214,7 @@ class Tracking(Lanes):
 
     # --- construction ---------------------------------------------------------------------------------------------
     def _new_drives(self, num_envs: int) -> Any:
-        from drive_env.drives import EmulatedDrives
+        from drive_env.emulator.emulated_drives import EmulatedDrives
 
         config = self.config
         return EmulatedDrives(

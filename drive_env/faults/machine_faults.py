@@ -18,7 +18,7 @@ from drive_env.faults.table import Row, checked_parameters, find_fault
 from drive_env.firmware.record import get_lanes, set_lanes
 
 if TYPE_CHECKING:
-    from drive_env.drives import EmulatedDrives
+    from drive_env.emulator.emulated_drives import EmulatedDrives
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -17,8 +17,8 @@ from drive_env.master.description import PROFILE_OFFSET
 from drive_env.master.errors import BusError
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
     from drive_env.devices import MasterHints
+    from drive_env.master.can_drives import CanDrives
 
 Key = tuple[int, int]
 

@@ -18,7 +18,7 @@ from drive_env.safety.rotor import RotorAngle, wrapped
 from drive_env.safety.states import is_live
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
+    from drive_env.master.can_drives import CanDrives
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]

@@ -16,7 +16,7 @@ from drive_env.safety.objects import VELOCITY
 from drive_env.safety.rotor import HOME_OFFSET, RotorAngle
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
+    from drive_env.master.can_drives import CanDrives
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]

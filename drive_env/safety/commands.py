@@ -42,7 +42,7 @@ from drive_env.safety.rotor import scale_objects
 from drive_env.safety.states import may_enable
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
+    from drive_env.master.can_drives import CanDrives
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]

@@ -16,7 +16,7 @@ from drive_env.master.errors import BusError
 from drive_env.master.tidying import Tidying
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
+    from drive_env.master.can_drives import CanDrives
 
 logger = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from drive_env.safety.objects import POSITION
 from drive_env.safety.rotor import HOME_OFFSET, read_scale
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
+    from drive_env.master.can_drives import CanDrives
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]

@@ -18,7 +18,7 @@ from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.objects import CURRENT, DEMAND, POSITION, STATUSWORD, VELOCITY
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
+    from drive_env.master.can_drives import CanDrives
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]

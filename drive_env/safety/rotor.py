@@ -11,7 +11,7 @@ from drive_env.master.description import Description, Key
 from drive_env.master.errors import RefusedError
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
+    from drive_env.master.can_drives import CanDrives
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]

@@ -21,7 +21,7 @@ from drive_env.safety.states import OPERATION_ENABLED, matches
 from drive_env.safety.stopping import AxisStop, Phase, Sample, Stop
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
+    from drive_env.master.can_drives import CanDrives
 
 logger = logging.getLogger(__name__)
 

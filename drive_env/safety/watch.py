@@ -28,7 +28,7 @@ from drive_env.safety.supervisor import Supervisor
 from drive_env.safety.watchdogs import Watchdogs
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
+    from drive_env.master.can_drives import CanDrives
 
 logger = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ from drive_env.safety.objects import CONTROLWORD, STATUSWORD
 from drive_env.safety.states import DISABLE_VOLTAGE, is_disabled, is_live
 
 if TYPE_CHECKING:
-    from drive_env.can_drives import CanDrives
+    from drive_env.master.can_drives import CanDrives
 
 logger = logging.getLogger(__name__)
 

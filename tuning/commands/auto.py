@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from drive_env.tools.tables import Column, print_lines, print_table
+from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     INTERRUPTED,
     REFUSED,
@@ -22,7 +22,7 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.auto_result import AxisRun, Result
+    from tuning.auto.result import AxisRun, Result
     from tuning.target import Target
 
 
@@ -44,7 +44,7 @@ def auto(
     report.html. Exit code 1 if an axis was rejected; why is said.
     """
     with errors_as_exit_codes():
-        from tuning import provenance
+        from tuning.runs import provenance
 
         folder = provenance.run_folder("auto") if out is None else out
         provenance.check_folder(folder)
@@ -56,8 +56,8 @@ def auto(
 
 
 def _run(target: Target, folder: Path, seed: int, store: bool) -> Result:
-    from tuning.auto import auto as tune
-    from tuning.auto_certificate import certificate
+    from tuning.auto.certify import certificate
+    from tuning.auto.one_button import auto as tune
 
     file = folder / "before.toml"
     try:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drive_env.tools.options import check_free, check_writable
-from drive_env.tools.tables import Column, print_table
+from drive_env.commands.options import check_free, check_writable
+from drive_env.commands.tables import Column, print_table
 from tuning.commands.options import (
     REFUSED,
     Json,
@@ -26,7 +26,7 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.identification import Identification
+    from tuning.identify.identification import Identification
 
 TITLES = {
     "resistance": "winding resistance, a phase",
@@ -66,7 +66,7 @@ def identify(
             check_writable(out)
         file = way_back(drive, "identify", None if out is None else out.with_suffix(""))
         from drive_env.whole_file import write_whole
-        from tuning.identification import identify as run
+        from tuning.identify.identification import identify as run
 
         with drive.open() as target, unchanged(target, file), progress_bar("identifying") as show:
             found = run(target, progress=lambda what, share: show(share))

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from drive_env.tools.tables import Column, print_lines, print_table
+from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
@@ -35,7 +35,7 @@ def _from_file(context: typer.Context, path: Path | None) -> Path | None:
     """Take the defaults of all other options from settings.toml of a search."""
     if path is not None:
         with errors_as_exit_codes():
-            from tuning.trials_files import load_options
+            from tuning.search.trials_files import load_options
 
             context.default_map = load_options(path)
     return path
@@ -118,8 +118,8 @@ def optimise(
                 "--searches, --workers, --cluster and --resume are of emulated machines; a search on a bus goes on "
                 "from its --journal"
             )
-        from tuning import provenance, unfinished
-        from tuning.optimise import Settings
+        from tuning.runs import provenance, unfinished
+        from tuning.search.optimise import Settings
         from tuning.snapshot import file_before
 
         folder = provenance.run_folder("optimise") if out is None else out
@@ -173,8 +173,9 @@ def _search_machine(
     resume: bool,
 ) -> Any:
     """Search on an emulated machine; return all searches as one."""
-    from tuning import provenance, searches, unfinished
-    from tuning.pools import open_pool
+    from tuning.runs import provenance, unfinished
+    from tuning.runs.pools import open_pool
+    from tuning.search import searches
 
     shards = searches.searches(machine, settings, count)
     versions = "".join(f"{name} = {version}\n" for name, version in provenance.versions().items())
@@ -194,7 +195,7 @@ def _search_machine(
 
 def _check_unfinished(folder: Path, journal: Path | None) -> None:
     """Raise ValueError where there is no search to go on with: it would be a new one. A journal has its own."""
-    from tuning import unfinished
+    from tuning.runs import unfinished
 
     if (folder / "trials.csv").is_file():
         raise ValueError(f"the search of {folder} is finished: nothing is left to resume, its results are there")
@@ -215,7 +216,7 @@ def _search_bus(target: Any, settings: Any, before: Path, folder: Path, options:
 
     Results that cannot be written down are none.
     """
-    from tuning.optimise import optimise as search
+    from tuning.search.optimise import optimise as search
     from tuning.snapshot import put_back
 
     leave_oscillations_to_trials(target.drives)
@@ -243,8 +244,8 @@ def leave_oscillations_to_trials(drives: Any) -> None:
 
 
 def _save(found: Any, settings: Any, folder: Path, options: dict[str, Any]) -> None:
-    from tuning import provenance
-    from tuning.trials_files import save
+    from tuning.runs import provenance
+    from tuning.search.trials_files import save
 
     with provenance.new_folder(folder) as partial:
         save(found, settings, partial, options, provenance.versions())
@@ -278,8 +279,8 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
     import numpy as np
 
     from drive_env.gains import Gains
-    from tuning.optimise import COST
-    from tuning.trials_files import TITLES
+    from tuning.search.optimise import COST
+    from tuning.search.trials_files import TITLES
 
     searches = sorted({row.search for row in found.rows})
     axes = len(found.gains) // max(len(searches), 1)
@@ -318,7 +319,7 @@ def _on_two_lines(title: str) -> str:
 
 
 def _told(row: Any, objectives: Sequence[str], t_0: float) -> list[str]:
-    from tuning.trials_files import figures
+    from tuning.search.trials_files import figures
 
     return [f"{value:.3g}" for value in figures(row, objectives, t_0)]
 

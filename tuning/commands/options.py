@@ -14,19 +14,19 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 
 import typer
 
-from drive_env.tools.options import INTERRUPTED as INTERRUPTED
-from drive_env.tools.options import REFUSED as REFUSED
-from drive_env.tools.options import USER_ERROR as USER_ERROR
-from drive_env.tools.options import Bitrate as Bitrate
-from drive_env.tools.options import Channel as Channel
-from drive_env.tools.options import Interface as Interface
-from drive_env.tools.options import Json as Json
-from drive_env.tools.options import Nodes as Nodes
-from drive_env.tools.options import Yes as Yes
-from drive_env.tools.options import ask as ask
-from drive_env.tools.options import ending_by, names_a_bus
-from drive_env.tools.options import print_json as print_json
-from drive_env.tools.options import progress_on as progress_on
+from drive_env.commands.options import INTERRUPTED as INTERRUPTED
+from drive_env.commands.options import REFUSED as REFUSED
+from drive_env.commands.options import USER_ERROR as USER_ERROR
+from drive_env.commands.options import Bitrate as Bitrate
+from drive_env.commands.options import Channel as Channel
+from drive_env.commands.options import Interface as Interface
+from drive_env.commands.options import Json as Json
+from drive_env.commands.options import Nodes as Nodes
+from drive_env.commands.options import Yes as Yes
+from drive_env.commands.options import ask as ask
+from drive_env.commands.options import ending_by, names_a_bus
+from drive_env.commands.options import print_json as print_json
+from drive_env.commands.options import progress_on as progress_on
 
 if TYPE_CHECKING:
     from tuning.snapshot import Transaction
@@ -197,7 +197,7 @@ def check_seed(seed: int) -> None:
 
 def check_machines(option: str, machines: int) -> None:
     """Raise ValueError for a number of emulated machines that cannot be."""
-    from drive_env.drives import MOST_MACHINES
+    from drive_env.emulator.emulated_drives import MOST_MACHINES
 
     if not 1 <= machines <= MOST_MACHINES:
         raise ValueError(
@@ -311,7 +311,7 @@ def errors_as_exit_codes() -> Iterator[None]:
     """End with one line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
     from drive_env.master.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError
-    from tuning.pools import PoolError
+    from tuning.runs.pools import PoolError
 
     with ending_by(fail, refused=(SafetyError, BusError, RefusedError, PoolError, TimeoutError)):
         yield
@@ -335,7 +335,7 @@ def fail(error: object, code: int = USER_ERROR) -> NoReturn:
 
 def what_an_interrupt_leaves(folder: Path) -> str:
     """Return what an interrupted run that can be resumed says."""
-    from tuning import unfinished
+    from tuning.runs import unfinished
 
     if unfinished.unfinished_folder(folder).exists():
         return f"interrupted; what is done is kept; go on with --out {folder} --resume"

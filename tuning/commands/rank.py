@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from drive_env.tools.tables import Column, print_lines, print_names, print_table
+from drive_env.commands.tables import Column, print_lines, print_names, print_table
 from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
@@ -63,7 +63,7 @@ def rank(
             return
         if resume and out is None:
             raise ValueError("--resume needs --out: the folder into which the comparison was to write")
-        from tuning import provenance
+        from tuning.runs import provenance
 
         folder = provenance.run_folder("rank") if out is None else out
         try:
@@ -89,13 +89,13 @@ def _compare(
     import hashlib
     from dataclasses import asdict
 
-    from tuning import provenance, unfinished
-    from tuning.compare import compare as run
-    from tuning.compare import save, settings_text
-    from tuning.pools import open_pool
-    from tuning.rivals import all_rivals
-    from tuning.suite import groups, load_suite
-    from tuning.tuners import MissingTunerError, find_tuner, tuner_rows
+    from tuning.compare.against_best import all_rivals
+    from tuning.compare.comparison import compare as run
+    from tuning.compare.comparison import save, settings_text
+    from tuning.compare.suite import groups, load_suite
+    from tuning.compare.tuners import MissingTunerError, find_tuner, tuner_rows
+    from tuning.runs import provenance, unfinished
+    from tuning.runs.pools import open_pool
 
     check_seed(seed)
     if trials is not None and trials < 1:
@@ -139,7 +139,7 @@ def _compare(
 
 
 def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
-    from tuning.rivals import all_rivals
+    from tuning.compare.against_best import all_rivals
 
     machines = comparison.tuners[0].machines
     titles = ("median", "p95", "> 5 %\nworse", "time\n[s]", "moves", "stops", "violations", "gave\nup")
@@ -164,8 +164,8 @@ def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
 
 
 def _list() -> None:
-    from tuning.suite import load_suite, suite_names
-    from tuning.tuners import tuner_rows
+    from tuning.compare.suite import load_suite, suite_names
+    from tuning.compare.tuners import tuner_rows
 
     print_names(
         {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drive_env.tools.tables import Column, print_lines, print_table
+from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     REFUSED,
     Json,
@@ -27,7 +27,7 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.measured_loop import MeasuredLoop
+    from tuning.response.measured_loop import MeasuredLoop
 
 FEWEST = 0.1  # of an axis's frequencies must be coherent for its response to say anything
 COLUMNS = (
@@ -59,8 +59,8 @@ def response(
     parameters of drives on a bus are in a file for `drive-tune undo` meanwhile, beside --out or in runs/.
     """
     with errors_as_exit_codes():
-        from tuning import provenance
-        from tuning.frequency_response import measure
+        from tuning.response.frequency_response import measure
+        from tuning.runs import provenance
 
         if out is not None:
             provenance.check_folder(out)
@@ -94,8 +94,8 @@ def _axes(measured: MeasuredLoop) -> range:
 def _write(folder: Path, measured: MeasuredLoop) -> None:
     import numpy as np
 
-    from tuning.bode import write_bode
-    from tuning.provenance import new_folder
+    from tuning.response.bode import write_bode
+    from tuning.runs.provenance import new_folder
 
     with new_folder(folder) as partial:
         for axis in _axes(measured):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drive_env.tools.tables import Column, print_lines, print_table
+from drive_env.commands.tables import Column, print_lines, print_table
 from tuning.commands.options import (
     REFUSED,
     Json,
@@ -28,8 +28,8 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.linear_model import Plant
-    from tuning.proposal import Proposal
+    from tuning.response.linear_model import Plant
+    from tuning.rules.proposal import Proposal
     from tuning.snapshot import Transaction
     from tuning.target import Target
 
@@ -61,8 +61,8 @@ def rules(
     parameters before are in --snapshot from the begin, and back at the end, but for what --apply writes.
     """
     with errors_as_exit_codes():
-        from tuning.provenance import run_folder
-        from tuning.rules import RULES
+        from tuning.rules.rules_by_name import RULES
+        from tuning.runs.provenance import run_folder
         from tuning.snapshot import check_place
 
         chosen = rule or list(RULES)
@@ -115,8 +115,8 @@ class _Axis:
 def _identified(target: Target) -> list[Plant | str]:
     """Return what the axes are, or why no rule can say anything of one: its inertia was not found."""
     from drive_env.safety.envelope import swinging_allowed
-    from tuning.identification import identify
-    from tuning.linear_model import Plant
+    from tuning.identify.identification import identify
+    from tuning.response.linear_model import Plant
 
     with progress_bar("identifying") as show, swinging_allowed(target.drives):
         found = identify(target, progress=lambda what, share: show(share))
@@ -131,7 +131,7 @@ def _identified(target: Target) -> list[Plant | str]:
 
 
 def _propose(target: Target, plant: Plant, names: Sequence[str]) -> dict[str, Proposal]:
-    from tuning.rules import propose
+    from tuning.rules.rules_by_name import propose
 
     return {name: propose(name, target.device, target.motor, plant) for name in names}
 
@@ -141,8 +141,8 @@ def _swing(target: Target, plants: Sequence[Plant]) -> list[Proposal | str]:
     import numpy as np
 
     from drive_env.gains import write_gains
-    from tuning.relay import gains_from_swing, relay_experiment, relay_rule
-    from tuning.trial_bench import read_gains
+    from tuning.rules.relay import gains_from_swing, relay_experiment, relay_rule
+    from tuning.search.trial_bench import read_gains
 
     before = read_gains(target)
     gains = [relay_rule(target.device, target.motor, plant).gains for plant in plants]
@@ -165,8 +165,8 @@ def _swing(target: Target, plants: Sequence[Plant]) -> list[Proposal | str]:
 def _margins(target: Target, plant: Plant, proposal: Proposal) -> Any:
     import numpy as np
 
-    from tuning.linear_model import velocity_open_loop
-    from tuning.margins import margins
+    from tuning.response.linear_model import velocity_open_loop
+    from tuning.response.margins import margins
 
     f = np.geomspace(0.5, 0.49 * target.device.velocity_rate, POINTS)
     return margins(f, velocity_open_loop(target.device, plant, proposal.gains, f))
@@ -233,7 +233,7 @@ def _apply(
     import numpy as np
 
     from drive_env.gains import write_gains
-    from tuning.rules import propose
+    from tuning.rules.rules_by_name import propose
     from tuning.snapshot import Transaction
 
     proposals = [propose(name, target.device, target.motor, plant) for plant in plants]

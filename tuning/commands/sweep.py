@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from drive_env.tools.tables import Column, print_lines, print_names, print_table
+from drive_env.commands.tables import Column, print_lines, print_names, print_table
 from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
@@ -57,7 +57,7 @@ def sweep(
         elif show_config:
             _show_config(config, overrides)
         else:
-            from tuning import provenance
+            from tuning.runs import provenance
 
             if resume and out is None:
                 raise ValueError("--resume needs --out: the folder into which the run was to write")
@@ -78,9 +78,9 @@ def _sweep(
 ) -> None:
     from rich.console import Console
 
-    from tuning import provenance, unfinished
-    from tuning.experiment import load_experiment
-    from tuning.pools import open_pool
+    from tuning.runs import provenance, unfinished
+    from tuning.runs.experiment import load_experiment
+    from tuning.runs.pools import open_pool
 
     console = Console()
     provenance.check_folder(folder)
@@ -108,8 +108,8 @@ def _note(console: Any, text: str) -> None:
 
 
 def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folder: Path) -> Any:
-    from tuning import unfinished
-    from tuning.sweep import run
+    from tuning.runs import unfinished
+    from tuning.runs.sweep import run
 
     texts = {
         "compiling": "loading the kernels (the first time: 30 seconds)",
@@ -184,7 +184,7 @@ def _print_best(result: Any, count: int) -> None:
 
 
 def _show_config(config: Path | None, overrides: dict[str, Any]) -> None:
-    from tuning.experiment import DEFAULT, load_experiment
+    from tuning.runs.experiment import DEFAULT, load_experiment
 
     experiment = load_experiment(config, **overrides)
     if any(value is not None for value in overrides.values()):
@@ -198,8 +198,8 @@ def _list_names() -> None:
     from drive_env.devices import device_names, find_device
     from drive_env.motors import MOTORS
     from mechanics.loads import LOADS
-    from tuning.experiment import gain_objects
-    from tuning.metrics import METRICS, TRACKING
+    from tuning.runs.experiment import gain_objects
+    from tuning.runs.metrics import METRICS, TRACKING
 
     devices = [find_device(name) for name in device_names()]
     gains = [(device, entry) for device in devices for entry in gain_objects(device, device.new_dictionary())]

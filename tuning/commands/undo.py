@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from drive_env.tools.parameters import OtherDrive, Unchecked
+from drive_env.commands.parameters import OtherDrive, Unchecked
 from tuning.commands.options import (
     REFUSED,
     Channel,

@@ -1,0 +1,49 @@
+"""The command `drive-agent`: it only puts together what lies in `commands`, one file per command."""
+
+from __future__ import annotations
+
+import importlib
+
+import typer
+
+from agents.commands.options import interrupted
+from drive_env.commands.program import Quiet, Verbose, Version, say_as_much
+
+app = typer.Typer(
+    name="drive-agent",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+PANELS = {
+    "Use an agent": ("tune", "evaluate", "export"),
+    "Make one": ("train", "search"),
+}
+for panel, names in PANELS.items():
+    for name in names:
+        module = importlib.import_module(f"agents.commands.{name}")
+        app.command(name, rich_help_panel=panel)(getattr(module, name))
+
+
+@app.callback()
+def drive_agent(version: Version = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
+    """Train agents for servo drives, judge them, and let them act: on emulated drives, and on real ones over CAN.
+
+    Exit codes: 0 done, 1 drive, bus or the watch over the agent said no, 2 a mistake in the command, 130
+    Ctrl-C, 141 nobody takes the output any more.
+    """
+    say_as_much(quiet, verbose)
+
+
+def main() -> None:
+    """Run the command; Ctrl-C ends it with 130."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        interrupted()
+
+
+if __name__ == "__main__":
+    main()

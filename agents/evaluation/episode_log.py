@@ -1,0 +1,101 @@
+"""Recorded episodes in a file, and what a policy would have done in them: the same, if it is the same policy."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.evaluation.scores import Episode
+from agents.policies.agent_file import plain
+from agents.policies.guard import PATIENT, GuardedPolicy
+from mechanics.untrusted import parse_json, read_arrays
+
+
+class Recording(NamedTuple):
+    """Episodes as a policy saw them: observations (steps, entries) and actions (steps, actions) of each, and seeds."""
+
+    environment: str
+    configuration: dict[str, Any]
+    seeds: list[int]
+    observations: list[NDArray[np.float32]]
+    actions: list[NDArray[np.float32]]
+
+
+class Repeated(NamedTuple):
+    """What a policy does with recorded observations: largest and RMS difference from the recorded actions."""
+
+    largest: float
+    rms: float
+    steps: int
+
+
+def save(path: Path, environment: str, configuration: dict[str, Any], episodes: Sequence[Episode]) -> None:
+    """Write episodes to an .npz."""
+    about = {"environment": environment, "configuration": plain(configuration)}
+    about |= {"seeds": [episode.seed for episode in episodes]}
+    np.savez_compressed(
+        path,
+        about=np.frombuffer(json.dumps(about).encode(), np.uint8),
+        lengths=np.array([len(episode.actions) for episode in episodes]),
+        observations=np.concatenate([episode.observations[:-1] for episode in episodes]).astype(np.float32),
+        actions=np.concatenate([episode.actions for episode in episodes]).astype(np.float32),
+    )
+
+
+def load(path: Path) -> Recording:
+    """Read what `save` wrote.
+
+    Raises:
+        ValueError: If the file is none.
+    """
+    try:
+        stored = read_arrays(path)
+        about = parse_json(bytes(stored["about"]))
+        lengths = [int(length) for length in stored["lengths"]]
+        rows = [stored[name].astype(np.float32) for name in ("observations", "actions")]
+        if not lengths or min(lengths) < 0 or any(one.ndim != 2 or len(one) != sum(lengths) for one in rows):
+            raise ValueError("its arrays do not fit each other")
+        if not all(np.isfinite(one).all() for one in rows):
+            raise ValueError("it holds values that are no numbers")
+        observations, actions = (np.split(one, np.cumsum(lengths)[:-1]) for one in rows)
+        configuration, seeds = dict(about["configuration"]), [int(seed) for seed in about["seeds"]]
+        return Recording(str(about["environment"]), configuration, seeds, observations, actions)
+    except FileNotFoundError:
+        raise ValueError(f"there is no file {path}") from None
+    except (OSError, KeyError, ValueError, TypeError, OverflowError) as error:
+        raise ValueError(
+            f"{path} holds no episodes ({error}); give the episodes.npz of `drive-agent evaluate --out`"
+        ) from None
+
+
+def repeat(policy: Any, recording: Recording, told: Callable[[float], None] = lambda share: None) -> Repeated:
+    """Return how far a policy's actions on the recorded observations lie from the recorded ones.
+
+    Args:
+        policy: What acts.
+        recording: What it is compared with.
+        told: Is told the share that is done, episode by episode.
+
+    Raises:
+        PolicyStoppedError: If the policy fails on what was recorded, or gives another number of actions.
+    """
+    unused = np.zeros(recording.actions[0].shape[1])  # nobody looks at it: what sticks does so in the recording, too
+    watched = GuardedPolicy(policy, unused, unused, 0.0, PATIENT)
+    largest, squares, count = 0.0, 0.0, 0
+    try:
+        for number, (observations, actions) in enumerate(zip(recording.observations, recording.actions, strict=True)):
+            told(number / len(recording.actions))
+            watched.reset(None)
+            for seen, done in zip(observations, actions, strict=True):
+                difference = np.asarray(watched.act(seen[None]), float).reshape(-1) - done
+                largest = max(largest, float(np.abs(difference).max()))
+                squares += float(np.mean(np.square(difference)))
+                count += 1
+    finally:
+        watched.close()
+    return Repeated(largest, float(np.sqrt(squares / max(count, 1))), count)

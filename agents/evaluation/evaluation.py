@@ -1,0 +1,357 @@
+"""Episodes of a policy, on emulated machines or on a bus, and what they say: score, interval, violations.
+
+On emulated machines many lanes run side by side, each with a machine of its own. On a bus (or `as_on_a_bus`, which
+hides the machine so that the environment acts as it would there) the lanes are those of the drives.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.evaluation.scores import Episode, Interval, figures, interval
+from agents.policies.agent_file import plain
+from agents.policies.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
+from agents.training.tasks import ENVIRONMENTS, configuration_of, environment_name, make_lanes
+from agents.tuner.tune_target import TRIAL_SECONDS
+from drive_env.master.realtime_section import undisturbed
+from mechanics.untrusted import read_json
+
+LANES = 64
+FIRST_SEED = 1_000_000  # far from those of a training
+TOLD = 0.5  # s between two looks at a progress bar, which takes a millisecond
+STEP_SECONDS: dict[str, Callable[[Any], float]] = {"ServoDrive/Tracking-v0": lambda config: 1.0 / config.rate,
+                "ServoDrive/GainScheduling-v0": lambda config: config.step,
+                "ServoDrive/GainTuning-v0": lambda config: TRIAL_SECONDS}  # fmt: skip
+TRIAL_OF = {"gains": "trial_gains", "measured": "trial_measured", "hidden": "trial_hidden"}  # of incumbent, of trial
+FIXED_STEPS = ("ServoDrive/Tracking-v0", "ServoDrive/GainScheduling-v0")  # a trial takes what clearing up takes besides
+
+
+@dataclass
+class Evaluation:
+    """What episodes said.
+
+    Attributes:
+        policy: Its name.
+        environment: Name of the environment.
+        configuration: Its options.
+        side: "emulator", "emulator as on a bus", or the bus.
+        seeds: Of the episodes.
+        values: Figure -> value of each episode.
+        lower_is_better: Figure -> direction.
+        violations: What ended episodes early -> how often.
+        pace: Time that steps took over the time that they should; 1 where time waits, or a step has no fixed time.
+        late: Share of the SYNCs within a step that were more than a cycle late; 0 where time waits.
+        episodes: What was recorded; not saved with the report.
+    """
+
+    policy: str
+    environment: str
+    configuration: dict[str, Any]
+    side: str
+    seeds: list[int]
+    values: dict[str, list[float]]
+    lower_is_better: dict[str, bool]
+    violations: dict[str, int]
+    pace: float = 1.0
+    late: float = 0.0
+    episodes: list[Episode] = field(default_factory=list, repr=False)
+
+    @property
+    def score(self) -> str:
+        """Name of the figure that is the score."""
+        return next(iter(self.values))
+
+    def interval(self, name: str) -> Interval:
+        """Return mean, 95 % interval and median of a figure."""
+        return interval(self.values[name])
+
+    def save(self, path: str | Path) -> Path:
+        """Write the report as JSON."""
+        path = Path(path)
+        table = {key: value for key, value in vars(self).items() if key != "episodes"}
+        table["intervals"] = {name: self.interval(name)._asdict() for name in self.values}
+        path.write_text(json.dumps(plain(table), indent=1), encoding="utf-8")
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path) -> Evaluation:
+        """Read a report.
+
+        Raises:
+            ValueError: If the file is none.
+        """
+        try:
+            table = read_json(path)
+            table.pop("intervals")
+            table["values"] = {name: [float(one) for one in values] for name, values in table["values"].items()}
+            return cls(**table)
+        except OSError as error:
+            raise ValueError(f"{path} cannot be read: {error.strerror}") from None
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise ValueError(f"{path} is no report of `drive-agent evaluate`; give its report.json") from None
+
+
+class AsOnABus:
+    """Emulated drives without their machine: whatever acts on them does as it would on a bus."""
+
+    machine = None
+
+    def __init__(self, drives: Any) -> None:
+        self._drives = drives
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._drives, name)
+
+
+def evaluate(
+    policy: Any,
+    environment: str,
+    configuration: Mapping[str, Any] | None = None,
+    *,
+    name: str = "policy",
+    episodes: int = 64,
+    seed: int = FIRST_SEED,
+    drives: Any = None,
+    sensor: Any = None,
+    guard: GuardLimits | None = None,
+    side: str | None = None,
+    told: Callable[[float], None] = lambda share: None,
+) -> Evaluation:
+    """Run episodes and return what they say.
+
+    Args:
+        policy: What acts: `act(observations)`, shape (lanes, entries), and `reset(mask)`.
+        environment: Name of the environment.
+        configuration: Its options.
+        name: Of the policy, for the report.
+        episodes: How many; each has a seed of its own, `seed`, `seed` + 1, ...
+        seed: Of the first one.
+        drives: Drives to act on, whose gains, offsets and mode are as before afterwards; emulated machines of the
+            environment's own by default.
+        sensor: As `Tracking` takes it.
+        guard: Limits of the policy; by default those of guard.LIMITS on given drives, and guard.PATIENT on emulated
+            machines.
+        side: What the report calls the drives.
+        told: Is told the share that is done.
+
+    Raises:
+        PolicyStoppedError: If the policy did what it must not; given drives are at rest and disabled then.
+        ValueError: For a configuration that is none.
+    """
+    environment = environment_name(environment)
+    given = drives is not None
+    options = dict(configuration or {})
+    if given:  # machines are drawn on emulators alone
+        options = {key: value for key, value in options.items() if key not in ("distributions", "privileged", "stage")}
+    lanes: Any
+    count = min(episodes, LANES) if not given else _lanes_of(environment, drives, options)
+    more = {"drives": drives, "autoreset_mode": "Disabled"} if given else {"autoreset_mode": "NextStep"}
+    if sensor is not None:
+        more["sensor"] = sensor
+    recorded: list[Episode] = []
+    spent, due = 0.0, 0.0
+    with ExitStack() as care:
+        if given:
+            care.enter_context(unchanged(drives))
+            care.enter_context(stopping(drives))
+        lanes = make_lanes(environment, count, options, **more)
+        if not getattr(drives, "time_waits", True):
+            care.enter_context(undisturbed())
+        try:
+            space: Any = lanes.single_action_space
+            limits = guard or (LIMITS[environment] if given else PATIENT)
+            step = STEP_SECONDS[environment](lanes.config)
+            watched = GuardedPolicy(policy, space.low, space.high, step, limits)
+            care.callback(watched.close)
+            if given:
+                watched.warm_up(np.zeros(lanes.observation_space.shape, np.float32))
+            for first in range(0, episodes, count):
+                seeds = [seed + first + lane for lane in range(count)]
+                wanted = min(count, episodes - first)
+                steps = ENVIRONMENTS[environment].steps(lanes.config)
+
+                def tell(done: int, first: int = first, wanted: int = wanted, steps: int = steps) -> None:
+                    told((first + wanted * min(done / steps, 1.0)) / episodes)
+
+                found_now, seconds = _episodes(watched, lanes, seeds, all_end=given, told=tell)
+                recorded += found_now[:wanted]
+                spent += seconds
+                due += step * max(len(episode.rewards) for episode in found_now)
+            if given:
+                come_to_rest(drives)
+            config = lanes.config
+            found = configuration_of(lanes)
+        finally:
+            lanes.close()
+    evaluation = summary(recorded, config, found, environment, name, side or ("bus" if given else "emulator"))
+    if not getattr(drives, "time_waits", True):
+        timing = drives.total_timing
+        evaluation.late = timing.late / max(timing.cycles, 1)
+        evaluation.pace = spent / due if environment in FIXED_STEPS else 1.0
+    return evaluation
+
+
+def joined(parts: Sequence[Evaluation]) -> Evaluation:
+    """Return evaluations of one policy on one side, an episode after the other, as one."""
+    first = parts[0]
+    names = [name for name in first.values if all(name in part.values for part in parts)]
+    violations: dict[str, int] = {}
+    for part in parts:
+        for what, count in part.violations.items():
+            violations[what] = violations.get(what, 0) + count
+    return replace(
+        first,
+        seeds=[seed for part in parts for seed in part.seeds],
+        values={name: [value for part in parts for value in part.values[name]] for name in names},
+        lower_is_better={name: first.lower_is_better[name] for name in names},
+        violations=violations,
+        pace=float(np.mean([part.pace for part in parts])),
+        late=float(np.mean([part.late for part in parts])),
+        episodes=[episode for part in parts for episode in part.episodes],
+    )
+
+
+def summary(
+    episodes: Sequence[Episode], config: Any, configuration: dict[str, Any], environment: str, policy: str, side: str
+) -> Evaluation:
+    """Return what recorded episodes say."""
+    rows = figures(environment, config)
+    values = {row.name: [row.compute(episode, config) for episode in episodes] for row in rows}
+    values = {name: found for name, found in values.items() if np.isfinite(found).any()}
+    violations: dict[str, int] = {}
+    for episode in episodes:
+        if episode.terminated:
+            what = episode.fault or "ended early"
+            violations[what] = violations.get(what, 0) + 1
+    better = {row.name: row.lower_is_better for row in rows if row.name in values}
+    seeds = [episode.seed for episode in episodes]
+    return Evaluation(
+        policy, environment, configuration, side, seeds, values, better, violations, episodes=list(episodes)
+    )
+
+
+def _episodes(
+    policy: Any, lanes: Any, seeds: Sequence[int], all_end: bool, told: Callable[[int], None]
+) -> tuple[list[Episode], float]:
+    """Return an episode of every lane, and the time that its steps took [s].
+
+    Args:
+        policy: What acts.
+        lanes: The lanes.
+        seeds: One for each lane.
+        all_end: Whether every lane's episode ends with the first that does: beginning anew would move the others.
+        told: Is told how many steps are done, not more often than every TOLD.
+    """
+    count = lanes.num_envs
+    observation, begun = lanes.reset(seed=list(seeds))
+    policy.reset(None)
+    first = [_of_lane(begun, lane) for lane in range(count)]
+    rows: list[Any] = [_seen(observation)]
+    actions: list[Any] = []
+    rewards: list[Any] = []
+    terms: dict[str, list[Any]] = {}
+    lengths = np.zeros(count, np.int64)
+    fell = np.zeros(count, bool)
+    faults: list[str] = [""] * count
+    last: list[dict[str, Any]] = [{} for _ in range(count)]
+    open_ = np.ones(count, bool)
+    trials = [{name: begun[name] for name in TRIAL_OF if name in begun}]  # the first is of the gains at the begin
+    start = last_told = time.perf_counter()
+    while open_.any():
+        action = policy.act(rows[-1])
+        observation, reward, terminated, truncated, info = lanes.step(action)
+        rows.append(_seen(observation))
+        actions.append(np.array(action, np.float32).reshape(count, -1))
+        rewards.append(reward)
+        for name, value in info.get("reward_terms", {}).items():
+            terms.setdefault(name, []).append(np.array(value, float))
+        trials.append({name: info[own] for name, own in TRIAL_OF.items() if own in info})
+        lengths += open_
+        ended = open_ & (terminated | truncated)
+        for lane in map(int, np.flatnonzero(ended)):
+            fell[lane] = terminated[lane]
+            last[lane] = _of_lane(info, lane)
+            faults[lane] = str(last[lane].get("fault", "") or "")
+        open_ &= ~ended
+        if (now := time.perf_counter()) - last_told > TOLD:
+            last_told = now
+            told(len(rewards))
+        if all_end and ended.any():
+            for lane in map(int, np.flatnonzero(open_)):
+                last[lane] = _of_lane(info, lane)
+            break
+    seconds = time.perf_counter() - start
+    if "trial_gains" in info and (answer := policy.answer(rows[-1])) is not None:
+        _stay_with(lanes.gains_of(answer), trials, last)
+    episodes = [
+        Episode(
+            seeds[lane],
+            np.stack([row[lane] for row in rows[: lengths[lane] + 1]]),
+            np.stack([row[lane] for row in actions[: lengths[lane]]]),
+            np.array([row[lane] for row in rewards[: lengths[lane]]], float),
+            {name: np.array([row[lane] for row in values[: lengths[lane]]]) for name, values in terms.items()},
+            bool(fell[lane]),
+            faults[lane],
+            first[lane],
+            last[lane],
+        )
+        for lane in range(count)
+    ]
+    return episodes, seconds
+
+
+def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[dict[str, Any]]) -> None:
+    """Let the end of episodes tell of a tuner's own answers, which are gains that it tried, instead of incumbents.
+
+    Args:
+        gains: The answers, (lanes, axes, 5).
+        trials: What was told of every trial of all lanes, by the names of TRIAL_OF.
+        last: What the environment told in the last step of each lane; changed.
+    """
+    for lane, told in enumerate(last):
+        for trial in trials:
+            if np.array_equal(trial["gains"][lane], gains[lane]):
+                told.update({name: values[lane] for name, values in trial.items()})
+                break
+        else:
+            raise ValueError(f"the tuner answered gains that it had not tried: {gains[lane].tolist()}")
+
+
+def _seen(observation: Any) -> Any:
+    """Return what a policy sees: of a dict its `observation`; a copy, since it is kept."""
+    return np.array(observation["observation"] if isinstance(observation, dict) else observation)
+
+
+def _of_lane(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
+    """Return the numbers and texts that an info tells of a lane."""
+    found = {}
+    for key, value in info.items():
+        if key.startswith("_") or isinstance(value, Mapping) or np.ndim(value) < 1:
+            continue
+        found[key] = value[lane]
+    return found
+
+
+def _lanes_of(environment: str, drives: Any, options: Mapping[str, Any]) -> int:
+    """Return how many lanes given drives are: a lane has the axes of the load."""
+    from mechanics.loads import find_load
+
+    load = options.get("load")
+    if load is None:
+        import importlib
+
+        task = ENVIRONMENTS[environment]
+        module = importlib.import_module(f"drive_env.envs.{task.short}")
+        load = getattr(module, f"{task.kind}Config")().load
+    axes = find_load(load).num_axes
+    if drives.num_axes % axes:
+        raise ValueError(f"the load {load!r} has {axes} axes and {drives.num_axes} drives were given; name all --node")
+    return int(drives.num_axes // axes)

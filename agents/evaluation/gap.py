@@ -1,0 +1,97 @@
+"""The difference between two evaluations of a policy: on the emulator and on the bus, figure by figure."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.evaluation.evaluation import Evaluation
+from agents.evaluation.scores import Interval, interval
+from tuning.bootstrap import bootstrap_interval
+
+Floats = NDArray[np.float64]
+
+
+class Gap(NamedTuple):
+    """A figure on two sides.
+
+    first, second: Of the two sides.
+    difference: Second less first, with its 95 % interval; paired by seed where both ran the same episodes.
+    paired: Whether they did.
+    medians: (low, value, high) of the quotient of the medians less 1, second over first, with its 95 % interval; NaN
+        where the first one is 0.
+    """
+
+    figure: str
+    first: Interval
+    second: Interval
+    difference: Interval
+    paired: bool
+    medians: tuple[float, float, float]
+
+
+def compare(first: Evaluation, second: Evaluation) -> list[Gap]:
+    """Return the gap of each figure that both have.
+
+    Raises:
+        ValueError: If they are of different environments.
+    """
+    if first.environment != second.environment:
+        raise ValueError(f"{first.environment} and {second.environment} have no gap: they are different tasks")
+    # Emulated machines are drawn anew for every episode and a bus has its own: their episodes are no pairs.
+    paired = first.seeds == second.seeds and "emulator" not in (first.side, second.side)
+    found = []
+    for name in first.values:
+        if name not in second.values:
+            continue
+        one, two = np.array(first.values[name]), np.array(second.values[name])
+        difference = interval(two - one) if paired else _unpaired(one, two)
+        medians = _medians(one, two, paired)
+        found.append(Gap(name, first.interval(name), second.interval(name), difference, paired, medians))
+    return found
+
+
+def text(gaps: list[Gap], first: str, second: str) -> list[str]:
+    """Return lines that say it."""
+    lines = []
+    for gap in gaps:
+        share = f", {gap.difference.mean / abs(gap.first.mean):+.1%}" if gap.first.mean else ""
+        low, value, high = gap.medians
+        medians = "" if np.isnan(value) else f", {value:+.1%} (95 % of {low:+.1%} to {high:+.1%})"
+        lines.append(
+            f"gap of {gap.figure}: {first} {gap.first.mean:.4g}, {second} {gap.second.mean:.4g}, difference "
+            f"{gap.difference.mean:+.3g} (95 % of {gap.difference.low:+.3g} to {gap.difference.high:+.3g}{share}; "
+            f"{'paired by seed' if gap.paired else 'not paired'}); medians {gap.first.median:.4g} and "
+            f"{gap.second.median:.4g}{medians}"
+        )
+    return lines
+
+
+def _medians(one: Floats, two: Floats, paired: bool) -> tuple[float, float, float]:
+    """Return the quotient of medians less 1 between the ends of its bootstrap interval."""
+    if paired:
+        both = np.isfinite(one) & np.isfinite(two)
+        one, two = one[both], two[both]
+    else:
+        one, two = one[np.isfinite(one)], two[np.isfinite(two)]
+    if not len(one) or not len(two) or np.median(one) == 0.0:
+        return float("nan"), float("nan"), float("nan")
+    low, high = bootstrap_interval(_excess_of_medians, one, two, paired=paired)
+    return low, float(np.median(two) / np.median(one) - 1.0), high
+
+
+def _excess_of_medians(one: Floats, two: Floats) -> Floats:
+    """Return the second median over the first less 1, of draws where the first is not 0."""
+    medians, others = np.median(one, axis=1), np.median(two, axis=1)
+    held = medians != 0.0
+    return np.asarray(others[held] / medians[held] - 1.0)
+
+
+def _unpaired(one: Floats, two: Floats) -> Interval:
+    """Return the difference of two means with a bootstrap interval."""
+    one, two = one[np.isfinite(one)], two[np.isfinite(two)]
+    low, high = bootstrap_interval(lambda x, y: y.mean(axis=1) - x.mean(axis=1), one, two, paired=False)
+    count = min(len(one), len(two))
+    return Interval(float(two.mean() - one.mean()), low, high, float(np.median(two) - np.median(one)), count)

@@ -1,0 +1,87 @@
+"""Drives of a bus for an evaluation: inside an envelope made for the task, with everything compiled before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agents.policies.guard import GuardLimits
+from agents.training.tasks import environment_name, make_lanes
+
+if TYPE_CHECKING:
+    from tuning.target import Target
+
+POSITION_SCALER = 0x2058  # increments of a revolution
+# Of the task's amplitude and speed: what a policy may do beyond them before the envelope stops it.
+POSITION_SLACK, SPEED_SLACK = 1.5, 2.0
+
+
+@contextmanager
+def drives_for(environment: str, configuration: Mapping[str, Any], guard: GuardLimits, **options: Any) -> Iterator[Any]:
+    """Open drives on a bus for a policy, as `target_for` does, and give them alone."""
+    with target_for(environment, configuration, guard, **options) as target:
+        yield target.drives
+
+
+@contextmanager
+def target_for(
+    environment: str,
+    configuration: Mapping[str, Any],
+    guard: GuardLimits,
+    *,
+    device: str = "tmcm1636",
+    interface: str | None = None,
+    channel: str | None = None,
+    nodes: Sequence[int] = (1,),
+    lockstep: bool = False,
+    **options: Any,
+) -> Iterator[Target]:
+    """Open drives on a bus for a policy; they are at rest and disabled afterwards.
+
+    Of the target nothing counts but the drives and how they are opened again: not motor, supply and travel.
+
+    The envelope's limits are the task's: about the place where the axes stand now, half as far again as the amplitude,
+    and twice the speed; the drive's own limits hold besides. Its watch for stalls is the guard's.
+
+    Raises:
+        BusError: If the bus cannot be opened or a node does not answer.
+    """
+    from drive_env.master.can_drives import CanDrives
+    from drive_env.safety.limits import Limits
+    from tuning.target import FREE, LOCKSTEP_PATIENCE, on_bus
+
+    more: dict[str, Any] = {"device": device, "interface": interface, "channel": channel, "nodes": nodes}
+    more |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE} if lockstep else {"pace": "real-time"}
+    more |= options
+    warm_up(environment, configuration)
+    position, velocity = None, None
+    if environment_name(environment) == "ServoDrive/Tracking-v0":
+        lanes = make_lanes(environment, 1, _emulated(configuration))
+        amplitude, speed = lanes.config.amplitude, lanes.config.speed  # type: ignore[attr-defined]
+        lanes.close()
+        with CanDrives(**more) as drives:
+            turn, at = drives.read(POSITION_SCALER), drives.read(0x6064)
+        reach = POSITION_SLACK * amplitude * turn
+        position = ((at - reach).tolist(), (at + reach).tolist())
+        velocity = (SPEED_SLACK * speed * turn).tolist()
+    # A trial of gains may oscillate: it sees that and stops the lane by itself.
+    oscillation = environment_name(environment) != "ServoDrive/GainTuning-v0"
+    limits = Limits(position=position, velocity=velocity, oscillation=oscillation, stall=guard.stall)
+    with on_bus(travel=FREE, safety=limits, **more) as target:
+        yield target
+
+
+def warm_up(environment: str, configuration: Mapping[str, Any]) -> None:
+    """Compile what the environment runs, on an emulated machine: a policy would else stall in its first step."""
+    lanes = make_lanes(environment, 1, _emulated(configuration))
+    space: Any = lanes.action_space
+    lanes.reset(seed=0)
+    lanes.step(np.zeros(space.shape, np.float32))
+    lanes.close()
+
+
+def _emulated(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in configuration.items() if key not in ("distributions", "privileged", "stage")}

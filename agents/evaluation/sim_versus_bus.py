@@ -1,0 +1,164 @@
+"""A policy on the same machines twice: in this process, and over the bus on which they are served.
+
+In lockstep the two must agree to the bit. In real time they differ by what the clock brings in: when a set-point
+arrives, how long an axis rested before a move, which noise it met. What that does to the figures is the gap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from agents.evaluation.evaluation import AsOnABus, Evaluation, evaluate, joined
+from agents.evaluation.on_the_bus import drives_for
+from agents.evaluation.served import Served, draw_machines, emulated, in_lockstep, in_real_time
+from agents.policies.guard import LIMITS, GuardLimits, PolicyStoppedError
+from agents.training.tasks import environment_name, make_lanes
+from drive_env.bus.config import Machine
+from drive_env.master.errors import BusError
+from drive_env.safety.envelope import SafetyError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+HIDDEN = "hidden J over the fitted rule's"
+PATIENCE = 30.0  # s, for a node that waits for us: a late answer says that the computer is busy, not that it is gone
+OTHER_NOISE = 1_000_003  # added to the seed of the drives' noise
+
+
+class BothSides(NamedTuple):
+    """What came of it.
+
+    inside, bus: The evaluations, an episode of each machine that was judged on both sides, in the same order.
+    again: In this process once more, with other noise: what the gap may be without any bus; None in lockstep.
+    missing: Machine -> why it could not be judged on both sides.
+    """
+
+    inside: Evaluation
+    bus: Evaluation
+    again: Evaluation | None
+    missing: dict[int, str]
+
+
+def on_both_sides(
+    policy: Any,
+    environment: str,
+    configuration: Mapping[str, Any] | None = None,
+    *,
+    machines: int = 20,
+    seed: int = 0,
+    name: str = "policy",
+    lockstep: bool = False,
+    guard: GuardLimits | None = None,
+    told: Callable[[float], None] = lambda share: None,
+) -> BothSides:
+    """Run an episode of a policy on each of some machines, in this process and over their bus.
+
+    Args:
+        policy: What acts.
+        environment: Name of the environment.
+        configuration: Its options; its distributions say what machines there are.
+        machines: How many.
+        seed: Of machines and episodes; episode k is that of seed + k.
+        name: Of the policy.
+        lockstep: Serve them in lockstep instead of in real time.
+        guard: Limits of the policy over the bus.
+        told: Is told the share that is done.
+
+    Raises:
+        PolicyStoppedError: If the policy did in this process what it must not.
+        ValueError: For a load that cannot be served.
+        BusError: If no machine could be judged over the bus.
+    """
+    environment = environment_name(environment)
+    lanes: Any = make_lanes(environment, 1, configuration)
+    config = lanes.config
+    lanes.close()
+    joint = getattr(getattr(config, "task", None), "joint", None)
+    if joint is not None and not lockstep:
+        raise ValueError(
+            f"{config.load} needs the pendulum's angle, which no drive on a bus shows; judge it with --lockstep"
+        )
+    rows = draw_machines(config, machines, seed)
+    options: dict[str, Any] = {"name": name, "episodes": 1}
+    limits = guard or LIMITS[environment]
+    noises = (0,) if lockstep else (0, OTHER_NOISE)
+    found: dict[int, list[Evaluation]] = {}
+    missing: dict[int, str] = {}
+    serve = in_lockstep if lockstep else in_real_time
+    for k, machine in enumerate(rows):
+        sides = []
+        for noise in noises:
+            with emulated(machine, seed + noise) as drives:
+                sides.append(
+                    evaluate(
+                        policy, environment, configuration, drives=AsOnABus(drives), sensor=_sensor(drives, joint),
+                        seed=seed + k, side="emulator as on a bus", **options,
+                    )
+                )  # fmt: skip
+        with serve(machine, seed) as there:
+            try:
+                bus = _over_the_bus(
+                    policy, environment, configuration, config, there, limits, lockstep, joint, seed=seed + k, **options
+                )
+                found[k] = [bus, *sides]
+            except (SafetyError, BusError, PolicyStoppedError, RuntimeError) as error:
+                missing[k] = str(error)
+        told((k + 1) / machines)
+    if not found:
+        raise BusError(f"no machine could be judged over the bus; of the first: {missing[0]}")
+    bus, *inside = (joined([sides[number] for sides in found.values()]) for number in range(1 + len(noises)))
+    if environment == "ServoDrive/GainTuning-v0":
+        _add_hidden([rows[k] for k in found], [bus, *inside])
+    return BothSides(inside[0], bus, None if lockstep else inside[1], missing)
+
+
+def _over_the_bus(
+    policy: Any,
+    environment: str,
+    configuration: Mapping[str, Any] | None,
+    config: Any,
+    there: Served,
+    limits: GuardLimits,
+    lockstep: bool,
+    joint: int | None,
+    **options: Any,
+) -> Evaluation:
+    with drives_for(
+        environment, dict(configuration or {}), limits, device=config.device, interface="slcan", channel=there.channel,
+        nodes=there.nodes, lockstep=lockstep, **({"timeout": PATIENCE} if lockstep else {}),
+    ) as drives:  # fmt: skip
+        return evaluate(
+            policy, environment, configuration, drives=drives, sensor=_sensor(there.drives, joint), guard=limits,
+            **options,
+        )  # fmt: skip
+
+
+def _sensor(drives: Any, joint: int | None) -> Callable[[], Any] | None:
+    return None if joint is None else lambda: drives.machine.joint_positions[:, joint]
+
+
+def _add_hidden(machines: Sequence[Machine], sides: Sequence[Evaluation]) -> None:
+    """Add hidden J of the answers, which no bus shows: the machines are known here."""
+    from drive_env.motors import find_motor
+    from tuning.compare.comparison import Yardstick
+    from tuning.compare.suite import Machine as OfSuite
+
+    group = [
+        OfSuite(str(k), row.device, row.load, row.motor, row.parameters, find_motor(row.motor).voltage)
+        for k, row in enumerate(machines)
+    ]
+    yardstick = Yardstick(group, num_threads=1)
+    try:
+        for side in sides:
+            hidden = yardstick.score(np.concatenate([_answer(episode) for episode in side.episodes]))
+            side.values = {HIDDEN: list(map(float, hidden / yardstick.rule)), **side.values}
+            side.lower_is_better = {HIDDEN: True, **side.lower_is_better}
+    finally:
+        yardstick.close()
+
+
+def _answer(episode: Any) -> NDArray[np.int64]:
+    return np.asarray(episode.last["gains"], np.int64)

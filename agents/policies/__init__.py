@@ -1,0 +1,1 @@
+"""Acting: files of agents, ONNX, callables, and the guard over them."""

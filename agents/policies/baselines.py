@@ -1,0 +1,132 @@
+"""What an agent must beat, as policies, by name: `drive-agent evaluate feed_forward --environment tracking`.
+
+`nothing` is the drive's own cascade, or the fitted rule's gains; `surrogate` is the tuner that ships. The others are
+feed-forward as one identifies it: the constants below gave the least mean following error over 64 machines drawn from
+the load's distribution.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.training.tasks import environment_name
+
+Array = NDArray[np.float32]
+AXIS_ENTRIES = 8  # of an axis in Tracking's observation
+ERROR, SPEED, SPEED_LATER = 0, 5, 6
+PREVIEW = 0.01  # s, how much later
+# The commissioned cascade's lag behind its reference: times velocity [s], about 1/k_v, and times acceleration [s^2], of
+# the velocity loop and the bus.
+LAG = (0.030, 3e-4)
+LAGS = {"gantry": (0.032, 4e-4)}  # of loads that have another
+GAIN = 60.0  # 1/s, k_v of a position loop in the master
+ACCELERATION_TIME = 0.010  # s, the lag of the commissioned velocity loop
+# Entry of Tracking's observation of inverted_pendulum -> weight: position, velocity, angle and its rate. Found by the
+# cross-entropy method (examples/own_algorithm.py) over machines drawn from the load's distribution.
+BALANCE = {2: 0.44, 3: 0.57, 8: 5.3, 9: 0.33}
+
+
+def nothing(axes: int) -> Any:
+    """Return the policy of so many actions that adds nothing."""
+    return Law(lambda rows: np.zeros((len(rows), axes)))
+
+
+class Law:
+    """A function of observations, shape (lanes, entries), as a policy."""
+
+    def __init__(self, function: Any) -> None:
+        self._function = function
+
+    def act(self, observation: Any) -> Array:
+        """Return the action for one observation, or one for each lane."""
+        action = np.clip(self._function(np.atleast_2d(observation)), -1.0, 1.0).astype(np.float32)
+        found: Array = action[0] if np.ndim(observation) == 1 else action
+        return found
+
+    def reset(self, mask: Any = None) -> None:
+        """Do nothing."""
+
+
+def state_feedback(configuration: Any) -> Law:
+    """Return the law that holds the inverted pendulum through cst: BALANCE on its state."""
+    if configuration.load != "inverted_pendulum" or configuration.mode != "cst" or configuration.action != "direct":
+        raise ValueError("state_feedback holds the load inverted_pendulum in mode cst with action = 'direct'")
+    entries, weights = list(BALANCE), np.array(list(BALANCE.values()))
+    return Law(lambda rows: (rows[:, entries] @ weights)[:, None])
+
+
+def feed_forward(configuration: Any, lags: Any = None) -> Law:
+    """Return the identified feed-forward for a configuration of Tracking whose action is the offset.
+
+    csp: 60B0h leads by the lags, those of the load or given ones, each a number or of shape (lanes, axes). csv: a
+    position loop in the master, and through 60B1h the velocity that the acceleration needs besides. Of cst it is
+    nothing: its profile is the current already.
+    """
+    mode, offset = configuration.mode, configuration.offset
+    if configuration.action != "offset":
+        raise ValueError("the baselines of Tracking add to the profile: configure action = 'offset'")
+    speed, amplitude = configuration.speed, configuration.amplitude
+    lag, lag_of_speed = LAGS.get(str(configuration.load), LAG) if lags is None else lags
+
+    def rows_of(observation: Any) -> Any:
+        count = np.shape(observation)[-1] // AXIS_ENTRIES
+        return np.asarray(observation)[:, : AXIS_ENTRIES * count].reshape(-1, count, AXIS_ENTRIES)
+
+    def lead(observation: Any) -> Any:
+        rows = rows_of(observation)
+        wanted = lag * rows[:, :, SPEED] * speed + lag_of_speed * acceleration_of(rows)
+        return wanted / (1.25 * offset * amplitude)
+
+    def loop(observation: Any) -> Any:
+        rows = rows_of(observation)
+        wanted = GAIN * rows[:, :, ERROR] * amplitude + ACCELERATION_TIME * acceleration_of(rows)
+        return wanted / (1.25 * offset * speed)
+
+    def acceleration_of(rows: Any) -> Any:
+        return (rows[:, :, SPEED_LATER] - rows[:, :, SPEED]) * speed / PREVIEW
+
+    return Law({"csp": lead, "csv": loop}.get(mode, lambda rows: np.zeros(rows_of(rows).shape[:2])))
+
+
+def surrogate(configuration: Any) -> Any:
+    """Return the shipped tuner for a configuration of GainTuning with the gains that it was trained for."""
+    from agents.policies.agent_file import Bundle
+    from agents.policies.policy import policy_of
+    from agents.shipped import TUNER, shipped
+
+    bundle = Bundle.load(shipped(TUNER))
+    own = tuple(bundle.configuration["gains"])
+    if tuple(configuration.gains) != own or configuration.waveform:
+        raise ValueError(f"surrogate changes the gains {', '.join(own)} and sees no waveform; configure that")
+    return policy_of(replace(bundle, settings={**bundle.settings, "step": configuration.step}))
+
+
+# Environment -> name of a baseline -> what makes it from configuration and number of actions.
+BASELINES: dict[str, dict[str, Any]] = {
+    "ServoDrive/GainTuning-v0": {
+        "nothing": lambda configuration, actions: nothing(actions),
+        "surrogate": lambda configuration, actions: surrogate(configuration),
+    },
+    "ServoDrive/GainScheduling-v0": {"nothing": lambda configuration, actions: nothing(actions)},
+    "ServoDrive/Tracking-v0": {
+        "nothing": lambda configuration, actions: nothing(actions),
+        "feed_forward": lambda configuration, actions: feed_forward(configuration),
+        "state_feedback": lambda configuration, actions: state_feedback(configuration),
+    },
+}
+
+
+def baseline(name: str, environment: str, configuration: Any, actions: int) -> Any:
+    """Return a baseline of an environment by name.
+
+    Raises:
+        ValueError: If it has none of that name.
+    """
+    rows = BASELINES[environment_name(environment)]
+    if name not in rows:
+        raise ValueError(f"{environment} has no baseline {name!r}; it has {', '.join(rows)}")
+    return rows[name](configuration, actions)

@@ -1,0 +1,239 @@
+"""A watch over a policy that acts on drives: one that gives no number, sticks at its limit or stalls is stopped.
+
+The safety envelope of a bus watches what the drives do; this watches what acts. A policy is asked in a thread of its
+own: when it has not answered in time it is given up, whether it is slow or never returns, and `stop` brings the drives
+to rest and leaves them disabled. The envelope's thread has quick-stopped them by then (`Limits(stall=...)`).
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agents.policies.deadline import Deadline, DeadlineError
+from agents.policies.policy import PolicyError
+from drive_env import motion
+from drive_env.gains import GAIN_OBJECTS
+
+logger = logging.getLogger(__name__)
+
+AT_LIMIT = 0.999  # of the action's range: it cannot ask for more
+STOP_TIMEOUT, CYCLE = 2.0, 0.001  # s, for the ramp of a quick stop; a communication cycle
+# What an agent may change and what must not stay so: gains, offsets, profile velocity and mode.
+KEPT = (*GAIN_OBJECTS, (0x60B0, 0), (0x60B1, 0), (0x60B2, 0), (0x6081, 0), (0x6060, 0))
+AT_REST = 0.01  # of the speed at the begin of the ramp
+
+
+class PolicyStoppedError(PolicyError):
+    """A policy was stopped; the message says why, with value, limit and remedy."""
+
+
+@dataclass(frozen=True)
+class GuardLimits:
+    """What a policy may do; None for no limit.
+
+    saturation: With an action at the end of its range for so long [s], a policy sticks.
+    stall: Without an action for so long [s], a policy stalls.
+    """
+
+    saturation: float | None = 0.1
+    stall: float | None = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("saturation", "stall"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise ValueError(f"{name} must be above 0 s, not {value:g} s; None for no limit")
+
+
+# Limits on given drives, by environment. A trial's gains may well be at the end of their range, and between two trials
+# the axes hold their position: a second to think is what the envelope of a bus grants by itself.
+LIMITS = {
+    "ServoDrive/Tracking-v0": GuardLimits(),
+    "ServoDrive/GainScheduling-v0": GuardLimits(),
+    "ServoDrive/GainTuning-v0": GuardLimits(saturation=None, stall=1.0),
+}
+# Where nothing is at stake but the user's patience: emulated machines, and a policy's first answer, for which it may
+# load and compile things.
+PATIENT = GuardLimits(saturation=None, stall=60.0)
+
+
+class GuardedPolicy:
+    """A policy under watch; it acts as the one that it holds, in a thread of its own if `limits` have a stall.
+
+    Args:
+        policy: What acts.
+        low, high: Ends of the action's range, shape (actions,).
+        step: Time between two actions [s].
+        limits: What it may do.
+    """
+
+    def __init__(self, policy: Any, low: ArrayLike, high: ArrayLike, step: float, limits: GuardLimits) -> None:
+        self._policy, self._step, self._limits = policy, step, limits
+        least, most = np.asarray(low, float), np.asarray(high, float)
+        self._middle, self._reach = (most + least) / 2.0, (most - least) / 2.0
+        self._at_limit = np.zeros((1, len(least)), np.int64)
+        self._deadline = Deadline()
+
+    def warm_up(self, observation: Any) -> None:
+        """Ask once and forget the answer, before anything moves: what loads or compiles then is no stall.
+
+        Raises:
+            PolicyStoppedError: If it does not answer within PATIENT.stall.
+        """
+        self._ask(self._policy.act, observation, within=PATIENT.stall)
+        self._ask(self._policy.reset, None, within=PATIENT.stall)
+
+    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+        """Begin an episode."""
+        self._at_limit[:] = 0
+        self._ask(self._policy.reset, mask, within=self._limits.stall)
+
+    def act(self, observation: Any) -> Any:
+        """Return the policy's action.
+
+        Raises:
+            PolicyStoppedError: If it took too long, is no number, or has been at the end of its range for too long.
+        """
+        action = self._ask(self._policy.act, observation, within=self._limits.stall)
+        rows = self._checked(action, len(observation))
+        saturation = self._limits.saturation
+        if saturation is not None:
+            there = np.abs(rows - self._middle) >= AT_LIMIT * self._reach
+            if self._at_limit.shape != there.shape:
+                self._at_limit = np.zeros(there.shape, np.int64)
+            self._at_limit = np.where(there, self._at_limit + 1, 0)
+            longest = float(self._at_limit.max()) * self._step
+            # One action at its end is no sticking, however long the step.
+            if longest >= saturation - 1e-9 and self._at_limit.max() > 1:
+                entry = int(np.argmax(self._at_limit.max(axis=0)))
+                raise PolicyStoppedError(
+                    f"entry {entry} of the policy's action has been at the end of its range for {1e3 * longest:.0f} "
+                    f"ms, and the limit is {1e3 * saturation:.0f} ms; train it on such a machine, or allow more "
+                    "(--saturation)"
+                )
+        return rows
+
+    def answer(self, observation: Any) -> Any:
+        """Return what a tuner would stay with after its last trial, as an action; None of a policy that does not say.
+
+        Raises:
+            PolicyStoppedError: If it took too long, or is no number.
+        """
+        answer = getattr(self._policy, "answer", None)
+        if answer is None:
+            return None
+        return self._checked(self._ask(answer, observation, within=self._limits.stall), len(observation))
+
+    def close(self) -> None:
+        """End the policy's thread."""
+        self._deadline.close()
+
+    def _checked(self, action: Any, lanes: int) -> NDArray[Any]:
+        """Return an action as rows, (lanes, actions)."""
+        entries = len(self._middle)
+        try:
+            rows = np.asarray(action)
+            finite = np.isfinite(rows)
+        except (TypeError, ValueError):
+            raise PolicyStoppedError(f"the policy's action is a {type(action).__name__}, no array of numbers") from None
+        if rows.size != lanes * entries:
+            raise PolicyStoppedError(
+                f"the policy's action has shape {rows.shape}; {lanes} lane(s) of this environment take "
+                f"({lanes}, {entries})"
+            )
+        rows, finite = rows.reshape(lanes, entries), finite.reshape(lanes, entries)
+        if not finite.all():
+            lane, entry = np.argwhere(~finite)[0]
+            raise PolicyStoppedError(f"entry {entry} of the policy's action is {rows[lane, entry]}, no number")
+        return rows
+
+    def _ask(self, function: Callable[[Any], Any], argument: Any, within: float | None) -> Any:
+        """Return what the policy answers; PolicyStoppedError if it does not in time, or raises what it may."""
+        try:
+            if within is None:
+                return function(argument)
+            start = time.perf_counter()
+            answer = self._deadline.call(function, argument, within=within)
+            if time.perf_counter() - start >= within:  # this thread, too, may be late
+                raise DeadlineError
+            return answer
+        except DeadlineError:
+            raise PolicyStoppedError(
+                f"the policy gave no answer for {1e3 * (within or 0.0):.0f} ms: it is too slow, or never returns; use "
+                "a smaller network or a faster computer, or allow more (--stall)"
+            ) from None
+        except PolicyError as error:
+            raise PolicyStoppedError(str(error)) from error
+        except Exception as error:  # anybody's code
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            raise PolicyStoppedError(
+                f"the policy failed: {type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
+            ) from error
+
+
+@contextmanager
+def unchanged(drives: Any) -> Iterator[None]:
+    """Put gains, offsets, profile velocity and mode back as they were when what is inside ends; log what fails."""
+    before = {name: drives.read(name) for name in KEPT}
+    try:
+        yield
+    finally:
+        for name, values in before.items():
+            for attempt in range(2):  # after a stall the envelope refuses one call, to tell of it
+                try:
+                    other = drives.read(name) != values
+                    if other.any():
+                        drives.write(name, values, where=other)
+                    break
+                except (RuntimeError, ValueError, OSError) as error:
+                    if attempt:
+                        logger.error("%04Xh:%02X stays changed: %s", *name, error)
+
+
+@contextmanager
+def stopping(drives: Any) -> Iterator[None]:
+    """Leave the drives at rest and disabled if what is inside ends with any exception, Ctrl-C too."""
+    try:
+        yield
+    except BaseException as error:
+        stop(drives, str(error) or type(error).__name__)
+        raise
+
+
+def stop(drives: Any, reason: str) -> None:
+    """Bring drives to rest in a hurry and leave them disabled.
+
+    Args:
+        drives: Emulated ones, or on a bus; there the envelope does it, which goes on where one of them does not answer.
+        reason: For the log.
+    """
+    envelope = getattr(drives, "safety", None)
+    if envelope:
+        envelope.stop(reason)
+    else:
+        come_to_rest(drives)
+
+
+def come_to_rest(drives: Any) -> None:
+    """Quick-stop the drives, wait for the end of the ramp, and switch the voltage off."""
+    motion.quick_stop(drives)
+    first = np.abs(drives.read(0x606C))
+    for _ in range(round(STOP_TIMEOUT / CYCLE)):
+        status = drives.read(0x6041)
+        running = np.zeros(drives.num_axes, bool)
+        for mask, value in (motion.OPERATION_ENABLED, motion.QUICK_STOP_ACTIVE):
+            running |= status & mask == value
+        moving = np.abs(drives.read(0x606C)) > np.maximum(AT_REST * first, 1)
+        if not np.any(running & moving):
+            break
+        drives.advance(CYCLE)
+    drives.write(0x6040, 0)

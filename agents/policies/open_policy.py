@@ -1,0 +1,210 @@
+"""Any policy as something that acts: our bundle, a checkpoint of Stable-Baselines3, ONNX, or a Python callable.
+
+How it is written says what it is: the name of an agent that ships, agent.npz, checkpoint.zip (ours, or what
+Stable-Baselines3's `save` writes), agent.onnx, or module:function.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.policies.policy import load_policy
+from agents.shipped import shipped, shipped_names
+
+CHECKPOINT = ".zip"  # ending of a file of Stable-Baselines3, which holds pickles
+ACTOR = "observation"  # the entry of a dict observation that the actor sees
+
+
+class PolicyNotFoundError(ValueError):
+    """There is no such policy, or it cannot be used; the message says what can."""
+
+
+@dataclass
+class LoadedPolicy:
+    """A policy and what is known of it.
+
+    Attributes:
+        name: As the user wrote it.
+        policy: What acts: `act(observation)`, `reset(mask)`.
+        environment: Name of the environment that it was trained in; None if unknown.
+        configuration: The environment's options then.
+        card: What is known of it.
+    """
+
+    name: str
+    policy: Any
+    environment: str | None = None
+    configuration: Mapping[str, Any] = field(default_factory=dict)
+    card: Mapping[str, Any] = field(default_factory=dict)
+
+
+def open_policy(text: str, *, trust: bool = False) -> LoadedPolicy:
+    """Return the policy that a text names.
+
+    Args:
+        text: What names it.
+        trust: The writer of a checkpoint is trusted: to load it runs what he put there. The other files run nothing,
+            and a Python function is the user's own.
+
+    Raises:
+        PolicyNotFoundError: If it is none; BundleError or CheckpointError if its file is not what it seems;
+            UntrustedError for a checkpoint without `trust`.
+    """
+    if is_checkpoint(text):
+        return _checkpoint(text, trust)
+    for ending, opened in OPENERS.items():
+        if text.lower().endswith(ending):
+            return opened(text)
+    if ":" in text:
+        return _callable(text)
+    if text in shipped_names():
+        return replace(_bundle(str(shipped(text))), name=text)
+    raise PolicyNotFoundError(
+        f"{text!r} is no policy; give an agent that ships ({', '.join(shipped_names())}), a file "
+        f"({', '.join((*OPENERS, CHECKPOINT))}) or a Python function (module:function)"
+    )
+
+
+class CallablePolicy:
+    """A Python function of an observation; it gets all lanes' at once, shape (lanes, entries).
+
+    A class, or an object with `act`, is taken as it is.
+    """
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self._function = function
+
+    def act(self, observation: Any) -> Any:
+        """Return what the function returns."""
+        return np.asarray(self._function(observation), np.float32)
+
+    def reset(self, mask: Any = None) -> None:
+        """Do nothing."""
+
+
+class ModelPolicy:
+    """A model of Stable-Baselines3 with its normaliser, acting without noise."""
+
+    def __init__(self, model: Any, normaliser: Any) -> None:
+        self.model, self._normaliser = model, normaliser
+        self._state: Any = None
+        self._begins: Any = None
+
+    def act(self, observation: Any) -> Any:
+        """Return the model's action."""
+        rows: Any = np.atleast_2d(observation)
+        lanes = len(rows)
+        if hasattr(self.model.observation_space, "spaces"):  # what only the critic saw does not matter to the actor
+            spaces = self.model.observation_space.spaces
+            rows = {key: rows if key == ACTOR else np.zeros((lanes, *spaces[key].shape)) for key in spaces}
+        if self._normaliser is not None:
+            rows = self._normaliser.normalize_obs(rows)
+        if self._begins is None or len(self._begins) != lanes:
+            self._begins = np.ones(lanes, bool)
+        action, self._state = self.model.predict(rows, self._state, self._begins, deterministic=True)
+        self._begins = np.zeros(lanes, bool)
+        return action[0] if np.ndim(observation) == 1 else action
+
+    def reset(self, mask: Any = None) -> None:
+        """Forget what was."""
+        if mask is None or self._begins is None:
+            self._state = self._begins = None
+        else:
+            self._begins = self._begins | mask
+
+
+def _bundle(text: str) -> LoadedPolicy:
+    policy = load_policy(text)
+    bundle = policy.bundle
+    return LoadedPolicy(text, policy, bundle.environment, bundle.configuration, bundle.card)
+
+
+def _onnx(text: str) -> LoadedPolicy:
+    from agents.policies.onnx_policy import OnnxPolicy
+
+    policy = OnnxPolicy(text)
+    return LoadedPolicy(text, policy, policy.environment, policy.configuration, policy.card)
+
+
+def is_checkpoint(text: str) -> bool:
+    """Return whether a text names a checkpoint, the one kind of file that runs code of its writer."""
+    return text.lower().endswith(CHECKPOINT)
+
+
+def described_checkpoint(text: str) -> LoadedPolicy:
+    """Return what is known of a checkpoint, its policy None: nothing of its writer is run.
+
+    A file of Stable-Baselines3's own says nothing of its environment.
+
+    Raises:
+        CheckpointError: If the file is none.
+    """
+    from agents.training import checkpoint
+
+    if checkpoint.is_plain(Path(text)):
+        return LoadedPolicy(text, None)
+    run = checkpoint.read_run(Path(text))
+    card = {"trained": f"{run['algorithm']}, {run['timesteps']} steps", "seeds": {"training": run["run"]["seed"]}}
+    return LoadedPolicy(text, None, run["environment"], run["configuration"], card)
+
+
+def _checkpoint(text: str, trust: bool) -> LoadedPolicy:
+    from agents.training import checkpoint
+
+    described = described_checkpoint(text)
+    if checkpoint.is_plain(Path(text)):
+        return replace(described, policy=ModelPolicy(checkpoint.load_plain(Path(text), trust=trust), None))
+    model, normaliser = checkpoint.load(Path(text), trust=trust)
+    return replace(described, policy=ModelPolicy(model, normaliser))
+
+
+def find_object(text: str) -> Any:
+    """Return what module:name means; the present folder's modules count, too.
+
+    Raises:
+        PolicyNotFoundError: If there is no such thing, or its module cannot be imported.
+    """
+    module, colon, name = text.partition(":")
+    if not colon or not name:
+        raise PolicyNotFoundError(f"{text!r} must be module:function")
+    folder = str(Path.cwd())
+    if folder not in sys.path:  # a console script's path lacks it, and the user's function is there
+        sys.path.insert(0, folder)
+    try:
+        found = importlib.import_module(module)
+    except ImportError as error:
+        raise PolicyNotFoundError(f"{text}: module {module!r} cannot be imported: {error}") from None
+    except Exception as error:  # whatever somebody's module does when it is imported
+        raise PolicyNotFoundError(f"{text}: module {module!r} fails: {type(error).__name__}: {error}") from error
+    if not hasattr(found, name):
+        functions = [key for key, value in vars(found).items() if callable(value) and not key.startswith("_")]
+        raise PolicyNotFoundError(f"{text}: {module} has no {name!r}; it has {', '.join(functions) or 'nothing'}")
+    return getattr(found, name)
+
+
+def _callable(text: str) -> LoadedPolicy:
+    policy = find_object(text)
+    if inspect.isclass(policy):
+        try:
+            policy = policy()
+        except TypeError as error:
+            raise PolicyNotFoundError(f"{text} cannot be made without arguments: {error}") from None
+    if not hasattr(policy, "act"):
+        if not callable(policy):
+            raise PolicyNotFoundError(f"{text} is a {type(policy).__name__}; a policy is a function of an observation")
+        policy = CallablePolicy(policy)
+    elif not hasattr(policy, "reset"):
+        policy = CallablePolicy(policy.act)
+    return LoadedPolicy(text, policy)
+
+
+# Ending of a file that runs nothing of its writer -> what opens it.
+OPENERS: dict[str, Callable[[str], LoadedPolicy]] = {".npz": _bundle, ".onnx": _onnx}

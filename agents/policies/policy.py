@@ -1,0 +1,240 @@
+"""Acting with a bundle, by NumPy alone: for a controller on a small computer, without torch, Gymnasium or MuJoCo.
+
+`load_policy("agent.npz").act(observation)` takes observations of shape (entries,) or (lanes, entries).
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agents.policies.agent_file import Bundle, BundleError
+
+Array = NDArray[np.float32]
+
+# Kind of a bundle -> what is made of one: a class or function that takes it. Another kind of agent is another row.
+KINDS: dict[str, str] = {
+    "mlp": "agents.policies.policy:MlpPolicy",
+    "lstm": "agents.policies.policy:LstmPolicy",
+    "surrogate": "agents.tuner.surrogate:SurrogatePolicy",
+}
+
+
+class PolicyError(RuntimeError):
+    """A policy got or gave what is no number; whoever acts with it stops the drives."""
+
+
+def load_policy(path: str | Path) -> Any:
+    """Return what a bundle's kind makes of it.
+
+    Raises:
+        BundleError: If the file is none, or its kind is not known here.
+    """
+    return policy_of(Bundle.load(path))
+
+
+def policy_of(bundle: Bundle) -> Any:
+    """Return what a bundle's kind makes of it."""
+    if bundle.kind not in KINDS:
+        raise BundleError(f"an agent of kind {bundle.kind!r} needs a newer drive-env; this one has {', '.join(KINDS)}")
+    module, _, name = KINDS[bundle.kind].partition(":")
+    try:
+        return getattr(importlib.import_module(module), name)(bundle)
+    except BundleError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise BundleError(f"the agent's arrays and settings make no {bundle.kind!r}: {error}; get it anew") from None
+
+
+# --- pieces -----------------------------------------------------------------------------------------------------------
+def sigmoid(x: Array) -> Array:
+    """Return 1/(1 + exp(-x)), which overflows nowhere in this form."""
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * x)), np.float32)
+
+
+def _elu(x: Array) -> Array:
+    return np.asarray(np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))), np.float32)
+
+
+# Names as the settings have them; torch's own defaults (elu's alpha 1, leaky_relu's slope 0.01).
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, np.float32(0.0)),
+    "elu": _elu,
+    "leaky_relu": lambda x: np.where(x > 0.0, x, np.float32(0.01) * x),
+    "silu": lambda x: x * sigmoid(x),
+}
+
+
+def _clip(x: Array, low: Array, high: Array) -> Array:
+    return np.minimum(np.maximum(x, low), high)
+
+
+def _squash(x: Array, low: Array, high: Array) -> Array:
+    return np.asarray(low + np.float32(0.5) * (np.tanh(x) + np.float32(1.0)) * (high - low), np.float32)
+
+
+# How a network's output becomes an action: cut off at the space's bounds (PPO), or squashed into them (SAC).
+OUTPUTS: dict[str, Callable[[Array, Array, Array], Array]] = {"clip": _clip, "tanh": _squash}
+
+
+class Ends:
+    """What all networks have in front and behind: checks, normaliser, action bounds.
+
+    Arrays: observation_mean, observation_scale (1/standard deviation), shape (entries,); action_low, action_high, shape
+    (actions,). Settings: observation_clip (of the normalised observation; None for no normaliser), output (OUTPUTS).
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        arrays, settings = bundle.arrays, bundle.settings
+        clip = settings.get("observation_clip")
+        self.mean = np.asarray(arrays["observation_mean"], np.float64)
+        self.scale = np.asarray(arrays["observation_scale"], np.float64)
+        self.clip = None if clip is None else float(clip)
+        self.low, self.high = (np.asarray(arrays[f"action_{end}"], np.float32) for end in ("low", "high"))
+        self._output = OUTPUTS[_choice("output", settings["output"], OUTPUTS)]
+
+    def enter(self, observation: ArrayLike) -> Array:
+        """Return the normalised observations, shape (lanes, entries)."""
+        x = np.asarray(observation)
+        if x.shape[-1:] != self.mean.shape or x.ndim > 2:
+            raise PolicyError(
+                f"the policy takes {len(self.mean)} entries, (entries,) or (lanes, entries), not {x.shape}; "
+                "is it of this environment and configuration?"
+            )
+        if not np.isfinite(x).all():
+            wrong = int(np.argwhere(~np.isfinite(x))[0][-1])
+            raise PolicyError(f"entry {wrong} of the observation is no number: the policy was not asked")
+        if self.clip is not None:
+            x = np.minimum(np.maximum((x - self.mean) * self.scale, -self.clip), self.clip)
+        return np.atleast_2d(x.astype(np.float32))
+
+    def leave(self, x: Array, observation: ArrayLike) -> Array:
+        """Return the action of a network's output, in the observation's shape."""
+        if not np.isfinite(x).all():
+            raise PolicyError("the policy's output is no number")
+        action = self._output(x, self.low, self.high)
+        return action[0] if np.ndim(observation) == 1 else action
+
+
+def _layers(bundle: Bundle) -> list[tuple[Array, Array]]:
+    """Return weights (in, out) and biases of the layers, in order."""
+    found: list[tuple[Array, Array]] = []
+    while f"weight_{len(found)}" in bundle.arrays:
+        weight, bias = (bundle.arrays[f"{name}_{len(found)}"] for name in ("weight", "bias"))
+        found.append((np.ascontiguousarray(weight, np.float32), np.asarray(bias, np.float32)))
+    if not found:
+        raise BundleError("the agent has no layers: there is no array weight_0")
+    return found
+
+
+def _choice(what: str, name: Any, table: dict[str, Any]) -> str:
+    if name not in table:
+        raise BundleError(f"the agent's {what} is {name!r}; there are {', '.join(table)}")
+    return str(name)
+
+
+# --- kinds ------------------------------------------------------------------------------------------------------------
+class MlpPolicy:
+    """A network of fully connected layers.
+
+    Arrays besides those of `Ends`: weight_0 (in, out), bias_0, weight_1, ... Settings: activation (ACTIVATIONS), after
+    each layer but the last.
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        self._ends = Ends(bundle)
+        *self._hidden, self._last = _layers(bundle)
+        self._activation = ACTIVATIONS[_choice("activation", bundle.settings["activation"], ACTIVATIONS)]
+
+    def act(self, observation: ArrayLike) -> Array:
+        """Return the action for one observation, or one for each lane.
+
+        Raises:
+            PolicyError: If observation or action is no number, or the observation has another shape.
+        """
+        x = self._ends.enter(observation)
+        with np.errstate(over="ignore", invalid="ignore"):  # `leave` tells what comes of it
+            for weight, bias in self._hidden:
+                x = self._activation(x @ weight + bias)
+            x = x @ self._last[0] + self._last[1]
+        return self._ends.leave(x, observation)
+
+    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+        """Do nothing: it remembers nothing."""
+
+
+class LstmPolicy:
+    """A layer of LSTM cells, then fully connected layers; the state of each lane is its own.
+
+    Arrays besides those of `MlpPolicy`: lstm_input (entries, 4 cells), lstm_state (cells, 4 cells), lstm_bias (4
+    cells), the gates in torch's order: input, forget, cell, output.
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        self._ends = Ends(bundle)
+        *self._hidden, self._last = _layers(bundle)
+        self._activation = ACTIVATIONS[_choice("activation", bundle.settings["activation"], ACTIVATIONS)]
+        self._input, self._recurrent, self._bias = (
+            np.ascontiguousarray(bundle.arrays[f"lstm_{name}"], np.float32) for name in ("input", "state", "bias")
+        )
+        self._state = self._cell = np.zeros((0, len(self._recurrent)), np.float32)
+
+    def act(self, observation: ArrayLike) -> Array:
+        """Return the action for one observation, or one for each lane, and remember.
+
+        Raises:
+            PolicyError: As `MlpPolicy.act`.
+        """
+        x = self._ends.enter(observation)
+        if len(self._state) != len(x):
+            self._state = self._cell = np.zeros((len(x), len(self._recurrent)), np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            gates = x @ self._input + self._state @ self._recurrent + self._bias
+            enter, forget, cell, leave = np.split(gates, 4, axis=1)
+            self._cell = sigmoid(forget) * self._cell + sigmoid(enter) * np.tanh(cell)
+            x = self._state = sigmoid(leave) * np.tanh(self._cell)
+            for weight, bias in self._hidden:
+                x = self._activation(x @ weight + bias)
+            x = x @ self._last[0] + self._last[1]
+        return self._ends.leave(x, observation)
+
+    def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
+        """Forget what was, in all lanes or where the mask is true."""
+        keep = np.zeros(len(self._state), bool) if mask is None else ~np.asarray(mask, bool)
+        if len(keep) != len(self._state):  # of an earlier number of lanes
+            keep = np.zeros(len(self._state), bool)
+        self._state, self._cell = (np.where(keep[:, None], x, np.float32(0.0)) for x in (self._state, self._cell))
+
+
+# --- latency ----------------------------------------------------------------------------------------------------------
+class Latency(NamedTuple):
+    """Time of an action for one observation [s]."""
+
+    median: float
+    p99: float
+    worst: float
+
+    def __str__(self) -> str:
+        return f"median {1e6 * self.median:.0f} µs, p99 {1e6 * self.p99:.0f} µs, worst {1e6 * self.worst:.0f} µs"
+
+
+def measure_latency(act: Callable[[Array], Any], entries: int, calls: int = 2000) -> Latency:
+    """Return how long a policy takes for one observation of so many entries, on this computer as it is now."""
+    rng = np.random.default_rng(0)
+    observations = rng.uniform(-1.0, 1.0, (64, entries)).astype(np.float32)
+    times = np.empty(calls)
+    for k in range(-min(calls, 50), calls):  # some first, unmeasured: caches fill
+        start = time.perf_counter()
+        act(observations[k % 64])
+        times[max(k, 0)] = time.perf_counter() - start
+    return Latency(float(np.median(times)), float(np.quantile(times, 0.99)), float(times.max()))

@@ -1,0 +1,513 @@
+"""Training with Stable-Baselines3: one seed gives the same agent on the same machine, and a run can be resumed.
+
+A run is cut into segments, at whose ends a checkpoint is written and every lane begins a new episode with seeds of the
+segment. So a resumed run equals an uninterrupted one to the last digit: what cannot be saved, the emulated machines in
+the middle of their episodes, is begun anew in both. Not equal are times, and a run with other numbers of threads of
+torch, which may add up in another order.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.policies.agent_file import Bundle, plain
+from agents.training import checkpoint
+from agents.training.hyperparameters import RUN_KEYS, HyperparameterError, schedule
+from agents.training.learning_curve import draw_learning_curve
+from agents.training.networks import bundle_of
+from agents.training.tasks import ENVIRONMENTS, configuration_of, environment_name, make_lanes
+from agents.training.training_lanes import CountedLanes
+from agents.training.training_table import TrainingTable
+
+logger = logging.getLogger(__name__)
+
+# Algorithm -> its class.
+ALGORITHMS = {
+    "ppo": "stable_baselines3:PPO",
+    "sac": "stable_baselines3:SAC",
+    "recurrent_ppo": "sb3_contrib:RecurrentPPO",
+}
+CHECKPOINT, AGENT, TABLE, CURVE = "checkpoint.zip", "agent.npz", "training.csv", "learning_curve.png"
+ROWS = 200  # of the table, about
+IMITATION = 1_000_000  # a segment's number that no run has, for seeds
+EPISODES_PER_SEGMENT = 3  # of every lane, at least
+# "constant" is SB3's word for SAC's automatic entropy and others.
+_SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
+# Keys whose value SB3 wants as a whole number, though YAML may say 1e5.
+_WHOLE = ("n_steps", "batch_size", "n_epochs", "buffer_size", "learning_starts", "train_freq", "gradient_steps")
+
+
+class DivergedError(ValueError):
+    """The networks hold what nothing can act with: the training is lost; the message says what to change."""
+
+
+class MissingPackageError(ImportError):
+    """A package that training needs is not installed; the message says which extra has it."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is trained.
+
+    Attributes:
+        environment: Name of the environment.
+        algorithm: A row of ALGORITHMS.
+        hyperparameters: As agents.training.hyperparameters.load returns them.
+        seed: Of everything random.
+        preset: Which preset the hyper-parameters came from, for the card.
+        segments: Checkpoints over the run, at whose ends lanes begin anew.
+        torch_threads: Threads of torch; small networks are fastest with 1.
+    """
+
+    environment: str
+    algorithm: str
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    preset: str = "full"
+    segments: int = 10
+    torch_threads: int = 1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "environment", environment_name(self.environment))
+        if self.algorithm not in ALGORITHMS:
+            raise ValueError(f"there is no algorithm {self.algorithm!r}; there are {', '.join(ALGORITHMS)}")
+        if self.segments < 1:
+            raise ValueError(f"segments must be 1 or more, not {self.segments}")
+        if self.seed < 0:
+            raise ValueError(f"the seed must be 0 or more, not {self.seed}")
+
+    @property
+    def total(self) -> int:
+        """Steps of all lanes together."""
+        return int(self.hyperparameters["n_timesteps"])
+
+
+class Progress(NamedTuple):
+    """How far a training is: means of the last episodes and of each term per step; speed [steps/s]; time's shares.
+
+    `imitated` is the share of what comes before it, if the policy begins as a teacher: all else is 0 until that is 1.
+    """
+
+    timesteps: int
+    total: int
+    episodes: int
+    means: Mapping[str, float]
+    terms: Mapping[str, float]
+    speed: float
+    environment_share: float
+    imitated: float = 1.0
+
+
+Report = Callable[[Progress], None]
+
+
+def train(
+    run: Run, folder: str | Path, *, report: Report | None = None, resume: bool = False, trust: bool = False
+) -> Bundle:
+    """Train an agent and return it.
+
+    The folder gets agent.npz, checkpoint.zip, training.csv, its picture learning_curve.png, and TensorBoard's files.
+
+    Args:
+        run: What is trained; with `resume` None of it is used but the folder's own.
+        folder: Where results go.
+        report: Is told how far it is, some 200 times.
+        resume: Go on from the folder's checkpoint.
+        trust: Its writer is trusted; needed to resume, see `agents.training.checkpoint`.
+
+    Raises:
+        CheckpointError: If there is nothing to resume, or it is not trusted; MissingPackageError without the extra
+            `agents`.
+        HyperparameterError: For hyper-parameters that the algorithm does not take.
+        DivergedError: If the networks come to hold what nothing can act with; the last checkpoint is from before.
+    """
+    import torch
+    from stable_baselines3.common.logger import configure
+
+    folder = Path(folder)
+    path = folder / CHECKPOINT
+    if resume:
+        run = run_to_resume(folder)
+        checkpoint.check_trust(path, trust)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(run.torch_threads)
+    lanes, env = make_env(run)
+    try:
+        if resume:
+            model, normaliser = checkpoint.load(path, env, trust=trust)
+        else:
+            model, normaliser = make_model(run, env)
+            agent_of(model, normaliser, run, configuration_of(lanes))  # what no bundle holds is told now
+            if run.hyperparameters.get("imitate"):
+                _imitate(run, model, lanes, report)
+        folder.mkdir(parents=True, exist_ok=True)
+        model.set_logger(configure(str(folder), ["tensorboard"]))
+        segments = _segments_class()(run, folder, lanes, normaliser, report, resume)
+        if resume:
+            # SB3 would reset the lanes before the segment does, and count that in the normaliser.
+            model._last_obs = np.zeros(0)
+            model._last_episode_starts = np.ones(lanes.num_envs, bool)
+        else:
+            model.get_env().seed(segment_seed(run.seed, 0))
+        _count_from(env, model.num_timesteps if resume else 0)
+        left = run.total - (model.num_timesteps if resume else 0)
+        if left > 0:
+            try:
+                model.learn(left, callback=segments, log_interval=1, reset_num_timesteps=not resume)
+            except ValueError:  # torch's, of a distribution without a mean
+                if is_sound(model):
+                    raise
+            if not is_sound(model):
+                raise DivergedError(
+                    f"the training diverged: after {model.num_timesteps} steps its networks give no numbers any more. "
+                    "Use a smaller learning_rate or max_grad_norm; the checkpoint, if there is one, is from before"
+                )
+            segments.finish()
+        bundle = agent_of(model, normaliser, run, configuration_of(lanes))
+        bundle.save(folder / AGENT)
+        return bundle
+    finally:
+        torch.set_num_threads(threads)
+        env.close()
+
+
+def clear(folder: str | Path) -> None:
+    """Delete what a run has written that was ended before its first checkpoint: nothing can go on with it."""
+    folder = Path(folder)
+    for path in (folder / TABLE, *folder.glob("events.out.tfevents.*")):
+        path.unlink(missing_ok=True)
+    with suppress(OSError):  # not there, or something of the user's in it
+        folder.rmdir()
+
+
+def run_to_resume(folder: str | Path) -> Run:
+    """Return the run whose checkpoint a folder holds.
+
+    Raises:
+        CheckpointError: If it holds none.
+    """
+    path = Path(folder) / CHECKPOINT
+    if not path.is_file():
+        raise checkpoint.CheckpointError(
+            f"there is no file {path} to go on with: a run writes its first one after a tenth of its steps"
+        )
+    return _run_of(checkpoint.read_run(path), path)
+
+
+def agent_of(model: Any, normaliser: Any, run: Run, configuration: Mapping[str, Any]) -> Bundle:
+    """Return a trained model as a bundle with what is known of the run on its card."""
+    card = {
+        "trained": f"{run.algorithm} of Stable-Baselines3, preset {run.preset}, {model.num_timesteps} steps",
+        "distribution": plain(configuration.get("distributions")) or "the environment's own",
+        "seeds": {"training": run.seed},
+        "hyperparameters": plain(run.hyperparameters),
+        "figures": {},
+        "limits": [f"trained on the load {configuration.get('load')!r} alone"],
+    }
+    return bundle_of(model, normaliser, environment=run.environment, configuration=configuration, card=card)
+
+
+def bundle_of_checkpoint(path: str | Path, *, trust: bool = False) -> Bundle:
+    """Return the agent of a checkpoint.
+
+    Raises:
+        CheckpointError: If the file is none, or its writer is not trusted.
+    """
+    table = checkpoint.read_run(Path(path))
+    model, normaliser = checkpoint.load(Path(path), trust=trust)
+    return agent_of(model, normaliser, _run_of(table, Path(path)), table["configuration"])
+
+
+def _run_of(table: Mapping[str, Any], path: Path) -> Run:
+    """Return the run that a checkpoint tells of."""
+    try:
+        return Run(**table["run"])
+    except TypeError as error:
+        raise checkpoint.CheckpointError(f"{path} is no checkpoint of this drive-agent: {error}") from None
+
+
+def with_figures(bundle: Bundle, figures: Mapping[str, Any], seeds: Mapping[str, Any]) -> Bundle:
+    """Return a bundle whose card has figures, and the seeds of the episodes that they come from."""
+    card = {**bundle.card, "figures": plain(figures), "seeds": {**bundle.card.get("seeds", {}), **seeds}}
+    return replace(bundle, card=card)
+
+
+def make_env(run: Run) -> tuple[CountedLanes, Any]:
+    """Return counted lanes, and the VecEnv of Stable-Baselines3 over them."""
+    _need("stable_baselines3")
+    from drive_env.envs.stable_baselines import LanesVecEnv
+
+    options = run.hyperparameters.get("env_kwargs") or {}
+    lanes = make_lanes(run.environment, run.hyperparameters["n_envs"], options, autoreset_mode="SameStep")
+    counted = CountedLanes(lanes)
+    env: Any = LanesVecEnv(counted)  # type: ignore[arg-type]
+    wrapper = run.hyperparameters.get("vec_env_wrapper")
+    if wrapper:
+        name, settings = _named(wrapper)
+        with _settings_of(name):
+            env = found(name)(env, **settings)
+    return counted, env
+
+
+def make_model(run: Run, env: Any) -> tuple[Any, Any]:
+    """Return a new model on the environment, and its normaliser, if the hyper-parameters want one."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    given = run.hyperparameters
+    options = {key: value for key, value in given.items() if key not in RUN_KEYS}
+    normalize = given.get("normalize")
+    normaliser = None
+    if normalize:
+        wanted = dict(normalize) if isinstance(normalize, Mapping) else {}
+        with _settings_of("normalize"):
+            normaliser = env = VecNormalize(env, gamma=float(options.get("gamma", 0.99)), **wanted)
+    for key in _SCHEDULED:
+        if key in options:
+            options[key] = schedule(options[key])
+    for key in _WHOLE:
+        if isinstance(options.get(key), float):
+            options[key] = int(options[key])
+    if options.get("policy_kwargs"):
+        options["policy_kwargs"] = _with_classes(options["policy_kwargs"])
+    with _settings_of(run.algorithm):
+        model = algorithm_class(run.algorithm)(_policy(given["policy"]), env, seed=run.seed, device="cpu", **options)
+    return model, normaliser
+
+
+def is_sound(model: Any) -> bool:
+    """Return whether all weights of a model are numbers, and the deviation of its actions is one above 0."""
+    weights = list(model.policy.parameters())
+    if getattr(model.policy, "log_std", None) is not None:
+        deviation = model.policy.log_std.exp()
+        weights += [deviation, 1.0 / deviation]
+    return all(bool(weight.isfinite().all()) for weight in weights)
+
+
+def algorithm_class(name: str) -> Any:
+    """Return the class of an algorithm."""
+    module, _, kind = ALGORITHMS[name].partition(":")
+    _need(module)
+    return getattr(importlib.import_module(module), kind)
+
+
+def segment_length(run: Run, lanes: CountedLanes) -> int:
+    """Return the steps of a segment: a share of the run, but some episodes of every lane, which else never ended."""
+    episode: int = ENVIRONMENTS[run.environment].steps(lanes.config) * lanes.num_envs
+    return max(int(run.total // run.segments), EPISODES_PER_SEGMENT * episode)
+
+
+def segment_seed(seed: int, segment: int) -> int:
+    """Return the seed of lane 0 in a segment; the other lanes' follow by one."""
+    return int(np.random.SeedSequence([seed, segment]).generate_state(1)[0]) >> 1
+
+
+def _count_from(env: Any, steps: int) -> None:
+    """Have the curriculum's steps be those of the run: neither an imitation's nor those since it was resumed."""
+    while hasattr(env, "venv"):
+        env = env.venv
+    env._steps = steps
+
+
+def _imitate(run: Run, model: Any, lanes: CountedLanes, report: Report | None) -> None:
+    """Have the model begin as the baseline that the hyper-parameters name."""
+    from agents.policies.baselines import baseline
+    from agents.training.imitation import imitate
+
+    if run.algorithm != "ppo":
+        raise HyperparameterError(f"imitate is of ppo; leave it out with {run.algorithm}")
+    name, settings = _named(run.hyperparameters["imitate"])
+    teacher = baseline(name, run.environment, lanes.config, int(model.action_space.shape[0]))
+
+    def told(share: float) -> None:
+        if report is not None:
+            report(Progress(0, run.total, 0, {}, {}, 0.0, 0.0, share))
+
+    seed = segment_seed(run.seed, IMITATION)
+    with _settings_of(f"imitate {name}"):
+        wanted = inspect.signature(imitate).bind(model, teacher, seed=seed, told=told, **settings)
+    left = imitate(*wanted.args, **wanted.kwargs)
+    logger.info("the policy begins as %s, its actions within %.3g", name, left)
+
+
+@contextmanager
+def _settings_of(name: str) -> Iterator[None]:
+    """Tell what a constructor does not take as a mistake in the hyper-parameters: SB3 asserts some of it."""
+    try:
+        yield
+    except (TypeError, AssertionError) as error:
+        raise HyperparameterError(f"{name} does not take these hyper-parameters: {error}") from None
+
+
+def _named(value: Any) -> tuple[str, dict[str, Any]]:
+    """Return name and settings of an entry that is a name, or a table of a name and its settings, as RL-Zoo has it."""
+    if not isinstance(value, Mapping):
+        return str(value), {}
+    if len(value) != 1:
+        raise HyperparameterError(f"one name with its settings is wanted, not {', '.join(map(str, value))}")
+    [(name, settings)] = value.items()
+    return str(name), dict(settings or {})
+
+
+def found(name: str) -> Any:
+    """Return what "module:name" names.
+
+    Raises:
+        HyperparameterError: If there is no such thing.
+    """
+    module, _, kind = str(name).partition(":")
+    try:
+        return getattr(importlib.import_module(module), kind)
+    except (ImportError, AttributeError) as error:
+        raise HyperparameterError(f"{name!r} is no module:name that can be imported: {error}") from None
+
+
+def _policy(name: str) -> Any:
+    """Return the policy class of a name "module:class", or SB3's own name."""
+    return found(name) if ":" in str(name) else name
+
+
+def _with_classes(value: Any) -> Any:
+    """Return policy_kwargs with "nn.Tanh" and the like as torch's classes."""
+    import torch
+
+    if isinstance(value, Mapping):
+        return {key: _with_classes(one) for key, one in value.items()}
+    if isinstance(value, str) and value.startswith("nn."):
+        try:
+            return getattr(torch.nn, value[3:])
+        except AttributeError:
+            raise HyperparameterError(f"torch.nn has no {value[3:]!r}; activations are nn.Tanh, nn.ReLU, ...") from None
+    return value
+
+
+def _need(package: str) -> None:
+    try:
+        importlib.import_module(package)
+    except ImportError:
+        raise MissingPackageError(
+            f"training needs {package}, which is not installed: pip install 'drive-env[agents]'"
+        ) from None
+
+
+def _segments_class() -> Any:
+    """Return the callback; its base is Stable-Baselines3's, which must not be imported before it is needed."""
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    class Segments(BaseCallback):  # type: ignore[misc]
+        """Writes checkpoints, begins segments, tells how far it is."""
+
+        def __init__(
+            self, run: Run, folder: Path, lanes: CountedLanes, normaliser: Any, report: Report | None, resumed: bool
+        ) -> None:
+            super().__init__()
+            self._run, self._folder, self._lanes, self._normaliser = run, folder, lanes, normaliser
+            self._report, self._resumed = report, resumed
+            self._length = segment_length(run, lanes)
+            self._row_length = max(1, run.total // ROWS)
+            self._segment = 0
+            self._next_row = 0
+            self._table: TrainingTable | None = None
+            self._began = self._row_began = time.perf_counter()
+            self._row_steps, self._row_seconds = 0, 0.0
+
+        def _on_training_start(self) -> None:
+            self._segment = self.num_timesteps // self._length
+            self._next_row = self.num_timesteps + self._row_length
+            self._table = TrainingTable(self._folder / TABLE, keep=self.num_timesteps if self._resumed else 0)
+            self._began = self._row_began = time.perf_counter()
+            # An imitation's steps and the first reset are no part of the training's speed.
+            self._row_steps, self._row_seconds = self._lanes.steps, self._lanes.seconds
+
+        def _on_rollout_start(self) -> None:
+            if self._resumed:
+                self._resumed = False
+                checkpoint.restore_random_states(self._folder / CHECKPOINT, self.model)
+                self._begin_segment()
+            elif self.num_timesteps // self._length > self._segment:
+                self._segment = self.num_timesteps // self._length
+                self._save()
+                self._draw()
+                self._begin_segment()
+            if self.num_timesteps >= self._next_row:
+                self._next_row = self.num_timesteps + self._row_length
+                self._tell()
+
+        def _on_step(self) -> bool:
+            return True
+
+        def finish(self) -> None:
+            """Write what the end of the run leaves."""
+            self._save()
+            if self.num_timesteps and self._lanes.steps > self._row_steps:
+                self._tell()
+            self._draw()
+
+        def _draw(self) -> None:
+            title = f"{self._run.environment}, {self._run.algorithm}, {self._run.preset}, seed {self._run.seed}"
+            draw_learning_curve(self._folder / TABLE, self._folder / CURVE, title)
+
+        def _save(self) -> None:
+            checkpoint.save(
+                self._folder / CHECKPOINT,
+                self.model,
+                self._normaliser,
+                {
+                    "algorithm": self._run.algorithm,
+                    "environment": self._run.environment,
+                    "configuration": configuration_of(self._lanes),
+                    "timesteps": self.num_timesteps,
+                    "run": plain(asdict(self._run)),
+                },
+            )
+
+        def _begin_segment(self) -> None:
+            """Begin an episode in every lane, with the segment's seeds."""
+            model = self.model
+            env = model.get_env()
+            env.seed(segment_seed(self._run.seed, self._segment))
+            model._last_obs = env.reset()
+            model._last_episode_starts = np.ones(env.num_envs, bool)
+            if getattr(model, "_vec_normalize_env", None) is not None:
+                model._last_original_obs = model._vec_normalize_env.get_original_obs()
+
+        def _tell(self) -> None:
+            now = time.perf_counter()
+            spent = max(now - self._row_began, 1e-9)
+            lanes = self._lanes
+            progress = Progress(
+                self.num_timesteps,
+                self._run.total,
+                lanes.episodes,
+                lanes.episode_means(),
+                lanes.take_terms(),
+                (lanes.steps - self._row_steps) / spent,
+                (lanes.seconds - self._row_seconds) / spent,
+            )
+            self._row_began, self._row_steps, self._row_seconds = now, lanes.steps, lanes.seconds
+            for name, value in progress.means.items():
+                self.logger.record(f"episode/{name}", value)
+            for name, value in progress.terms.items():
+                self.logger.record(f"reward_terms/{name}", value)
+            self.logger.record("time/steps_per_s", progress.speed)
+            self.logger.record("time/environment_share", progress.environment_share)
+            if self._table is not None:
+                self._table.add(
+                    {"timesteps": progress.timesteps, "seconds": round(now - self._began, 2)}
+                    | {"episodes": progress.episodes, **progress.means}
+                    | {f"term {name}": value for name, value in progress.terms.items()}
+                    | {"steps/s": progress.speed, "environment share": progress.environment_share}
+                )
+            if self._report is not None:
+                self._report(progress)
+
+    return Segments

@@ -1,0 +1,1 @@
+"""A trained tuner at work on drives."""

@@ -1,0 +1,345 @@
+"""What a tuning would do to drives of a bus, found out by reading alone: nothing is written, no state is changed.
+
+Everything that a run needs is looked at: who answers, whether the objects are there, how fast answers come, whether
+the samples fit into PDOs, who watches over the master, what the motor's row says against what the drive was set to.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from drive_env.dictionary.access import ObjectAccessError
+from drive_env.gains import GAIN_NAMES, GAIN_OBJECTS
+
+if TYPE_CHECKING:
+    from tuning.target import Target
+
+OK, NOTE, NO = "ok", "note", "no"  # a run would begin, would begin all the same, would not
+
+READS = 50  # of the statusword, to see how fast answers come
+SLOWEST = 0.01  # s, the median of those; a trial that watches for oscillation asks more often
+AT_REST = 0.02  # of the speed limit
+BY_ENCODER = 3  # 2055h
+# What a trial samples besides the envelope's own, and what it plays (gain_trial.py, frequency_response.py).
+SAMPLED, PLAYED = (0x6064, 0x6062, 0x6077, 0x6041), (0x607A,)
+
+
+class Check(NamedTuple):
+    """Something that was looked at: what, OK, NOTE or NO, and what was found, with the remedy where it is a NO."""
+
+    what: str
+    verdict: str
+    found: str
+
+
+class Write(NamedTuple):
+    """An object that a run would write.
+
+    key: Index and sub-index of the object.
+    name: Its own.
+    values: Between which limits, or which.
+    why: What for.
+    present: What the drive holds now, of each axis; None where it cannot be read.
+    stays: Whether the drive has the new value afterwards; all others are put back.
+    """
+
+    key: tuple[int, int]
+    name: str
+    values: str
+    why: str
+    present: tuple[int, ...] | None
+    stays: bool
+
+
+class Rehearsal(NamedTuple):
+    """What there is to say before a run."""
+
+    checks: tuple[Check, ...]
+    writes: tuple[Write, ...]
+
+    @property
+    def refused(self) -> list[Check]:
+        """What a run would not begin for."""
+        return [check for check in self.checks if check.verdict == NO]
+
+
+def rehearse(target: Target, *, keep: bool = True) -> Rehearsal:
+    """Look at drives of a bus without writing, and return what was found and what a run would write.
+
+    Args:
+        target: The drives, as `tuning.target.on_bus` opens them.
+        keep: Whether the run would have the drives keep the gains over a power cycle.
+
+    Raises:
+        BusError: If a node does not answer any more.
+    """
+    checks: list[Check] = []
+    for axis in range(target.num_axes):
+        prefix = f"node {target.drives.nodes[axis]}: " if target.num_axes > 1 else ""
+        checks += [check._replace(what=prefix + check.what) for check in _checks(target, axis)]
+    writes = []
+    for key, values, why, stays in _plan(target, keep):
+        entry = target.drives.description.dictionary.find(key)
+        try:
+            present = tuple(map(int, target.drives.read(key)))
+        except ObjectAccessError as error:
+            present = None
+            checks.append(Check(f"object {key[0]:04X}h:{key[1]:02X}", NO, f"{error}"))
+        writes.append(Write(key, entry.name, values, why, present, stays))
+    return Rehearsal(tuple(checks), tuple(writes))
+
+
+def _checks(target: Target, axis: int) -> Iterator[Check]:
+    for look in LOOKS:
+        yield from look(target, axis)
+
+
+def _read(target: Target, name: Any, axis: int) -> int:
+    return int(target.drives.read(name)[axis])
+
+
+# --- what is looked at ------------------------------------------------------------------------------------------------
+def _identity(target: Target, axis: int) -> Iterator[Check]:
+    drives, facts = target.drives, []
+    for name, word in ((0x1008, ""), (0x1009, "hardware "), (0x100A, "software "), ((0x1018, 1), "vendor "),
+                       ((0x1018, 2), "product "), ((0x1018, 3), "revision "), ((0x1018, 4), "serial ")):  # fmt: skip
+        if not drives.description.has(name):
+            continue
+        found = drives.read(name)[axis]
+        facts.append(word + (f"{found:X}h" if isinstance(name, tuple) else str(found)))
+    yield Check("identity", OK, f"node {drives.nodes[axis]} is a {target.device.name}: {', '.join(facts)}")
+
+
+def _state(target: Target, axis: int) -> Iterator[Check]:
+    from drive_env import motion
+
+    status = _read(target, 0x6041, axis)
+    names = ("switch on disabled", "ready to switch on", "switched on", "operation enabled", "quick stop", "fault")
+    patterns = (motion.SWITCH_ON_DISABLED, motion.READY_TO_SWITCH_ON, motion.SWITCHED_ON, motion.OPERATION_ENABLED,
+                motion.QUICK_STOP_ACTIVE, motion.FAULT)  # fmt: skip
+    found = next(
+        (name for name, (mask, value) in zip(names, patterns, strict=True) if status & mask == value), "between two"
+    )
+    text = f"{found} (statusword {status:04X}h)"
+    if found == "operation enabled":
+        yield Check("state", NO, f"{text}: another master drives this axis; end that, or disable the axis")
+    elif found == "fault":
+        yield Check("state", NOTE, f"{text}, error register {_read(target, 0x1001, axis):02X}h: a run would reset it "
+                                   "once; remove its cause first")  # fmt: skip
+    else:
+        yield Check("state", OK, text)
+    speed = abs(_read(target, 0x606C, axis)) / target.increments()[axis]
+    if speed > AT_REST * target.speed:
+        yield Check("standstill", NO, f"the axis turns at {speed:.3g} rad/s; bring it to rest")
+    else:
+        yield Check("standstill", OK, "the axis is at rest")
+
+
+def _answers(target: Target, axis: int) -> Iterator[Check]:
+    drives, times = target.drives, []
+    entry = drives.description.dictionary.find(0x6041)
+    for _ in range(READS):
+        start = time.perf_counter()
+        drives.read_axis(entry, axis)
+        times.append(time.perf_counter() - start)
+    median, worst = float(np.median(times)), max(times)
+    text = f"SDO answers in {1e3 * median:.2f} ms (median of {READS}), {1e3 * worst:.2f} ms at the worst"
+    if median > SLOWEST:
+        yield Check("interface", NO, f"{text}; {1e3 * SLOWEST:g} ms are needed: take a faster adapter or bit rate")
+    else:
+        yield Check("interface", OK, text)
+
+
+def _samples(target: Target, axis: int) -> Iterator[Check]:
+    """Look whether what is sampled and played fits, and whether its PDOs have identifiers."""
+    from drive_env.canopen.frames import IDENTIFIER, RPDO, TPDO
+    from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, plan
+
+    drives = target.drives
+    description, watched = drives.description, []
+    if drives.safety is not None:
+        watched = drives.safety.watched()
+    wanted = [description.dictionary.find(name) for name in SAMPLED]
+    welcome = [entry for entry in watched if entry not in wanted]
+    out = plan(description, [*wanted, *welcome], OUT_OF_DRIVE) or plan(description, wanted, OUT_OF_DRIVE)
+    into = plan(description, [description.dictionary.find(name) for name in PLAYED], INTO_DRIVE)
+    if out is None or into is None:
+        yield Check("PDO", NO, f"{len(wanted)} samples do not fit into the drive's TPDOs")
+        return
+    texts = []
+    for name, groups, communication, standard in (("TPDO", out, 0x1800, TPDO), ("RPDO", into, 0x1400, RPDO)):
+        for number, group in enumerate(groups):
+            cob_id = _read(target, (communication + number, 1), axis)
+            identifier = cob_id & IDENTIFIER or standard[number] + drives.nodes[axis]
+            if cob_id & 1 << 29:
+                yield Check("PDO", NO, f"{name} {number + 1} has a 29-bit identifier ({cob_id:08X}h in "
+                                       f"{communication + number:04X}h:01); give it an 11-bit one")  # fmt: skip
+                return
+            objects = ", ".join(f"{entry.index:04X}h" for entry in group)
+            texts.append(f"{name} {number + 1} ({identifier:03X}h) would carry {objects}")
+    yield Check("PDO", OK, "; ".join(texts))
+
+
+def _error_control(target: Target, axis: int) -> Iterator[Check]:
+    """Look who would stop the drive if this process died."""
+    drives, description = target.drives, target.drives.description
+    silence = None if drives.safety is None else drives.safety.limits.silence
+    if silence is None:
+        yield Check("heartbeat", NOTE, "no silence of this process would stop the drive")
+    elif description.has((0x1016, 1)):
+        value = _read(target, (0x1016, 1), axis)
+        now = f"node {value >> 16 & 0x7F}, {value & 0xFFFF} ms" if value else "nobody"
+        yield Check("heartbeat", OK, f"the drive can watch over its master: 1016h, now {now}; in real time it would be "
+                                     f"{1e3 * silence:.0f} ms")  # fmt: skip
+    elif description.has((0x100C, 0)) and description.has((0x100D, 0)):
+        yield Check("heartbeat", OK, "the drive can guard its life: 100Ch and 100Dh would be set in real time")
+    else:
+        yield Check("heartbeat", NO, "the drive would not stop by itself if this process died: no 1016h, no 100Ch")
+
+
+def _motor(target: Target, axis: int) -> Iterator[Check]:
+    motor, kind = target.motor, _read(target, 0x2050, axis)
+    if kind == 0:
+        yield Check("motor", NO, "the drive knows no motor (2050h is 0): commission it for the one that turns first")
+        return
+    rows = [("encoder counts", (0x2080, 2), motor.encoder_counts)]
+    if motor.kind != "dc":
+        rows += [("pole pairs", (0x2056, 0), motor.n_p), ("commutation by the encoder", (0x2055, 0), BY_ENCODER)]
+    wrong = []
+    for what, key, wanted in rows:
+        if (has := _read(target, key, axis)) != wanted:
+            wrong.append(f"{key[0]:04X}h:{key[1]:02X} ({what}) is {has}, and {wanted} is needed for {motor.name}")
+    if wrong:
+        yield Check("motor", NO, f"{'; '.join(wrong)}: give the --motor that turns, or set the drive up for it")
+    else:
+        facts = ", ".join(f"{what} {wanted}" if wanted > BY_ENCODER else what for what, _, wanted in rows)
+        yield Check("motor", OK, f"the drive is set up for {motor.name}: {facts}")
+
+
+def _supply(target: Target, axis: int) -> Iterator[Check]:
+    volts = float(target.supply[axis])
+    text = f"{volts:g} V entered; the drive does not show it: measure it, the gains scale with it"
+    if _read(target, (0x2006, 1), axis) and _read(target, (0x2006, 2), axis) * 0.1 <= volts:
+        chopper = _read(target, (0x2006, 2), axis) * 0.1
+        yield Check("supply", NO, f"{volts:g} V entered, and the brake chopper acts from {chopper:g} V (2006h:02) on: "
+                                  "it would burn; correct one of them")  # fmt: skip
+    else:
+        yield Check("supply", OK, text)
+
+
+def _travel(target: Target, axis: int) -> Iterator[Check]:
+    here, scale = _read(target, 0x6064, axis), target.increments()[axis]
+    low, high = target.low[axis], target.high[axis]
+    if not np.isfinite([low, high]).all():
+        yield Check("travel", OK, "free to both sides")
+        return
+    ends = round(here + low * scale), round(here + high * scale)
+    text = f"{low:.3g} to {high:.3g} rad from here: 6064h from {ends[0]} to {ends[1]}, now {here}"
+    own = _read(target, (0x607D, 1), axis), _read(target, (0x607D, 2), axis)
+    if own[0] < own[1] and (ends[0] < own[0] or ends[1] > own[1]):
+        yield Check("travel", NO, f"{text}; the drive's own limits 607Dh are {own[0]} to {own[1]}: give less --travel")
+    else:
+        yield Check("travel", OK, text)
+
+
+def _envelope(target: Target, axis: int) -> Iterator[Check]:
+    """Say what would stop the drives while a run acts on them."""
+    if target.drives.safety is None:
+        yield Check("envelope", NO, "there is none: open the drives with safety")
+        return
+    limits = target.drives.safety.limits
+    reasons = [] if limits.position is None else [f"a position beyond {limits.position[0]} to {limits.position[1]}"]
+    reasons += ["a current that oscillates"] if limits.oscillation else []
+    reasons += [] if limits.stall is None else [f"{limits.stall:g} s without a call while an axis is enabled"]
+    yield Check("envelope", OK, f"a quick stop for {', '.join(reasons)}, and beyond the drive's own limits")
+
+
+def _limits(target: Target, axis: int) -> Iterator[Check]:
+    amperes = _read(target, 0x2003, axis) * 1e-3
+    text = f"at most {target.speed:.4g} rad/s and {target.current:.3g} A are commanded while it is identified"
+    if amperes <= 0.0:
+        yield Check("limits", NO, f"{text}; the drive's limit 2003h is 0 A: set it to the motor's peak current")
+    else:
+        yield Check("limits", OK, f"{text}; trials may take the drive's own limit, 2003h, {amperes:.3g} A")
+    window = _read(target, 0x6065, axis)
+    yield Check("following error", OK, f"window 6065h is {window} inc; it is widened while the axis is shaken")
+
+
+def _gains(target: Target, axis: int) -> Iterator[Check]:
+    from tuning.search.trial_bench import first_gains, read_gains
+
+    has, begins = (_named(gains(target)[axis]) for gains in (read_gains, first_gains))
+    fresh = " (factory-fresh)" if not read_gains(target)[axis].any() else ""
+    yield Check("gains", OK, f"now {has}{fresh}; a run begins with {begins}, from the motor's data sheet")
+
+
+def _named(gains: Any) -> str:
+    return ", ".join(f"{name} {value}" for name, value in zip(GAIN_NAMES, gains, strict=True))
+
+
+LOOKS = (_identity, _state, _answers, _samples, _error_control, _motor, _supply, _travel, _envelope, _limits, _gains)
+
+
+# --- what would be written --------------------------------------------------------------------------------------------
+def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, str, bool]]:
+    """Yield the objects that a run writes: which, between which limits, what for, and whether that stays."""
+    turn = target.increments()
+    speed = round(float(np.max(target.speed * turn)))
+    ends = target.low * turn, target.high * turn
+    here = target.drives.read(0x6064)
+    finite = all(np.isfinite(end).all() for end in ends)
+    way = f"{round(float(np.min(here + ends[0])))}...{round(float(np.max(here + ends[1])))}" if finite else "any"
+    amperes = round(1e3 * target.current)
+    for key, name in zip(GAIN_OBJECTS, GAIN_NAMES, strict=True):
+        yield key, "1...32767", f"gain on trial, {name}", True
+    yield (0x6040, 0), "0, 2, 6, 7, Fh, 1Fh, 80h", "enable, start moves, stop, clear a fault", False
+    yield (0x6060, 0), "0, 1, 8, 9, 10", "pp for moves, csp, csv and cst for what identifies", False
+    yield (0x607A, 0), way, "moves", False
+    yield (0x60FF, 0), f"{-speed}...{speed}", "speed while it is shaken, in csv", False
+    yield (0x6071, 0), f"{-amperes}...{amperes}", "current pulses and the shaking, in cst", False
+    yield (0x6081, 0), f"1...{speed}", "speed of the moves", False
+    for index in (0x6083, 0x6084, 0x6085):
+        yield (index, 0), "above 0", "ramps of the moves and of a stop", False
+    yield (0x2003, 0), f"up to {amperes}", "current limit while it is identified", False
+    yield (0x2004, 0), f"0...{amperes}", "current of the encoder's check", False
+    yield (0x2055, 0), "1, 3", "open loop for the encoder's check, then the encoder again", False
+    yield (0x6065, 0), "up to 100 turns", "following error while it is shaken", False
+    for sub, value in ((1, "1"), (2, "-3")):
+        yield (0x60C2, sub), value, "interpolation period of csv and cst, 1 ms", False
+    yield from _communication(target)
+    if keep and target.drives.description.has((0x1010, 1)):
+        yield (0x1010, 1), "65766173h", '"save": the gains outlive a power cycle', True
+
+
+def _communication(target: Target) -> Iterator[tuple[tuple[int, int], str, str, bool]]:
+    """Yield what is written so that samples come in PDOs and the drive watches over its master."""
+    from drive_env.master.pdo import OUT_OF_DRIVE, slots
+
+    known = target.drives.description.dictionary
+    for name, communication, mapping, pdos in (("RPDO", 0x1400, 0x1600, 1), ("TPDO", 0x1800, 0x1A00, 2)):
+        for number in range(pdos):
+            for entry in known:
+                if entry.index == mapping + number or (entry.index == communication + number and entry.sub in (1, 2)):
+                    why = f"{name} {number + 1} off, mapped as above, on again, with SYNC"
+                    yield (entry.index, entry.sub), "", why, False
+    for number in slots(target.drives.description, OUT_OF_DRIVE, 0).numbers[2:]:
+        yield (0x1800 + number, 1), "", f"TPDO {number + 1} silent meanwhile, if it goes with SYNC", False
+    if np.isfinite(target.low).all() and np.isfinite(target.high).all():
+        for sub, end in ((1, "lower"), (2, "upper")):
+            if target.drives.description.has((0x607D, sub)):
+                yield (0x607D, sub), "the travel", f"{end} software limit, which the drive holds meanwhile", False
+    if target.drives.description.has(0x605A):
+        yield (0x605A, 0), "5, 6", "an axis that is stopped is held at first, in case a weight pulls it", False
+    if target.drives.time_waits and target.drives.description.has(0x1017):
+        yield (0x1017, 0), "1", "for a hundredth of a second: proof that time waits for SYNC", False
+    in_real_time = (
+        ((0x1016, 1), "this process, 500 ms", "whom the drive watches, in real time"),
+        ((0x1029, 1), "0", "what it does when that one falls silent, where it was 1"),
+    )
+    for key, values, why in in_real_time:
+        if target.drives.description.has(key):
+            yield key, values, why, False

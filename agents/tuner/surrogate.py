@@ -1,0 +1,261 @@
+"""A tuner that has learnt what gains are worth: a network for hidden J that reads all trials of the machine so far.
+
+It acts in `ServoDrive/GainTuning-v0`. Of every machine it keeps the context c (what was identified, and what the trial
+at the rule's gains showed) and its trials (log gains over the rule's x_i, what they showed y_i). A conditional neural
+process with attention (Kim et al., "Attentive Neural Processes", 2019), trained on emulated machines whose hidden J is
+known, says of any gains x what ln of hidden J over the rule's is, as a Laplace law:
+
+    v_i, p_i, k_i = trial(c, x_i, y_i)                      value, share of the summary, keys
+    u   = silu(mean of p_i)                                 what kind of machine this is
+    z_h = sum_i softmax_i(q_h(c, x) . k_ih - s_h |x - x_i|^2) v_i        what was seen near x, for each head h
+    median, ln scale = worth(c, x, u, z)
+
+The next trial is the candidate with the least median less some of the scale. The answer is the trial, the rule's
+included, with the least median more some of the scale: what it showed itself and what the others did count.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from agents.policies.agent_file import Bundle, BundleError
+from agents.policies.policy import PolicyError, sigmoid
+
+Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# Of an axis's observation (the class docstring of GainTuning): what was identified, then gains, then two trials.
+IDENTIFIED, SHOWN = 4, 16
+STOPPED = (4, 9, 14)  # of what a trial showed: whether its move, its reversal, its probe was stopped
+CONTEXT = IDENTIFIED + SHOWN
+CLIP = 6.0  # of normalised inputs
+LEAST, MOST = -3.5, 1.0  # of ln of the scale
+KEY = 12  # entries of a head's key
+WIDE, NEAR = 320, 96  # candidates all over the range, and around the best trial, then around the best candidate
+NEARNESS = (0.08, 0.25)  # standard deviations of the latter
+NORMALISER = ("context_mean", "context_scale", "shown_mean", "shown_scale", "gains_scale")
+LAYERS = ("trial_in", "trial_out", "query", "worth_in", "worth_hidden", "worth_out")
+WEIGHTS = ("nearness", *(f"{layer}_{part}" for layer in LAYERS for part in ("weight", "bias")))
+
+
+def silu(x: Array) -> Array:
+    """Return x/(1 + exp(-x))."""
+    return x * sigmoid(x)
+
+
+class Normaliser(NamedTuple):
+    """What inputs are normalised with: mean and 1/standard deviation, shapes (20,), (16,); 1/reach of gains."""
+
+    context_mean: Array
+    context_scale: Array
+    shown_mean: Array
+    shown_scale: Array
+    gains_scale: Array
+
+    def context(self, raw: Array) -> Array:
+        """Return contexts as the networks take them."""
+        return np.asarray(np.clip((raw - self.context_mean) * self.context_scale, -CLIP, CLIP))
+
+    def shown(self, raw: Array) -> Array:
+        """Return what trials showed as the networks take it."""
+        return np.asarray(np.clip((raw - self.shown_mean) * self.shown_scale, -CLIP, CLIP))
+
+    def gains(self, raw: Array) -> Array:
+        """Return log gains over the rule's as the networks take them."""
+        return raw * self.gains_scale
+
+
+class Memory(NamedTuple):
+    """What a network makes of machines and their trials; heads come second.
+
+    shared: What every candidate's first layer gets alike, (machines, hidden). query: The context's part of queries,
+    (machines, heads * KEY). gains: (machines, trials, gains). keys: (machines, heads, trials, KEY). values: (machines,
+    1, trials, value). hidden: What is no trial of the machine, (machines, 1, 1, trials).
+    """
+
+    shared: Array
+    query: Array
+    gains: Array
+    keys: Array
+    values: Array
+    hidden: Mask
+
+
+class Network:
+    """One member of the ensemble; weights as (in, out), `nearness` is ln of s, (heads,)."""
+
+    def __init__(self, weights: dict[str, Array]) -> None:
+        self._w = weights
+        self._near = np.exp(weights["nearness"])[:, None, None]
+        self._heads = len(weights["nearness"])
+        self._gains = len(weights["query_weight"]) - CONTEXT
+        total, keys = len(weights["trial_out_bias"]), self._heads * KEY
+        # worth_in takes gains, heads * value, context, summary; trial_out gives value, summary, keys.
+        rest = len(weights["worth_in_weight"]) - self._gains - CONTEXT
+        self._value = (rest - (total - keys)) // (self._heads - 1)
+
+    def read(self, context: Array, tried: Array, showed: Array, known: Mask) -> Memory:
+        """Return the memory of normalised contexts (n, 20) and trials (n, trials, ...), where `known` is true."""
+        w, (n, trials), value = self._w, known.shape, self._value
+        each = np.concatenate([np.repeat(context[:, None], trials, axis=1), tried, showed], axis=2)
+        told = silu(each @ w["trial_in_weight"] + w["trial_in_bias"]) @ w["trial_out_weight"] + w["trial_out_bias"]
+        first_key = told.shape[2] - self._heads * KEY
+        share = known / known.sum(axis=1, keepdims=True)
+        summary = silu(np.einsum("nt,ntu->nu", share.astype(np.float32), told[..., value:first_key]))
+        own = self._gains + self._heads * value
+        shared = np.concatenate([context, summary], axis=1) @ w["worth_in_weight"][own:] + w["worth_in_bias"]
+        query = context @ w["query_weight"][self._gains :] + w["query_bias"]
+        keys = told[..., first_key:].reshape(n, trials, self._heads, KEY).transpose(0, 2, 3, 1)
+        return Memory(shared, query, tried, keys, told[:, None, :, :value], ~known[:, None, None])
+
+    def ask(self, memory: Memory, gains: Array) -> tuple[Array, Array]:
+        """Return median and ln of the scale for normalised gains of shape (machines, n, gains)."""
+        w, (count, n, _), heads = self._w, gains.shape, self._heads
+        query = (gains @ w["query_weight"][: self._gains] + memory.query[:, None]).reshape(count, n, heads, KEY)
+        distance = np.square(gains[:, :, None] - memory.gains[:, None]).sum(axis=-1)
+        score = query.transpose(0, 2, 1, 3) @ memory.keys - self._near * distance[:, None]
+        score = np.where(memory.hidden, np.float32(-1e9), score)
+        score = np.exp(score - score.max(axis=-1, keepdims=True))
+        seen = (score / score.sum(axis=-1, keepdims=True)) @ memory.values  # (machines, heads, n, value)
+        seen = seen.transpose(0, 2, 1, 3).reshape(count, n, -1)
+        into, own = w["worth_in_weight"], self._gains + seen.shape[2]
+        h = silu(gains @ into[: self._gains] + seen @ into[self._gains : own] + memory.shared[:, None])
+        h = silu(h @ w["worth_hidden_weight"] + w["worth_hidden_bias"])
+        told = h @ w["worth_out_weight"] + w["worth_out_bias"]
+        return told[..., 0], np.clip(told[..., 1], LEAST, MOST)
+
+
+class SurrogatePolicy:
+    """Proposes gains for GainTuning, and answers: kind "surrogate" of a bundle.
+
+    Arrays: those of NORMALISER, and those of WEIGHTS with the networks in the first dimension. Settings: gains (their
+    number), step (the action's bound), low, high (of what is tried, ln over the rule's, for each gain), curiosity (of
+    the scale, for trials), caution (of it, for the answer).
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        try:
+            self._normal = Normaliser(*(np.asarray(bundle.arrays[name], np.float32) for name in NORMALISER))
+            stacked = {name: np.asarray(bundle.arrays[name], np.float32) for name in WEIGHTS}
+        except KeyError as error:
+            raise BundleError(f"the agent has no array {error}; it is no surrogate") from None
+        count = len(stacked["nearness"])
+        self._networks = [Network({name: array[k] for name, array in stacked.items()}) for k in range(count)]
+        s = bundle.settings
+        self._gains, self._step = int(s["gains"]), float(s["step"])
+        self._low, self._high = (np.asarray(s[end], np.float32) for end in ("low", "high"))
+        self._curiosity, self._caution = float(s["curiosity"]), float(s["caution"])
+        self._entries = IDENTIFIED + 2 * self._gains + 2 * SHOWN  # of an axis
+        rng = np.random.default_rng(0)  # the same candidates for ever: a run repeats
+        self._wide = rng.uniform(self._low, self._high, (WIDE, self._gains)).astype(np.float32)
+        spread = np.repeat(NEARNESS, NEAR // len(NEARNESS))[:, None]
+        self._near = (spread * rng.normal(0.0, 1.0, (NEAR, self._gains))).astype(np.float32)
+        self._forget(0)
+
+    def reset(self, mask: Mask | None = None) -> None:
+        """Forget the machines, all or those of a mask over the lanes."""
+        if mask is None or not len(self._known):
+            self._forget(0)
+        else:
+            self._known[np.repeat(mask, len(self._known) // len(mask))] = False
+
+    def act(self, observation: ArrayLike) -> Array:
+        """Return the change of the log gains to try, in the observation's shape.
+
+        Raises:
+            PolicyError: If the observation is of another configuration, or holds what is no number.
+        """
+        each, incumbent = self._take(observation)
+        memory = self._read()
+        median, _ = self._ask(memory, self._tried)
+        best = _pick(self._tried, np.where(self._known, median, np.inf))
+        wide = np.repeat(self._wide[None], len(each), axis=0)
+        chosen = self._least(memory, np.concatenate([wide, self._around(best)], axis=1))
+        chosen = self._least(memory, np.concatenate([chosen[:, None], self._around(chosen)], axis=1))
+        return self._leave(chosen - incumbent, observation)
+
+    def answer(self, observation: ArrayLike) -> Array:
+        """Return the change of the log gains to stay with: it leads to a trial's gains, or to the rule's.
+
+        All axes of a lane stay with the same trial: that whose worst axis is best, of those that were not stopped. It
+        is asked instead of `act`, with the observation after the last trial, and raises what that does.
+        """
+        _, incumbent = self._take(observation)
+        median, scale = self._ask(self._read(), self._tried)
+        good = self._known & ~(self._showed[:, :, STOPPED] > 0.0).any(axis=-1)
+        value = np.where(good, median + self._caution * scale, np.inf)
+        lanes = len(np.atleast_2d(observation))
+        of_lanes = value.reshape(lanes, -1, value.shape[1]).max(axis=1)
+        chosen = _pick(self._tried, np.repeat(of_lanes, len(value) // lanes, axis=0))
+        return self._leave(chosen - incumbent, observation)
+
+    # --- what is remembered: the first trial of every machine is that of the rule's gains -----------------------------
+    def _forget(self, count: int) -> None:
+        self._context = np.zeros((count, CONTEXT), np.float32)
+        self._tried = np.zeros((count, 0, self._gains), np.float32)
+        self._showed = np.zeros((count, 0, SHOWN), np.float32)
+        self._known = np.zeros((count, 0), bool)
+
+    def _take(self, observation: ArrayLike) -> tuple[Array, Array]:
+        """Take note of the trial that was last; return the axes' observations and their incumbents' gains."""
+        given = np.asarray(observation, np.float32)
+        lanes = np.atleast_2d(given)
+        axes, rest = divmod(lanes.shape[1] - 1, self._entries)
+        if rest or not axes:
+            raise PolicyError(
+                f"the policy takes {self._entries} entries per axis and one more, not {lanes.shape[1]}; make the "
+                f"environment with the agent's configuration: {dict(self.bundle.configuration)}"
+            )
+        if not np.isfinite(lanes).all():
+            raise PolicyError("the observation holds what is no number: the policy was not asked")
+        each = lanes[:, :-1].reshape(-1, self._entries)
+        if len(self._known) != len(each):
+            self._forget(len(each))
+        G, at = self._gains, IDENTIFIED + 2 * self._gains
+        last, incumbent, shown = each[:, IDENTIFIED : IDENTIFIED + G], each[:, at - G : at], each[:, at : at + SHOWN]
+        number = self._known.sum(axis=1)
+        fresh = number == 0
+        self._context[fresh] = np.concatenate([each[:, :IDENTIFIED], shown], axis=1)[fresh]
+        if number.max() == self._known.shape[1]:
+            room = ((0, 0), (0, 1))
+            self._known = np.pad(self._known, room)
+            self._tried, self._showed = np.pad(self._tried, (*room, (0, 0))), np.pad(self._showed, (*room, (0, 0)))
+        every = np.arange(len(each))
+        self._known[every, number], self._tried[every, number], self._showed[every, number] = True, last, shown
+        return each, incumbent
+
+    # --- what the networks say ----------------------------------------------------------------------------------------
+    def _read(self) -> list[Memory]:
+        normal = self._normal
+        seen = normal.context(self._context), normal.gains(self._tried), normal.shown(self._showed)
+        return [network.read(*seen, self._known) for network in self._networks]
+
+    def _ask(self, memory: list[Memory], gains: Array) -> tuple[Array, Array]:
+        """Return median and scale for gains of shape (machines, n, gains): the networks' doubt adds to the scale."""
+        normal = self._normal.gains(gains)
+        told = [network.ask(one, normal) for network, one in zip(self._networks, memory, strict=True)]
+        medians, scales = np.stack([one[0] for one in told]), np.exp([one[1] for one in told])
+        return medians.mean(axis=0), scales.mean(axis=0) + medians.std(axis=0)
+
+    def _least(self, memory: list[Memory], candidates: Array) -> Array:
+        """Return the candidate to try of every machine, (machines, gains)."""
+        median, scale = self._ask(memory, candidates)
+        return _pick(candidates, median - self._curiosity * scale)
+
+    def _around(self, gains: Array) -> Array:
+        """Return candidates around gains of shape (machines, gains), within the range."""
+        return np.asarray(np.clip(gains[:, None] + self._near, self._low, self._high))
+
+    def _leave(self, change: Array, observation: ArrayLike) -> Array:
+        lanes = np.atleast_2d(observation)
+        action = np.clip(change, -self._step, self._step).astype(np.float32).reshape(len(lanes), -1)
+        return action[0] if np.ndim(observation) == 1 else action
+
+
+def _pick(gains: Array, value: Array) -> Array:
+    """Return the gains with the least value of every machine, (machines, gains)."""
+    return np.asarray(gains[np.arange(len(gains)), value.argmin(axis=1)], np.float32)

@@ -1,0 +1,205 @@
+"""A trained tuner at work on a target: the environment's trials on given drives, and a policy that chooses them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.policies.policy import load_policy
+from agents.shipped import TUNER, shipped
+
+if TYPE_CHECKING:
+    from agents.policies.guard import GuardLimits
+    from tuning.compare.tuners import Outcome
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+TRIAL_SECONDS = 0.75
+PATIENCE = 2  # windows of 25 ms for which an axis may shake; what it does with the incumbent then decays or does not
+
+
+class TrialShown(NamedTuple):
+    """A trial of every machine of a target.
+
+    number: 0 is the fitted rule's gains.
+    gains: Raw integers, (num_axes, 5) in the order of `Gains`.
+    measured: J by measured terms of the machine's worst axis, (num_machines,).
+    aborted, better: Whether it was stopped; whether it became the incumbent, (num_machines,).
+    faults: Names of emergencies, a tuple for each machine.
+    """
+
+    number: int
+    gains: Integers
+    measured: Floats
+    aborted: Mask
+    better: Mask
+    faults: tuple[tuple[str, ...], ...]
+
+
+class Tuned(NamedTuple):
+    """What came of it: the answer's gains, raw (num_axes, 5), all trials, and which of them each machine's answer was.
+
+    The answer is the policy's own choice (`answer`) where it makes one that was not stopped, else the best trial by
+    measured terms that was not; of a machine all of whose trials were stopped it is the first one, the fitted rule's.
+    overruled: Machines whose policy would have stayed with gains that were stopped.
+    """
+
+    gains: Integers
+    trials: tuple[TrialShown, ...]
+    answers: Integers
+    overruled: Mask
+
+    @property
+    def moves(self) -> int:
+        """How often each axis was moved."""
+        from tuning.search.trial_bench import MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL
+
+        return MOVES_OF_IDENTIFICATION + MOVES_OF_TRIAL * len(self.trials)
+
+
+def tune_target(
+    target: Target,
+    policy: Any,
+    *,
+    show: Callable[[TrialShown], None] = lambda trial: None,
+    trials: int | None = None,
+    calm: Integers | None = None,
+) -> Tuned:
+    """Let a policy for GainTuning tune a target; the drives have the answer's gains and are disabled afterwards.
+
+    Args:
+        target: The drives; they may have any gains, also none.
+        policy: What proposes, with its `bundle` for the configuration.
+        show: Called after every trial.
+        trials: How many; the agent's own number by default.
+        calm: Gains for an axis that shakes on though its trial was stopped, (num_axes, 5): the incumbent's, with which
+            it goes on, may be so near to the edge. By default those of the data sheet.
+
+    Raises:
+        PolicyStoppedError: If the policy gives no number, or no answer within the envelope's limit for a stall (on
+            emulated drives within `guard.PATIENT.stall`): the drives are at rest and disabled.
+        RuntimeError: If a drive cannot be cleared any more.
+    """
+    from agents.policies.guard import GuardedPolicy, stopping
+    from drive_env import motion
+    from drive_env.envs.gain_tuning import GainTuning
+    from drive_env.gains import write_gains
+    from tuning.auto.fallback_gains import CalmedDrives
+    from tuning.search.trial_bench import first_gains
+
+    axes = target.axes_per_machine
+    drives = CalmedDrives(target.drives, target.motor.rated_current, windows=PATIENCE)
+    drives.calm = first_gains(target) if calm is None else calm
+    configuration = dict(policy.bundle.configuration) | ({} if trials is None else {"trials": trials})
+    write_gains(drives, first_gains(target))  # before anything is enabled: the drives may have any
+    reach = np.where(target.high >= -target.low, target.high, target.low)
+    env = GainTuning(
+        target.num_axes // axes,
+        drives=drives,
+        reach=reach,
+        device=target.device.name,
+        motor=target.motor.name,
+        **{name: value for name, value in configuration.items() if name not in NOT_OF_DRIVES},
+    )
+    space: Any = env.single_action_space
+    watched = GuardedPolicy(policy, space.low, space.high, TRIAL_SECONDS, _limits_of(drives))
+    shown = []
+    try:
+        watched.warm_up(np.zeros(env.observation_space.shape or (), np.float32))
+        with stopping(drives):
+            observation, info = env.reset(seed=0)
+            watched.reset()
+            better = ~info["aborted"]
+            shown.append(
+                TrialShown(0, _flat(info["gains"]), info["measured"], info["aborted"], better, ((),) * env.num_envs)
+            )
+            show(shown[-1])
+            for number in range(1, env.config.trials + 1):
+                action = watched.act(observation)
+                before = info["measured"]
+                observation, _, terminated, _, info = env.step(action)
+                shown.append(
+                    TrialShown(
+                        number,
+                        _flat(info["trial_gains"]),
+                        info["trial_measured"],
+                        info["aborted"],
+                        info["measured"] < before,
+                        tuple(info["faults"]),
+                    )
+                )
+                show(shown[-1])
+                if terminated.all():
+                    names = ", ".join(shown[-1].faults[0]) or "it stays disabled"
+                    raise RuntimeError(f"the drive cannot be cleared after trial {number}: {names}")
+            answer = watched.answer(observation)
+            wanted = None if answer is None else _flat(env.gains_of(answer))
+            answers = np.array([_answer(shown, machine, axes, wanted) for machine in range(env.num_envs)])
+            gains = np.stack([shown[answers[axis // axes]].gains[axis] for axis in range(target.num_axes)])
+            motion.disable(drives)
+            write_gains(drives, gains)
+    finally:
+        watched.close()
+        env.close()
+    same = np.ones(target.num_axes, bool) if wanted is None else np.all(wanted == gains, axis=1)
+    overruled = np.logical_not(same.reshape(-1, axes).all(axis=1))
+    return Tuned(gains, tuple(shown), answers, overruled)
+
+
+def best_unstopped(trials: Sequence[TrialShown], machine: int) -> TrialShown | None:
+    """Return the trial of a machine that was best by measured terms, None if all were stopped."""
+    good = [trial for trial in trials if not trial.aborted[machine]]
+    return min(good, key=lambda trial: float(trial.measured[machine]), default=None)
+
+
+def _answer(trials: Sequence[TrialShown], machine: int, axes: int, wanted: Integers | None) -> int:
+    """Return the number of the trial that a machine stays with."""
+    own = slice(machine * axes, (machine + 1) * axes)
+    if wanted is not None:
+        for trial in trials:
+            if np.array_equal(trial.gains[own], wanted[own]) and not trial.aborted[machine]:
+                return trial.number
+    best = best_unstopped(trials, machine)
+    return 0 if best is None else best.number
+
+
+# Options of the environment that are of random machines, or that the target says.
+NOT_OF_DRIVES = ("distributions", "privileged", "stage", "load", "motor", "device", "travel", "friction", "num_threads")
+
+
+def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
+    """Tune a target with the agent that ships, as `drive-tune rank` wants it (entry point `drive_env.tuners`)."""
+    from tuning.compare.tuners import Outcome
+    from tuning.target import timed
+
+    with timed(target) as (watched, clock):
+        found = tune_target(watched, load_policy(shipped(TUNER)))
+    lanes = target.axes_per_machine
+    aborts = np.sum([trial.aborted for trial in found.trials], axis=0)
+    zero = np.zeros(target.num_axes, np.int64)
+    return Outcome(
+        found.gains,
+        np.full(target.num_axes, clock.seconds),
+        zero + found.moves,
+        np.repeat(aborts, lanes),
+        zero,
+        ("",) * target.num_axes,
+    )
+
+
+def _limits_of(drives: Any) -> GuardLimits:
+    """Return what a policy may do: it may stay at an end of its range, and think while an axis holds its position."""
+    from agents.policies.guard import PATIENT, GuardLimits
+
+    envelope = getattr(drives, "safety", None)
+    return PATIENT if envelope is None else GuardLimits(saturation=None, stall=envelope.limits.stall)
+
+
+def _flat(gains: NDArray[Any]) -> Integers:
+    return np.asarray(gains, np.int64).reshape(-1, gains.shape[-1])

@@ -1,0 +1,130 @@
+"""A whole run of a trained tuner on a drive: auto's, with the agent's trials in place of its search."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.tuner.tune_target import TrialShown, best_unstopped, tune_target
+
+if TYPE_CHECKING:
+    from tuning.auto.result import Result
+    from tuning.auto.run import Run as AutoRun
+    from tuning.certificate.certificate import Certificate
+    from tuning.target import Target
+
+Integers = NDArray[np.int64]
+
+
+class Run(NamedTuple):
+    """What became of a target: the result, its certificate, and the agent's trials."""
+
+    result: Result
+    certificate: Certificate
+    trials: tuple[TrialShown, ...]
+
+
+def run(
+    target: Target,
+    policy: Any,
+    file: Path,
+    *,
+    name: str,
+    keep: bool = True,
+    show: Callable[[TrialShown], None] = lambda trial: None,
+    say: Callable[[str], None] = lambda what: None,
+    files: Callable[[Certificate], AbstractContextManager[object]] = nullcontext,
+) -> Run:
+    """Tune a target; gains that fail a check are rolled back, and the result says why.
+
+    What raises leaves the drives with what they had, at rest and disabled.
+
+    Args:
+        target: The drives.
+        policy: A policy for GainTuning.
+        file: Where the state before is left, for `drive-tune undo`.
+        name: Of the agent, for the certificate.
+        keep: Whether drives on a bus keep the gains over a power cycle.
+        show: Called after every trial.
+        say: Called with what is under way.
+        files: Writes the certificate down, before the drives keep the gains; its files vanish if the block in it fails.
+
+    Raises:
+        PolicyError: If the policy gives no number; BusError, RuntimeError or TimeoutError for the drives; OSError for
+            a file that cannot be written.
+    """
+    from tuning.auto.certify import certificate
+    from tuning.auto.one_button import prove_found
+
+    trials: list[TrialShown] = []
+
+    def tried(trial: TrialShown) -> None:
+        trials.append(trial)
+        show(trial)
+
+    def find(run: AutoRun, _: Any) -> None:
+        say("trials")
+        _try(run, policy, tried)
+
+    def told(what: str, share: float) -> None:
+        if share < 1.0:
+            say(what)
+
+    certificates: list[Certificate] = []
+
+    def written(result: Result) -> AbstractContextManager[object]:
+        certificates.append(certificate(target, result, 0, tuner=f"agent {name}"))
+        return files(certificates[0])
+
+    result = prove_found(target, file, find, keep=keep, progress=told, budget=math.inf, files=written)
+    return Run(result, certificates[0], tuple(trials))
+
+
+def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
+    """Have the policy make its trials; leave its answer, what was second best, and where moves go on from."""
+    from dataclasses import replace
+
+    from drive_env.safety.envelope import SafetyError, swinging_allowed
+    from tuning.auto.proving import ProvingGround
+    from tuning.auto.trials import BY_TRIAL, watch_following
+
+    target, going = run.target, run.going
+    if not going.all():
+        run.stop(going, "another axis was refused, and an agent tunes all of them or none")
+        return
+    low, high = run.room()
+    try:
+        # The trials stop by themselves what oscillates, within 50 ms, and go on.
+        with run.spending(going), swinging_allowed(target.drives):
+            tuned = tune_target(replace(target, low=low, high=high), policy, show=show, calm=run.fallbacks[-1])
+    except SafetyError as error:
+        run.stop(going, f"the envelope stopped the trials: {error}")
+        return
+    lanes = target.axes_per_machine
+    run.gains = tuned.gains
+    run.ground = ground = ProvingGround(
+        target, [axis.plant for axis in run.axes], run.room(), run.fallbacks[-1], run.reference
+    )
+    ground.aborts += np.repeat(np.sum([trial.aborted for trial in tuned.trials], axis=0), lanes)
+    ground.moves += tuned.moves
+    watch_following(run, going)
+    for machine in range(target.num_axes // lanes):
+        own = slice(machine * lanes, (machine + 1) * lanes)
+        answer = tuned.trials[int(tuned.answers[machine])]
+        if answer.aborted[machine]:
+            run.stop(np.arange(target.num_axes) // lanes == machine, "every trial was stopped, the fitted rule's too")
+            continue
+        others = [trial for trial in tuned.trials if not np.array_equal(trial.gains[own], tuned.gains[own])]
+        second = best_unstopped(others, machine)
+        if second is not None:
+            run.spare[own] = second.gains[own]
+        for axis in run.axes[own]:
+            axis.proof, axis.verified = float(answer.measured[machine]), BY_TRIAL
+            if tuned.overruled[machine]:
+                axis.notes.append("the agent's own answer was stopped when it was tried: the best trial that was not")

@@ -1,0 +1,146 @@
+"""`drive-env check-model`: a recorded move against emulated machines, and the machines that would respond like it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from drive_env.commands.options import DeviceName, Json, check_free, errors_as_exit_codes, print_json
+from drive_env.commands.tables import print_lines
+
+if TYPE_CHECKING:
+    from drive_env.dictionary.entries import ObjectDictionary
+    from drive_env.trials.replay import Difference, Fit
+
+LEAST = 16  # machines that a fit needs
+
+
+def check_model(
+    log: Annotated[Path, typer.Argument(help="Log of a move from rest, as `scope` writes it (CSV).")],
+    device: DeviceName = "tmcm1636",
+    motor: Annotated[str, typer.Option(help="Motor by name.")] = "qbl4208",
+    load: Annotated[str, typer.Option(help="Load: a name, or the path of an MJCF.")] = "two_mass",
+    settings: Annotated[
+        Path | None, typer.Option(help="Parameters of the real drive, as `backup` writes them (TOML); give them.")
+    ] = None,
+    fit: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fit",
+            "-f",
+            help="Parameter to fit to the log: load.inertia, motor.coulomb, ...; may be repeated. '?' lists "
+            "those that the load has.",
+        ),
+    ] = None,
+    distributions: Annotated[
+        str | None,
+        typer.Option(help="Set of laws (a name, or a TOML file) in which to look for it.", show_default="the load's"),
+    ] = None,
+    machines: Annotated[int, typer.Option(help=f"Machines tried at a time in a fit, {LEAST} or more.")] = 64,
+    rounds: Annotated[int, typer.Option(help="Rounds of a fit.")] = 4,
+    seed: Annotated[int, typer.Option(help="Seed of a fit, and of the machines' noise.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="New file for the fitted set of laws (TOML).")] = None,
+    json: Json = False,
+) -> None:
+    """Repeat a recorded move on the emulated machine and tell how far its response lies from the log.
+
+    With --fit the parameters are drawn from their laws until machines respond like the log; --out writes their range as
+    a set of laws that environments take.
+    """
+    with errors_as_exit_codes():
+        if out is not None and not fit:
+            raise ValueError("--out is for the fitted laws; name what to fit with --fit")
+        if fit and machines < LEAST:
+            raise ValueError(f"--machines {machines} is too few for a fit; give {LEAST} or more")
+        if rounds < 1:
+            raise ValueError(f"--rounds {rounds} must be 1 or more")
+        if out is not None and not out.absolute().parent.is_dir():
+            raise ValueError(f"the folder {out.parent} does not exist; create it")
+        if out is not None:
+            check_free(out, "choose another --out")
+        from drive_env.trials.replay import read_log
+
+        recorded = read_log(log)
+        # The compiler is imported from here on: a mistake above is told at once.
+        from drive_env.commands.parameters import load_parameters
+        from drive_env.emulator.emulated_drives import EmulatedDrives
+        from drive_env.envs.randomisation import Distributions
+        from drive_env.trials.replay import compare as differences
+        from drive_env.trials.replay import fit as fitted
+        from drive_env.trials.replay import fittable, replay
+        from drive_env.whole_file import write_whole
+
+        laws = Distributions.load(distributions or load) if fit else None
+        if laws is not None and "?" in (fit or ()):
+            names = fittable(laws)
+            print_json({"parameters": names}) if json else print_lines([f"{load} has {', '.join(names)}"])
+            return
+        with EmulatedDrives(device, load, motor, machines if fit else 1, seed) as drives:
+            dictionary = drives.device.new_dictionary()
+            given = None if settings is None else load_parameters(settings, dictionary)
+            report = differences(recorded, replay(drives, recorded, given), drives.num_machines)
+            found = None
+            if laws is not None and fit:
+                found = fitted(drives, recorded, laws, fit, settings=given, rounds=rounds, seed=seed)
+        if found is not None and out is not None:
+            write_whole(out, found.to_toml())
+        if json:
+            print_json(_as_json(report, dictionary, found, out))
+        else:
+            _print(report, dictionary, found, out)
+
+
+def _print(report: Mapping[Any, Difference], dictionary: ObjectDictionary, found: Fit | None, out: Path | None) -> None:
+    for key, row in report.items():
+        late = float(row.shift[0]) * 1e3
+        how = "in time" if abs(late) < 0.05 else f"{abs(late):.1f} ms {'late' if late > 0.0 else 'early'}"
+        print(
+            f"{dictionary.find(key).label}: off by {100.0 * row.nrmse[0]:.2f} % of its range (RMS); {how}, "
+            f"{100.0 * row.shifted[0]:.2f} % without that"
+        )
+    if found is None:
+        return
+    print(
+        f"fitted: {100.0 * found.distance[0]:.2f} % on average with the best machine, "
+        f"{100.0 * found.nominal:.2f} % with the nominal one; {len(found.distance)} machines respond alike"
+    )
+    for name, values in found.accepted.items():
+        unseen = "" if found.is_seen(name) else ": the log does not show it"
+        print(f"{name}: best {values[0]:.4g}, {values.min():.4g} to {values.max():.4g}{unseen}")
+    if out is not None:
+        print(f"laws written to {out}")
+
+
+def _as_json(
+    report: Mapping[Any, Difference], dictionary: ObjectDictionary, found: Fit | None, out: Path | None
+) -> dict[str, Any]:
+    told: dict[str, Any] = {
+        "differences": {
+            dictionary.find(key).label: {
+                "nrmse": float(row.nrmse[0]),
+                "shift_s": float(row.shift[0]),
+                "nrmse_shifted": float(row.shifted[0]),
+            }
+            for key, row in report.items()
+        }
+    }
+    if found is not None:
+        told["fit"] = {
+            "nominal": found.nominal,
+            "best": float(found.distance[0]),
+            "machines": len(found.distance),
+            "parameters": {
+                name: {
+                    "best": float(values[0]),
+                    "low": float(values.min()),
+                    "high": float(values.max()),
+                    "seen": found.is_seen(name),
+                }
+                for name, values in found.accepted.items()
+            },
+            "file": None if out is None else str(out),
+        }
+    return told

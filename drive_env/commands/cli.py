@@ -1,0 +1,69 @@
+"""The command `drive-env`: it only puts together what lies beside it, one file per command or family."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from drive_env.commands.check_model import check_model
+from drive_env.commands.compiling import compile_kernels
+from drive_env.commands.fault import fault
+from drive_env.commands.get import get, set_object
+from drive_env.commands.jog import jog
+from drive_env.commands.log import log, replay
+from drive_env.commands.monitor import monitor
+from drive_env.commands.names import list_names
+from drive_env.commands.options import INTERRUPTED
+from drive_env.commands.parameters import backup, commission, diff, restore
+from drive_env.commands.program import Quiet, Verbose, Version, say_as_much
+from drive_env.commands.render import render
+from drive_env.commands.scan import scan
+from drive_env.commands.scope import scope
+from drive_env.commands.serve import serve
+
+app = typer.Typer(
+    name="drive-env",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+PANELS = {
+    "Drives on a bus": (
+        ("scan", scan),
+        ("get", get),
+        ("set", set_object),
+        ("monitor", monitor),
+        ("scope", scope),
+        ("jog", jog),
+    ),
+    "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
+    "This installation": (("list", list_names), ("compile", compile_kernels)),
+    "Frames": (("log", log), ("replay", replay)),
+    "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("check-model", check_model)),
+}
+for panel, commands in PANELS.items():
+    for name, function in commands:
+        app.command(name, rich_help_panel=panel)(function)
+
+
+@app.callback()
+def drive_env(version: Version = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
+    """Servo drives: real ones and emulated ones, over CAN.
+
+    Interface, channel and time-out may stand in DRIVE_ENV_INTERFACE, DRIVE_ENV_CHANNEL and DRIVE_ENV_TIMEOUT, the token
+    of a hub that asks for one in DRIVE_ENV_TOKEN. Exit codes: 0 done, 1 the drive or the bus said no (or differs), 2 a
+    mistake in the command, 130 Ctrl-C, 141 nobody takes the output any more.
+    """
+    say_as_much(quiet, verbose)
+
+
+def main() -> None:
+    """Run the command; Ctrl-C ends it with 130."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        print("drive-env: interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)

@@ -1,0 +1,68 @@
+"""`drive-env compile`: compile the kernels ahead, for a computer on which the first result is not to wait for that."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from drive_env.commands.options import Json, errors_as_exit_codes, print_json, progress_on
+
+
+def compile_kernels(json: Json = False) -> None:
+    """Compile the kernels and keep them, so that no program waits half a minute for its first result.
+
+    Once is enough for an installation: kernels are kept in the user's cache, or in DRIVE_ENV_CACHE, under a hash of
+    the sources that they are made from. Workers of a cluster, and a container's image, want it done ahead.
+    """
+    from rich.console import Console
+
+    from mechanics.compiled import user_cache_folder
+
+    with errors_as_exit_codes():
+        folder = user_cache_folder()
+        before, began = set(folder.rglob("*.kernel")), time.monotonic()
+        with progress_on(Console(stderr=True), transient=True) as progress:
+            task = progress.add_task("", total=float(len(STEPS)))
+            for name, use in STEPS.items():
+                progress.update(task, description=f"kernels of {name}")
+                use()
+                progress.advance(task)
+        after = set(folder.rglob("*.kernel"))
+        if not after:
+            raise OSError(f"no kernel could be kept in {folder}; name a folder that can be written in DRIVE_ENV_CACHE")
+        compiled = len(after - before)
+        seconds = time.monotonic() - began
+    if json:
+        print_json({"compiled": compiled, "seconds": round(seconds, 1), "folder": str(folder)})
+    elif compiled:
+        print(f"compiled {compiled} kernels in {seconds:.0f} s; they are kept in {folder}")
+    else:
+        print(f"nothing to compile: the kernels of these sources are in {folder}")
+
+
+def _use_drives() -> None:
+    """Run emulated drives as every program does; the third call of `record` is a prepared one."""
+    from drive_env import EmulatedDrives, motion
+
+    with EmulatedDrives() as drives:
+        motion.enable(drives, "csv")
+        for _ in range(3):
+            drives.record(["Statusword"], 0.002, play={"Target velocity": [0, 0]})
+
+
+def _use_environments() -> None:
+    """Take a step in lanes whose bus is late."""
+    import gymnasium
+    import numpy as np
+
+    import drive_env.envs  # noqa: F401  # it registers them
+
+    with_delays = gymnasium.make_vec("ServoDrive/Tracking-v0", num_envs=2, distributions="two_mass")
+    try:
+        with_delays.reset(seed=0)
+        with_delays.step(np.zeros(with_delays.action_space.shape, np.float32))
+    finally:
+        with_delays.close()
+
+
+STEPS: dict[str, Callable[[], None]] = {"emulated drives": _use_drives, "environments": _use_environments}

@@ -1,0 +1,106 @@
+"""`drive-env fault`: let something fail on a bus that `drive-env serve` serves."""
+
+from __future__ import annotations
+
+import shlex
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from drive_env.commands.options import Json, ending_by, fail, print_json
+from drive_env.commands.tables import print_lines
+
+if TYPE_CHECKING:
+    from drive_env.faults.table import Row
+
+CONTROL_PORT = 29637  # of faults/control.py, whose import takes long
+
+
+def fault(
+    name: Annotated[str | None, typer.Argument(help="Fault by name; --list tells which there are.")] = None,
+    numbers: Annotated[
+        list[str] | None, typer.Argument(metavar="[PARAMETER=VALUE]...", help="Numbers of the fault, as share=0.2.")
+    ] = None,
+    at: Annotated[float, typer.Option(help="Time from now, or from when the condition holds [s].")] = 0.0,
+    when: Annotated[
+        str, typer.Option(help="Condition: enabled, or as 'speed > 100' [rad/s], 'position < -3' [rad] of the rotor.")
+    ] = "",
+    duration: Annotated[
+        float | None, typer.Option(help="How long it lasts [s].", show_default="until it is cleared")
+    ] = None,
+    node: Annotated[
+        int | None, typer.Option("--node", "-n", help="Node that it is of.", show_default="the only one")
+    ] = None,
+    control: Annotated[int, typer.Option(help="Port of serve's --control.")] = CONTROL_PORT,
+    table: Annotated[bool, typer.Option("--list", help="Print the table of faults, and end.")] = False,
+    status: Annotated[
+        bool, typer.Option("--status", help="Print the faults that are still to come or are there.")
+    ] = False,
+    clear: Annotated[str | None, typer.Option(help="End the fault of this number, or all.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Let something fail on emulated drives: sensor, motor, supply, load, bus or node.
+
+    They are served with --control; `drive-env fault encoder_stuck --at 2 --duration 0.1` prints the fault's number.
+    What each does, what the drive and its master make of it, and the way back are in docs/faults.md.
+    """
+    from drive_env.faults.control import ControlError, ask
+    from drive_env.faults.schedule import parse_order
+    from drive_env.faults.table import checked_parameters, find_fault
+
+    with ending_by(fail, refused=(ControlError,)):
+        if sum((name is not None, table, status, clear is not None)) != 1:
+            raise ValueError("say one of a fault's name, --list, --status and --clear NUMBER")
+        if table:
+            _print_table(as_json)
+        elif status:
+            _print_status(ask(control, "faults")["faults"], as_json)
+        elif clear is not None:
+            ask(control, f"clear {clear}")
+        else:
+            given = {"at": at, "duration": duration, "node": node}
+            words = [
+                str(name),
+                *(numbers or []),
+                *(f"{key}={value}" for key, value in given.items() if value is not None),
+            ]
+            words += [f"when={when}"] if when else []
+            line = shlex.join(words)
+            order = parse_order(line)  # what cannot be understood is told here, with or without a server
+            checked_parameters(find_fault(order.name), order.parameters)
+            number = ask(control, f"fault {line}")["number"]
+            print_json({"number": number}) if as_json else print(number)
+
+
+def _print_table(as_json: bool) -> None:
+    from drive_env.faults.table import FAULTS
+
+    if as_json:
+        print_json({row.name: _row(row) for row in FAULTS.values()})
+        return
+    group = ""
+    for row in FAULTS.values():
+        if row.group != group:
+            group = row.group
+            print(f"{group}:")
+        print(f"  {row.name:<20} {row.title}")
+        for key, parameter in row.parameters.items():
+            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            limits = f"{parameter.low:g}...{parameter.high:g}{unit}, default {parameter.default:g}"
+            print_lines([f"    {key}: {parameter.meaning} ({limits})"])
+
+
+def _row(row: Row) -> dict[str, Any]:
+    return vars(row) | {"parameters": {key: vars(parameter) for key, parameter in row.parameters.items()}}
+
+
+def _print_status(faults: list[dict[str, Any]], as_json: bool) -> None:
+    if as_json:
+        print_json(faults)
+        return
+    for one in faults:
+        where = "" if one["node"] is None else f" node {one['node']}"
+        given = "".join(f" {key}={value:g}" for key, value in one["parameters"].items())
+        lasts = "for ever" if one["duration"] is None else f"for {one['duration']:g} s"
+        state = "is there" if one["active"] else "is to come"
+        print_lines([f"{one['number']}: {one['name']}{where}{given}, {lasts}, {state}"])

@@ -1,0 +1,199 @@
+"""`drive-env get` and `drive-env set`: single objects, by index, index:sub-index or name."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from drive_env.commands.options import (
+    REFUSED,
+    Bitrate,
+    Channel,
+    DeviceName,
+    Eds,
+    Interface,
+    Json,
+    Nodes,
+    Timeout,
+    WouldDo,
+    Yes,
+    ask,
+    axis_name,
+    axis_place,
+    connect,
+    errors_as_exit_codes,
+    fail,
+    increments_per_revolution,
+    look_first,
+    object_name,
+    print_json,
+)
+
+if TYPE_CHECKING:
+    from drive_env.dictionary.entries import Entry
+    from drive_env.master.can_drives import CanDrives
+
+CONTROLWORD, STATUSWORD = 0x6040, 0x6041
+Raw = Annotated[bool, typer.Option("--raw", help="Integers as the wire carries them, without units.")]
+
+
+def get(
+    objects: Annotated[list[str], typer.Argument(help="6041, 607D:1 (hexadecimal) or 'Velocity actual value'.")],
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    raw: Raw = False,
+    json: Json = False,
+) -> None:
+    """Read objects over SDO and show them with their units."""
+    with (
+        errors_as_exit_codes(),
+        connect(interface, channel, node, device, eds, bitrate=bitrate, timeout=timeout, safety=False) as drives,
+    ):
+        entries = [drives.description.dictionary.find(object_name(name)) for name in objects]
+        increments = [None] * drives.num_axes if raw else increments_per_revolution(drives)
+        rows = []
+        for entry in entries:
+            for axis, value in enumerate(drives.read((entry.index, entry.sub))):
+                rows.append((axis, entry, value, increments[axis]))
+        if json:
+            print_json([axis_place(drives, axis) | _row(*row) for axis, *row in rows])
+            return
+        for axis, entry, value, scale in rows:
+            print(f"{axis_name(drives, axis)}  {entry.label} = {_text(value, entry, scale, raw)}")
+
+
+def set_object(
+    name: Annotated[str, typer.Argument(metavar="OBJECT", help="2042:1 (hexadecimal) or 'Profile velocity'.")],
+    value: Annotated[str, typer.Argument(help="An integer, or a quantity: '1000 rpm', '7 A', '0.5 rev', '20 ms'.")],
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    raw: Raw = False,
+    yes: Yes = False,
+    json: Json = False,
+    dry_run: WouldDo = False,
+) -> None:
+    """Write an object over SDO, read it back and show what it is now.
+
+    Put -- before a negative value: drive-env set 60FF -- -1000. Where an axis is live it asks first. A controlword that
+    enables is refused, since nobody would watch the motor; one that stops (0, 2, 6, 7) always goes through.
+    """
+    from drive_env.master import quantities
+    from drive_env.master.parameters import command, of_first_axis
+
+    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
+    with errors_as_exit_codes(), ExitStack() as stack:
+        if dry_run:
+            look_first(interface, channel, node or [1], bitrate, device, eds, timeout)
+        drives = stack.enter_context(connect(interface, channel, node, device, eds, **options))
+        entry = drives.description.dictionary.find(object_name(name))
+        is_controlword = of_first_axis(entry.index) == CONTROLWORD
+        # A controlword has no unit, and one that stops is not kept waiting for what one would need.
+        increments = [None] * drives.num_axes if raw or is_controlword else increments_per_revolution(drives)
+        wanted: list[Any] = [value] * drives.num_axes
+        if drives.description.is_number(entry):
+            wanted = [
+                quantities.parse_raw(value, entry) if raw else quantities.parse(value, entry, scale)
+                for scale in increments
+            ]
+        if is_controlword:
+            _refuse_to_enable(entry, wanted[0])
+        if dry_run:
+            _tell_plan(drives, entry, wanted, increments, value, raw=raw, json=json)
+            return
+        if not is_controlword:
+            _ask_where_live(drives, f"{entry.label} = {value}", yes)
+        drives.write((entry.index, entry.sub), wanted if drives.description.is_number(entry) else value)
+        rows = []
+        readable = entry.access != "wo"
+        found = drives.read((entry.index, entry.sub)) if readable else wanted
+        for axis in range(drives.num_axes):
+            rows.append((axis, entry, found[axis], increments[axis]))
+        if json:
+            print_json([axis_place(drives, axis) | _row(*row) for axis, *row in rows])
+        else:
+            for axis, _, now, scale in rows:
+                print(f"{axis_name(drives, axis)}  {entry.label} = {_text(now, entry, scale, raw)}")
+        differs = readable and any(a != b for a, b in zip(found, wanted, strict=True))
+        # Stores and the like take a signature and read something else.
+        if differs and not command(entry.index, drives.description.hints).endswith("a service"):
+            fail(f"{entry.label} does not read back as it was written ({wanted[0]})", REFUSED)
+
+
+def _tell_plan(
+    drives: CanDrives, entry: Entry, wanted: list[Any], increments: list[Any], text: str, *, raw: bool, json: bool
+) -> None:
+    """Say what the drive has, and what would be written; raises for a value that the object cannot take."""
+    from drive_env.dictionary.access import check_limits, check_writable
+
+    check_writable(entry)
+    is_number = drives.description.is_number(entry)
+    for one in wanted if is_number else []:
+        check_limits(entry, one)
+    found = drives.read((entry.index, entry.sub)) if entry.access != "wo" else [None] * drives.num_axes
+    if json:
+        rows = [
+            axis_place(drives, axis) | {"object": f"{entry.index:04X}h:{entry.sub:02X}", "is": found[axis],
+                                        "would be": wanted[axis]}
+            for axis in range(drives.num_axes)
+        ]  # fmt: skip
+        print_json(rows)
+        return
+    for axis, scale in enumerate(increments):
+        now = "" if found[axis] is None else f" is {_text(found[axis], entry, scale, raw)};"
+        then = _text(wanted[axis], entry, scale, raw) if is_number else text
+        print(f"{axis_name(drives, axis)}  {entry.label}{now} {then} would be written; nothing was")
+
+
+def _refuse_to_enable(entry: Any, controlword: int) -> None:
+    """Raise ValueError for a controlword that would enable: this command ends, and nothing watches then."""
+    from drive_env import motion
+
+    if motion.is_enabling(controlword):
+        raise ValueError(
+            f"{entry.label} = {controlword} would enable the axis, and this command ends right after: nobody would "
+            "watch the motor. Turn it with `drive-env jog`, or from Python with CanDrives; to stop it, set 2 or 0"
+        )
+
+
+def _ask_where_live(drives: Any, what: str, yes: bool) -> None:
+    """Have the user agree to a write where a drive may turn its motor; `ask` raises otherwise."""
+    from drive_env import motion
+
+    status = [int(word) for word in drives.read(STATUSWORD)]
+    live = [f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if motion.is_live(word)]
+    if live:
+        who = ", ".join(live)
+        ask(f"{who} is live by its statusword, and obeys at once (to stop it, set 6040 to 2). Write {what}?", yes)
+
+
+def _row(entry: Any, value: Any, increments: float | None) -> dict[str, Any]:
+    from drive_env.master import quantities
+
+    row = {"index": f"{entry.index:04X}", "sub": entry.sub, "name": entry.name, "raw": value}
+    if not isinstance(value, str):
+        row["unit"] = entry.unit
+        row["text"] = quantities.show(int(value), entry, increments)
+    return row
+
+
+def _text(value: Any, entry: Any, increments: float | None, raw: bool) -> str:
+    from drive_env.master import quantities
+
+    if isinstance(value, str):
+        return str(value)
+    if raw or entry.bits is None:
+        return str(value)
+    text = quantities.show(int(value), entry, increments)
+    return text if entry.unit else f"{text} ({int(value) & (1 << entry.bits) - 1:X}h)"

@@ -1,0 +1,257 @@
+"""`drive-env jog`: turn an axis, by hand so to speak."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from drive_env.commands.options import (
+    REFUSED,
+    Bitrate,
+    Channel,
+    DeviceName,
+    Eds,
+    Interface,
+    Json,
+    Timeout,
+    WouldDo,
+    connect,
+    errors_as_exit_codes,
+    fail,
+    increments_per_revolution,
+    look_first,
+    object_name,
+    print_json,
+)
+from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
+
+Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
+TARGET_VELOCITY, PROFILE_VELOCITY, TARGET_POSITION, POSITION = 0x60FF, 0x6081, 0x607A, 0x6064
+ACCELERATION, STATUSWORD, CONTROLWORD = 0x6083, 0x6041, 0x6040
+DEFAULT_KEYS = [(int(name, 16), 0) for name in DEFAULT]
+CYCLE = 0.001  # s between two samples
+FIRST, LAST = 20, 500  # samples at rest before a movement that is recorded, and besides the time that it should take
+RELATIVE, NEW_SET_POINT = 0x4F, 0x10  # controlword: enabled, targets are relative; and bit 4
+INTERNAL_LIMIT = 0x0800  # bit 11 of the statusword
+LOOK, STANDS = 0.2, 0.05  # s between two looks, and the share of the speed asked for below which an axis stands
+LEAST, ENOUGH = 0.01, 0.9  # of the way asked for: less is no movement, and less with an emergency was stopped by that
+
+
+def jog(
+    speed: Annotated[str, typer.Argument(help="Speed: '100 rpm', '1 rev/s', or an integer of the drive's unit.")],
+    duration: Annotated[float, typer.Option("--for", help="How long, without --by [s].")] = 1.0,
+    by: Annotated[str | None, typer.Option(help="How far: '1 rev', '-90 deg', or increments; then it stops.")] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Node = 1,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    max_current: Annotated[
+        str | None, typer.Option(help="Limit of the current, which the drive holds; by default the drive's own.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Record the movement, as scope does: new files OUT.csv and OUT.png."),
+    ] = None,
+    json: Json = False,
+    dry_run: WouldDo = False,
+) -> None:
+    """Enable an axis, turn it for a while or by a distance, and switch it off again.
+
+    The safety envelope is on: Ctrl-C, a passed limit and a dead process all end in a quick stop. A negative speed
+    turns back: drive-env jog -- '-100 rpm'. Ends with 1 where something stopped it, or nothing moved.
+    """
+    with errors_as_exit_codes():
+        from drive_env import motion
+        from drive_env.dictionary.access import check_limits
+        from drive_env.master import quantities
+        from drive_env.master.description import describe
+        from drive_env.safety.limits import Limits
+
+        known = describe(device, eds).dictionary
+        current = None if max_current is None else quantities.parse(max_current, known.find(0x6077), None)
+        if current is not None and current <= 0:
+            raise ValueError(f"--max-current {max_current} must be above 0 A; leave it out for the drive's own limit")
+        if not 0.001 <= duration <= 3600.0:
+            raise ValueError(f"--for {duration:g} s must be at least 0.001 s and at most an hour")
+        files = None if out is None else new_files(out)
+        options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout}
+        if dry_run:
+            look_first(interface, channel, [node], bitrate, device, eds, timeout)
+        with connect(interface, channel, [node], device, eds, safety=Limits(current=current), **options) as drives:
+            scale = increments_per_revolution(drives)[0]
+            velocity = quantities.parse(speed, known.find(TARGET_VELOCITY), scale)
+            if velocity == 0:
+                raise ValueError("a speed of 0 turns nothing; give one, e.g. '60 rpm'")
+            distance = None if by is None else quantities.parse(by, known.find(TARGET_POSITION), scale)
+            # Told before the axis is enabled.
+            check_limits(known.find(TARGET_VELOCITY), velocity)
+            check_limits(known.find(TARGET_POSITION), distance or 0)
+            if drives.description.has(ACCELERATION) and int(drives.read(ACCELERATION)[0]) == 0:
+                raise ValueError(
+                    "the drive's profile acceleration 6083h is 0, so nothing would move; set it "
+                    "(drive-env set 6083 '500 rev/s^2'), or commission the drive"
+                )
+            start = int(drives.read(POSITION)[0])
+            if dry_run:
+                _tell_plan(motion, drives, speed, by, duration, start, scale, json=json)
+                return
+            reasons: list[str] = []
+            trace: Any = None
+            with _what_stops(reasons):
+                if distance is None:
+                    trace = _turn(motion, drives, velocity, round(duration, 3), files is not None)
+                else:
+                    trace = _go(motion, drives, abs(velocity), distance, files is not None)
+            with _what_stops([]):
+                motion.disable(drives)
+            drives.advance(0.1)
+            moved = int(drives.read(POSITION)[0]) - start
+            emergencies = [message._asdict() for message in drives.emergencies()]
+            if files is not None and trace is not None:
+                entries = [known.find(object_name(name)) for name in DEFAULT]
+                rows = {entry: trace[entry.index, entry.sub] for entry in entries}
+                write_table(files[0], entries, [""], trace.t, rows)
+                draw(files[1], entries, [""], [scale], trace.t, rows)
+        stopped = _verdict(moved, velocity * duration if distance is None else distance, reasons, emergencies)
+        if json:
+            print_json({"moved": moved, "start": start, "emergencies": emergencies, "stopped": stopped})
+        else:
+            print(f"node {node} moved by {quantities.show(moved, known.find(POSITION), scale)}")
+            for message in emergencies:
+                print(f"emergency {_told(message)}")
+            if files is not None:
+                print("nothing was recorded" if trace is None else f"recorded in {files[0]} and {files[1]}")
+        if stopped:
+            fail(stopped, REFUSED)
+
+
+@contextlib.contextmanager
+def _what_stops(reasons: list[str]) -> Iterator[None]:
+    """Note what ends a movement early, in words of this command; what the bus says is none of it."""
+    from drive_env.master.errors import BusError
+    from drive_env.safety.envelope import SafetyError
+
+    try:
+        yield
+    except BusError:
+        raise
+    except SafetyError as error:
+        reasons.append(str(error).replace("Limits(current=...)", "--max-current").partition(", or set Limits(")[0])
+    except (RuntimeError, TimeoutError) as error:  # motion's, whose remedies are Python's
+        reasons.append(str(error).partition(";")[0])
+
+
+def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dict[str, Any]]) -> str:
+    """Return why a movement was not what was asked for; "" where it was."""
+    share = moved / asked
+    told = [_told(message) for message in emergencies if message["code"]]
+    if told and (reasons or share < ENOUGH):
+        return f"it was stopped: emergency {', '.join(dict.fromkeys(told))}{''.join(f'; {one}' for one in reasons)}"
+    if reasons:
+        return "; ".join(reasons)
+    if share < LEAST:
+        return (
+            "it hardly moved, and the drive names no reason: look for a brake, a load that is stuck, a limit of "
+            "current (--max-current, 2003h) or a small profile acceleration (6083h)"
+        )
+    return ""
+
+
+def _told(message: dict[str, Any]) -> str:
+    return f"{message['code']:04X}h {message['name'].replace('_', ' ')}"
+
+
+def _tell_plan(
+    motion: Any,
+    drives: Any,
+    speed: str,
+    by: str | None,
+    duration: float,
+    start: int,
+    scale: float | None,
+    *,
+    json: bool,
+) -> None:
+    """Say where the axis is and what would be done; raises for one in fault, which could not be enabled."""
+    from drive_env.master import quantities
+
+    status = int(drives.read(STATUSWORD)[0])
+    mask, fault = motion.FAULT_BIT
+    if status & mask == fault:
+        raise RuntimeError(f"the drive is in fault ({status:04X}h) and would not be enabled; reset it first")
+    what = f"turn at {speed} for {duration:g} s" if by is None else f"turn by {by} at {speed}"
+    if json:
+        print_json({"would": what, "start": start, "statusword": status, "moved": 0})
+        return
+    here = quantities.show(start, drives.description.dictionary.find(POSITION), scale)
+    print(
+        f"node {drives.nodes[0]} is at {here} ({status:04X}h) and would be enabled, {what}, and be switched off again; "
+        "nothing was done"
+    )
+
+
+def _turn(motion: Any, drives: Any, velocity: int, duration: float, is_recorded: bool) -> Any:
+    """Turn in pv, then let the drive brake with its own deceleration; return the samples that were wanted of it."""
+    motion.enable(drives, mode="pv")
+    trace = None
+    if is_recorded:
+        rows = [0] * FIRST + [velocity] * round(duration / CYCLE) + [0] * LAST
+        trace = drives.record(DEFAULT_KEYS, len(rows) * CYCLE, play={TARGET_VELOCITY: rows})
+    else:
+        drives.write(TARGET_VELOCITY, velocity)
+        drives.advance(duration)
+    drives.write(TARGET_VELOCITY, 0)
+    # Bit 10 in pv tells that the ramp has ended.
+    motion.wait_for(drives, motion.TARGET_REACHED, 10.0, "standstill")
+    drives.advance(0.05)
+    return trace
+
+
+def _go(motion: Any, drives: Any, velocity: int, distance: int, is_recorded: bool) -> Any:
+    """Move in pp, and give the drive its profile velocity back; return the samples that were wanted of it."""
+    trace = None
+    before = int(drives.read(PROFILE_VELOCITY)[0])
+    drives.write(PROFILE_VELOCITY, velocity)
+    try:
+        motion.enable(drives, mode="pp")
+        if is_recorded:
+            count = FIRST + round(abs(distance) / velocity / CYCLE) + LAST
+            words = [RELATIVE] * FIRST + [RELATIVE | NEW_SET_POINT] * FIRST + [RELATIVE] * (count - 2 * FIRST)
+            play = {TARGET_POSITION: [distance] * count, CONTROLWORD: words}
+            trace = drives.record(DEFAULT_KEYS, count * CYCLE, play=play)
+        else:
+            motion.start_move(drives, distance, relative=True)
+        _arrive(motion, drives, velocity, 10.0 + 2.0 * abs(distance) / velocity)
+    finally:
+        drives.write(PROFILE_VELOCITY, before)
+    return trace
+
+
+def _arrive(motion: Any, drives: Any, velocity: int, timeout: float) -> None:
+    """Wait until the target is reached; RuntimeError for an axis that stands at a limit."""
+    from drive_env.master.errors import BusError
+
+    waited, before = 0.0, int(drives.read(POSITION)[0])
+    while True:
+        try:
+            motion.wait_for(drives, motion.TARGET_REACHED, LOOK, "its target")
+        except BusError:
+            raise
+        except TimeoutError:
+            waited += LOOK
+            here = int(drives.read(POSITION)[0])
+            is_still = abs(here - before) < STANDS * velocity * LOOK
+            if is_still and int(drives.read(STATUSWORD)[0]) & INTERNAL_LIMIT:
+                raise RuntimeError("it stands at a limit switch, or at a limit of position") from None
+            if waited >= timeout:
+                raise TimeoutError(f"it was not where it should be after {waited:.1f} s") from None
+            before = here
+        else:
+            return

@@ -1,0 +1,235 @@
+"""`drive-env log` and `drive-env replay`: the frames of a bus in a file, and back."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from drive_env.commands.options import (
+    INTERRUPTED,
+    REFUSED,
+    Bitrate,
+    Channel,
+    DryRun,
+    Interface,
+    Json,
+    Timeout,
+    check_free,
+    check_time,
+    errors_as_exit_codes,
+    fail,
+    print_json,
+)
+from drive_env.drives.arguments import LONGEST
+from mechanics.untrusted import MOST_RECORDING, check_size
+
+MOST_CHANNELS = 0xFFFF
+SIGNAL_WAIT = 0.02  # s, the longest pause between two looks whether the user has pressed Ctrl-C
+FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc")
+WRITTEN = (*FORMATS, ".pcap")
+
+
+def log(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="New file; Wireshark opens .log (candump's) and .pcap, .blf is Vector's, also .asc .csv .trc."
+        ),
+    ],
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    duration: Annotated[float | None, typer.Option(help="End after this time [s]; else by Ctrl-C.")] = None,
+    json: Json = False,
+) -> None:
+    """Write every frame of the bus to a file; nothing is sent. Where the bus is lost, what came until then is kept."""
+    with errors_as_exit_codes():
+        import can
+        from can.util import channel2int
+
+        from drive_env.commands.frame_files import FRAME_FILES, FrameFile
+        from drive_env.master.port import open_bus
+
+        _check_format(file, WRITTEN)
+        check_time("--duration", duration)
+        if not file.parent.is_dir():
+            raise ValueError(f"there is no folder {file.parent}; choose another file")
+        check_free(file)
+        bus = open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {}))
+        count = 0
+        lost: Exception | None = None
+        taken = _take_interrupts()
+        end = time.monotonic() + (float("inf") if duration is None else duration)
+        try:
+            with FrameFile(file) if file.suffix.lower() in FRAME_FILES else can.Logger(str(file)) as writer:
+                try:
+                    while (left := end - time.monotonic()) > 0.0:
+                        try:
+                            message = bus.recv(min(left, 0.1))
+                        except (can.CanError, OSError, ValueError) as error:  # ValueError: of a closed socket
+                            lost = error
+                            break
+                        if message is not None:
+                            # BLF has two bytes for a channel, which python-can fills with the last digits of its name.
+                            if (channel2int(message.channel) or 0) >= MOST_CHANNELS:
+                                message.channel = None
+                            writer(message)
+                            count += 1
+                except KeyboardInterrupt:
+                    pass  # the usual end: the file is complete
+        finally:
+            if taken is not None:
+                signal.signal(signal.SIGINT, taken)
+            bus.shutdown()
+        if lost is not None:
+            if json:
+                print_json({"frames": count, "file": str(file), "lost": str(lost)})
+            fail(f"the bus was lost: {lost}; the {count} frames that came until then are in {file}", REFUSED)
+        _say(f"{count} frames written to {file}", {"frames": count, "file": str(file)}, json)
+
+
+def replay(
+    file: Annotated[Path, typer.Argument(help="File that `log`, candump or another tool wrote.")],
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    speed: Annotated[float, typer.Option(help="How many times as fast as it was recorded.")] = 1.0,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Send the drives' frames, too; only onto a bus without these drives.")
+    ] = False,
+    timeout: Timeout = None,
+    json: Json = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Send the recorded frames of a master again, in their time: NMT, SYNC, SDO requests, RPDOs, its heartbeat.
+
+    Drives obey them as they did then, and no envelope watches: keep the emergency stop at hand. What is live at the
+    end, after Ctrl-C or an error, gets a quick stop and is switched off at rest. --dry-run shows the frames.
+    """
+    with errors_as_exit_codes():
+        import can
+
+        from drive_env.commands.replayed_motors import ANSWER_TIMEOUT
+        from drive_env.master.description import check_timeout
+        from drive_env.master.dry_run import show_frame
+        from drive_env.master.port import Port, open_bus
+
+        _check_format(file, FORMATS)
+        if not file.is_file():
+            raise ValueError(f"there is no file {file}")
+        if not 0.0 < speed < math.inf:
+            raise ValueError(f"--speed {speed:g} must be above 0")
+        check_size(file, MOST_RECORDING)
+        try:
+            with can.LogReader(str(file)) as reader:
+                frames = [frame for frame in reader if everything or _is_from_a_master(frame)]
+        except OSError:
+            raise
+        except Exception as error:  # each format's reader raises what the broken place leads to
+            raise ValueError(f"{file} cannot be read as {file.suffix}: {error}; is it complete?") from error
+        frames = [f for f in frames if not (f.is_extended_id or f.is_error_frame)]
+        _check_stamps(file, frames, speed)
+        if dry_run:
+            for frame in frames:
+                print(show_frame(frame.arbitration_id, bytes(frame.data), frame.is_remote_frame))
+            _say(f"{len(frames)} frames shown", {"frames": len(frames)}, json)
+            return
+        patience = ANSWER_TIMEOUT if timeout is None else check_timeout(timeout)
+        port = Port(open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {})))
+        try:
+            _replay(port, frames, speed, patience, json)
+        finally:
+            port.close()
+
+
+def _check_stamps(file: Path, frames: list[Any], speed: float) -> None:
+    """Raise ValueError for stamps between which nobody can wait; a log goes a little back where two buses were."""
+    for number, frame in enumerate(frames, 1):
+        after = (frame.timestamp - frames[0].timestamp) / speed
+        if not -LONGEST <= after <= LONGEST:
+            raise ValueError(
+                f"{file}: frame {number} of a master has the stamp {frame.timestamp:g} s, {after:g} s after the first "
+                f"at this speed; at most {LONGEST:g} s are waited: take the frame out, or give a higher --speed"
+            )
+
+
+def _replay(port: Any, frames: list[Any], speed: float, timeout: float, json: bool) -> None:
+    """Send frames, stop what they leave live, and say so; a signal ends the sending, never the stop."""
+    from drive_env.commands.replayed_motors import ReplayedMotors
+    from drive_env.held_signals import held_signals
+
+    motors = ReplayedMotors(port, frames, timeout)
+    problem: Exception | None = None
+    sent = 0
+    with held_signals() as noted:
+        motors.check_none_is_live()
+        try:
+            for frame in _in_time(port, frames, speed, noted):
+                port.send(frame.arbitration_id, bytes(frame.data), remote=frame.is_remote_frame, length=frame.dlc)
+                sent += 1
+        except Exception as error:
+            problem = error
+        stopped, unproven = motors.stop()
+    for axis in stopped:
+        print(f"drive-env: {axis}", file=sys.stderr)
+    if unproven:
+        fail("; ".join([*([] if problem is None else [str(problem)]), *unproven]), REFUSED)
+    if problem is not None:
+        raise problem
+    if noted:
+        fail(f"interrupted; {sent} of {len(frames)} frames were sent, and no motor is left enabled", INTERRUPTED)
+    _say(f"{sent} frames sent", {"frames": sent, "stopped": [axis._asdict() for axis in stopped]}, json)
+
+
+def _in_time(port: Any, frames: list[Any], speed: float, noted: list[int]) -> Iterator[Any]:
+    """Yield each frame when it is due, until a signal is noted."""
+    start = time.monotonic()
+    for frame in frames:
+        due = start + (frame.timestamp - frames[0].timestamp) / speed
+        while (left := due - time.monotonic()) > 0.0 and not noted:
+            port.receive(min(left, SIGNAL_WAIT))
+        port.drain()
+        if noted:
+            return
+        yield frame
+
+
+def _is_from_a_master(frame: Any) -> bool:
+    """Return whether the predefined connection set has a master send this identifier."""
+    from drive_env.canopen.frames import ERROR_CONTROL, NMT, RPDO, SDO_REQUEST, SYNC
+    from drive_env.safety.error_control import MASTERS
+
+    can_id = frame.arbitration_id
+    if frame.is_remote_frame or can_id in (NMT, SYNC) or can_id - ERROR_CONTROL in MASTERS:
+        return True
+    return any(base < can_id < base + 0x80 for base in (*RPDO, SDO_REQUEST))
+
+
+def _take_interrupts() -> Any:
+    """Let SIGINT end a log also where it is ignored, and return the handler before, None where nothing was changed.
+
+    A script's shell starts what is in its background so (POSIX), and such a log would have no end.
+    """
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+        return None
+    return signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _check_format(file: Path, formats: tuple[str, ...]) -> None:
+    if file.suffix.lower() not in formats:
+        raise ValueError(f"{file}: the ending says the format, and {file.suffix!r} is none of {', '.join(formats)}")
+
+
+def _say(text: str, value: dict[str, Any], json: bool) -> None:
+    if json:
+        print_json(value)
+    else:
+        print(text)

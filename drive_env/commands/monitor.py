@@ -1,0 +1,136 @@
+"""`drive-env monitor`: objects of drives as they change."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated, Any
+
+import typer
+
+from drive_env.commands.options import (
+    Bitrate,
+    Channel,
+    DeviceName,
+    Eds,
+    Interface,
+    Json,
+    Nodes,
+    Timeout,
+    axis_name,
+    check_time,
+    connect,
+    errors_as_exit_codes,
+    increments_per_revolution,
+    object_name,
+    print_json,
+)
+from drive_env.commands.tables import Column, tables
+
+DEFAULT = ("6041", "6061", "6064", "606C", "6077")
+# Statusword: mask, value and state (CiA 402, state coding).
+STATES = (
+    (0x4F, 0x00, "not ready to switch on"),
+    (0x4F, 0x40, "switch on disabled"),
+    (0x6F, 0x21, "ready to switch on"),
+    (0x6F, 0x23, "switched on"),
+    (0x6F, 0x27, "operation enabled"),
+    (0x6F, 0x07, "quick stop active"),
+    (0x4F, 0x0F, "fault reaction active"),
+    (0x4F, 0x08, "fault"),
+)
+
+
+def monitor(
+    objects: Annotated[
+        list[str] | None, typer.Argument(help="Objects; by default status, mode, position, velocity, current.")
+    ] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    period: Annotated[float, typer.Option(help="Time between two looks [s].")] = 0.2,
+    duration: Annotated[float | None, typer.Option(help="End after this time [s]; else by Ctrl-C.")] = None,
+    json: Json = False,
+) -> None:
+    """Show objects in a table that refreshes, with the emergencies that come; reads only, over SDO.
+
+    With --json a line for each look.
+    """
+    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
+    with errors_as_exit_codes():
+        check_time("--period", period)
+        check_time("--duration", duration)
+        with connect(interface, channel, node, device, eds, **options) as drives:
+            known = drives.description.dictionary
+            entries = [known.find(object_name(name)) for name in objects or DEFAULT]
+            end = time.monotonic() + (float("inf") if duration is None else duration)
+            try:
+                if json:
+                    _lines(drives, entries, period, end)
+                else:
+                    _table(drives, entries, period, end)
+            except KeyboardInterrupt:
+                pass  # the usual end
+
+
+def _look(drives: Any, entries: list[Any]) -> dict[Any, Any]:
+    return {entry: drives.read((entry.index, entry.sub)) for entry in entries}
+
+
+def _lines(drives: Any, entries: list[Any], period: float, end: float) -> None:
+    start = time.monotonic()
+    while True:
+        values = _look(drives, entries)
+        row: dict[str, Any] = {"t": round(time.monotonic() - start, 3)}
+        row |= {f"{e.index:04X}:{e.sub:02X}": list(values[e]) for e in entries}
+        row["emergencies"] = [message._asdict() for message in drives.emergencies()]
+        print_json(row)
+        if time.monotonic() + period > end:
+            return
+        time.sleep(period)
+
+
+def _table(drives: Any, entries: list[Any], period: float, end: float) -> None:
+    from rich.live import Live
+
+    increments = increments_per_revolution(drives)
+    emergencies: list[str] = []
+    with Live(auto_refresh=False) as live:
+        while True:
+            for message in drives.emergencies():
+                when = time.strftime("%H:%M:%S")
+                emergencies.append(f"{when}  {axis_name(drives, message.axis)}: {message.code:04X}h {message.name}")
+            live.update(
+                _draw(drives, entries, _look(drives, entries), increments, emergencies[-5:], live.console.width),
+                refresh=True,
+            )
+            if time.monotonic() + period > end:
+                return
+            time.sleep(period)
+
+
+def _draw(
+    drives: Any, entries: list[Any], values: Any, increments: list[float | None], emergencies: list[str], width: int
+) -> Any:
+    from rich.console import Group
+    from rich.text import Text
+
+    from drive_env.master.quantities import show
+
+    columns = [Column("object", "text"), *(Column(axis_name(drives, axis), "text") for axis in range(drives.num_axes))]
+    rows = []
+    for entry in entries:
+        cells = []
+        for axis, value in enumerate(values[entry]):
+            if entry.index % 0x800 == 0x41 and entry.index >= 0x6000:
+                state = next((name for mask, word, name in STATES if int(value) & mask == word), "?")
+                cells.append(f"{int(value):04X}h {state}")
+            elif entry.bits is None:
+                cells.append(str(value))
+            else:
+                cells.append(show(int(value), entry, increments[axis]))
+        rows.append((entry.label, *cells))
+    return Group(*tables(columns, rows, width), *map(Text, emergencies))

@@ -1,0 +1,269 @@
+"""What the commands of `drive-env` have in common: their options, how they connect, and how they end."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from drive_env.commands.program import is_quiet
+from drive_env.programs import CLOSED, output_is_closed
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from drive_env.dictionary.entries import ObjectName
+    from drive_env.master.can_drives import CanDrives
+
+REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
+
+Interface = Annotated[
+    str | None,
+    typer.Option(
+        "--interface", "-i", envvar="DRIVE_ENV_INTERFACE", help="python-can interface: socketcan, pcan, slcan, ..."
+    ),
+]
+Channel = Annotated[
+    str | None,
+    typer.Option(
+        "--channel",
+        "-c",
+        envvar="DRIVE_ENV_CHANNEL",
+        help="Channel: can0, or socket://127.0.0.1:PORT of `drive-env serve` (its token, if any, in DRIVE_ENV_TOKEN).",
+    ),
+]
+Bitrate = Annotated[int | None, typer.Option(help="Bit rate [bit/s], where the interface sets it.")]
+Nodes = Annotated[list[int] | None, typer.Option("--node", "-n", help="Node-ID; may be repeated.", show_default="1")]
+DeviceName = Annotated[str, typer.Option("--device", help="Drive by name.")]
+Eds = Annotated[Path | None, typer.Option("--eds", help="EDS of any other CiA 402 drive, in place of --device.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the frames and send none.")]
+WouldDo = Annotated[bool, typer.Option("--dry-run", help="Read the drive and say what would be done; change nothing.")]
+Timeout = Annotated[
+    float | None,
+    typer.Option(envvar="DRIVE_ENV_TIMEOUT", help="Longest wait for an answer [s].", show_default="the device's, 0.5"),
+]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
+
+_INDEX = re.compile(r"^(?:0x)?([0-9a-f]{4})h?(?:[:.]([0-9a-f]{1,2})h?)?$", re.IGNORECASE)
+
+
+# Whoever types one of these means drives on a bus.
+OF_A_BUS = ("interface", "channel", "node", "nodes", "bitrate", "lockstep")
+
+
+def was_typed(context: typer.Context, name: str) -> bool:
+    """Return whether an option stands on the command line: one in the environment must turn no motor by surprise."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def names_a_bus(context: typer.Context) -> bool:
+    """Return whether the command line names a bus or a node of it."""
+    return any(was_typed(context, name) for name in OF_A_BUS)
+
+
+def object_name(text: str) -> ObjectName:
+    """Return how the dictionary is asked for an object written as 6041, 0x6041, 607D:1 (hexadecimal) or name."""
+    found = _INDEX.match(text.strip())
+    if found is None:
+        return text
+    return int(found[1], 16), int(found[2] or "0", 16)
+
+
+def connect(
+    interface: str | None,
+    channel: str | None,
+    nodes: list[int] | None,
+    device: str,
+    eds: Path | None,
+    **others: Any,
+) -> CanDrives:
+    """Open drives with a command's options."""
+    from drive_env.master.can_drives import CanDrives
+
+    bitrate = others.pop("bitrate", None)
+    if bitrate is not None:
+        others["bitrate"] = bitrate
+    return CanDrives(device, eds=eds, interface=interface, channel=channel, nodes=nodes or (1,), **others)
+
+
+def look_first(
+    interface: str | None,
+    channel: str | None,
+    nodes: Iterable[int],
+    bitrate: int | None,
+    device: str,
+    eds: Path | None = None,
+    timeout: float | None = None,
+) -> None:
+    """Raise NoAnswerError for a node that is silent: to open it as drives would send it an NMT command."""
+    from drive_env.master.description import describe
+    from drive_env.master.errors import NoAnswerError
+    from drive_env.master.port import Port, open_bus
+    from drive_env.master.sdo import SdoClient
+
+    patience = describe(device, eds).answer_timeout if timeout is None else timeout
+    port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
+    try:
+        for node in nodes:
+            SdoClient(port, node).read(0x1000, 0, "1000h:00 Device type", patience)
+    except NoAnswerError as error:
+        raise NoAnswerError(f"{error}; if it is stopped (NMT), a run would take it to pre-operational") from None
+    finally:
+        port.close()
+
+
+@contextmanager
+def errors_as_exit_codes() -> Iterator[None]:
+    """End with one red line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
+    from drive_env.master.errors import BusError, RefusedError
+    from drive_env.safety.envelope import SafetyError
+
+    with ending_by(fail, refused=(RefusedError, SafetyError, BusError, TimeoutError)):
+        yield
+
+
+@contextmanager
+def ending_by(
+    fail: Callable[[object, int], NoReturn],
+    *,
+    refused: tuple[type[Exception], ...],
+    mistakes: tuple[type[Exception], ...] = (),
+) -> Iterator[None]:
+    """End a program by its own `fail`, which takes what to say and the exit code.
+
+    Args:
+        fail: What ends it.
+        refused: Errors that end it with 1 besides a plain RuntimeError; a bus that cannot be opened is a mistake.
+        mistakes: Errors that end it with 2 besides a ValueError, an object that cannot be had and a file's.
+    """
+    from drive_env.dictionary.access import ObjectAccessError
+    from drive_env.master.errors import OpenError
+
+    mistaken: tuple[type[Exception], ...] = (ObjectAccessError, ValueError, *mistakes)
+    try:
+        yield
+    except OpenError as error:
+        fail(error, USER_ERROR)
+    except refused as error:
+        fail(error, REFUSED)
+    except mistaken as error:
+        fail(error, USER_ERROR)
+    except RuntimeError as error:  # motion: an axis is in fault; ask: the user says no
+        if type(error) is not RuntimeError:
+            raise
+        fail(error, REFUSED)
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) and output_is_closed():
+            raise typer.Exit(CLOSED) from None  # `| head -1` has seen enough: no mistake, and nobody to tell
+        fail(f"{error.filename}: {error.strerror}" if error.filename else error, USER_ERROR)
+    except MemoryError as error:
+        fail(f"there is not enough memory{f' ({error})' if str(error) else ''}; ask for less at a time", USER_ERROR)
+    except KeyboardInterrupt:
+        fail("interrupted", INTERRUPTED)
+
+
+def fail(error: object, code: int) -> NoReturn:
+    """End the command with a red line."""
+    typer.secho(f"drive-env: {error}", fg=typer.colors.RED, err=True)
+    raise typer.Exit(code)
+
+
+def progress_on(console: Console, *, transient: bool = False) -> Progress:
+    """Return bars for a console: what is under way, the share done and the time since; transient ones vanish."""
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+    )
+    return Progress(*columns, console=console, transient=transient, disable=is_quiet())
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON on one line."""
+    print(json.dumps(value, ensure_ascii=False, default=_plain))
+    sys.stdout.flush()
+
+
+def check_time(option: str, value: float | None) -> None:
+    """Raise ValueError for a time [s] that is not above 0, endless, or not a number; None is any."""
+    from drive_env.drives.arguments import LONGEST
+
+    if value is not None and not 0.0 < value <= LONGEST:
+        raise ValueError(f"{option} {value:g} s must be above 0 s, and {LONGEST:g} s at most")
+
+
+def check_free(file: Path, remedy: str = "choose another file") -> None:
+    """Raise ValueError for a file that is there already: no command replaces one. What is no file (/dev/null) is any.
+
+    Call it before anything takes long, or is asked of a drive.
+    """
+    if file.is_file():
+        raise ValueError(f"{file} is there already, and would be replaced; {remedy}")
+
+
+def check_writable(file: Path) -> None:
+    """Raise ValueError for a file that could not be written; call it before a motor turns."""
+    if file.exists() and not file.is_file():
+        return  # a device
+    try:
+        with tempfile.NamedTemporaryFile(dir=file.parent, prefix=f".{file.name}."):
+            pass
+    except OSError as error:
+        why = (error.strerror or str(error)).lower()
+        raise ValueError(f"{file} cannot be written: {why}; give another --out") from None
+
+
+def ask(question: str, yes: bool) -> None:
+    """Go on if the user agrees; else each program's `errors_as_exit_codes` ends it under its own name.
+
+    Raises:
+        ValueError: If nobody is there to ask.
+        RuntimeError: If the user says no.
+    """
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise ValueError(f"{question} Nobody is there to ask; say --yes")
+    if not typer.confirm(question):
+        raise RuntimeError("nothing was changed")
+
+
+def increments_per_revolution(drives: CanDrives) -> list[float | None]:
+    """Return the position increments of a revolution of every axis, None where the drive does not say."""
+    from drive_env.master import quantities
+
+    return quantities.increments_per_revolution(drives)
+
+
+def axis_name(drives: CanDrives, axis: int) -> str:
+    """Return what a line calls an axis: its node and, of a node with several, its number in the node."""
+    node, part = divmod(axis, drives.description.num_axes)
+    return f"node {drives.nodes[node]}" + (f" axis {part}" if drives.description.num_axes > 1 else "")
+
+
+def axis_place(drives: CanDrives, axis: int) -> dict[str, Any]:
+    """Return what JSON calls an axis, as `axis_name` does a line."""
+    node, part = divmod(axis, drives.description.num_axes)
+    return {"node": drives.nodes[node]} | ({"axis": part} if drives.description.num_axes > 1 else {})
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "item"):
+        return value.item()
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value)

@@ -1,0 +1,409 @@
+"""`drive-env backup`, `diff`, `restore` and `commission`: the parameters of a drive as a file."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from drive_env.commands.options import (
+    REFUSED,
+    Bitrate,
+    Channel,
+    DeviceName,
+    Eds,
+    Interface,
+    Json,
+    Timeout,
+    WouldDo,
+    Yes,
+    ask,
+    check_free,
+    connect,
+    errors_as_exit_codes,
+    fail,
+    increments_per_revolution,
+    look_first,
+    print_json,
+)
+from drive_env.commands.tables import Column, print_table
+from mechanics.untrusted import read_toml
+
+if TYPE_CHECKING:
+    from drive_env.master.identity import Identity
+
+Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
+Axis = Annotated[int, typer.Option(help="Axis of a node with several, from 0.")]
+File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `backup` writes them.")]
+Store = Annotated[bool, typer.Option("--store", help="Have the drive keep them over a power cycle (1010h:01, 'save').")]
+OtherDrive = Annotated[
+    bool, typer.Option("--other-drive", help="Write it also to another drive than the one it was read from.")
+]
+Unchecked = Annotated[
+    bool, typer.Option("--unchecked", help="Take a file that was changed, or that has no check sum: you have read it.")
+]
+SAVE = 0x65766173  # CiA 301: "save", written to 1010h
+
+
+def backup(
+    file: Annotated[Path, typer.Argument(help="New file (TOML); - prints it.")],
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Node = 1,
+    axis: Axis = 0,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    json: Json = False,
+) -> None:
+    """Read all parameters of a drive into a file; commands and services are none."""
+    from drive_env.master.parameters import read_parameters
+    from drive_env.whole_file import sealed, write_whole
+
+    with errors_as_exit_codes():
+        if str(file) != "-":
+            check_free(file)
+        with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
+            _check_axis(drives, axis)
+            values = read_parameters(drives, axis)
+            text = sealed(_toml(drives, axis, values))
+        if str(file) == "-":
+            print(text, end="")
+            return
+        write_whole(file, text)
+        if json:
+            print_json({"file": str(file), "parameters": len(values)})
+        else:
+            print(f"{len(values)} parameters of node {node} written to {file}")
+
+
+def diff(
+    file: File,
+    other: Annotated[Path | None, typer.Argument(help="Another file, to compare with in place of the drive.")] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Node = 1,
+    axis: Axis = 0,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    json: Json = False,
+) -> None:
+    """Show where a drive, or another file, differs from a file; exit code 1 if it does."""
+    from drive_env.master.description import describe
+    from drive_env.master.parameters import Difference, compare
+
+    with errors_as_exit_codes():
+        if other is not None:
+            dictionary = describe(device, eds).dictionary
+            wanted, found = load_parameters(file, dictionary), load_parameters(other, dictionary)
+            _tell_of_changes(file)
+            _tell_of_changes(other)
+            differences = [
+                Difference(dictionary.find(key), wanted.get(key, 0), found.get(key))
+                for key in {**wanted, **found}
+                if wanted.get(key) != found.get(key)
+            ]
+            scale = None
+        else:
+            with _connected(interface, channel, node, device, eds, bitrate, timeout) as drives:
+                _check_axis(drives, axis)
+                differences = compare(drives, load_parameters(file, drives.description.dictionary), axis)
+                _tell_of_changes(file)
+                scale = increments_per_revolution(drives)[axis]
+        _print(differences, "drive" if other is None else other.name, file.name, scale, json)
+        if differences:
+            raise typer.Exit(REFUSED)
+
+
+def restore(
+    file: File,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Node = 1,
+    axis: Axis = 0,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    store: Store = False,
+    other_drive: OtherDrive = False,
+    unchecked: Unchecked = False,
+    yes: Yes = False,
+    json: Json = False,
+    dry_run: WouldDo = False,
+) -> None:
+    """Write a file's parameters to a drive, all or none: what was written is read back, or else taken back.
+
+    The file must be as `backup` wrote it, and of this drive. Bit rate and node-ID are left alone; commands and services
+    are refused. The axis must not be enabled.
+    """
+    from drive_env.master.description import describe
+    from drive_env.master.identity import check_same_drive, read_identity
+    from drive_env.master.parameters import check_no_commands
+
+    with errors_as_exit_codes():
+        known = describe(device, eds)
+        wanted = load_parameters(file, known.dictionary)
+        written, axis_then = _check_file(file, unchecked=unchecked)
+        check_no_commands(wanted, file, known.hints)
+        bus = _Bus(interface, channel, node, device, eds, bitrate, timeout)
+
+        def check(drives: Any) -> None:
+            check_same_drive(file, written, read_identity(drives), other_drive=other_drive)
+            if axis_then not in (None, axis) and not other_drive:
+                raise ValueError(
+                    f"{file} was read from axis {axis_then}, and --axis says {axis}; nothing was written. If it is "
+                    "meant for this axis all the same, say --other-drive"
+                )
+
+        _exchange(bus, wanted, axis, file.name, check, store=store, yes=yes, json=json, dry_run=dry_run)
+
+
+def commission(
+    motor: Annotated[str, typer.Argument(help="Motor whose preset is written; ? lists them.")],
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Node = 1,
+    axis: Axis = 0,
+    device: DeviceName = "tmcm1636",
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    store: Store = False,
+    yes: Yes = False,
+    json: Json = False,
+    dry_run: WouldDo = False,
+) -> None:
+    """Write a motor's preset to a drive: motor, encoder, current limit, gains and profile; shows the difference first.
+
+    All or none, as `restore`.
+    """
+    with errors_as_exit_codes():
+        from drive_env.devices import find_device
+
+        known = find_device(device)
+        if motor == "?":
+            print("\n".join(sorted(path.stem for path in known.presets.glob("*.toml"))))
+            return
+        preset = known.preset(motor)
+        dictionary = known.new_dictionary()
+        wanted = {(e.index, e.sub): value for e, value in ((dictionary.find(n), v) for n, v in preset.items())}
+        bus = _Bus(interface, channel, node, device, None, bitrate, timeout)
+        name = f"preset {motor}"
+        _exchange(bus, wanted, axis, name, lambda drives: None, store=store, yes=yes, json=json, dry_run=dry_run)
+
+
+class _Bus(NamedTuple):
+    """A node, as the options name it."""
+
+    interface: str | None
+    channel: str | None
+    node: int
+    device: str
+    eds: Path | None
+    bitrate: int | None
+    timeout: float | None
+
+
+def _exchange(
+    bus: _Bus,
+    wanted: dict[tuple[int, int], int],
+    axis: int,
+    name: str,
+    check: Callable[[Any], None],
+    *,
+    store: bool,
+    yes: bool,
+    json: bool,
+    dry_run: bool,
+) -> None:
+    """Write parameters and say what the drive holds then, as another connection reads it.
+
+    Args:
+        bus: The node.
+        wanted: The parameters.
+        axis: Of the node.
+        name: What they are from.
+        check: Raises for a drive that they are not meant for.
+        store: Have the drive keep them.
+        yes: Do not ask.
+        json: Print JSON.
+        dry_run: Say what would be written, and write nothing.
+    """
+    from drive_env.master.description import describe
+    from drive_env.master.parameters import check_at_rest, compare, list_differences, restorable, write_all_or_none
+
+    wanted = restorable(wanted, describe(bus.device, bus.eds).hints)
+    if dry_run:  # to open a node that is stopped would send it an NMT command
+        look_first(bus.interface, bus.channel, [bus.node], bus.bitrate, bus.device, bus.eds, bus.timeout)
+    with _connected(*bus) as drives:
+        _check_axis(drives, axis)
+        check(drives)
+        differences = compare(drives, wanted, axis)
+        scale = increments_per_revolution(drives)[axis]
+        if not json:
+            _print(differences, "drive", name, scale, json)
+        if dry_run:
+            check_at_rest(drives, wanted, axis)
+            _tell_plan(differences, scale, bus.node, store=store, json=json)
+            return
+        if differences:
+            ask(f"Write {len(differences)} parameters to node {bus.node}?", yes)
+        changes = write_all_or_none(drives, wanted, axis)
+        if store:
+            drives.write((0x1010, 1), SAVE)
+    # What was just written is not believed to whom wrote it: another connection reads it anew.
+    with _connected(*bus) as drives:
+        left = compare(drives, wanted, axis)
+    if left:
+        fail(
+            f"node {bus.node} does not hold what was written, as a second reading shows: {list_differences(left)}; "
+            "is another master writing to it? Look with `drive-env diff`, then restore again",
+            REFUSED,
+        )
+    if json:
+        rows = [_row(change, scale) for change in changes]
+        print_json({"changed": rows, "verified": len(wanted), "stored": store})
+    else:
+        kept = "; the drive keeps them" if store else "" if not changes else "; they last until a reset (--store)"
+        print(f"{len(changes)} written, {len(wanted)} verified by a second reading{kept}")
+
+
+def _tell_plan(differences: list[Any], scale: float | None, node: int, *, store: bool, json: bool) -> None:
+    """Say what would be written."""
+    if json:
+        rows = [_row(difference, scale) for difference in differences]
+        print_json({"would change": rows, "would store": store, "written": 0})
+        return
+    kept = ", and kept over a power cycle" if store else ""
+    print(f"{len(differences)} parameters would be written to node {node}{kept}; nothing was written")
+
+
+def _check_file(file: Path, *, unchecked: bool) -> tuple[Identity | None, int | None]:
+    """Return from which drive and axis a file was read, None where it does not say; raise if it is not as written."""
+    from drive_env.master.identity import load_identity
+    from drive_env.whole_file import check_seal
+
+    table = _read_toml(file)
+    check_seal(file, table, unchecked=unchecked)
+    identity = table.get("identity")
+    if not isinstance(identity, dict):
+        return None, None
+    axis = identity.get("axis")
+    return load_identity(identity), axis if type(axis) is int else None
+
+
+def _tell_of_changes(file: Path) -> None:
+    """Say on stderr that a file is not as it was written: to compare with it, it need not be."""
+    from drive_env.whole_file import FileChangedError
+
+    try:
+        _check_file(file, unchecked=False)
+    except FileChangedError as error:
+        print(f"drive-env: note: {error}", file=sys.stderr)
+
+
+def _connected(
+    interface: str | None,
+    channel: str | None,
+    node: int,
+    device: str,
+    eds: Path | None,
+    bitrate: int | None,
+    timeout: float | None,
+) -> Any:
+    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
+    return connect(interface, channel, [node], device, eds, **options)
+
+
+def _check_axis(drives: Any, axis: int) -> None:
+    if not 0 <= axis < drives.num_axes:
+        raise ValueError(f"--axis {axis}: the node has {drives.num_axes} axes, from 0")
+
+
+def _toml(drives: Any, axis: int, values: Mapping[tuple[int, int], int]) -> str:
+    """Return parameters as TOML; the objects' names are comments, their index is what counts."""
+    from drive_env.master.identity import read_identity
+    from drive_env.whole_file import FORMAT
+
+    known = drives.description
+    lines = [
+        f"# Parameters of node {drives.nodes[0]}. The check sum at the end shows a change: restore refuses it.",
+        f"format = {FORMAT}",
+        f'read = "{datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC"',
+        "",
+        "[identity]",
+        *read_identity(drives).to_toml(),
+        f"axis = {axis}",
+    ]
+    lines += ["", "[parameters]  # index:sub-index, both hexadecimal"]
+    for (index, sub), value in values.items():
+        entry = known.dictionary.find((index, sub))
+        unit = f" [{entry.unit}]" if entry.unit else ""
+        lines.append(f'"{index:04X}:{sub:02X}" = {value}  # {entry.name}{unit}')
+    return "\n".join(lines) + "\n"
+
+
+def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
+    """Return the parameters of a file; ValueError for what is none."""
+    from drive_env.dictionary.access import check_in_range, check_writable
+
+    rows = _read_toml(path).get("parameters")
+    if not isinstance(rows, dict) or not rows:
+        raise ValueError(f"{path} has no table [parameters]; `drive-env backup` writes one")
+    import numpy as np
+
+    values = {}
+    for text, value in rows.items():
+        index, _, sub = text.partition(":")
+        try:
+            key = int(index, 16), int(sub or "0", 16)
+        except ValueError:
+            raise ValueError(f"{path}: {text!r} is no index:sub-index; write it as 607D:01") from None
+        entry = dictionary.find(key)
+        check_writable(entry)
+        check_in_range(entry, np.asarray(value))
+        values[key] = int(value)
+    return values
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    """Return what a file holds; ValueError if it is no TOML."""
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}; write one with `drive-env backup {path}`")
+    try:
+        return read_toml(path)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no TOML, or is torn: {error}; take another copy") from error
+
+
+def _print(differences: Iterable[Any], found: str, wanted: str, scale: float | None, json: bool) -> None:
+    rows = [_row(difference, scale) for difference in differences]
+    if json:
+        print_json(rows)
+        return
+    if not rows:
+        print(f"no difference between {found} and {wanted}")
+        return
+    columns = [Column(title, "text") for title in ("object", found, wanted)]
+    print_table(columns, [(row["object"], row["found text"], row["wanted text"]) for row in rows])
+
+
+def _row(difference: Any, scale: float | None) -> dict[str, Any]:
+    from drive_env.master.quantities import show
+
+    entry, wanted, found = difference
+    return {
+        "object": entry.label,
+        "found": found,
+        "wanted": wanted,
+        "found text": "absent" if found is None else show(found, entry, scale),
+        "wanted text": show(wanted, entry, scale),
+    }

@@ -1,0 +1,143 @@
+"""`drive-env scan`: which nodes are on the bus, and what they are."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated, Any
+
+import typer
+
+from drive_env.commands.options import (
+    Bitrate,
+    Channel,
+    Interface,
+    Json,
+    check_time,
+    errors_as_exit_codes,
+    fail,
+    print_json,
+)
+from drive_env.commands.tables import print_lines
+
+NOTHING_FOUND = 1
+GAP = 0.001  # between two requests [s]: 127 at once would overrun small controllers
+STRINGS = {0x1008: "name", 0x1009: "hardware", 0x100A: "software"}
+IDENTITY = {1: "vendor", 2: "product", 3: "revision", 4: "serial"}
+
+
+def scan(
+    interface: Interface = None,
+    channel: Channel = None,
+    bitrate: Bitrate = None,
+    first: Annotated[int, typer.Option(min=1, max=127, help="First node-ID to ask.")] = 1,
+    last: Annotated[int, typer.Option(min=1, max=127, help="Last node-ID to ask.")] = 127,
+    timeout: Annotated[float, typer.Option(help="Longest wait for an answer [s].")] = 0.3,
+    json: Json = False,
+) -> None:
+    """Find nodes and read what they say of themselves: 1000h, 1008h to 100Ah, 1018h. Nothing is written."""
+    with errors_as_exit_codes():
+        from drive_env.master.port import Port, open_bus
+
+        check_time("--timeout", timeout)
+        if last < first:
+            raise ValueError(f"--last {last} lies before --first {first}")
+        options = {"bitrate": bitrate} if bitrate else {}
+        port = Port(open_bus(interface, channel, **options))
+        try:
+            found = [_look(port, node, state, timeout) for node, state in sorted(_find(port, first, last, timeout))]
+        finally:
+            port.close()
+        if json:
+            print_json(found)
+        elif found:
+            _print(found, timeout)
+        if not found:
+            fail(
+                f"no node of {first} to {last} answered within {timeout:g} s; check power, bit rate, termination and "
+                "the channel",
+                NOTHING_FOUND,
+            )
+
+
+def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, str]]:
+    """Return the nodes that answer or are heard, each with what is known of its state."""
+    from drive_env.canopen.frames import ERROR_CONTROL, SDO_REQUEST, SDO_RESPONSE
+
+    answered: set[int] = set()
+    heard: dict[int, str] = {}
+    states = {4: "stopped", 5: "operational", 127: "pre-operational"}
+
+    def hear(node: int, data: bytes) -> None:
+        if data == bytes(1):  # it has booted: where it is now it does not say
+            heard.setdefault(node, "")
+            return
+        heard[node] = states.get(data[0] & 0x7F, "unknown") if data else "unknown"
+
+    for node in range(first, last + 1):
+        port.subscribe(SDO_RESPONSE + node, lambda _, node=node: answered.add(node))
+        port.subscribe(ERROR_CONTROL + node, partial(hear, node))
+    for node in range(first, last + 1):
+        port.send(SDO_REQUEST + node, bytes((0x40, 0x00, 0x10, 0, 0, 0, 0, 0)))
+        port.wait(lambda: False, GAP)
+    port.wait(lambda: False, timeout)
+    return {(node, heard.get(node, "")) for node in answered | set(heard)}
+
+
+def _look(port: Any, node: int, state: str, timeout: float) -> dict[str, Any]:
+    from drive_env.dictionary.access import ObjectAccessError
+    from drive_env.master.errors import BusError, NoAnswerError
+    from drive_env.master.sdo import SdoClient
+
+    sdo = SdoClient(port, node)
+    row: dict[str, Any] = {"node": node, "state": state}
+
+    def read(index: int, sub: int) -> bytes | None:
+        label = f"{index:04X}h:{sub:02X}"
+        try:
+            return sdo.read(index, sub, label, timeout)
+        except NoAnswerError:
+            row.setdefault("timed out", []).append(label)
+        except (ObjectAccessError, BusError):
+            pass  # optional
+        return None
+
+    kind = read(0x1000, 0)
+    if kind is None:
+        return row
+    row["device type"] = int.from_bytes(kind, "little")
+    for index, name in STRINGS.items():
+        text = read(index, 0)
+        if text is not None:
+            row[name] = text.decode("utf-8", "replace").rstrip("\0 ")
+    for sub, name in IDENTITY.items():
+        number = read(0x1018, sub)
+        if number is not None:
+            row[name] = int.from_bytes(number, "little")
+    row["device"] = _known_device(row.get("vendor"), row.get("product"))
+    return row
+
+
+def _known_device(vendor: int | None, product: int | None) -> str | None:
+    from drive_env.devices import device_names, find_device
+
+    for name in device_names():
+        dictionary = find_device(name).new_dictionary()
+        if (vendor, product) == tuple(dictionary.find((0x1018, sub)).default for sub in (1, 2)):
+            return name
+    return None
+
+
+def _print(found: list[dict[str, Any]], timeout: float) -> None:
+    for row in found:
+        late = ", ".join(row.get("timed out", ()))
+        late = f"no answer to {late} within {timeout:g} s; try a longer --timeout" if late else ""
+        if "device type" not in row:
+            why = late if late and row["state"] != "stopped" else "no SDO answer"  # of a stopped node none comes
+            print_lines([f"node {row['node']}  {why}" + (f" ({row['state']})" if row["state"] else "")])
+            continue
+        profile = row["device type"] & 0xFFFF
+        facts = [row["device"] or "unknown device, give its --eds", row.get("name", "")]
+        facts += [f"{name} {row[name]}" for name in ("hardware", "software") if name in row]
+        facts += [f"{name} {row[name]:X}h" for name in ("vendor", "product", "revision", "serial") if name in row]
+        facts += [f"CiA {profile}" if profile else "no profile", row["state"], late]
+        print_lines([f"node {row['node']}  " + "  ".join(fact for fact in facts if fact)])

@@ -1,0 +1,280 @@
+"""`drive-env scope`: objects at every SYNC, from a trigger on, as CSV and picture."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import typer
+
+from drive_env.commands.options import (
+    INTERRUPTED,
+    REFUSED,
+    Bitrate,
+    Channel,
+    DeviceName,
+    Eds,
+    Interface,
+    Json,
+    Nodes,
+    Timeout,
+    axis_name,
+    check_free,
+    check_writable,
+    connect,
+    errors_as_exit_codes,
+    fail,
+    increments_per_revolution,
+    object_name,
+    print_json,
+)
+
+# Response and commands of the usual modes: what `drive-env check-model` needs.
+DEFAULT = ("6062", "6064", "606C", "60FF", "6077")
+LISTENED = 0.3  # how long other masters are listened for before anything is sent [s]
+CHUNK = 0.05  # recorded at a time while the trigger is waited for [s]
+PIECE = 0.25  # recorded at a time afterwards [s]: as much is lost at most where the recording is broken off
+_TRIGGER = re.compile(r"^\s*(.+?)\s*(<=|>=|<|>|==|!=)\s*(.+?)\s*$")
+
+
+class Trigger(NamedTuple):
+    """A condition on an object: it fires where the condition begins to hold."""
+
+    entry: Any
+    relation: str
+    text: str
+
+
+def scope(
+    objects: Annotated[
+        list[str] | None,
+        typer.Argument(help="Objects that can be mapped; by default demands and responses."),
+    ] = None,
+    interface: Interface = None,
+    channel: Channel = None,
+    node: Nodes = None,
+    device: DeviceName = "tmcm1636",
+    eds: Eds = None,
+    bitrate: Bitrate = None,
+    timeout: Timeout = None,
+    duration: Annotated[float, typer.Option(help="How long to record from the trigger on [s].")] = 1.0,
+    trigger: Annotated[
+        str | None, typer.Option(help="Begin when this becomes true: '606C > 100 rpm', 'Statusword == 0x1637'.")
+    ] = None,
+    before: Annotated[float, typer.Option(help="How much to keep from before the trigger [s].")] = 0.05,
+    wait: Annotated[float, typer.Option(help="How long to wait for the trigger [s].")] = 30.0,
+    period: Annotated[float, typer.Option(help="Time between samples [s], whole milliseconds.")] = 0.001,
+    out: Annotated[Path, typer.Option(help="New files, without ending: OUT.csv and OUT.png.")] = Path("scope"),
+    json: Json = False,
+) -> None:
+    """Sample objects with SYNC, one sample per millisecond, and write CSV (raw integers) and PNG (in units).
+
+    After Ctrl-C, or where the bus is lost, what came until then is written, and told.
+    It sends SYNC and maps TPDOs, which it puts back. Where another master commands the drive it refuses, or ends with
+    what came until then: samples of two masters would be wrong.
+    """
+    options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
+    with errors_as_exit_codes():
+        _check_times(duration=duration, before=before, wait=wait, period=period)
+        table, picture = new_files(out)
+        _listen(interface, channel, node, bitrate)
+        with connect(interface, channel, node, device, eds, **options) as drives:
+            known = drives.description.dictionary
+            entries = [known.find(object_name(name)) for name in objects or DEFAULT]
+            condition = None if trigger is None else _parse(trigger, known)
+            scales = increments_per_revolution(drives)
+            labels = [axis_name(drives, axis) for axis in range(drives.num_axes)]
+            rows, start, broken = _record(drives, entries, condition, scales, duration, before, wait)
+            _, late, worst = drives.total_timing
+        if broken is not None and not len(rows[entries[0]]):
+            raise broken
+        every = round(period / 0.001)
+        t, rows = _thin(rows, start, every)
+        write_table(table, entries, labels, t, rows)
+        draw(picture, entries, labels, scales, t, rows)
+        summary = {"samples": len(t), "csv": str(table), "png": str(picture), "complete": broken is None}
+        if json:
+            print_json(summary | {"late": late, "worst lateness": worst})
+        elif broken is None:
+            print(f"{len(t)} samples written to {table} and {picture}")
+        if late and not json:
+            print(f"{late} SYNCs were late, the worst by {1e3 * worst:.1f} ms: times are those of the SYNCs' grid")
+        if broken is not None:
+            why, code = (str(broken), REFUSED) if isinstance(broken, Exception) else ("interrupted", INTERRUPTED)
+            fail(f"{why}; the {len(t)} samples that came until then are in {table} and {picture}", code)
+
+
+def new_files(out: Path) -> tuple[Path, Path]:
+    """Return where table and picture go; ValueError where they cannot be written, or are there."""
+    if not out.parent.is_dir():
+        raise ValueError(f"there is no folder {out.parent}; choose another --out")
+    table, picture = out.with_suffix(".csv"), out.with_suffix(".png")
+    for file in (table, picture):
+        check_free(file, "choose another --out")
+    check_writable(table)
+    return table, picture
+
+
+def _listen(interface: str | None, channel: str | None, nodes: list[int] | None, bitrate: int | None) -> None:
+    """Raise OtherMastersError where another master is at work; nothing is sent."""
+    from drive_env.master.other_masters import OtherMasters
+    from drive_env.master.port import Port, open_bus
+
+    port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
+    try:
+        OtherMasters(port, nodes or (1,)).listen(LISTENED)
+    finally:
+        port.close()
+
+
+def _check_times(**times: float) -> None:
+    for name, value in times.items():
+        if not 0.0 <= value <= 3600.0 or (value == 0.0 and name in ("duration", "period")):
+            raise ValueError(f"--{name} {value:g} s must be above 0 s and at most an hour")
+        if name != "wait" and abs(value / 0.001 - round(value / 0.001)) > 1e-6:
+            raise ValueError(f"--{name} {value:g} s is no whole number of milliseconds; use {round(value, 3):g}")
+
+
+def _parse(text: str, known: Any) -> Trigger:
+    found = _TRIGGER.match(text)
+    if found is None:
+        raise ValueError(f"--trigger {text!r} is no condition; write it as '606C > 100 rpm'")
+    return Trigger(known.find(object_name(found[1])), found[2], found[3])
+
+
+def _fires(trigger: Trigger, values: Any, scales: list[float | None]) -> Any:
+    """Return in which rows the condition holds on any axis."""
+    import operator
+
+    import numpy as np
+
+    from drive_env.master.quantities import parse
+
+    relation = {
+        "<": operator.lt, ">": operator.gt, "<=": operator.le, ">=": operator.ge, "==": operator.eq, "!=": operator.ne,
+    }[trigger.relation]  # fmt: skip
+    level = np.array([parse(trigger.text, trigger.entry, scale) for scale in scales])
+    return relation(values, level).any(axis=1)
+
+
+def _record(
+    drives: Any,
+    entries: list[Any],
+    trigger: Trigger | None,
+    scales: list[float | None],
+    duration: float,
+    before: float,
+    wait: float,
+) -> tuple[dict[Any, Any], int, BaseException | None]:
+    """Return rows of each entry, the number of the row at which the trigger fired, and what broke the rest off."""
+    import numpy as np
+
+    from drive_env.master.errors import BusError
+    from drive_env.master.other_masters import OtherMasters
+
+    wanted = list(dict.fromkeys([*entries, trigger.entry] if trigger else entries))
+    names = [(entry.index, entry.sub) for entry in wanted]
+
+    others = OtherMasters(drives.port, drives.nodes)
+
+    def record(seconds: float) -> dict[Any, Any]:
+        try:
+            trace = drives.record(names, round(seconds, 3))
+        except BusError:
+            others.check()  # samples that stay out are another master's doing, if there is one
+            raise
+        drives.port.drain()
+        others.check()
+        return {entry: trace[name] for entry, name in zip(wanted, names, strict=True)}
+
+    def rest(rows: dict[Any, Any], missing: int) -> tuple[dict[Any, Any], BaseException | None]:
+        """Return these rows and as many more, or those that came before Ctrl-C or the loss of the bus."""
+        pieces, broken, piece = [rows], None, round(PIECE / 0.001)
+        try:
+            for first in range(0, missing, piece):
+                pieces.append(record(min(piece, missing - first) * 0.001))
+        except (BusError, KeyboardInterrupt) as error:
+            broken = error
+        return {entry: np.concatenate([part[entry] for part in pieces]) for entry in wanted}, broken
+
+    nothing: dict[Any, Any] = {entry: np.empty((0, drives.num_axes), np.int64) for entry in wanted}
+    if trigger is None:
+        rows, broken = rest(nothing, round(duration / 0.001))
+        return rows, 0, broken
+    _fires(trigger, np.zeros((1, drives.num_axes), np.int64), scales)  # a wrong level is told before the wait
+    keep = round(before / 0.001)
+    rows = nothing
+    held = True  # a condition that holds from the start must end first
+    for _ in range(max(1, round(wait / CHUNK))):
+        chunk = record(CHUNK)
+        holds = _fires(trigger, chunk[trigger.entry], scales)
+        first = np.flatnonzero(holds & ~np.concatenate([[held], holds[:-1]]))
+        held = bool(holds[-1])
+        old = len(rows[trigger.entry])
+        rows = {entry: np.concatenate([rows[entry], chunk[entry]]) for entry in wanted}
+        if first.size:
+            fired = old + int(first[0])
+            begin, end = max(0, fired - keep), fired + round(duration / 0.001)
+            rows, broken = rest(rows, end - len(rows[trigger.entry]))
+            return {entry: rows[entry][begin:end] for entry in entries}, fired - begin, broken
+        if keep:
+            rows = {entry: rows[entry][-keep:] for entry in wanted}
+        else:
+            rows = {entry: rows[entry][:0] for entry in wanted}
+    fail(f"the trigger {trigger.entry.label} {trigger.relation} {trigger.text} did not fire within {wait:g} s", REFUSED)
+
+
+def _thin(rows: dict[Any, Any], start: int, every: int) -> tuple[Any, dict[Any, Any]]:
+    import numpy as np
+
+    count = len(next(iter(rows.values())))
+    chosen = np.arange(start % every, count, every)
+    return (chosen - start) * 0.001, {entry: values[chosen] for entry, values in rows.items()}
+
+
+def write_table(path: Path, entries: list[Any], labels: list[str], t: Any, rows: dict[Any, Any]) -> None:
+    """Write samples as CSV: times [s], then integers of each entry and axis, rows of shape (n, axes)."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        header = ["t [s]"]
+        for entry in entries:
+            unit = f" [{entry.unit}]" if entry.unit else ""
+            header += [f"{entry.label}{unit}" + (f" ({label})" if len(labels) > 1 else "") for label in labels]
+        writer.writerow(header)
+        for k, time in enumerate(t):
+            writer.writerow([f"{time:.3f}", *(int(v) for entry in entries for v in rows[entry][k])])
+
+
+def draw(
+    path: Path, entries: list[Any], labels: list[str], scales: list[float | None], t: Any, rows: dict[Any, Any]
+) -> None:
+    """Draw samples as PNG, a panel for each entry, in units where the scale of positions [inc/rev] is known."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from drive_env.master.quantities import SHOWN, UNITS, find_unit
+
+    figure = Figure(figsize=(9.0, 1.2 + 1.9 * len(entries)), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(len(entries), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, entry in zip(panels, entries, strict=True):
+        shown = entry.unit
+        for axis, label in enumerate(labels):
+            unit = find_unit(entry.unit, scales[axis])
+            factor = 1.0
+            if unit is not None:
+                shown = SHOWN[unit.dimension]
+                factor = unit.factor / UNITS[shown].factor
+            panel.plot(t, rows[entry][:, axis] * factor, linewidth=1.2, drawstyle="steps-post", label=label)
+        panel.set_ylabel(shown)
+        panel.set_title(entry.label, fontsize="medium", loc="left")
+        panel.grid(alpha=0.3)
+        panel.margins(x=0)
+        if t[0] < 0.0:
+            panel.axvline(0.0, color="0.4", linewidth=0.8, linestyle="--")
+    if len(labels) > 1:
+        panels[0].legend(loc="upper right", fontsize="small", ncols=min(len(labels), 4))
+    panels[-1].set_xlabel("time from the trigger [s]" if t[0] < 0.0 else "time [s]")
+    figure.savefig(path, dpi=110)

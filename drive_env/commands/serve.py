@@ -1,0 +1,317 @@
+"""`drive-env serve`: emulated drives on a CAN bus that any master can join."""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import signal
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+
+from drive_env.commands.options import REFUSED, USER_ERROR, fail
+
+# The compiler and MuJoCo take long to import: whoever asks for --help should not pay it.
+if TYPE_CHECKING:
+    from drive_env.bus.config import Bus
+    from drive_env.bus.server import Server
+    from drive_env.faults.control import Control
+
+PORT = 29636  # no service is registered there, and no system gives it to others
+LOOPBACK = "127.0.0.1"
+PATIENCE = 8.0  # s after which a user wants to know what takes so long
+AUTO = "auto"  # as --token
+NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then hears nobody
+TOKEN_BYTES = 12  # of chance: 16 characters
+COMPILING = "drive-env: compiling the kernels, once; about 30 seconds"
+# SDO of any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1 synchronous.
+WARM_UP_REQUESTS = tuple(
+    bytes.fromhex(text)
+    for text in ("4041600000000000", "4008100000000000", "6000000000000000", "2B40600006000000", "2F00180201000000")
+)
+
+
+def serve(
+    device: Annotated[str | None, typer.Argument(help="Drive, e.g. tmcm1636 (the default).")] = None,
+    load: Annotated[str | None, typer.Option(help="Load that it turns; two_mass by default.")] = None,
+    motor: Annotated[
+        str | None, typer.Option(help="Motor; qbl4208 by default. none: factory values, not commissioned.")
+    ] = None,
+    node: Annotated[
+        list[int] | None,
+        typer.Option("--node", "-n", help="Node identifier, 1 by default; once per axis of the machine."),
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="Several drives on one bus (TOML), as examples/bus.toml.")] = None,
+    port: Annotated[int, typer.Option(help="TCP port of the hub; 0 for a free one.")] = PORT,
+    listen: Annotated[
+        str, typer.Option(help="Address of the hub; anything but loopback lets the network in and needs --token.")
+    ] = LOOPBACK,
+    token: Annotated[
+        str | None,
+        typer.Option(help="What clients of the hub must present: 8 to 48 letters, digits, - and _; auto: makes one."),
+    ] = None,
+    interface: Annotated[
+        str | None, typer.Option("--interface", "-i", help="python-can interface instead of the hub, e.g. socketcan.")
+    ] = None,
+    channel: Annotated[
+        str | None, typer.Option("--channel", "-c", help="Channel of that interface, e.g. vcan0.")
+    ] = None,
+    bitrate: Annotated[int | None, typer.Option(help="Bit rate of the bus [bit/s]; 1,000,000 by default.")] = None,
+    real_time: Annotated[
+        bool, typer.Option("--real-time/--lockstep", help="Time passes by the clock, or 1 ms with each SYNC.")
+    ] = True,
+    store: Annotated[
+        Path | None, typer.Option(help="Folder in which the nodes keep what is saved in them; without it, nowhere.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
+    stats: Annotated[
+        bool, typer.Option("--stats", help="Say at the end how late cycles were and how full the bus.")
+    ] = False,
+    duration: Annotated[float | None, typer.Option(help="End after this time [s]; else by Ctrl-C.")] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(help="Let something fail: 'encoder_stuck at=2 duration=0.1 node=1'; may be repeated."),
+    ] = None,
+    control: Annotated[
+        int | None, typer.Option(help="Port on loopback at which `drive-env fault` reaches it; 0 for a free one.")
+    ] = None,
+) -> None:
+    """Put emulated drives on a CAN bus that python-can, python-canopen and drive-env itself can join."""
+    server: list[Server] = []
+    previous = [(number, signal.signal(number, _ender(server))) for number in (signal.SIGINT, signal.SIGTERM)]
+    logging.basicConfig(format="drive-env: %(message)s", level=logging.WARNING)
+    try:
+        bus = _bus(device, load, motor, node, config, bitrate, store, seed)
+        if duration is not None and not duration > 0.0:
+            _fail(f"--duration {duration:g} s must be above 0 s")
+        if token == AUTO:
+            token = secrets.token_urlsafe(TOKEN_BYTES)
+        made = _server(bus, real_time, port, listen, token, interface, channel)
+        server.append(made)
+        controls = _faults(made, fault or [], control)
+        _announce(made, bus, real_time, token, interface, channel)
+        try:
+            made.run(duration)
+        except _can_error() as error:
+            _fail(f"the interface {interface} failed: {error}", REFUSED)
+        finally:
+            for one in controls:
+                one.close()
+            made.close()
+            made.world.close()
+        if stats:
+            print(_statistics(made), flush=True)
+        print("drive-env: ended", flush=True)
+    finally:
+        for number, handler in previous:
+            signal.signal(number, handler)
+
+
+def _bus(
+    device: str | None,
+    load: str | None,
+    motor: str | None,
+    node: list[int] | None,
+    config: Path | None,
+    bitrate: int | None,
+    store: Path | None,
+    seed: int | None,
+) -> Bus:
+    """Return the bus that the arguments ask for."""
+    from drive_env.bus.config import Bus, BusConfigError, Machine, load_bus
+
+    one: dict[str, Any] = {"device": device, "load": load, "motor": motor, "nodes": tuple(node) if node else None}
+    one = {key: value for key, value in one.items() if value is not None}
+    every: dict[str, Any] = {"bit_rate": bitrate, "store": str(store) if store else None, "seed": seed}
+    every = {key: value for key, value in every.items() if value is not None}
+    try:
+        if config is None:
+            return replace(Bus(machines=(Machine(**one),)), **every)
+        bus = load_bus(config)
+        if one and len(bus.machines) > 1:
+            flag = {"nodes": "--node", "device": "a device"}.get(next(iter(one)), f"--{next(iter(one))}")
+            _fail(f"{config} has {len(bus.machines)} machines, so {flag} cannot say which it means; change the file")
+        return replace(bus, machines=tuple(replace(row, **one) for row in bus.machines), **every)
+    except BusConfigError as error:
+        _fail(str(error))
+
+
+def _server(
+    bus: Bus,
+    real_time: bool,
+    port: int,
+    listen: str,
+    token: str | None,
+    interface: str | None,
+    channel: str | None,
+) -> Server:
+    """Return the server of a bus, its transport open."""
+    from drive_env.bus.config import BusConfigError, build_world
+    from drive_env.bus.hub import Hub
+    from drive_env.bus.server import Server
+    from drive_env.bus.transport import Transport
+
+    if interface is None and channel is not None:
+        _fail(f"--channel {channel} needs --interface, e.g. --interface socketcan")
+    if interface is not None and token is not None:
+        _fail(f"--token is for the hub; --interface {interface} cannot ask for one")
+    if not listen:  # the system would take it for every address
+        _fail(f"--listen must be an address, e.g. {LOOPBACK}; 0.0.0.0 lets the whole network in")
+    if not 0 <= port <= 65_535:
+        _fail(f"--port {port} must be 0 to 65535")
+    try:
+        world = build_world(bus, lockstep=not real_time, own_wire=interface is None)
+    except BusConfigError as error:
+        _fail(str(error))
+    transport: Transport
+    if interface is None:
+        try:
+            transport = Hub(port, listen, bus.bit_rate, token=token)
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            _fail(f"cannot listen on {listen}:{port}: {reason}; choose another --port (0: a free one) or --listen")
+        except ValueError as error:
+            _fail(f"{error}; say --token auto, --token TEXT of 8 characters or more, or --listen {LOOPBACK}")
+    else:
+        transport = _can_port(interface, channel, bus.bit_rate)
+    waiting = threading.Timer(PATIENCE, lambda: print(COMPILING, file=sys.stderr, flush=True))
+    waiting.daemon = True
+    waiting.start()
+    _warm_up(bus)
+    waiting.cancel()
+    return Server(world, transport)
+
+
+def _faults(server: Server, orders: list[str], port: int | None) -> list[Control]:
+    """Schedule faults, and return the control socket if one is asked for."""
+    from drive_env.faults.bus_faults import BusFaults
+    from drive_env.faults.control import Control
+    from drive_env.faults.schedule import parse_order
+
+    if not orders and port is None:
+        return []
+    faults = BusFaults(server.world)
+    try:
+        for order in orders:
+            faults.add(parse_order(order))
+        if port is None:
+            return []
+        if not 0 <= port <= 65_535:
+            raise ValueError(f"--control {port} must be 0 to 65535")
+        control = Control(faults, port)
+    except (ValueError, OSError) as error:
+        server.close()
+        server.world.close()
+        if isinstance(error, OSError):
+            why = os.strerror(error.errno or 0)
+            _fail(f"cannot listen on {LOOPBACK}:{port}: {why}; choose another --control (0: a free one)")
+        _fail(f"--fault: {error}" if orders else str(error))
+    print(f"drive-env: drive-env fault NAME --control {control.port} lets something fail")
+    return [control]
+
+
+def _can_port(interface: str, channel: str | None, bit_rate: int) -> Any:
+    import can
+
+    from drive_env.bus.can_port import CanPort
+
+    if interface in NEEDS_CHANNEL and not (channel or can.util.load_config(config={"interface": interface})["channel"]):
+        _fail(f"--interface {interface} needs --channel, e.g. --channel vcan0; without one it would serve nobody")
+    try:
+        return CanPort(can.Bus(interface=interface, channel=channel, bitrate=bit_rate))
+    except (can.CanError, OSError, ValueError, TypeError, NotImplementedError, ImportError) as error:
+        _fail(f"cannot open --interface {interface} --channel {channel}: {error}")
+
+
+def _warm_up(bus: Bus) -> None:
+    """Do once on drives that are thrown away what serving does: what happens first compiles or loads for long."""
+    from drive_env.bus.config import build_world
+    from drive_env.canopen.frames import NMT, SDO_REQUEST, SYNC, Frame
+
+    row = bus.machines[0]
+    world = build_world(replace(bus, machines=(row,), store=None), lockstep=True)
+    world.power_on()
+    for data in WARM_UP_REQUESTS:
+        world.receive(Frame(SDO_REQUEST + row.nodes[0], data))
+    world.receive(Frame(NMT, bytes((1, row.nodes[0]))))
+    for _ in range(3):
+        world.receive(Frame(SYNC))
+    world.close()
+
+
+def _announce(
+    server: Server, bus: Bus, real_time: bool, token: str | None, interface: str | None, channel: str | None
+) -> None:
+    from drive_env.bus.hub import Hub
+
+    nodes = ", ".join(
+        f"node {', '.join(map(str, row.nodes))} ({row.device}, {row.motor}, {row.load})" for row in bus.machines
+    )
+    pace = "in real time" if real_time else "in lockstep: each SYNC is 1 ms"
+    print(f"drive-env: {nodes}, {bus.bit_rate / 1e3:g} kbit/s, {pace}; Ctrl-C ends it")
+    hub = server.transport
+    if isinstance(hub, Hub):
+        if hub.is_public:
+            print(
+                f"drive-env: {hub.host}:{hub.port} is open to the network: whoever reaches it and has the token may "
+                "read and move these drives. Token and frames travel as plain text; where others listen, serve on "
+                f"{LOOPBACK} and use an SSH tunnel."
+            )
+        print("import can")
+        print(f'bus = can.Bus(interface="slcan", channel="{hub.channel}", sleep_after_open=0)')
+        if token is not None:
+            print(f'bus.serialPortOrig.write(b"K{token}\\r"); bus.open()')
+            print(f"drive-env: programs of drive-env take the token from the environment: DRIVE_ENV_TOKEN={token}")
+    else:
+        print(f"on {interface} {channel or ''}".rstrip())
+    sys.stdout.flush()
+
+
+def _statistics(server: Server) -> str:
+    """Return what --stats prints."""
+    world, late = server.world, server.lateness
+    counts = world.wire.statistics
+    lost = counts.lost + getattr(server.transport, "lost", 0)
+    rate = f" = {counts.frames / world.time:.0f}/s" if world.time else ""
+    lines = [
+        f"{counts.frames} frames in {world.time:.3f} s of the drives' time{rate}, {counts.errors} error frames, "
+        f"{lost} lost",
+        f"bus load {100 * world.load():.1f} %, at most {counts.most_waiting} frames waiting",
+    ]
+    if late.count:
+        p50, p99 = late.percentile(0.5), late.percentile(0.99)
+        lines.insert(
+            0,
+            f"lateness of {late.count} cycles of 1 ms: p50 {1e3 * p50:.3f} ms, p99 {1e3 * p99:.3f} ms, "
+            f"max {1e3 * late.largest:.3f} ms, {server.skipped:.3f} s skipped",
+        )
+    return "\n".join(lines)
+
+
+def _ender(server: list[Server]) -> Any:
+    """Return a signal handler that ends the server, or the process where there is none yet."""
+
+    def end(*_: object) -> None:
+        if server:
+            server[0].stop()
+        else:  # not by an exception: raised while the compiler calls back into Python it would be lost
+            print("drive-env: ended before it began to serve", flush=True)
+            os._exit(0)
+
+    return end
+
+
+def _can_error() -> type[Exception]:
+    import can
+
+    error: type[Exception] = can.CanError
+    return error
+
+
+def _fail(message: str, code: int = USER_ERROR) -> NoReturn:
+    fail(message, code)

@@ -1,0 +1,1 @@
+"""Emulated drives: their records, groups, machines, parameters and recording."""

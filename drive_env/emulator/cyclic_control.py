@@ -1,0 +1,188 @@
+"""The same few cycles again and again: set-points out, samples in, with an agent's own compiled code beside them.
+
+What an outer controller computes for each machine is computed in the thread that runs the machine, so that it takes
+part in what threads gain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.dictionary.entries import ObjectName
+from drive_env.emulator.group import call_of
+from drive_env.emulator.prepared_record import ProcessImage, from_od_rows, to_od_rows
+from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, Numbers, reader
+from mechanics.calls import address_of_hook, call_hook
+from mechanics.compiled import cached
+
+if TYPE_CHECKING:
+    from drive_env.emulator.emulated_drives import EmulatedDrives
+
+Integers = NDArray[np.int64]
+
+
+class Hooks(NamedTuple):
+    """Compiled code that runs before and after the cycles, for the axes `first` up to `first + count` at a time.
+
+    Both are `cached` functions of (address of the bundle, first, count) that return an integer; several threads may be
+    in them at once, each with axes of whole machines of its own.
+    """
+
+    before: Any
+    after: Any
+    bundle: Bundle
+
+
+class Exchange:
+    """A call of `record` with memory of its own, on any Drives.
+
+    Attributes:
+        play: What is played.
+        played: Integers to play, shape (objects, cycles, num_axes); whoever runs, or `before`, fills them in.
+        sampled: Integers of each cycle, written, shape (objects, cycles, num_axes).
+    """
+
+    def __init__(
+        self, drives: Any, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int, period: float
+    ) -> None:
+        self.hooks: Hooks | None = None
+        self.played: Integers = np.zeros((len(play), cycles, drives.num_axes), np.int64)
+        self.sampled: Integers = np.zeros((len(objects), cycles, drives.num_axes), np.int64)
+        self._drives, self._objects, self.play = drives, tuple(objects), tuple(play)
+        self._duration = cycles * period
+
+    def run(self) -> None:
+        """Let the cycles pass.
+
+        Raises:
+            ObjectAccessError: For an object that cannot be recorded or played, or a value out of range.
+        """
+        drives, hooks = self._drives, self.hooks
+        if hooks is not None:
+            hooks.before(hooks.bundle.address, 0, drives.num_axes)
+        trace = drives.record(self._objects, self._duration, play=dict(zip(self.play, self.played, strict=True)))
+        for rows, name in zip(self.sampled, self._objects, strict=True):
+            rows[:] = trace[name]
+        if hooks is not None:
+            hooks.after(hooks.bundle.address, 0, drives.num_axes)
+
+
+@dataclass(eq=False)
+class Conversion(Bundle):
+    """Integers that are played and sampled, their factors [SI per drive unit], and whose hooks run beside."""
+
+    played: NumberCube  # (objects, cycles, axes)
+    factors: Matrix  # (objects, axes)
+    limits: NumberCube  # (objects, 2, 1)
+    values: Cube  # SI, (cycles, objects, axes)
+    sampled: NumberCube
+    sample_factors: Matrix
+    sample_limits: Matrix  # (objects, 2)
+    wraps: Numbers
+    samples: Cube  # SI
+    refused: Numbers  # (1,) not 0: an integer was out of range, and its group stayed as it was
+    before: int = 0
+    after: int = 0
+    data: int = 0
+
+
+conversion_at = reader(Conversion)
+
+
+@cached(allocates=False)
+def convert_in(address: Any, first: Any, count: Any) -> Any:
+    """Run the hook before, and bring what is played into SI; return 0 if an integer is out of range."""
+    own = conversion_at(address)
+    if own.before != 0:
+        call_hook(own.before, own.data, first, count)
+    played, factors, limits, values = own.played, own.factors, own.limits, own.values
+    for k in range(played.shape[0]):
+        low, high = limits[k, 0, 0], limits[k, 1, 0]
+        if not from_od_rows(played[k], factors[k], low, high, values, k, first, first + count):
+            own.refused[0] = 1
+            return 0
+    return 1
+
+
+@cached(allocates=False)
+def convert_out(address: Any, first: Any, count: Any) -> Any:
+    """Bring samples into drive units, and run the hook after."""
+    own = conversion_at(address)
+    to_od_rows(own.samples, own.sample_factors, own.sample_limits, own.wraps, own.sampled, first, first + count)
+    if own.after != 0:
+        call_hook(own.after, own.data, first, count)
+    return 1
+
+
+class EmulatedExchange(Exchange):
+    """The same on emulated drives, without the interpreter once it has begun."""
+
+    def __init__(
+        self, drives: EmulatedDrives, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int
+    ) -> None:
+        super().__init__(drives, objects, play, cycles, 1.0 / drives.device.profile_rate)
+        self._cycles = cycles
+        self._scale_changes = -1
+
+    def run(self) -> None:
+        """Let the cycles pass; of axes whose integers are out of range none of the group is run."""
+        if self._scale_changes != self._drives._objects.scale_changes:
+            self._prepare()
+        if self._image is None:
+            super().run()
+            return
+        self._refused[0] = 0
+        self._drives._run(self._cycles, self._call)
+        if self._refused[0]:
+            self._drives._objects.plan_play(dict(zip(self.play, self.played, strict=True)), self._cycles)
+
+    def _prepare(self) -> None:
+        drives, hooks = self._drives, self.hooks
+        # What cannot be recorded or played at all is refused here.
+        for name in self._objects:
+            drives._objects.recordable(drives._objects.entries.find(name))
+        drives._objects.plan_play(dict(zip(self.play, self.played, strict=True)), self._cycles)
+        self._scale_changes = drives._objects.scale_changes
+        self._image: ProcessImage | None = drives._objects.process_image(self._objects, self.play)
+        if self._image is None:
+            return
+        image, axes = self._image, drives.num_axes
+        values = np.zeros((self._cycles, len(self.play), axes))
+        samples = np.zeros((self._cycles, len(self._objects), axes))
+        self._refused = np.zeros(1, np.int64)
+        rows = image.inputs
+        self._conversion = Conversion(
+            played=self.played,
+            factors=np.array([row.factor for row in rows], float).reshape(len(rows), axes),
+            limits=np.array([(row.low, row.high) for row in rows], np.int64).reshape(len(rows), 2, 1),
+            values=values,
+            sampled=self.sampled,
+            sample_factors=image.factors,
+            sample_limits=image.limits,
+            wraps=image.wraps.astype(np.int64),
+            samples=samples,
+            refused=self._refused,
+            before=0 if hooks is None else address_of_hook(hooks.before),
+            after=0 if hooks is None else address_of_hook(hooks.after),
+            data=0 if hooks is None else hooks.bundle.address,
+        )
+        self._call = call_of(values, image.played, samples, image.sampled, 1)
+        self._call.replace(
+            before=address_of_hook(convert_in), after=address_of_hook(convert_out), data=self._conversion.address
+        )
+
+
+def exchange(
+    drives: Any, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int, period: float
+) -> Exchange:
+    """Return the exchange of some cycles of `period` [s], in the way that is best for these drives."""
+    from drive_env.emulator.emulated_drives import EmulatedDrives
+
+    if isinstance(drives, EmulatedDrives):
+        return EmulatedExchange(drives, objects, play, cycles)
+    return Exchange(drives, objects, play, cycles, period)

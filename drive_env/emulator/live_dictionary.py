@@ -1,0 +1,364 @@
+"""The object dictionary of emulated drives, alive: its values are the fields of their records.
+
+Reading and writing check type, access, range and state exactly as the bus does; the error carries the SDO abort code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env.devices import Device
+from drive_env.dictionary import units
+from drive_env.dictionary.access import (
+    CANNOT_BE_STORED,
+    WRONG_STATE,
+    ObjectAccessError,
+    check_allowed,
+    check_in_range,
+    check_readable,
+    check_writable,
+    checked_values,
+)
+from drive_env.dictionary.bindings import Binding
+from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
+from drive_env.emulator.group import Channels, channels
+from drive_env.emulator.prepared_record import SCALES, SPECIAL_UNITS, ProcessImage, Row
+from drive_env.emulator.record_snapshot import LaneImage
+from drive_env.firmware import cycle
+from drive_env.firmware.fsa import State
+from drive_env.firmware.modes import MODES
+from drive_env.firmware.record import get_lanes, set_lanes
+
+Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
+NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
+POSITION_SCALER = (0x2058, 0)
+MODE_OF_OPERATION = (0x6060, 0)
+
+
+class LiveDictionary:
+    """Objects of all axes.
+
+    Args:
+        device: Whose dictionary it is.
+        records: The axes' records.
+        num_axes: Number of axes.
+        preset: Object name -> raw value, written after the factory values; both are what a reset restores.
+    """
+
+    def __init__(self, device: Device, records: NDArray[np.void], num_axes: int, preset: Mapping[str, int]) -> None:
+        self.device = device
+        self.entries: ObjectDictionary = device.new_dictionary()
+        self._records = records
+        self.num_axes = num_axes
+        self._scale_changes = 0
+        self._image: LaneImage | None = None  # of what a restart restores
+        self._values: dict[tuple[int, int], Integers | str] = {}
+        self._stored = self._commission(preset)
+
+    def read(self, name: ObjectName) -> Integers:
+        """Return an object of every axis, int64 of shape (num_axes,); a text as an array of str."""
+        entry = self.entries.find(name)
+        check_readable(entry)
+        return self._read(entry)
+
+    def write(self, name: ObjectName, value: ArrayLike, where: Mask) -> None:
+        """Write an object of the axes where the mask is true; everything is checked before anything changes."""
+        entry = self.entries.find(name)
+        check_writable(entry)
+        raw = checked_values(entry, value, self.num_axes)
+        self._check(entry, raw, where)
+        self._write(entry, raw, where)
+
+    def impose(self, name: ObjectName, raw: ArrayLike) -> None:
+        """Set what a read-only object that the firmware does not compute shows, from outside; its range is checked."""
+        entry = self.entries.find(name)
+        self._set_value(entry, checked_values(entry, raw, self.num_axes), np.ones(self.num_axes, bool))
+
+    def restart(self, axes: Mask) -> None:
+        """Restore the stored values of the axes where the mask is true, and start their firmware anew."""
+        before = self._context()
+        if self._image is None:
+            self._image = self._stored_image()
+        self._image.restore(axes)
+        chosen = np.flatnonzero(axes)
+        for key, raw in self._stored.items():
+            values = self._values.get(key)
+            if isinstance(values, np.ndarray):
+                values[chosen] = raw[chosen]
+        after = self._context()
+        if np.any(before.position_scaler != after.position_scaler):
+            self._scale_changes += 1
+        cycle.power_on(self._records, axes)
+
+    @property
+    def records(self) -> NDArray[np.void]:
+        """The axes' records."""
+        return self._records
+
+    def unbound(self, entry: Entry) -> Integers | str:
+        """Return the values of an object that no field of the record is, one per axis, not a copy; or its text."""
+        return self._values[entry.index, entry.sub]
+
+    def stored(self, axis: int) -> dict[tuple[int, int], int]:
+        """Return what a restart restores on one axis."""
+        return {key: int(raw[axis]) for key, raw in self._stored.items()}
+
+    def store(self, axis: int, values: Mapping[tuple[int, int], int]) -> None:
+        """Set what a restart restores on one axis; the values are those of objects that exist, within their range."""
+        for key, raw in values.items():
+            self._stored[key][axis] = raw
+        self._image = None
+
+    def write_checked(self, entry: Entry, raw: int, axis: int) -> None:
+        """Write an object of one axis that was checked before."""
+        where = np.zeros(self.num_axes, bool)
+        where[axis] = True
+        self._write(entry, np.full(self.num_axes, raw, np.int64), where)
+
+    @property
+    def scale_changes(self) -> int:
+        """How often the scale of positions has been written, on whatever axis."""
+        return self._scale_changes
+
+    def process_image(self, sampled: Sequence[ObjectName], played: Sequence[ObjectName]) -> ProcessImage | None:
+        """Return what a call of `record` needs when it repeats, None if an object needs the long way.
+
+        The call was made before, so that everything was found that could be refused but values.
+        """
+        entries = [self.entries.find(name) for name in sampled]
+        inputs = [self.entries.find(name) for name in played]
+        for entry in entries + inputs:
+            binding = self.device.bindings.get((entry.index, entry.sub))
+            if binding is None or binding.unit in SPECIAL_UNITS:
+                return None
+        if any(allowed_values(self.device, entry) is not None for entry in inputs):
+            return None
+        outputs = list({(entry.index, entry.sub): entry for entry in entries}.values())
+        rows, sources = [self._row(entry) for entry in outputs], [self._row(entry) for entry in inputs]
+        if any(row.binding.field in SCALES for row in sources):
+            return None
+        into = channels(
+            [(row.binding.field, row.binding.part) for row in sources], [_EVENTS[row.binding.event] for row in sources]
+        )
+        out_of = channels([(row.binding.field, row.binding.part) for row in rows])
+        return ProcessImage((into, sources), (out_of, rows), self._scale_changes)
+
+    def _row(self, entry: Entry) -> Row:
+        binding = self.device.bindings[entry.index, entry.sub]
+        factor = np.broadcast_to(units.UNITS[binding.unit].factor(self._context()), (self.num_axes,))
+        assert entry.low is not None and entry.high is not None, "only numbers are bound"
+        wraps = (entry.index, entry.sub) in units.WRAPPING
+        return Row(entry, binding, np.array(factor, float), wraps, entry.low, entry.high)
+
+    def recordable(self, entry: Entry) -> Binding | None:
+        """Return the binding of an entry whose value changes by itself, None of one that only a write changes."""
+        check_readable(entry)
+        return self.device.bindings.get((entry.index, entry.sub))
+
+    def plan_play(self, play: Mapping[ObjectName, ArrayLike], cycles: int) -> tuple[Floats, Channels]:
+        """Return SI values, shape (cycles, objects, num_axes), and the fields that they go to.
+
+        Raises:
+            ObjectAccessError: For an object that cannot be played or a value that it cannot have.
+            ValueError: For rows that do not fit.
+        """
+        values = np.empty((cycles, len(play), self.num_axes))
+        fields: list[tuple[str, int]] = []
+        kinds: list[int] = []
+        for k, (name, given) in enumerate(play.items()):
+            entry = self.entries.find(name)
+            check_writable(entry)
+            if not self._is_bound(entry) or (entry.index, entry.sub) == POSITION_SCALER:
+                raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} cannot be played; write it before")
+            raw = np.asarray(given)
+            if raw.shape not in ((cycles,), (cycles, self.num_axes)):
+                raise ValueError(
+                    f"{entry.label}: play takes shape ({cycles},) or ({cycles}, {self.num_axes}), one row per cycle, "
+                    f"not {raw.shape}"
+                )
+            check_in_range(entry, raw)
+            self._check_value(entry, raw.astype(np.int64).reshape(-1))
+            binding = self.device.bindings[entry.index, entry.sub]
+            values[:, k] = self._from_od(binding, raw if raw.ndim == 2 else raw[:, None])
+            fields.append((binding.field, binding.part))
+            kinds.append(_EVENTS[binding.event])
+        return values, channels(fields, kinds) if fields else NOTHING
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _commission(self, preset: Mapping[str, int]) -> dict[tuple[int, int], Integers]:
+        """Write factory values, then the preset; return the raw values that a reset restores."""
+        everywhere = np.ones(self.num_axes, bool)
+        stored: dict[tuple[int, int], Integers] = {}
+        for entry in self.entries:
+            if isinstance(entry.default, str):
+                self._values[entry.index, entry.sub] = entry.default
+            else:
+                stored[entry.index, entry.sub] = np.full(self.num_axes, entry.default, np.int64)
+        modes = sum(1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None)
+        stored[0x6502, 0] = np.full(self.num_axes, modes, np.int64)
+        for name, value in preset.items():
+            entry = self.entries.find(name)
+            raw = checked_values(entry, value, self.num_axes)
+            self._check_value(entry, raw)
+            stored[entry.index, entry.sub] = raw.copy()
+        # The scaler first: the factors of positions follow it.
+        for key in sorted(stored, key=lambda key: key != POSITION_SCALER):
+            self._restore(self.entries.find(key), stored[key], everywhere)
+        return stored
+
+    def _restore(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        """Write a value without what a write sets off; a read-only field that the firmware computes stays."""
+        if self._is_bound(entry):
+            if entry.access not in ("ro", "const"):
+                self._set_field(entry, raw, where)
+        else:
+            self._set_value(entry, raw, where)
+
+    def _stored_image(self) -> LaneImage:
+        """Return the fields that `_restore` would set from what is stored, converted by the scales that are stored."""
+        context = self._context()._replace(position_scaler=self._stored[POSITION_SCALER].astype(float))
+        bound = [key for key in self._stored if key in self.device.bindings]
+        rows = [self.device.bindings[key] for key in bound if self.entries.find(key).access not in ("ro", "const")]
+        values = [self._from_od(row, self._stored[row.index, row.sub], context) for row in rows]
+        return LaneImage(self._records, [(row.field, row.part) for row in rows], np.array(values))
+
+    def _is_bound(self, entry: Entry) -> bool:
+        return (entry.index, entry.sub) in self.device.bindings
+
+    def _context(self) -> units.Context:
+        device = self.device
+        return units.Context(
+            position_scaler=get_lanes(self._records, "position_scaler", self.num_axes).astype(float),
+            current_lsb=device.current_full_scale / 32768.0,
+        )
+
+    def _read(self, entry: Entry) -> Integers:
+        if self._is_bound(entry):
+            binding = self.device.bindings[entry.index, entry.sub]
+            value = get_lanes(self._records, binding.field, self.num_axes, binding.part)
+            return self.to_od(entry, binding, value.astype(float))
+        stored = self._values[entry.index, entry.sub]
+        return np.full(self.num_axes, stored) if isinstance(stored, str) else stored.copy()
+
+    def to_od(self, entry: Entry, binding: Binding, value: Floats) -> Integers:
+        """Return integers on the wire of SI values; axes are the last dimension."""
+        if binding.unit == "position window":
+            return units.window_to_od(value, self._context())
+        if binding.unit == "position limit":
+            return units.limit_to_od(value, self._context())
+        if (entry.index, entry.sub) in units.WRAPPING:
+            increments = np.rint(value / units.UNITS["inc"].factor(self._context()))
+            return np.nan_to_num(units.wrap(increments)).astype(np.int64)
+        low, high = entry.low, entry.high
+        assert low is not None and high is not None, "only numbers are bound"
+        return units.to_od(binding.unit, value, self._context(), low, high)
+
+    def _from_od(self, binding: Binding, raw: NDArray[Any], context: units.Context | None = None) -> Floats:
+        scales = self._context() if context is None else context
+        if binding.unit == "position window":
+            return units.window_from_od(raw, scales)
+        if binding.unit == "position limit":
+            return units.limit_from_od(raw, scales)
+        return units.from_od(binding.unit, raw, scales)
+
+    def _check(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        self._check_value(entry, raw[where])
+        key = (entry.index, entry.sub)
+        if key in self.device.write_states:
+            states = get_lanes(self._records, "fsa", self.num_axes)[where]
+            for state in np.unique(states):
+                check_state(self.device, entry, int(state))
+        if key == MODE_OF_OPERATION and self.device.refuses_same_mode:
+            same = raw[where] == get_lanes(self._records, "mode", self.num_axes)[where]
+            if np.any(same):
+                refuse_same_mode(entry, int(raw[where][same][0]))
+
+    def _check_value(self, entry: Entry, raw: Integers) -> None:
+        check_supported(self.device, entry)
+        allowed = allowed_values(self.device, entry)
+        if allowed is not None:
+            check_allowed(entry, raw, allowed)
+
+    def _write(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        key = (entry.index, entry.sub)
+        if not self._is_bound(entry):
+            self._set_value(entry, raw, where)
+            return
+        event = _EVENTS[self.device.bindings[key].event]
+        if event == cycle.SET_POINT:
+            self._set_field(entry, raw, where)
+            set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
+        elif event >= 0:
+            cycle.write_events(self._records, event, raw, where)
+        elif key == POSITION_SCALER:
+            self._rescale(entry, raw, where)
+        else:
+            self._set_field(entry, raw, where)
+
+    def _rescale(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        """Change 2058h: what is stored in increments keeps its integers, and so changes its SI value."""
+        kept = [
+            (other, self._read(other))
+            for other in self.entries
+            if self._is_bound(other)
+            and other.access not in ("ro", "const")
+            and self.device.bindings[other.index, other.sub].unit in units.SCALED_BY_POSITION
+        ]
+        self._set_field(entry, raw, where)
+        for other, value in kept:
+            self._set_field(other, value, where)
+
+    def _set_field(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        binding = self.device.bindings[entry.index, entry.sub]
+        if binding.field in SCALES:
+            self._scale_changes += 1
+        set_lanes(self._records, binding.field, self._from_od(binding, raw), where, binding.part)
+
+    def _set_value(self, entry: Entry, raw: Integers, where: Mask) -> None:
+        key = (entry.index, entry.sub)
+        before = self._values.get(key)
+        self._values[key] = raw.copy() if before is None else np.where(where, raw, before)
+
+
+# --- what the device allows, the same for a set of axes and for the one axis of a node --------------------------------
+def check_supported(device: Device, entry: Entry) -> None:
+    """Raise 08000020h for an object whose write would need a service that is not there."""
+    if (entry.index, entry.sub) in device.unsupported:
+        raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} has no service behind it in this emulator")
+
+
+def allowed_values(device: Device, entry: Entry) -> tuple[int, ...] | None:
+    """Return the few values that an object knows, None if it takes its whole range."""
+    if (entry.index, entry.sub) == MODE_OF_OPERATION:
+        return tuple(mode.number for mode in MODES)
+    return device.allowed_values.get((entry.index, entry.sub))
+
+
+def check_state(device: Device, entry: Entry, state: int) -> None:
+    """Raise 08000022h for an object that cannot be written while the drive is in this state."""
+    needed = State[device.write_states[entry.index, entry.sub]]
+    if state != needed:
+        raise ObjectAccessError(
+            WRONG_STATE,
+            f"{entry.label} can only be written in {_state_name(needed)}; the drive is in {_state_name(State(state))}",
+        )
+
+
+def refuse_same_mode(entry: Entry, mode: int) -> NoReturn:
+    """Raise 08000022h: the mode is what it is already."""
+    raise ObjectAccessError(
+        WRONG_STATE,
+        f"{entry.label} is {mode} already, and this drive refuses the same mode twice; read 6061h first",
+    )
+
+
+def _state_name(state: State) -> str:
+    return state.name.lower().replace("_", " ")

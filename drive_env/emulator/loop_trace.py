@@ -1,0 +1,110 @@
+"""What emulated drives do between two communication cycles: signals at the rate of the velocity loop.
+
+No bus carries this; a real drive of this kind shows its loops once a millisecond. The machines run exactly as they do
+otherwise, to the bit: a cycle is run as windows, and only the first of them does what the drive does once a cycle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env.dictionary.entries import ObjectName
+from drive_env.emulator.group import call_of, channels
+from drive_env.emulator.live_dictionary import NOTHING
+from drive_env.firmware.record import get_lanes, set_lanes
+
+if TYPE_CHECKING:
+    from drive_env.emulator.emulated_drives import EmulatedDrives
+
+Floats = NDArray[np.float64]
+
+# Signal -> unit; fields of the drive's record (firmware/record.py), as they are at a window's start.
+SIGNALS = {
+    "position_demand": "rad",
+    "theta_meas": "rad",
+    "velocity_demand": "rad/s",
+    "omega_ref": "rad/s",
+    "omega_meas": "rad/s",
+    "i_q_ref": "A",
+    "torque_meas": "A",
+    "theta_m": "rad",
+    "omega_m": "rad/s",
+}
+
+
+class LoopTrace(NamedTuple):
+    """Sample times [s], shape (n,), and each signal in SI, shape (n, num_axes)."""
+
+    t: Floats
+    signals: dict[str, Floats]
+
+
+def trace_loops(
+    drives: EmulatedDrives,
+    signals: Sequence[str],
+    duration: float,
+    play: Mapping[ObjectName, ArrayLike] | None = None,
+) -> LoopTrace:
+    """Let `duration` [s] pass while signals are sampled at the start of every window of the velocity loop.
+
+    Sample 5 k (with five windows a cycle) is what `record` has in row k: what the last cycle left behind.
+
+    Args:
+        drives: Emulated drives; on a bus no such trace exists.
+        signals: Names of `SIGNALS`.
+        duration: Whole communication cycles [s].
+        play: As `record` takes it, one row per communication cycle.
+
+    Raises:
+        ValueError: For drives on a bus, an unknown signal, or a time that is no whole number of cycles.
+        ObjectAccessError: For an object that cannot be played, or a value out of range.
+    """
+    if getattr(drives, "machine", None) is None:
+        raise ValueError("drives on a bus show their loops once per communication cycle only; use record()")
+    drives = drives.machine._drives  # whatever is wrapped around them
+    for name in signals:
+        if name not in SIGNALS:
+            raise ValueError(f"no signal is named {name!r}; there are {', '.join(SIGNALS)}")
+    cycles = drives._cycles(duration)
+    values, played = drives._objects.plan_play(play or {}, cycles)
+    sampled = channels([(name, 0) for name in signals])
+    windows = round(drives.device.velocity_rate / drives.device.profile_rate)
+    samples = np.empty((cycles, windows, len(signals), drives.num_axes))
+    live = get_lanes(drives._records, "live", drives.num_axes).astype(np.int32)
+    rates = {id(group.machinery.rates): group.machinery.rates for group in drives._groups}.values()
+    period = 1.0 / drives.device.profile_rate
+    begin, diverged = drives._now, False
+    try:
+        # Each window as if it were a cycle.
+        for one in rates:
+            one.replace(windows=1)
+        for k in range(cycles):
+            while drives._schedule and drives._schedule[0][0] <= begin + k:
+                _, name, row, where = drives._schedule.pop(0)
+                drives.machine.set(name, row, where)
+            first = call_of(np.ascontiguousarray(values[k : k + 1]), played, samples[k, :1], sampled, 1)
+            diverged |= drives._run_groups(first, 0, 1, True, True)
+            # A lane that is not alive is computed as ever, and left out of what happens once a cycle.
+            set_lanes(drives._records, "live", np.zeros(drives.num_axes, np.int32))
+            for one in rates:
+                one.replace(period=0.0)
+            nothing = np.empty((windows - 1, 0, drives.num_axes))
+            others = call_of(nothing, NOTHING, samples[k, 1:], sampled, 1)
+            diverged |= drives._run_groups(others, 0, windows - 1, True, True)
+            set_lanes(drives._records, "live", live)
+            for one in rates:
+                one.replace(period=period)
+            drives._now = begin + k + 1
+    finally:
+        set_lanes(drives._records, "live", live)
+        for one in rates:
+            one.replace(windows=windows, period=period)
+    if diverged:
+        drives._report_divergence()
+    rows = samples.reshape(cycles * windows, len(signals), drives.num_axes)
+    t = np.arange(len(rows)) / drives.device.velocity_rate
+    return LoopTrace(t, {name: rows[:, k].copy() for k, name in enumerate(signals)})

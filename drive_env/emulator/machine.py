@@ -1,0 +1,364 @@
+"""The emulated machines' side that no bus shows: true parameters, disturbances, supply, power.
+
+A task may use it to make a world, never to act; `drives.machine` is None on a real drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env.drives.arguments import checked_mask
+from drive_env.emulator.parameters import check_known, check_parameter
+from drive_env.emulator.record_snapshot import LaneImage
+from drive_env.faults.machine_faults import InjectedFault
+from drive_env.faults.schedule import Order
+from drive_env.firmware.record import STATE, get_lanes, set_lanes
+
+if TYPE_CHECKING:
+    from drive_env.emulator.emulated_drives import EmulatedDrives
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_BRAKES = ("open", "closed", "with_stage")  # numbers of firmware/cycle.py
+
+
+def checked_supply(value: ArrayLike, num_axes: int) -> Floats:
+    """Return the supply voltage of each axis [V], shape (num_axes,); ValueError for one that cannot be."""
+    volts = np.broadcast_to(np.asarray(value, float), (num_axes,))
+    bad = ~np.isfinite(volts) | (volts < 0.0)
+    if np.any(bad):
+        raise ValueError(f"supply voltage must be finite and 0 V or more, not {volts[bad][0]:g} V")
+    return volts
+
+
+class Machines:
+    """The emulated machines behind drives: one value per machine, shape (num_machines,), unless said otherwise."""
+
+    def __init__(self, drives: EmulatedDrives) -> None:
+        self._drives = drives
+        self._rest: LaneImage | None = None  # state of a machine at rest
+
+    @property
+    def parameters(self) -> dict[str, Floats]:
+        """True parameters by name [SI], each of shape (num_machines,)."""
+        return {name: values.copy() for name, values in self._drives._parameters.items()}
+
+    @property
+    def diverged(self) -> Mask:
+        """Which machines left physics and are frozen, shape (num_machines,)."""
+        return np.concatenate([group.load.plant.diverged != 0 for group in self._drives._groups])
+
+    @property
+    def load_torque(self) -> Floats:
+        """External torque on the load [N*m; N on a belt], shape (num_machines,); set one value or one per machine."""
+        return np.concatenate([group.load.plant.load_torque for group in self._drives._groups])
+
+    @load_torque.setter
+    def load_torque(self, value: ArrayLike) -> None:
+        values = self._per_machine(value, "load torque")
+        for group in self._drives._groups:
+            group.load.plant.load_torque[:] = values[group.machines]
+
+    def load_profile(
+        self,
+        at: ArrayLike | None,
+        torque: ArrayLike | None = None,
+        *,
+        of: str = "time",
+        period: float | None = None,
+    ) -> None:
+        """Add a torque from a table to `load_torque`, interpolated linearly, in all machines; None takes it away.
+
+        Args:
+            at: Times from now [s], or positions of the first axis's joint or carriage [rad or m]; increasing, (n,).
+            torque: On the load [N*m; N where the load moves in a line], shape (n,) or (num_machines, n).
+            of: "time" or "position".
+            period: After which the table begins anew; without one the first and last values hold outside.
+
+        Raises:
+            ValueError: For a table that is none; nothing is changed then.
+        """
+        drives = self._drives
+        if of not in ("time", "position"):
+            raise ValueError(f"a load profile is of time or of position, not of {of!r}")
+        points = np.zeros(0) if at is None else np.asarray(at, float)
+        values = np.zeros(0) if torque is None else np.asarray(torque, float)
+        if points.ndim != 1 or np.any(np.diff(points) <= 0.0) or not np.all(np.isfinite(points)):
+            raise ValueError("a load profile needs one finite, increasing row of times or positions")
+        if values.shape not in (points.shape, (drives.num_machines, *points.shape)) or not np.all(np.isfinite(values)):
+            raise ValueError(
+                f"a load profile of {len(points)} points needs finite torques of shape ({len(points)},) or "
+                f"({drives.num_machines}, {len(points)}), not {values.shape}"
+            )
+        if period is not None and (not len(points) or not period >= points[-1] - points[0] or not period > 0.0):
+            raise ValueError(f"the period of a load profile must be above 0 and span its points, not {period:g}")
+        rows = np.broadcast_to(values, (drives.num_machines, len(points)))
+        for group in drives._groups:
+            group.load.set_profile(points, rows[group.machines], of_position=of == "position", period=period or 0.0)
+
+    def schedule(self, name: str, times: ArrayLike, values: ArrayLike, where: Mask | None = None) -> None:
+        """Let a parameter change while time passes: a payload that is picked up, a supply line that warms.
+
+        Args:
+            name: A parameter, as in `set`.
+            times: Times from now [s], whole communication cycles, shape (n,).
+            values: What the parameter becomes then [SI], shape (n,) or (n, num_machines).
+            where: Machines.
+
+        Raises:
+            ValueError: As in `set`, at once, and for times that are past or no whole cycles.
+        """
+        drives = self._drives
+        check_known(name, drives._parameters)
+        mask, rows = self._mask(where), np.asarray(values, float)
+        cycles = [drives._cycles(float(time)) for time in np.atleast_1d(np.asarray(times, float))]
+        if rows.shape not in ((len(cycles),), (len(cycles), drives.num_machines)):
+            raise ValueError(
+                f"a schedule of {len(cycles)} times needs values of shape ({len(cycles)},) or "
+                f"({len(cycles)}, {drives.num_machines}), not {rows.shape}"
+            )
+        check_parameter(name, rows)
+        if name.startswith("load."):
+            drives._groups[0].load.values.check(name.removeprefix("load."), rows)
+        drives._schedule += [(drives._now + cycle, name, row, mask) for cycle, row in zip(cycles, rows, strict=True)]
+        drives._schedule.sort(key=lambda change: change[0])
+
+    @property
+    def brake(self) -> NDArray[np.str_]:
+        """Holding brake of each axis: "open", "closed", or "with_stage", closed while the stage is off; set likewise.
+
+        Its torque is twice the motor's rated torque: what holding brakes of this size are built for.
+        """
+        return np.array([_BRAKES[int(mode)] for mode in self._axis_field("brake_mode")])
+
+    @brake.setter
+    def brake(self, value: ArrayLike) -> None:
+        drives = self._drives
+        chosen = np.broadcast_to(np.asarray(value), (drives.num_axes,))
+        for state in chosen:
+            if state not in _BRAKES:
+                raise ValueError(f"a brake is {', '.join(_BRAKES)}, not {str(state)!r}")
+        set_lanes(drives._records, "brake_mode", np.array([_BRAKES.index(state) for state in chosen], float))
+
+    @property
+    def joint_positions(self) -> Floats:
+        """Positions of the load's joints, in the order of its MJCF [rad or m], shape (num_machines, joints)."""
+        return np.concatenate([group.load.joint_positions() for group in self._drives._groups])
+
+    @property
+    def supply(self) -> Floats:
+        """Open-circuit supply voltage [V], shape (num_axes,)."""
+        return self._axis_field("supply_voltage")
+
+    @supply.setter
+    def supply(self, value: ArrayLike) -> None:
+        drives = self._drives
+        volts = checked_supply(value, drives.num_axes)
+        with drives._faults.suspended():
+            set_lanes(drives._records, "supply_voltage", volts)
+
+    @property
+    def rotor_angle(self) -> Floats:
+        """True rotor angle [rad], shape (num_axes,)."""
+        return self._axis_field("theta_m")
+
+    @property
+    def rotor_speed(self) -> Floats:
+        """True rotor speed [rad/s], shape (num_axes,)."""
+        return self._axis_field("omega_m")
+
+    @property
+    def motor_torque(self) -> Floats:
+        """True motor torque, mean of the last current tick [N*m], shape (num_axes,)."""
+        return self._axis_field("tau_m")
+
+    @property
+    def switches(self) -> NDArray[np.int64]:
+        """Inputs as the load presses them, bits of 60FDh, shape (num_axes,)."""
+        return self._axis_field("inputs").astype(np.int64)
+
+    @property
+    def enable_input(self) -> Mask:
+        """Whether the enable input is closed, shape (num_axes,); set it to a value or one per axis."""
+        return self._axis_field("enable_input") > 0
+
+    @enable_input.setter
+    def enable_input(self, value: ArrayLike) -> None:
+        drives = self._drives
+        closed = np.broadcast_to(np.asarray(value, bool), (drives.num_axes,))
+        with drives._faults.suspended():
+            set_lanes(drives._records, "enable_input", closed.astype(np.int32))
+
+    @property
+    def outputs(self) -> NDArray[np.int64]:
+        """Digital outputs, bit 0 is GPO0: those of 2703h:01 that the mask 2703h:02 lets through, shape (num_axes,)."""
+        read = self._drives.read
+        return (read((0x2703, 1)) & read((0x2703, 2))) >> 16 & 0xF
+
+    @property
+    def analog_inputs(self) -> NDArray[np.int64]:
+        """Readings of the analog inputs (270Eh), 0...4095, shape (2, num_axes); set them likewise."""
+        return np.stack([self._drives.read((0x270E, k)) for k in (1, 2)])
+
+    @analog_inputs.setter
+    def analog_inputs(self, value: ArrayLike) -> None:
+        values = np.broadcast_to(np.asarray(value), (2, self._drives.num_axes))
+        for k, raw in enumerate(values, 1):
+            self._drives._objects.impose((0x270E, k), raw)
+
+    @property
+    def temperatures(self) -> tuple[Floats, Floats]:
+        """Winding and stage temperature [degC], each of shape (num_axes,)."""
+        return self._axis_field("T_winding"), self._axis_field("T_stage")
+
+    def set_temperatures(self, winding: ArrayLike, stage: ArrayLike) -> None:
+        """Set winding and stage temperature [degC], as if the axis had worked before."""
+        for name, value in (("T_winding", winding), ("T_stage", stage)):
+            values = np.broadcast_to(np.asarray(value, float), (self._drives.num_axes,))
+            set_lanes(self._drives._records, name, values)
+
+    def set(self, name: str, value: ArrayLike, where: Mask | None = None) -> None:
+        """Set a true parameter [SI] of the machines where the mask is true; bad input changes nothing.
+
+        Raises:
+            ValueError: If there is no such parameter, the value is not finite, or no machine can have it.
+        """
+        drives = self._drives
+        check_known(name, drives._parameters)
+        mask = self._mask(where)
+        check_parameter(name, self._per_machine(value, name)[mask])
+        values = np.where(mask, self._per_machine(value, name), drives._parameters[name])
+        with drives._faults.suspended():
+            drives._apply_parameter(name, values, mask)
+        drives._parameters[name] = values
+
+    def set_all(self, values: Mapping[str, ArrayLike], where: Mask | None = None) -> None:
+        """Set several true parameters [SI] at once; bad input changes nothing.
+
+        Only the machine that results must be one that can be, not those on the way to it; and a machine's inertias
+        are derived once, which is what `set` spends its time with.
+
+        Args:
+            values: Parameter -> one value, or one per machine.
+            where: Machines.
+
+        Raises:
+            ValueError: As in `set`.
+        """
+        drives = self._drives
+        mask = self._mask(where)
+        new: dict[str, Floats] = {}
+        for name, value in values.items():
+            check_known(name, drives._parameters)
+            check_parameter(name, self._per_machine(value, name)[mask])
+            new[name] = np.where(mask, self._per_machine(value, name), drives._parameters[name])
+        before = {name: drives._parameters[name] for name in new}
+        with drives._faults.suspended():
+            try:
+                drives._apply_parameters(new, mask)
+            except ValueError:
+                drives._apply_parameters(before, mask)
+                raise
+
+    def fault(
+        self,
+        name: str,
+        *,
+        at: float = 0.0,
+        when: str = "",
+        duration: float | None = None,
+        where: Mask | None = None,
+        axis: int | None = None,
+        **parameters: float,
+    ) -> int:
+        """Let something fail on machines, by a schedule; what each fault does is in docs/faults.md.
+
+        A fault's change is on top of the machine as it was built, which `parameters` goes on to tell. It begins and
+        ends at communication cycles, and is the same for the same machine and seed.
+
+        Args:
+            name: A row of the table, as "encoder_stuck".
+            at: Time from now, or from when the condition holds for the first time [s], whole communication cycles.
+            when: What it waits for: "" nothing, "enabled" an axis in operation enabled, or a comparison of the true
+                rotor angle [rad] or its speed [rad/s], as "position > 3.1" or "speed > 100".
+            duration: Whole communication cycles [s]; None lasts until it is cleared or the machine is reset.
+            where: Machines.
+            axis: Number of the axis of each machine; all of them by default. Of a load's fault that is not of one axis
+                it has no meaning.
+            **parameters: Numbers of the fault, in the units of its row.
+
+        Returns:
+            Its number, for `clear_fault`.
+
+        Raises:
+            ValueError: For a fault, parameter, time or condition that is none, or one that this load cannot have.
+        """
+        order = Order(name, at, when, duration, axis=axis, parameters=parameters)
+        return self._drives._faults.add(order, self._mask(where))
+
+    def faults(self) -> list[InjectedFault]:
+        """Return the faults that are still to come or are there; one that has ended everywhere is forgotten."""
+        return self._drives._faults.listing()
+
+    def clear_fault(self, number: int | None = None, where: Mask | None = None) -> None:
+        """End a fault or call it off, None all of them; ValueError if there is none of that number."""
+        self._drives._faults.clear(number, self._mask(where))
+
+    def seed_noise(self, seeds: ArrayLike, where: Mask | None = None) -> None:
+        """Give machines another noise from their next reset on: whole numbers 1...2^32 - 1, shape (num_machines,)."""
+        mask = self._mask(where)
+        chosen = np.asarray(seeds, float)
+        if chosen.shape != mask.shape or np.any((chosen < 1.0) | (chosen >= 2.0**32)):
+            raise ValueError(f"noise takes {len(mask)} seeds of 1...{2**32 - 1}, one per machine")
+        axes = self._drives.num_axes // self._drives.num_machines
+        # As when machines are drawn: every axis has a noise of its own.
+        apart = np.repeat(chosen, axes) + np.tile(np.arange(axes), len(mask))
+        every = np.repeat(mask, axes)
+        self._drives._noise_seeds[every] = (np.mod(apart, 2.0**32 - 1.0) + 1.0)[every]
+
+    def reset(self, where: Mask | None = None) -> None:
+        """Put machines to rest at zero and switch their drives on anew; a diverged machine lives again, faults end."""
+        mask = self._mask(where)
+        drives = self._drives
+        if drives._faults.some:
+            drives._faults.clear(None, mask)
+        for group in drives._groups:
+            group.load.reset(mask[group.machines])
+        axes = np.repeat(mask, drives.num_axes // drives.num_machines)
+        if self._rest is None:
+            parts = [(field, part) for field in STATE for part in range(field.depth)]
+            initial = np.array([[field.initial] for field, _ in parts])
+            self._rest = LaneImage(drives._records, [(field.name, part) for field, part in parts], initial)
+        self._rest.restore(axes)
+        set_lanes(drives._records, "random", drives._noise_seeds, axes)
+        for live, nominal in (("R_s", "R_nominal"), ("psi_m", "psi_nominal")):
+            set_lanes(drives._records, live, get_lanes(drives._records, nominal, drives.num_axes), axes)
+        drives._reported[mask] = False
+        drives._objects.restart(axes)
+
+    def power_cycle(self, where: Mask | None = None) -> None:
+        """Switch the supply of the drives off and on: stored values return, counters and positions start at zero."""
+        drives = self._drives
+        drives._objects.restart(np.repeat(self._mask(where), drives.num_axes // drives.num_machines))
+
+    def _axis_field(self, name: str) -> Floats:
+        return get_lanes(self._drives._records, name, self._drives.num_axes).astype(float)
+
+    def _mask(self, where: Mask | None) -> Mask:
+        return checked_mask(where, self._drives.num_machines)
+
+    def _per_machine(self, value: ArrayLike, name: str) -> Floats:
+        values = np.asarray(value, float)
+        if values.shape not in ((), (self._drives.num_machines,)):
+            raise ValueError(
+                f"{name} takes one value or one for each of {self._drives.num_machines} machines, not shape "
+                f"{values.shape}"
+            )
+        if np.any(np.isnan(values)):
+            raise ValueError(f"{name} must be a number, not nan")
+        return np.broadcast_to(values, (self._drives.num_machines,)).copy()

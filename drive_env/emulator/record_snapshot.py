@@ -1,0 +1,44 @@
+"""Values of many fields of drive records, to be put into some axes at once: what a reset or a restart restores."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.emulator.group import channels
+from drive_env.firmware import cycle
+from drive_env.firmware.record import LANES, RECORD
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class LaneImage:
+    """Fields and the values that they get.
+
+    Args:
+        records: Whose fields they are, contiguous.
+        fields: Pairs of field and part.
+        values: One row per field, of one value for all axes or one per axis.
+    """
+
+    def __init__(self, records: NDArray[np.void], fields: Sequence[tuple[str, int]], values: Floats) -> None:
+        memory = records.view(np.uint8).reshape(len(records), RECORD.itemsize)
+        kinds, offsets = channels(list(fields))
+        real = kinds == cycle.REAL
+        self._reals, self._integers = memory.view(np.float64), memory.view(np.int32)
+        self._real_offsets, self._integer_offsets = offsets[real], offsets[~real]
+        self._real_values = np.ascontiguousarray(values[real].T)
+        self._integer_values = np.ascontiguousarray(values[~real].T.astype(np.int32))
+
+    def restore(self, where: Mask) -> None:
+        """Set the fields of the axes where the mask is true, shape (num_axes,)."""
+        axes = np.flatnonzero(where)
+        blocks, lanes = (axes // LANES)[:, None], (axes % LANES)[:, None]
+        for memory, offsets, values in (
+            (self._reals, self._real_offsets, self._real_values),
+            (self._integers, self._integer_offsets, self._integer_values),
+        ):
+            memory[blocks, offsets + lanes] = values if len(values) == 1 else values[axes]

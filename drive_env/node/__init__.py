@@ -1,0 +1,1 @@
+"""What the node of every fieldbus has."""

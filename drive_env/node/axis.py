@@ -1,0 +1,208 @@
+"""One axis of emulated drives as the node of a fieldbus sees it: its objects, one integer at a time, its emergencies.
+
+`LiveDictionary` works on all axes at once; a node needs a few values of one axis a thousand times a second, so here
+the way from an object to its place in the record is worked out once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from drive_env.dictionary import units
+from drive_env.dictionary.access import CANNOT_BE_STORED, ObjectAccessError, check_allowed, check_limits
+from drive_env.dictionary.bindings import Binding
+from drive_env.dictionary.entries import Entry
+from drive_env.emulator.live_dictionary import (
+    MODE_OF_OPERATION,
+    POSITION_SCALER,
+    LiveDictionary,
+    allowed_values,
+    check_state,
+    check_supported,
+    refuse_same_mode,
+)
+from drive_env.firmware import cycle, protection
+from drive_env.firmware.record import EMERGENCY_QUEUE, LANES, RECORD
+
+# Units whose factor an axis can change while it runs.
+_CHANGING = units.SCALED_BY_POSITION
+
+
+class Port(NamedTuple):
+    """The way to one object: what it is, its value, the check of a new value, the write of a checked one.
+
+    `event` names what a write sets off, as in a binding.
+    """
+
+    entry: Entry
+    read: Callable[[], int | str]
+    check: Callable[[int], None]
+    write: Callable[[int], None]
+    event: str = ""
+
+
+class QueuedEmergency(NamedTuple):
+    """An emergency that an axis queued: row of `protection.CAUSES` and the error register of that moment."""
+
+    row: int
+    error_register: int
+
+
+class Axis:
+    """One axis.
+
+    Args:
+        objects: The dictionary of all axes.
+        number: The axis' number among them.
+    """
+
+    def __init__(self, objects: LiveDictionary, number: int) -> None:
+        self._objects = objects
+        self._device = objects.device
+        self.number = number
+        self._block, self._lane = divmod(number, LANES)
+        self._records = objects.records[self._block : self._block + 1]
+        memory = self._records.view(np.uint8).reshape(-1)
+        # Of one element a memoryview takes a third of the time that an array takes.
+        self._reals = memoryview(memory.view(np.float64))  # type: ignore[arg-type]
+        self._integers = memoryview(memory.view(np.int32))  # type: ignore[arg-type]
+        self._word = np.zeros(LANES, np.int64)
+        self._here = np.arange(LANES) == self._lane
+        self._count = self._place("emergency_count")[1]
+        self._queue = [self._place("emergency", k)[1] for k in range(EMERGENCY_QUEUE)]
+        self._fsa = self._place("fsa")[1]
+        self._fresh = self._place("set_point_fresh")[1]
+        self._scaler = self._place("position_scaler")[1]
+        self._error_register = self._place("error_register")[1]
+        self._ports: dict[tuple[int, int], Port] = {}
+
+    @property
+    def state(self) -> int:
+        """The automaton's state, a number of `fsa.State`."""
+        return self._integers[self._fsa]
+
+    @property
+    def error_register(self) -> int:
+        """The axis' share of 1001h."""
+        return self._integers[self._error_register]
+
+    def port(self, entry: Entry) -> Port:
+        """Return the way to an object; indices are those of axis 0."""
+        key = (entry.index, entry.sub)
+        if key not in self._ports:
+            self._ports[key] = self._make_port(entry)
+        return self._ports[key]
+
+    def take_emergencies(self) -> list[QueuedEmergency]:
+        """Return and forget the emergencies since the last call, oldest first."""
+        count = self._integers[self._count]
+        if count == 0:
+            return []
+        words = [self._integers[place] for place in self._queue[:count]]
+        self._integers[self._count] = 0
+        return [QueuedEmergency((word & 0xFF) - 1, word >> 8) for word in words]
+
+    def trip(self) -> bool:
+        """Take the axis from operation enabled into fault because its network is lost; return whether it was there."""
+        taken = protection.trip(self._records, self._lane, 1, protection.COMMUNICATION)  # type: ignore[no-untyped-call]
+        return bool(taken)
+
+    # --- inside ---------------------------------------------------------------------------------------------------
+    def _place(self, field: str, part: int = 0) -> tuple[Any, int]:
+        """Return the memory that a field is in, and its index there."""
+        dtype, start = RECORD.fields[field][:2]  # type: ignore[index]
+        memory = self._reals if dtype.base.kind == "f" else self._integers
+        return memory, start // dtype.base.itemsize + part * LANES + self._lane
+
+    def _make_port(self, entry: Entry) -> Port:
+        binding = self._device.bindings.get((entry.index, entry.sub))
+        check = self._checker(entry)
+        if binding is None:
+            return Port(entry, self._unbound_reader(entry), check, self._unbound_writer(entry))
+        return Port(entry, self._reader(entry, binding), check, self._writer(entry, binding), binding.event)
+
+    def _checker(self, entry: Entry) -> Callable[[int], None]:
+        device, key = self._device, (entry.index, entry.sub)
+        allowed = allowed_values(device, entry)
+        known = None if allowed is None else frozenset(allowed)
+        has_state = key in device.write_states
+        keeps_mode = key == MODE_OF_OPERATION and device.refuses_same_mode
+        mode, mode_place = self._place("mode")
+
+        def check(raw: int) -> None:
+            check_limits(entry, raw)
+            check_supported(device, entry)
+            if known is not None and raw not in known:
+                check_allowed(entry, np.array([raw]), allowed or ())
+            if has_state:
+                check_state(device, entry, self.state)
+            if keeps_mode and raw == mode[mode_place]:
+                refuse_same_mode(entry, raw)
+
+        return check
+
+    def _unbound_reader(self, entry: Entry) -> Callable[[], int | str]:
+        objects, number = self._objects, self.number
+
+        def read() -> int | str:
+            values = objects.unbound(entry)
+            return values if isinstance(values, str) else int(values[number])
+
+        return read
+
+    def _unbound_writer(self, entry: Entry) -> Callable[[int], None]:
+        objects, number = self._objects, self.number
+
+        def write(raw: int) -> None:
+            values = objects.unbound(entry)
+            if isinstance(values, str):
+                raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} is a text that cannot be written")
+            values[number] = raw
+
+        return write
+
+    def _factor(self, unit: str) -> float:
+        context = units.Context(self._reals[self._scaler], self._device.current_full_scale / 32768.0)
+        return units.factor_of_one(unit, context)
+
+    def _reader(self, entry: Entry, binding: Binding) -> Callable[[], int]:
+        memory, place = self._place(binding.field, binding.part)
+        unit, low, high = binding.unit, entry.low, entry.high
+        assert low is not None and high is not None, "only numbers are bound"
+        if memory is self._integers and unit == "raw":
+            return lambda: min(max(memory[place], low), high)
+        if (entry.index, entry.sub) in units.WRAPPING:
+            return lambda: units.one_wrapped(memory[place], self._factor(unit))
+        if unit in _CHANGING:
+            return lambda: units.one_to_od(unit, memory[place], self._factor(unit), low, high)
+        factor = self._factor(unit)
+        return lambda: units.one_to_od(unit, memory[place], factor, low, high)
+
+    def _writer(self, entry: Entry, binding: Binding) -> Callable[[int], None]:
+        memory, place = self._place(binding.field, binding.part)
+        unit = binding.unit
+        if (entry.index, entry.sub) == POSITION_SCALER:
+            return lambda raw: self._objects.write_checked(entry, raw, self.number)
+        if binding.event in ("controlword", "mode"):
+            kind = cycle.CONTROLWORD if binding.event == "controlword" else cycle.MODE
+            return lambda raw: self._write_event(kind, raw)
+        if memory is self._integers:
+            assert unit == "raw", "whole numbers of the record are bound as they are"
+            return lambda raw: memory.__setitem__(place, raw)
+        changing = unit in _CHANGING
+        fixed = self._factor(unit)
+        fresh = binding.event == "set_point"
+
+        def write(raw: int) -> None:
+            memory[place] = units.one_from_od(unit, raw, self._factor(unit) if changing else fixed)
+            if fresh:
+                self._integers[self._fresh] = 1
+
+        return write
+
+    def _write_event(self, kind: int, raw: int) -> None:
+        self._word[self._lane] = raw
+        cycle.write_events(self._records, kind, self._word, self._here)  # type: ignore[no-untyped-call]

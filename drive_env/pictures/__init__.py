@@ -1,0 +1,1 @@
+"""Pictures of machines and signals, and films of them."""

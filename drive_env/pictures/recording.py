@@ -1,0 +1,184 @@
+"""A run as a film needs it: where the machine was and what its drives measured, every communication cycle.
+
+`Recorder` stands in for the drives, so that `motion` and any script drive through it unchanged.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env.dictionary import units
+from drive_env.dictionary.entries import ObjectName
+
+if TYPE_CHECKING:
+    from drive_env.emulator.emulated_drives import EmulatedDrives
+    from mechanics.load import Load
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+POSITION_DEMAND, POSITION, VELOCITY, CURRENT = (0x6062, 0), (0x6064, 0), (0x606C, 0), (0x6077, 0)
+TARGET_VELOCITY, TARGET_CURRENT, MODE = (0x60FF, 0), (0x6071, 0), (0x6061, 0)
+POSITION_SCALER = (0x2058, 0)
+_RECORDED = (POSITION_DEMAND, POSITION, VELOCITY, CURRENT, TARGET_VELOCITY, TARGET_CURRENT, MODE)
+_PROFILED_MODES = (1, 3, 8)  # pp, pv, csp: 6062h goes on in them, and its slope is the velocity demand
+_CSV, _CST = 9, 10
+CYCLE = 0.001  # s between two samples
+
+
+class Recording(NamedTuple):
+    """A run of one machine: n samples of D joints and A axes. Motor side, SI; a demand that there is not is nan."""
+
+    load: Load
+    title: str
+    gears: Floats  # (A,) rotor angle per unit of each axis's position [1 or rad/m]
+    linear: NDArray[np.bool_]  # (A,) whether that position is in m, not an angle in rad
+    t: Floats  # (n,) [s]
+    joints: Floats  # (n, D) [rad or m], in the order of the MJCF
+    position_demand: Floats  # (n, A) [rad]
+    position: Floats  # (n, A) [rad]
+    velocity_demand: Floats  # (n, A) [rad/s]
+    velocity: Floats  # (n, A) [rad/s]
+    current_demand: Floats  # (n, A) [A], peak i_q
+    current: Floats  # (n, A) [A], peak i_q
+    load_torque: Floats  # (n,) [N*m, or the load's unit]
+    events: tuple[tuple[float, str], ...]  # what happens from when on [s]
+
+
+class Recorder:
+    """Emulated drives that remember what passes while time advances.
+
+    Args:
+        drives: The drives.
+        machine: Number of the machine to film.
+        period: Time between two calls of `look` [s].
+
+    Raises:
+        ValueError: If there is no such machine.
+    """
+
+    def __init__(self, drives: EmulatedDrives, machine: int = 0, period: float = CYCLE) -> None:
+        if not 0 <= machine < drives.num_machines:
+            raise ValueError(f"there is no machine {machine}; there are 0...{drives.num_machines - 1}")
+        self.drives = drives
+        self.num_axes = drives.num_axes
+        self._machine = machine
+        self._period = period
+        count = drives.num_axes // drives.num_machines
+        self._axes = slice(machine * count, (machine + 1) * count)
+        self._rows: list[Floats] = []
+        self._joints: list[Floats] = []
+        self._load_torque: list[float] = []
+        self._wanted: list[Floats] = []  # position and velocity that a master follows, (2, A), nan where it has none
+        self._events: list[tuple[float, str]] = []
+
+    @property
+    def now(self) -> float:
+        """Recorded time [s]."""
+        return len(self._rows) * self._period
+
+    def read(self, name: ObjectName) -> NDArray[np.int64]:
+        """Return an object of every axis, as the drives do."""
+        return self.drives.read(name)
+
+    def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
+        """Write an object, as the drives do."""
+        self.drives.write(name, value, where)
+
+    def advance(self, duration: float) -> None:
+        """Let time pass [s], whole communication cycles of 1 ms, and remember each."""
+        cycles = round(duration / CYCLE)
+        if cycles < 0 or abs(cycles * CYCLE - duration) > 1e-9:
+            raise ValueError(
+                f"{duration:g} s is not a whole number of communication cycles of {CYCLE:g} s; "
+                f"use {max(cycles, 0) * CYCLE:g} s"
+            )
+        for _ in range(cycles):
+            self._joints.append(self.drives.machine.joint_positions[self._machine])
+            self._load_torque.append(float(self.drives.machine.load_torque[self._machine]))
+            trace = self.drives.record(_RECORDED, CYCLE)
+            self._rows.append(np.array([trace[name][0, self._axes] for name in _RECORDED], np.float64))
+            self._wanted.append(np.full((2, self._axes.stop - self._axes.start), np.nan))
+
+    def look(self, wanted: tuple[Floats, Floats] | None = None) -> None:
+        """Remember how things stand now, once per period, while someone else lets time pass.
+
+        Args:
+            wanted: What a master follows that sends the drives something else: position [inc] and velocity [inc/s],
+                (num_axes,) each.
+        """
+        none = np.full(self.num_axes, np.nan)
+        self._wanted.append(np.stack([part[self._axes] for part in (wanted or (none, none))]))
+        self._joints.append(self.drives.machine.joint_positions[self._machine])
+        self._load_torque.append(float(self.drives.machine.load_torque[self._machine]))
+        self._rows.append(np.array([self.drives.read(name)[self._axes] for name in _RECORDED], np.float64))
+
+    def mark(self, text: str) -> None:
+        """Remember what happens from now on; it is shown beside the machine."""
+        self._events.append((self.now, text))
+
+    def recording(self, title: str = "") -> Recording:
+        """Return what has passed so far.
+
+        Raises:
+            ValueError: If no time has passed.
+        """
+        if not self._rows:
+            raise ValueError("nothing was recorded; let time pass with advance() of the recorder")
+        drives = self.drives
+        raw = np.stack(self._rows)  # (n, objects, A)
+        k = {name: raw[:, column] for column, name in enumerate(_RECORDED)}
+        si = {name: from_raw(drives, name, values, self._axes) for name, values in k.items() if name != MODE}
+        mode = k[MODE]
+        # From one millisecond to the next, across the end of the counter too.
+        slope = units.wrap(np.diff(k[POSITION_DEMAND], axis=0, prepend=k[POSITION_DEMAND][:1]))
+        profiled = from_raw(drives, POSITION_DEMAND, slope, self._axes) / self._period
+        wanted = np.stack(self._wanted)
+        followed = from_raw(drives, POSITION_DEMAND, wanted[:, 0], self._axes)
+        followed_velocity = from_raw(drives, TARGET_VELOCITY, wanted[:, 1], self._axes)
+        velocity_demand = np.where(mode == _CSV, si[TARGET_VELOCITY], np.where(np.isin(mode, _PROFILED_MODES), profiled,
+                                                                               followed_velocity))  # fmt: skip
+        from mechanics.shaft import way
+
+        found = way(drives._groups[0].load)
+        return Recording(
+            load=drives.load,
+            title=title or f"{drives.load.name} · {drives.motor.name} · {drives.device.name}",
+            gears=1.0 / found.position,
+            linear=found.linear,
+            t=np.arange(len(raw), dtype=np.float64) * self._period,
+            joints=np.stack(self._joints),
+            position_demand=np.where(np.isin(mode, _PROFILED_MODES[::2]), si[POSITION_DEMAND], followed),
+            position=si[POSITION],
+            velocity_demand=velocity_demand,
+            velocity=si[VELOCITY],
+            current_demand=np.where(mode == _CST, si[TARGET_CURRENT], np.nan),
+            current=si[CURRENT],
+            load_torque=np.array(self._load_torque),
+            events=tuple(self._events),
+        )
+
+
+def from_raw(drives: EmulatedDrives, name: tuple[int, int], raw: ArrayLike, axes: slice = slice(None)) -> Floats:
+    """Return an object's integers [drive units] as SI, axes last."""
+    values = np.asarray(raw, np.float64)
+    return units.from_od(drives.device.bindings[name].unit, values, _context(drives, axes))
+
+
+def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> NDArray[np.int64]:
+    """Return an SI value, one or one per axis, as an object's integers [drive units], saturated at its range."""
+    entry = drives.device.new_dictionary().find(name)
+    assert entry.low is not None and entry.high is not None, "a number"
+    values = np.broadcast_to(np.asarray(value, np.float64), (drives.num_axes,))
+    context = _context(drives, slice(None))
+    return units.to_od(drives.device.bindings[name].unit, values, context, entry.low, entry.high)
+
+
+def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
+    return units.Context(
+        position_scaler=drives.read(POSITION_SCALER)[axes].astype(float),
+        current_lsb=drives.device.current_full_scale / 32768.0,
+    )

@@ -1,0 +1,1 @@
+"""Moves and trials, and what they are worth: environments and tuning stand on these."""

@@ -1,0 +1,297 @@
+"""One trial of gains on drives: a positioning move, the reversal, and the gain probe; and identification before it.
+
+All of it can be done and seen on a real drive: position, its demand, current and statusword once a millisecond.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import motion
+from drive_env.gains import Gains, scaled, write_gains
+from drive_env.motors import Motor
+from drive_env.trials.positioning import (
+    CURRENT,
+    CYCLE,
+    DEMAND,
+    POSITION,
+    STATUS,
+    TRIAL,
+    VELOCITY,
+    WATCH,
+    Move,
+    move_terms,
+    plan_move,
+    start,
+    wrapped,
+    write_profile,
+)
+from drive_env.trials.score import Terms, cost
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+PHASES = ("move", "reversal", "probe")
+PROBE = 1.5  # velocity P of the probe over that of the trial
+ALL = Gains._fields
+VELOCITY_P = ALL.index("velocity_p")
+
+# The watch looks every 25 ms at what has passed since its last look: what oscillates is stopped within 50 ms.
+# RMS change of the current from millisecond to millisecond, over the rated current. The edges of a profile make 0.1 on
+# a fast loop; a limit cycle, whose current goes from limit to limit, 1 and more.
+OSCILLATION = 0.4
+RECOVERY, RECOVERY_TIME = 5, 0.01  # attempts, and the time between them [s]
+
+
+class Drives(motion.Drives, Protocol):
+    """What trials need of drives."""
+
+    def record(self, objects: Any, duration: float, play: Any = None, period: float = 0.001) -> Any:
+        """Let time pass while objects are recorded."""
+
+
+class Identified(NamedTuple):
+    """What a drive's own signals say of its machine, each of shape (num_axes,).
+
+    Inertia is measured over the torque constant, and given with that of the data sheet.
+    """
+
+    inertia: Floats  # kg*m^2, rotor and load
+    coulomb: Floats  # A, dry friction
+    viscous: Floats  # A*s/rad
+    offset: Floats  # A, what gravity or a constant load takes
+
+
+class Trial(NamedTuple):
+    """What a trial showed; `terms` and `aborted` are (phases, num_axes), `following` [s] too.
+
+    following: integral of |demand - actual| dt over the whole of a phase, over the move's size.
+    error: demand less actual of the move over its size, shape (TRIAL, num_axes).
+    culprit: Axes that oscillated or tripped themselves when their lane was stopped, (num_axes,): others of the lane are
+    stopped with them.
+    """
+
+    terms: Terms  # its disturbance is 1
+    following: Floats
+    aborted: Mask
+    error: Floats
+    culprit: Mask
+
+    def costs(self, softness: Floats) -> Floats:
+        """Return J by measured terms of every phase, (phases, num_axes).
+
+        Args:
+            softness: `softness` of the trial's gains over that of the rule's, (num_axes,), for E_d/E_0.
+        """
+        disturbance = np.stack([softness, softness, softness / PROBE])
+        return cost(self.terms._replace(disturbance=disturbance, tripped=self.aborted))
+
+
+def softness(gains: Integers) -> Floats:
+    """Return what the integral of the error after a load step is proportional to, (num_axes,).
+
+    No load step exists on a bus; but the integrators of a P-PI cascade leave it no choice: for a current i that the
+    load takes, the integral of the position error is i T_i / (P k_v), as long as the error keeps its sign.
+    """
+    cascade = [ALL.index(name) for name in ("velocity_p", "velocity_i", "position_p")]
+    return np.asarray(1.0 / np.prod(gains[:, cascade].astype(float), axis=1))
+
+
+def measured_cost(costs: Floats) -> Floats:
+    """Return what a trial is worth: half of move and reversal's mean, half of the worst phase; hidden J's likeness."""
+    return np.asarray(0.5 * costs[:2].mean(axis=0) + 0.5 * costs.max(axis=0))
+
+
+class Trials:
+    """Runs trials on drives; the axes of a lane are stopped together.
+
+    Args:
+        drives: The drives, in pp.
+        motor: What turns them.
+        axes: Axes of a lane.
+        t_0: Four times the sum of the small time constants [s].
+
+    Attributes:
+        look: If not None, called after every cycle.
+    """
+
+    def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:
+        self.look: Callable[[], None] | None = None
+        self._drives = drives
+        self._motor = motor
+        self._axes = axes
+        self._t_0 = t_0
+
+    def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
+        """Move there and back with the gains that are; return what that says, and where the axes began [inc].
+
+        Args:
+            reach: How far the rotors may turn from here, with the sign [rad], shape (num_axes,).
+            where: Axes that move.
+        """
+        drives = self._drives
+        origin = drives.read(POSITION)
+        scaler = drives.read((0x2058, 0))
+        move = plan_move(self._motor, np.full(drives.num_axes, 3.0 * self._motor.inertia), scaler, reach)
+        write_profile(drives, move, where)
+        objects = [POSITION, VELOCITY, CURRENT]
+        traces = []
+        self._prepare(objects)
+        for target in (origin + move.distance, origin):
+            start(drives, _on_the_counter(target), where)
+            traces.append(self._record(objects, TRIAL))
+        position, velocity, current = (np.concatenate([trace[name] for trace in traces]) for name in objects)
+        angle = wrapped(position - origin) / move.increments
+        speed = velocity / scaler * 2.0 * np.pi
+        return _momentum_balance(angle, speed, current * 1e-3, self._motor), origin
+
+    def run(
+        self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
+    ) -> Trial:
+        """Try gains, raw integers of shape (num_axes, 5), in a move from the origin [inc], back, and there again.
+
+        Where an axis oscillates or trips, its lane gets the incumbent back at once, is cleared, and goes on with it.
+
+        Args:
+            gains: What is tried.
+            incumbent: What an axis goes on with that is stopped.
+            move: The move.
+            origin: Where the axes are [inc].
+            direction: 1 to move as planned, -1 the other way, shape (num_axes,).
+            where: Axes that take part; the others' figures mean nothing.
+        """
+        drives = self._drives
+        away = origin + direction * move.distance
+        count = drives.num_axes
+        aborted = np.zeros((len(PHASES), count), bool)
+        stopped, culprit = np.zeros((2, count), bool)
+        shape = (len(PHASES), count)
+        settling, noise, overshoot, following = (np.zeros(shape) for _ in range(4))
+        first_error = np.zeros((TRIAL, count))
+        write_profile(drives, move, where)
+        probe = gains.copy()
+        probe[:, VELOCITY_P] = scaled(gains[:, VELOCITY_P], PROBE)
+        for phase, (target, tried) in enumerate(((away, gains), (origin, gains), (away, probe))):
+            write_gains(drives, np.where(stopped[:, None], incumbent, tried), where)
+            position, demand, current, stopped, new = self._phase(target, incumbent, stopped, where)
+            culprit |= new
+            aborted[phase] = stopped
+            sign = np.where(move.distance < 0, -1, 1) * direction * (-1 if phase == 1 else 1)
+            settling[phase], noise[phase], overshoot[phase] = move_terms(
+                position, current * 1e-3, move, self._t_0, self._motor.rated_current, target, sign
+            )
+            size = np.maximum(np.abs(move.distance), 1)
+            error = wrapped(demand - position) / size
+            following[phase] = np.maximum(np.abs(error).sum(axis=0), 0.5) * CYCLE
+            if phase == 0:
+                first_error = error
+        terms = Terms(settling, np.ones(shape), noise, overshoot, aborted)
+        return Trial(terms, following, aborted, first_error, culprit)
+
+    def recover(self, where: Mask) -> None:
+        """Bring axes to pp, enabled, whatever state they are in, within 50 ms; one that cannot stays as it is."""
+        drives = self._drives
+        motion.select_mode(drives, "pp", where)
+        for _ in range(RECOVERY):
+            down = where & self.down()
+            if not down.any():
+                return
+            clear(drives, down)
+            drives.advance(RECOVERY_TIME)
+
+    def down(self) -> Mask:
+        """Return which axes are not enabled."""
+        mask, enabled = motion.OPERATION_ENABLED
+        return np.asarray(self._drives.read(STATUS) & mask != enabled)
+
+    def _phase(
+        self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask
+    ) -> tuple[Floats, Floats, Floats, Mask, Mask]:
+        """Move and watch; return position, demand, current, whose lanes have been stopped so far, and by whom now."""
+        drives, to = self._drives, _on_the_counter(target)
+        objects = [POSITION, DEMAND, CURRENT, STATUS]
+        traces = []
+        culprit = np.zeros(len(stopped), bool)
+        self._prepare(objects)
+        start(drives, to, where)
+        for _ in range(TRIAL // WATCH):
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
+                trace = self._record(objects, WATCH)
+            traces.append(trace)
+            mask, enabled = motion.OPERATION_ENABLED
+            down = where & (trace[STATUS][-1] & mask != enabled)
+            change = np.diff(trace[CURRENT], axis=0) * 1e-3
+            shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * self._motor.rated_current
+            new = self._whole_lanes(down | shaking) & where & ~stopped
+            if new.any():
+                write_gains(drives, incumbent, new)
+                stopped = stopped | new
+                culprit |= new & (down | shaking)
+            if down.any():
+                clear(drives, down)
+                start(drives, to, down)
+        position, demand, current = (np.concatenate([trace[name] for trace in traces]) for name in objects[:3])
+        return position, demand, current, stopped, culprit
+
+    def _prepare(self, objects: list[Any]) -> None:
+        """Have a bus map what will be recorded: in real time the samples of a move would miss the 10 ms that takes."""
+        if not getattr(self._drives, "time_waits", True):
+            self._drives.record(objects, 0.0)
+
+    def _record(self, objects: list[Any], cycles: int) -> Mapping[Any, Integers]:
+        """Let cycles pass, one by one where someone looks, and return the objects, (cycles, num_axes) each."""
+        if self.look is None:
+            trace = self._drives.record(objects, cycles * CYCLE)
+            return {name: trace[name] for name in objects}
+        rows = []
+        for _ in range(cycles):
+            rows.append(self._drives.record(objects, CYCLE))
+            self.look()
+        return {name: np.concatenate([row[name] for row in rows]) for name in objects}
+
+    def _whole_lanes(self, axes: Mask) -> Mask:
+        return np.repeat(axes.reshape(-1, self._axes).any(axis=1), self._axes)
+
+
+def clear(drives: motion.Drives, where: Mask) -> None:
+    """Reset faults and enable again, without waiting; an axis that has not come to rest yet stays as it is."""
+    for word in (0x00, 0x80, 0x06, 0x07, 0x0F):
+        drives.write(0x6040, word, where=where)
+
+
+def _on_the_counter(position: Integers) -> Integers:
+    """Return positions as 607Ah takes them: the counter wraps at 2^31."""
+    return wrapped(position).astype(np.int64)
+
+
+def _momentum_balance(angle: Floats, speed: Floats, current: Floats, motor: Motor) -> Identified:
+    """Fit i = (J domega/dt) / K_t + coulomb sign(omega) + viscous omega + offset, integrated once over time.
+
+    The integral has no derivative of a noisy speed, and an elastic load that swings has little momentum of its own.
+    """
+    standstill = 1.0  # rad/s, one count in 1.5 ms: below it the sign is noise
+    sign = np.clip(speed / standstill, -1.0, 1.0)
+    samples, axes = speed.shape
+    t = np.arange(samples) * CYCLE
+    columns = np.stack(
+        [speed, np.cumsum(sign, axis=0) * CYCLE, angle, np.broadcast_to(t[:, None], (samples, axes)),
+         np.ones((samples, axes))],
+        axis=-1,
+    ).transpose(1, 0, 2)  # fmt: skip
+    impulse = np.cumsum(current, axis=0).T * CYCLE
+    scale = np.maximum(np.sqrt(np.mean(columns**2, axis=1, keepdims=True)), 1e-12)
+    X = columns / scale
+    # An axis that did not move says nothing; the small term keeps its equations solvable.
+    normal = X.transpose(0, 2, 1) @ X + 1e-6 * samples * np.eye(X.shape[2])
+    solved = np.linalg.solve(normal, X.transpose(0, 2, 1) @ impulse[:, :, None])[..., 0] / scale[:, 0]
+    # Of a machine that left physics nothing is known, and nothing moves with less than its rotor.
+    solved = np.nan_to_num(solved)
+    inertia = np.clip(solved[:, 0] * motor.torque_constant, 0.8 * motor.inertia, 300.0 * motor.inertia)
+    return Identified(inertia, np.maximum(solved[:, 1], 0.0), np.maximum(solved[:, 2], 0.0), solved[:, 3])

@@ -1,0 +1,397 @@
+"""A recorded move of a real machine, repeated on emulated ones: how far they lie from it, and which machines would fit.
+
+The log is the CSV that `drive-env scope` writes. What the drive was told is played again; what it did is compared.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import motion
+from drive_env.envs.randomisation import BESIDE, Distributions, Law
+from mechanics.near_names import did_you_mean
+from mechanics.untrusted import MOST_RECORDING, check_size
+
+if TYPE_CHECKING:
+    from drive_env.emulator.emulated_drives import EmulatedDrives
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Key = tuple[int, int]
+
+CYCLE = 0.001  # s
+# What the drive was told, in the order in which it is looked for: object, mode in which it is played, and played as.
+# A position demand comes first: it is what a profile in the drive (pp) made of its target.
+COMMANDS: tuple[tuple[Key, str, Key], ...] = (
+    ((0x6062, 0), "csp", (0x607A, 0)),
+    ((0x607A, 0), "csp", (0x607A, 0)),
+    ((0x60FF, 0), "csv", (0x60FF, 0)),
+    ((0x6071, 0), "cst", (0x6071, 0)),
+)
+RESPONSES: tuple[Key, ...] = ((0x6064, 0), (0x606C, 0), (0x6077, 0))  # position, velocity, current
+_POSITIONS: tuple[Key, ...] = ((0x6062, 0), (0x6064, 0), (0x607A, 0))
+MAX_SHIFT = 0.02  # s, the longest time by which a response is looked for earlier or later
+LATEST = 1e7  # s: a stamp of 1e300 has no milliseconds any more
+AT_REST = 0.1  # of the range of the speed: noise of a quiet axis
+_COLUMN = re.compile(r"^([0-9A-Fa-f]{4})h:([0-9A-Fa-f]{2}) [^()]*?(?: \[[^]]*\])?(?: \((.+)\))?$")
+
+
+class Log(NamedTuple):
+    """A recorded move: times `t` [s], shape (n,), and each object's integers, shape (n, axes)."""
+
+    t: Floats
+    objects: Mapping[Key, Integers]
+
+    @property
+    def num_axes(self) -> int:
+        """Axes in the log."""
+        return int(next(iter(self.objects.values())).shape[1])
+
+    @property
+    def every(self) -> int:
+        """Communication cycles between two samples."""
+        return max(1, round(float(self.t[1] - self.t[0]) / CYCLE))
+
+
+class Difference(NamedTuple):
+    """How far one object of an emulated machine lies from the log, each of shape (num_machines,).
+
+    nrmse: RMS of the difference over the log's range (greatest less least), samples by samples.
+    shift: Time [s] by which the emulator is late: shifted back by it, it fits best.
+    shifted: NRMSE then.
+    """
+
+    nrmse: Floats
+    shift: Floats
+    shifted: Floats
+
+
+class Fit(NamedTuple):
+    """Machines that fit a log.
+
+    distributions: The laws given, those of fitted parameters replaced by the range of the accepted machines.
+    accepted: Fitted parameter -> values of the accepted machines [SI], best first.
+    distance: Their distances, mean NRMSE over objects and axes, best first.
+    nominal: Distance of the machine without any draw.
+    narrowed: Fitted parameter -> width of the accepted machines' middle 90 % over that of the law given, in 0...1.
+    """
+
+    distributions: Distributions
+    accepted: dict[str, Floats]
+    distance: Floats
+    nominal: float
+    narrowed: dict[str, float]
+
+    def is_seen(self, name: str) -> bool:
+        """Return whether the log says something about a fitted parameter."""
+        return self.narrowed[name] < UNSEEN
+
+    def to_toml(self) -> str:
+        """Return the fitted set as `Distributions.load` reads it, with what was found as comments."""
+        lines = [
+            "# Fitted to a recorded move: the range of the machines that respond like it, 5th to 95th percentile.",
+            f"# Distance (mean NRMSE): nominal machine {self.nominal:.4f}, best {self.distance[0]:.4f}, "
+            f"worst accepted {self.distance[-1]:.4f} of {len(self.distance)}.",
+        ]
+        for name, share in self.narrowed.items():
+            seen = "" if self.is_seen(name) else ": the log says next to nothing about it, its law is the one given"
+            lines.append(f"# {name}: {100.0 * share:.0f} % of the range given{seen}")
+        return "\n".join(lines) + "\n\n" + self.distributions.to_toml()
+
+
+UNSEEN = 0.8  # share of the range above which a parameter counts as not identified
+
+
+def read_log(path: str | Path) -> Log:
+    """Return the log in a CSV of `drive-env scope`.
+
+    Raises:
+        ValueError: For a file that is none, with the line.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise ValueError(f"there is no log {file}; record one with drive-env scope")
+    check_size(file, MOST_RECORDING)
+    try:
+        with file.open(newline="", encoding="utf-8") as text:
+            rows = list(csv.reader(text))
+    except UnicodeDecodeError:
+        raise ValueError(f"{file} is no text; give the CSV that drive-env scope writes") from None
+    except csv.Error as error:
+        raise ValueError(f"{file} is no CSV: {error}; give the one that drive-env scope writes") from None
+    if not rows or not rows[0] or rows[0][0] != "t [s]" or len(rows[0]) < 2:
+        raise ValueError(f"{file}: the first line must begin with 't [s]', as drive-env scope writes it")
+    columns: dict[Key, list[int]] = {}
+    for k, title in enumerate(rows[0][1:]):
+        found = _COLUMN.match(title)
+        if found is None:
+            raise ValueError(f"{file}: column {title!r} names no object; it must begin as '6064h:00 '")
+        columns.setdefault((int(found[1], 16), int(found[2], 16)), []).append(k)
+    try:
+        t = np.array([float(row[0]) for row in rows[1:]])
+        raw = np.array([[int(value) for value in row[1:]] for row in rows[1:]], np.int64)
+    except (ValueError, OverflowError, IndexError) as error:
+        raise ValueError(f"{file}: every line needs a time and {len(rows[0]) - 1} whole numbers: {error}") from None
+    if len(t) < 10 or raw.shape != (len(t), len(rows[0]) - 1):
+        raise ValueError(f"{file}: needs at least 10 lines of {len(rows[0])} values each")
+    if not np.all(np.abs(t) <= LATEST):
+        wrong = int(np.argmax(~(np.abs(t) <= LATEST)))
+        raise ValueError(
+            f"{file}: line {wrong + 2} has the time {t[wrong]:g} s; times must lie within {LATEST:g} s of 0"
+        )
+    steps = np.diff(t)
+    if steps.min() <= 0.0 or np.ptp(steps) > 0.5 * CYCLE or abs(steps[0] / CYCLE - round(steps[0] / CYCLE)) > 0.01:
+        raise ValueError(f"{file}: times must increase by the same whole number of milliseconds from line to line")
+    if len({len(places) for places in columns.values()}) > 1:
+        raise ValueError(f"{file}: every object must be there for the same axes")
+    return Log(t, {key: raw[:, places] for key, places in columns.items()})
+
+
+def replay(drives: EmulatedDrives, log: Log, settings: Mapping[Any, int] | None = None) -> dict[Key, Integers]:
+    """Repeat a log's command on every emulated machine, from rest; return the log's objects, (n, num_axes) each.
+
+    Machines are reset first; their parameters stay. Positions begin at the log's first.
+
+    Args:
+        drives: Emulated drives whose machines have as many axes as the log.
+        log: The recorded move.
+        settings: Objects of the real drive (gains, limits): name -> integer; `drive-env backup` has them.
+
+    Raises:
+        ValueError: If the log holds no command, or was taken from another number of axes.
+    """
+    command, mode, played = command_of(log)
+    axes = drives.num_axes // drives.num_machines
+    if axes != log.num_axes:
+        raise ValueError(f"the log is of {log.num_axes} axes, a machine of load {drives.load.name!r} has {axes}")
+    drives.machine.reset()
+    for name, value in (settings or {}).items():
+        drives.write(name, value)
+    told = np.repeat(log.objects[command], log.every, axis=0)
+    if log.every > 1 and mode == "csp":
+        told = _between(log.objects[command], log.every)
+    start = told[0] - drives.read((0x6064, 0))[:axes] if mode == "csp" else np.zeros(axes, np.int64)
+    rows = np.tile(told - start, (1, drives.num_machines))
+    if mode == "csp":
+        drives.write(played, rows[0])
+    motion.enable(drives, mode)
+    if command == (0x6062, 0):
+        # A demand is where the drive had to be in that cycle; a target played in csp is reached a cycle later.
+        rows = np.concatenate([rows[1:], rows[-1:]])
+    names = [name for name in RESPONSES if name in log.objects]
+    trace = drives.record(names, len(rows) * CYCLE, play={played: rows}, period=log.every * CYCLE)
+    shift = np.tile(start, drives.num_machines)
+    return {name: trace[name] + (shift if name in _POSITIONS else 0) for name in names}
+
+
+def command_of(log: Log) -> tuple[Key, str, Key]:
+    """Return which object of a log is the command, the mode that plays it, and the object that it is played as.
+
+    Raises:
+        ValueError: If there is none, naming those that can be, or if the log begins in the middle of a move.
+    """
+    speed = log.objects.get((0x606C, 0))
+    if speed is not None and np.any(np.abs(speed[0]) > AT_REST * np.maximum(np.ptp(speed, axis=0), 1)):
+        raise ValueError("the log begins in the middle of a move; record it from rest, with scope --before")
+    for key, mode, played in COMMANDS:
+        if key in log.objects and (mode != "csp" or _is_a_path(log.objects[key])):
+            return key, mode, played
+    known = ", ".join(f"{key[0]:04X}h" for key, *_ in COMMANDS)
+    raise ValueError(f"the log holds no command that changes step by step; record one of {known} with the response")
+
+
+def compare(log: Log, found: Mapping[Key, Integers], num_machines: int = 1) -> dict[Key, Difference]:
+    """Return how far replayed objects lie from the log; of several axes the worst counts.
+
+    Args:
+        log: The recorded move.
+        found: As `replay` returns it.
+        num_machines: Machines in it.
+    """
+    report: dict[Key, Difference] = {}
+    for key, values in found.items():
+        axes = log.num_axes
+        want = log.objects[key].astype(float)
+        have = values.astype(float).reshape(len(want), num_machines, axes)
+        span = np.maximum(np.ptp(want, axis=0), 1.0)
+        plain = (_rms(have - want[:, None]) / span).max(axis=-1)
+        shift, shifted = _best_shift(want, have, span, log.every * CYCLE)
+        report[key] = Difference(plain, shift, shifted)
+    return report
+
+
+def fittable(laws: Distributions) -> list[str]:
+    """Return which parameters of a set of laws can be fitted: those that are drawn from a range."""
+    return [name for name, law in laws.laws.items() if name not in BESIDE and law.law != "choice"]
+
+
+def fit(
+    drives: EmulatedDrives,
+    log: Log,
+    distributions: Distributions | str,
+    parameters: Sequence[str],
+    *,
+    settings: Mapping[Any, int] | None = None,
+    rounds: int = 4,
+    accept: float = 0.1,
+    slack: float = 1.2,
+    seed: int = 0,
+) -> Fit:
+    """Fit laws to a log: draw machines, keep those that respond like it, draw anew around them, and so on.
+
+    A population Monte Carlo search without likelihood: every machine of `drives` is a candidate. The first round draws
+    from the laws given, the later ones from the best `accept` share of all so far, spread by their own covariance. The
+    accepted machines are those within `slack` times the best distance. Their range is not a confidence interval: it is
+    the set of machines that this log cannot tell from the best one by more than that.
+
+    Args:
+        drives: Emulated drives, at least 16 machines; the more the better.
+        log: The recorded move.
+        distributions: Laws, or a set's name; what is not fitted stays nominal in the search.
+        parameters: Which of them to fit.
+        settings: As in `replay`.
+        rounds: Of candidates, 1 or more.
+        accept: Share that the next round is drawn around.
+        slack: Distance of the worst machine that is accepted, over that of the best.
+        seed: Of the search.
+
+    Raises:
+        ValueError: For a parameter without a law, or too few machines.
+    """
+    laws = Distributions.load(distributions)
+    machine = drives.machine
+    nominal = {name: values.copy() for name, values in machine.parameters.items()}
+    candidates = drives.num_machines
+    known = fittable(laws)
+    for name in parameters:
+        if name not in known:
+            near = did_you_mean(name, known)
+            raise ValueError(f"{name!r} cannot be fitted{near}; there are {', '.join(known)}")
+    if candidates < 16 or not parameters:
+        raise ValueError(f"a fit needs at least 16 machines and one parameter, not {candidates} and {len(parameters)}")
+    rng = np.random.default_rng(seed)
+    default = {name: float(nominal[name][0]) for name in parameters}
+    # The search is in shares of chance of each law, 0...1: every law has the same shape there.
+    tried = np.empty((0, len(parameters)))
+    distances = np.empty(0)
+    try:
+        base = float(_distances(drives, log, settings).min())
+        for _ in range(rounds):
+            shares = _candidates(rng, tried, distances, candidates, len(parameters), accept)
+            values = {
+                name: np.array([laws.laws[name].value(share, default[name]) for share in shares[:, k]])
+                for k, name in enumerate(parameters)
+            }
+            possible = _give(drives, values)
+            found = np.where(possible, _distances(drives, log, settings), np.inf)
+            tried, distances = np.concatenate([tried, shares]), np.concatenate([distances, found])
+    finally:
+        machine.set_all({name: nominal[name] for name in parameters})
+        machine.reset()
+    order = np.argsort(distances, kind="stable")
+    order = order[distances[order] <= slack * distances[order[0]]]
+    return _result(laws, parameters, default, tried[order], distances[order], base)
+
+
+# --- inside -----------------------------------------------------------------------------------------------------------
+def _candidates(
+    rng: np.random.Generator, tried: Floats, distances: Floats, count: int, width: int, accept: float
+) -> Floats:
+    if not len(tried):
+        # Stratified: every law's range is covered evenly.
+        strata = np.stack([rng.permutation(count) for _ in range(width)], axis=-1)
+        return (strata + rng.random((count, width))) / count
+    best = np.argsort(distances, kind="stable")[: max(2 * width, round(accept * count), 4)]
+    # Twice the population's covariance, as in Beaumont et al. 2009 (adaptive approximate Bayesian computation).
+    spread = 2.0 * np.atleast_2d(np.cov(tried[best], rowvar=False)) + 1e-10 * np.eye(width)
+    around = tried[rng.choice(best, count)] + rng.multivariate_normal(np.zeros(width), spread, count)
+    # Reflected at the ends of the laws, so that a parameter at its limit stays reachable.
+    folded = np.mod(around, 2.0)
+    return np.asarray(np.where(folded > 1.0, 2.0 - folded, folded))
+
+
+def _give(drives: EmulatedDrives, values: Mapping[str, Floats]) -> NDArray[np.bool_]:
+    """Set parameters; return which machines can have them."""
+    machine, possible = drives.machine, np.ones(drives.num_machines, bool)
+    try:
+        machine.set_all(values)
+    except ValueError:
+        for k in range(drives.num_machines):
+            try:
+                machine.set_all(values, np.arange(drives.num_machines) == k)
+            except ValueError:
+                possible[k] = False
+    return possible
+
+
+def _distances(drives: EmulatedDrives, log: Log, settings: Mapping[Any, int] | None) -> Floats:
+    report = compare(log, replay(drives, log, settings), drives.num_machines)
+    return np.asarray(np.mean([difference.nrmse for difference in report.values()], axis=0))
+
+
+def _result(
+    laws: Distributions,
+    parameters: Sequence[str],
+    default: Mapping[str, float],
+    shares: Floats,
+    distances: Floats,
+    base: float,
+) -> Fit:
+    fitted = dict(laws.laws)
+    accepted: dict[str, Floats] = {}
+    narrowed: dict[str, float] = {}
+    for k, name in enumerate(parameters):
+        law = laws.laws[name]
+        accepted[name] = np.array([law.value(share, default[name]) for share in shares[:, k]])
+        low, high = np.quantile(shares[:, k], (0.05, 0.95))
+        narrowed[name] = float(min((high - low) / 0.9, 1.0))
+        if narrowed[name] >= UNSEEN:
+            continue
+        scale = default[name] if law.relative else 1.0
+        ends = sorted(float(law.value(share, default[name]) / scale) for share in (low, high))
+        log_law = law.law == "loguniform" and ends[0] > 0.0
+        fitted[name] = Law("loguniform" if log_law else "uniform", law.relative, ends[0], ends[1])
+    return Fit(Distributions(fitted, laws.curriculum, laws.faults), accepted, distances, base, narrowed)
+
+
+def _best_shift(want: Floats, have: Floats, span: Floats, period: float) -> tuple[Floats, Floats]:
+    """Return the shift [s] that fits best, to a tenth of a sample, and the NRMSE with it, shape (machines,)."""
+    n, machines = len(want), have.shape[1]
+    reach = min(max(1, math.floor(MAX_SHIFT / period)), n // 4)
+    inner = slice(reach, n - reach)
+    grid = np.arange(-10 * reach, 10 * reach + 1) / 10.0
+    errors = np.empty((len(grid), machines))
+    for k, shift in enumerate(grid):
+        whole = math.floor(shift)
+        share = shift - whole
+        index = np.arange(n)[inner] + whole
+        moved = (1.0 - share) * have[index] + share * have[np.minimum(index + 1, n - 1)]
+        errors[k] = (_rms(moved - want[inner, None]) / span).max(axis=-1)
+    best = errors.argmin(axis=0)
+    return grid[best] * period, errors[best, np.arange(machines)]
+
+
+def _is_a_path(values: Integers) -> bool:
+    """Return whether set-points go on from cycle to cycle: the target of a profile jumps."""
+    travel = np.ptp(values, axis=0).max()
+    return bool(travel == 0 or np.abs(np.diff(values, axis=0)).max() < 0.5 * travel)
+
+
+def _between(values: Integers, every: int) -> Integers:
+    """Return positions of every cycle from samples of every so many."""
+    rows = [np.linspace(a, b, every, endpoint=False) for a, b in pairwise(values)]
+    last = np.repeat(values[-1:], every, axis=0)
+    return np.asarray(np.rint(np.concatenate([*rows, last])), np.int64)
+
+
+def _rms(values: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.mean(np.square(values), axis=0)))

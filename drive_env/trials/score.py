@@ -1,0 +1,300 @@
+"""What a tuning is worth: J of a positioning move and a load step, and hidden J, which counts robustness.
+
+Lower is better. Every machine is judged on its own scales:
+
+    J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 (1 + (n/3 %)^2)^0.2 (1 + max(0, os - 2 %)/10 %), at most 30; a trip scores 30
+
+    t_s = t_0 + integral of min(1, |e|/w) dt from the profile's end to the load step; w = max(1 % of the move, 3 counts)
+    t_0 = four times the sum of the small time constants
+    E_d = integral of |e| dt after a load step of 0.3 rated torque; E_0 that with the gains of the fitted rule
+    n   = RMS increment of the demanded current from millisecond to millisecond, at rest before the load step, over the
+          rated current; on a bus that of the actual current
+    os  = largest way beyond the target over the move
+
+Hidden J is half of J plus half of the largest J of the machine as it is and its variants (`VARIANTS`). It is for
+scoring and training, never something to observe: a load step, and the machine's variants, do not exist on hardware.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import Gains, scaled, small_time_constants, write_gains
+from drive_env.trials.positioning import (
+    CURRENT,
+    CURRENT_ERROR,
+    CYCLE,
+    OPERATION_ENABLED,
+    POSITION,
+    SETTLED,
+    STATUS,
+    TRIAL,
+    Move,
+    move_terms,
+    plan_move,
+    power_up,
+    start,
+    swing,
+    wrapped,
+    write_profile,
+)
+
+if TYPE_CHECKING:
+    from drive_env.dictionary.entries import ObjectName
+    from drive_env.emulator.emulated_drives import EmulatedDrives
+    from mechanics.load import Load
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+TRIP = 30.0
+NOISE, OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.03, 0.02, 0.1
+LOAD_SHARE = 0.3  # of the rated torque
+
+_INERTIA = ("body_inertia", "body_mass", "density")  # fields of load parameters that are the load's inertia
+VELOCITY_P = Gains._fields.index("velocity_p")
+_STIFFNESS = ("jnt_stiffness", "contact_stiffness")
+
+
+class Variant(NamedTuple):
+    """A machine a little other than the nominal one: factors of its inertia and stiffness, and of velocity P."""
+
+    name: str
+    inertia: float = 1.0
+    stiffness: float = 1.0
+    velocity_p: float = 1.0
+
+
+VARIANTS = (
+    Variant("nominal"),
+    Variant("load inertia x 1.3", inertia=1.3),
+    Variant("load inertia x 0.7", inertia=0.7),
+    Variant("stiffness x 0.8", stiffness=0.8),
+    Variant("velocity P x 1.5", velocity_p=1.5),
+)
+
+
+class Terms(NamedTuple):
+    """What J is made of, each of one shape: t_s/t_0, E_d/E_0, n and os as fractions, and whether the drive tripped."""
+
+    settling: Floats
+    disturbance: Floats
+    noise: Floats
+    overshoot: Floats
+    tripped: Mask
+
+    def each(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> Terms:
+        """Return the terms with a function applied to each."""
+        return Terms(
+            function(self.settling),
+            function(self.disturbance),
+            function(self.noise),
+            function(self.overshoot),
+            function(self.tripped),
+        )
+
+
+def cost(terms: Terms) -> Floats:
+    """Return J of its terms, in their shape."""
+    raw = (
+        terms.settling**0.4
+        * terms.disturbance**0.4
+        * (1.0 + (terms.noise / NOISE) ** 2) ** 0.2
+        * (1.0 + np.maximum(0.0, terms.overshoot - OVERSHOOT_FREE) / OVERSHOOT_SCALE)
+    )
+    # Not finite: the axis left physics. Nothing is worse than a trip, or tripping early would pay.
+    return np.where(terms.tripped | ~np.isfinite(raw), TRIP, np.minimum(raw, TRIP))
+
+
+def hidden_cost(j: Floats) -> Floats:
+    """Return hidden J of the variants' J, the nominal machine's first in the last dimension."""
+    return np.asarray(0.5 * j[..., 0] + 0.5 * j.max(axis=-1))
+
+
+# --- hidden J of emulated machines ------------------------------------------------------------------------------------
+class Scores(NamedTuple):
+    """Of every machine: hidden J (num_machines,), and J and its terms, (num_machines, variants).
+
+    A machine with several axes is as good as its worst. swing: What a trial's watch would see of it, the largest RMS
+    increment of the current over 25 ms until the load step, over the rated one, likewise; J does not count it.
+    """
+
+    hidden: Floats
+    j: Floats
+    terms: Terms
+    swing: Floats
+
+
+class HiddenScore:
+    """Scores gains on emulated machines: every variant of every machine is a machine of one set, run side by side.
+
+    The score depends on the machine and the gains alone: every run begins at rest, with the same noise. A variant that
+    is none on this load (a stiffness where nothing is elastic) is left out.
+
+    Args:
+        device: Name of the device.
+        load: The load.
+        motor: Name of the motor.
+        num_machines: Machines to be scored.
+        num_threads: Threads that run them; the number of cores by default.
+        friction: Model of the load's friction, as in EmulatedDrives.
+    """
+
+    def __init__(
+        self,
+        device: str,
+        load: str | Path | Load,
+        motor: str,
+        num_machines: int,
+        *,
+        num_threads: int | None = None,
+        friction: str = "stribeck",
+    ) -> None:
+        from drive_env.emulator.emulated_drives import EmulatedDrives
+        from mechanics.loads import find_load
+        from mechanics.shaft import one, way
+
+        found = find_load(load)
+        fields = {parameter.field for parameter in found.parameters}
+        self.variants = tuple(
+            variant
+            for variant in VARIANTS
+            if (variant.inertia == 1.0 or fields & set(_INERTIA))
+            and (variant.stiffness == 1.0 or fields & set(_STIFFNESS))
+        )
+        self.num_machines = num_machines
+        self._drives: EmulatedDrives = EmulatedDrives(
+            device, found, motor, num_machines * len(self.variants), identical=True, num_threads=num_threads,
+            friction=friction,
+        )  # fmt: skip
+        packed = one(found)
+        lever = np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max()
+        # Against the move, as a load that lies in the way does.
+        self._load_torque = -LOAD_SHARE * self._drives.motor.rated_torque / float(lever)
+        self._constant: Floats = np.zeros(num_machines * len(self.variants))
+        axes = (num_machines, len(self.variants), found.num_axes)
+        self._factors = np.tile(np.repeat([v.velocity_p for v in self.variants], axes[2]), axes[0])
+        self._axes = axes
+        self._t_0 = np.ones(self._drives.num_axes)
+        self._reference = np.ones((axes[0], axes[2]))  # E_0 [rad s]
+        zero = np.zeros(self._drives.num_axes)
+        self._move = plan_move(self._drives.motor, zero + self._drives.motor.inertia, 1.0, zero)
+
+    def set_machines(self, parameters: Mapping[str, Floats], supply: Floats, where: Mask | None = None) -> None:
+        """Take the machines to score, shape (num_machines,): `drives.machine.parameters` and supply voltage."""
+        variants = len(self.variants)
+        mask = np.ones(self.num_machines, bool) if where is None else where
+        kind = {f"load.{p.name}": p.field for p in self._drives.load.parameters}
+        inertia = np.tile([v.inertia for v in self.variants], self.num_machines)
+        stiffness = np.tile([v.stiffness for v in self.variants], self.num_machines)
+        values = {name: np.repeat(value, variants) for name, value in parameters.items()}
+        for name, field in kind.items():
+            if field in _INERTIA:
+                values[name] = values[name] * inertia
+            elif field in _STIFFNESS:
+                values[name] = values[name] * stiffness
+        machine, each = self._drives.machine, np.repeat(mask, variants)
+        machine.set_all(values, each)
+        volts = np.repeat(np.asarray(supply, float), variants * self._axes[2])
+        machine.supply = np.where(np.repeat(each, self._axes[2]), volts, machine.supply)
+        filters = machine.parameters["stage.velocity_filter"]
+        t_0 = 4.0 * small_time_constants(self._drives.device, filters)
+        self._t_0 = np.repeat(t_0, self._axes[2])
+
+    def set_constant_load(self, torque: Floats) -> None:
+        """Take what pulls at the machines all the while [N*m], (num_machines,), signed as `machine.load_torque`."""
+        self._constant = np.repeat(np.asarray(torque, float), len(self.variants))
+
+    def set_moves(self, move: Move, where: Mask | None = None) -> None:
+        """Take the move of every axis of the machines, shape (num_machines * axes,)."""
+        lanes = np.ones(self.num_machines, bool) if where is None else where
+        each = np.repeat(lanes, len(self.variants) * self._axes[2])
+        old = self._move
+        self._move = Move(
+            np.where(each, self._spread(move.distance), old.distance),
+            np.where(each, self._spread(move.velocity), old.velocity),
+            np.where(each, self._spread(move.acceleration), old.acceleration),
+            np.where(each, self._spread(move.increments), old.increments),
+            move.counts,
+        )
+
+    def set_reference(self, gains: Integers, where: Mask | None = None) -> Scores:
+        """Take these gains, those of the fitted rule, for E_0; return their scores, E_d/E_0 of the nominal one 1."""
+        mask = np.ones(self.num_machines, bool) if where is None else where
+        measured = self._run(gains)
+        self._reference = np.where(mask[:, None], measured[1][:, 0], self._reference)
+        return self._scores(*measured)
+
+    def score(self, gains: Integers) -> Scores:
+        """Return the scores of gains, raw integers of shape (num_machines * axes, 5) in the order of `Gains`."""
+        return self._scores(*self._run(gains))
+
+    def close(self) -> None:
+        """Give the drives back."""
+        self._drives.close()
+
+    def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values of (num_machines * axes,) for the axes of all variants."""
+        machines, variants, axes = self._axes
+        shape = (machines, 1, axes, *values.shape[1:])
+        full = (machines, variants, axes, *values.shape[1:])
+        return np.broadcast_to(values.reshape(shape), full).reshape(-1, *values.shape[1:])
+
+    def _run(self, gains: Integers) -> tuple[Terms, Floats, Floats]:
+        """Return the terms of every axis without E_d/E_0, E_d [rad s] and swing, (machines, variants, axes) each."""
+        drives, move = self._drives, self._move
+        drives.machine.load_torque = self._constant
+        drives.machine.reset()
+        raw = self._spread(np.asarray(gains, np.int64)).copy()
+        raw[:, VELOCITY_P] = scaled(raw[:, VELOCITY_P], self._factors)
+        write_gains(drives, raw)
+        write_profile(drives, move)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
+            power_up(drives)
+            start(drives, move.distance)
+            objects: list[ObjectName] = [POSITION, CURRENT, CURRENT_ERROR, STATUS]
+            free = drives.record(objects, SETTLED * CYCLE)
+            drives.machine.load_torque = self._constant + self._load_torque
+            loaded = drives.record(objects, (TRIAL - SETTLED) * CYCLE)
+        current = (free[CURRENT] + free[CURRENT_ERROR]) * 1e-3
+        direction = np.where(move.distance < 0, -1, 1)
+        settling, noise, overshoot = move_terms(
+            free[POSITION].astype(float),
+            np.asarray(current, float),
+            move,
+            self._t_0,
+            drives.motor.rated_current,
+            move.distance,
+            direction,
+        )
+        mask, enabled = OPERATION_ENABLED
+        tripped = np.any(loaded[STATUS][-1:] & mask != enabled, axis=0) | np.repeat(
+            drives.machine.diverged, self._axes[2]
+        )
+        error = np.abs(wrapped(move.distance - loaded[POSITION])).sum(axis=0) * CYCLE / move.increments
+        # Half a count is the least that there is to see.
+        least = 0.5 / move.counts * (TRIAL - SETTLED) * CYCLE
+        shape = self._axes
+        terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
+        swings = swing(free[CURRENT].astype(float) * 1e-3, drives.motor.rated_current)
+        return (
+            terms.each(lambda value: value.reshape(shape)),
+            np.maximum(error, least).reshape(shape),
+            swings.reshape(shape),
+        )
+
+    def _scores(self, terms: Terms, disturbance: Floats, swings: Floats) -> Scores:
+        terms = terms._replace(disturbance=disturbance / self._reference[:, None])
+        j = cost(terms)
+        worst = j.argmax(axis=-1)[..., None]
+        of_worst = terms.each(lambda value: np.take_along_axis(value, worst, -1)[..., 0])
+        j = j.max(axis=-1)
+        return Scores(hidden_cost(j), j, of_worst, swings.max(axis=-1))

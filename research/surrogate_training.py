@@ -1,0 +1,289 @@
+"""Training of the surrogate tuner: trials on emulated machines, then a network that says what gains are worth.
+
+    python -m research.surrogate_training --out surrogate.npz --seed 0
+
+Round by round: trials of random gains on machines of every row of `TRAINING`, then of gains that the surrogate of the
+round before proposes, so that it learns where it is sent. With --trials FOLDER the trials are kept there, and those
+that are there are not made again: a training that was stopped goes on. With OMP_NUM_THREADS=1 it takes 9 minutes of a
+core; NumPy's threads do nothing for matrices this small but wait for each other, three times as long.
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.policies.agent_file import Bundle, installed
+from agents.tuner.surrogate import CONTEXT, IDENTIFIED, SHOWN, SurrogatePolicy
+from mechanics.untrusted import read_arrays
+from tuning.bootstrap import bootstrap_interval
+
+Floats = NDArray[np.float64]
+Array = NDArray[np.float32]
+
+ENVIRONMENT = "ServoDrive/GainTuning-v0"
+GAINS = ("velocity_p", "velocity_i", "position_p")
+# The optimum lies up to 2.9 (in ln) from the rule's gains; a step reaches it from wherever the incumbent is.
+CONFIGURATION: dict[str, Any] = {"gains": list(GAINS), "trials": 10, "step": 4.0}
+LOW, HIGH = (-1.6, -2.8, -1.2), (1.8, 1.8, 2.8)  # of what is tried, ln over the rule's
+# Load and motor of the machines, each from the load's shipped distributions.
+TRAINING = (
+    ("two_mass", "qbl4208"),
+    ("belt", "qbl4208"),
+    ("inertia", "ec_i_40"),
+    ("ball_screw", "teknic_m2310p"),
+    ("three_mass", "qbl4208"),
+    ("geared_joint", "ec_45_flat"),
+    ("vertical_screw", "re_40"),
+    ("fan", "re_35"),
+)
+LANES = 256  # machines of a row and set
+# Random gains, ln over the rule's: a share is drawn about where optima lie, the rest evenly between two ends.
+ABOUT, SPREAD, SHARE = (0.1, -0.5, 0.9), (0.6, 0.9, 0.9), 0.6
+EVENLY = (-1.2, -2.2, -1.0), (1.4, 1.5, 2.6)
+FARTHEST = 3.0
+SHAKES, SHAKE = (0.3, 1.0, 2.0), 0.15  # of proposals, for news: one of the factors, and the standard deviation
+FIRST_SEED = 1001  # of a training's machines; its rounds' are a thousand apart
+NETWORKS = 3  # of what is made; a round's proposals come from one
+MACHINES, UNSEEN = 26, 457_000  # of a row, and the seed of machines that figures are measured on
+LIMITS = "machines with one drive, of kinds and ranges like those trained on; velocity P and I and position P only"
+# The best of a few on machines of seed 555,000: of curiosities from -0.3 to 0.8, and of cautions from 0 to 2.
+SETTINGS = {"curiosity": 0.4, "caution": 0.5}
+
+
+class Round(NamedTuple):
+    """A round of a training: sets of machines of every row, and trials of each machine."""
+
+    sets: int
+    trials: int
+
+
+ROUNDS = (Round(sets=4, trials=8), *(Round(sets=1, trials=10) for _ in range(4)))  # the first of random gains
+
+
+class Answers(NamedTuple):
+    """What a tuner left machines with, (rows, machines) each.
+
+    ratio: Hidden J of its answer over the rule's. incumbent: That of the best trial by measured terms. best: That of
+    the best trial by hidden J. aborted: Share of the trials that were stopped.
+    """
+
+    ratio: Floats
+    incumbent: Floats
+    best: Floats
+    aborted: Floats
+
+
+@contextmanager
+def machines_of(load: str, motor: str, count: int, **options: Any) -> Iterator[Any]:
+    """Make the environment with random machines of a row, options in place of the configuration's."""
+    from drive_env.envs.gain_tuning import GainTuning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of machines that their motors can hardly move: they are tuned, too
+        env = GainTuning(count, load=load, motor=motor, config=CONFIGURATION, **options)
+        try:
+            yield env
+        finally:
+            env.close()
+
+
+def collect(load: str, motor: str, machines: int, trials: int, seed: int, policy: Any = None) -> Any:
+    """Return `Trials` on random machines: of random gains, or of what a policy proposes, shaken a little."""
+    from research.surrogate_fit import Trials
+
+    rng = np.random.default_rng(seed)
+    G = len(GAINS)
+    columns: tuple[list[Array], ...] = ([], [], [])
+    with machines_of(load, motor, machines, trials=trials, step=2.0 * FARTHEST) as env:
+        observation, info = env.reset(seed=seed)
+        rule = info["hidden"].astype(np.float32)
+        context = np.concatenate([observation[:, :IDENTIFIED], _shown(observation)], axis=1)
+        if policy is not None:
+            policy.reset()
+        for _ in range(trials):
+            if policy is None:
+                wanted = _random_gains(rng, machines)
+                action = wanted - observation[:, IDENTIFIED + G : IDENTIFIED + 2 * G]
+            else:
+                shake = SHAKE * rng.choice(SHAKES, (machines, 1))
+                action = policy.act(observation) + shake * rng.standard_normal((machines, G))
+            observation, _, _, _, info = env.step(action.astype(np.float32))
+            worth = np.log(info["trial_hidden"].astype(np.float32) / rule)
+            found = (observation[:, IDENTIFIED : IDENTIFIED + G], _shown(observation), worth)
+            for column, value in zip(columns, found, strict=True):
+                column.append(np.asarray(value, np.float32))
+    assert context.shape[1] == CONTEXT
+    return Trials(context, *(np.stack(column, axis=1) for column in columns))
+
+
+def _random_gains(rng: np.random.Generator, count: int) -> Floats:
+    """Return ln of gains over the rule's, (count, gains)."""
+    shape = (count, len(GAINS))
+    likely = rng.random((count, 1)) < SHARE
+    drawn = np.where(likely, rng.normal(ABOUT, SPREAD, shape), rng.uniform(*EVENLY, shape))
+    return np.clip(drawn, -FARTHEST, FARTHEST)
+
+
+def _shown(observation: Array) -> Array:
+    at = IDENTIFIED + 2 * len(GAINS)
+    return np.asarray(observation[:, at : at + SHOWN], np.float32)
+
+
+def bundle_of(arrays: Mapping[str, Array], card: Mapping[str, Any]) -> Bundle:
+    """Return the agent."""
+    settings = {"gains": len(GAINS), "step": CONFIGURATION["step"], "low": list(LOW), "high": list(HIGH), **SETTINGS}
+    versions = installed("drive-env", "numpy", "torch", "mujoco", "numba")
+    return Bundle("surrogate", arrays, settings, ENVIRONMENT, dict(CONFIGURATION), card, versions)
+
+
+def train(
+    seed: int = 0,
+    *,
+    rounds: Sequence[Round] = ROUNDS,
+    lanes: int = LANES,
+    rows: Sequence[tuple[str, str]] = TRAINING,
+    kept: Path | None = None,
+    progress: Callable[[str, float], None] = lambda what, share: None,
+) -> Bundle:
+    """Return a surrogate trained from nothing, or from the trials that were kept.
+
+    Args:
+        seed: Of machines, trials and networks.
+        rounds: What is tried; the first round's gains are random.
+        lanes: Machines in a set.
+        rows: Load and motor.
+        kept: Folder of the trials of a training with the same arguments; nothing is kept if not given.
+        progress: Called with what is under way and how much of it is done.
+    """
+    from research.surrogate_fit import fit, join
+
+    parts: list[Any] = []
+    policy, arrays = None, {}
+    for number, (sets, trials) in enumerate(rounds):
+        what = f"round {number + 1} of {len(rounds)}"
+        each = [(k, j) for k in range(sets) for j in range(len(rows))]
+        for done, (k, j) in enumerate(each):
+            own = int(np.random.SeedSequence((FIRST_SEED + 1000 * number + seed, k, j)).generate_state(1)[0])
+            file = None if kept is None else kept / f"trials_{seed}_{number}_{k}_{j}.npz"
+            parts.append(_kept(file) or _keep(file, collect(*rows[j], lanes, trials, own, policy)))
+            progress(f"{what}: trials", (done + 1) / len(each))
+        networks = 1 if number + 1 < len(rounds) else NETWORKS
+        arrays = fit(join(parts), seed, networks, partial(progress, f"{what}: networks"))
+        policy = SurrogatePolicy(bundle_of(arrays, {}))
+    card = {
+        "trained": f"{len(rounds)} rounds of trials on emulated machines, hidden J known; networks by torch",
+        "distribution": [f"{load} on {motor}" for load, motor in rows],
+        "machines": sum(len(part.worth) for part in parts),
+        "trials": sum(part.worth.size for part in parts),
+        "seed": seed,
+    }
+    return bundle_of(arrays, card)
+
+
+def _kept(file: Path | None) -> Any:
+    from research.surrogate_fit import Trials
+
+    if file is None or not file.exists():
+        return None
+    stored = read_arrays(file)
+    return Trials(**{name: stored[name] for name in Trials._fields})
+
+
+def _keep(file: Path | None, trials: Any) -> Any:
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        beside = file.with_name(f"{file.stem}_part.npz")  # a run that dies leaves no half of it
+        np.savez_compressed(beside, allow_pickle=False, **trials._asdict())
+        beside.replace(file)
+    return trials
+
+
+def judge(policy: Any, machines: int, seed: int, rows: Sequence[tuple[str, str]] = TRAINING) -> Answers:
+    """Let a tuner tune machines that it was not trained on, and score what it leaves."""
+    found = []
+    for load, motor in rows:
+        with machines_of(load, motor, machines) as env:
+            observation, info = env.reset(seed=seed)
+            tried, hidden, aborted = [info["gains"]], [info["hidden"]], []
+            policy.reset()
+            for _ in range(env.config.trials):
+                observation, _, _, _, info = env.step(policy.act(observation))
+                tried.append(info["trial_gains"])
+                hidden.append(info["trial_hidden"])
+                aborted.append(info["aborted"])
+            answer = env.gains_of(policy.answer(observation))
+            ratio = np.array(hidden) / hidden[0]
+            same = np.all(np.array(tried) == answer, axis=(2, 3))  # (trials, machines)
+            if not same.any(axis=0).all():
+                raise RuntimeError("the tuner answered gains that it had not tried")
+            of_answer = ratio[same.argmax(axis=0), np.arange(machines)]
+            found.append((of_answer, info["hidden"] / hidden[0], ratio.min(axis=0), np.mean(aborted, axis=0)))
+    return Answers(*(np.array(column) for column in zip(*found, strict=True)))
+
+
+def figures_of(ratios: Floats) -> dict[str, Any]:
+    """Return what a card says of hidden J over the rule's, each with its 95 % interval (bootstrap over machines)."""
+    flat = ratios.ravel()
+    figures: dict[str, Any] = {}
+    for name, of in (
+        ("median", lambda x: np.median(x, axis=-1)),
+        ("p95", lambda x: np.quantile(x, 0.95, axis=-1)),
+        ("share more than 5 % worse", lambda x: np.mean(x > 1.05, axis=-1)),
+    ):
+        figures[name] = round(float(of(flat)), 3)
+        figures[f"{name}, 95 % interval"] = [round(end, 3) for end in bootstrap_interval(of, flat)]
+    return figures
+
+
+def judged(made: Bundle) -> Bundle:
+    """Return the agent with figures in its card, of machines that it was not trained on."""
+    answers = judge(SurrogatePolicy(made), MACHINES, UNSEEN)
+    figures = {
+        "what": "hidden J of the answer over the fitted rule's, 10 trials, machines not trained on",
+        "machines": answers.ratio.size,
+        "seed": UNSEEN,
+        **figures_of(answers.ratio),
+        "median of the best trial": round(float(np.median(answers.best)), 3),
+        "trials that were stopped": round(float(answers.aborted.mean()), 3),
+        "median of each row": {
+            f"{load} on {motor}": round(float(np.median(row)), 3)
+            for (load, motor), row in zip(TRAINING, answers.ratio, strict=True)
+        },
+    }
+    return replace(made, card={**made.card, "figures": figures, "limits": LIMITS})
+
+
+def main() -> None:
+    """Train from the command line."""
+    from rich.progress import Progress
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="file of the agent (.npz)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of machines, trials and networks")
+    parser.add_argument("--trials", type=Path, help="folder to keep trials in, and to take them from")
+    arguments = parser.parse_args()
+    with Progress() as bar:
+        task = bar.add_task("training", total=1.0)
+        made = train(
+            arguments.seed,
+            kept=arguments.trials,
+            progress=lambda what, share: bar.update(task, description=what, completed=share),
+        )
+    made = judged(made)
+    print(
+        f"{made.card['figures']['median']} of the rule's hidden J in the median, written to {made.save(arguments.out)}"
+    )
+
+
+if __name__ == "__main__":
+    main()

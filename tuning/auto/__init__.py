@@ -1,0 +1,1 @@
+"""One button: identify, compute, try, verify, keep or roll back."""

@@ -1,0 +1,149 @@
+"""What auto did, as a certificate."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tuning.certificate.certificate import (
+    AxisCertificate,
+    Certificate,
+    FrequencyResponse,
+    StepResponse,
+    envelope,
+    frequency_response,
+    identified,
+    si_gains,
+)
+from tuning.response.linear_model import OPEN_LOOPS
+from tuning.response.margins import Margins, margins
+from tuning.runs.provenance import versions
+
+if TYPE_CHECKING:
+    from tuning.auto.proving import Shown
+    from tuning.auto.result import AxisRun, Result
+    from tuning.target import Target
+
+SETTLED = 0.01  # of the move: what counts as there
+
+
+def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") -> Certificate:
+    """Return the certificate of a run of auto.
+
+    Args:
+        target: What was tuned.
+        result: What came of it.
+        seed: That of the run.
+        tuner: What found the gains.
+    """
+    axes = tuple(_axis(target, result, axis, run) for axis, run in enumerate(result.axes))
+    return Certificate(
+        tuner=tuner,
+        device=target.device.name,
+        motor=target.motor.name,
+        machine=target.machine or "unnamed",
+        supply=float(target.supply[0]),
+        seed=seed,
+        envelope=envelope(target),
+        axes=axes,
+        versions=versions(),
+    )
+
+
+def _axis(target: Target, result: Result, axis: int, run: AxisRun) -> AxisCertificate:
+    supply = float(target.supply[axis])
+    loaded = [result.loaded[axis]] if axis in result.loaded else []
+    return AxisCertificate(
+        axis=axis,
+        accepted=run.accepted,
+        reservations=tuple(run.reservations),
+        reason=run.reason or f"{_opening(run)}: the gains were verified {run.verified}",
+        identified={} if run.identified is None else identified(run.identified),
+        before=tuple(run.before),
+        after=tuple(run.after),
+        before_si=si_gains(target.device, supply, run.before),
+        after_si=si_gains(target.device, supply, run.after),
+        steps=(*_steps(result, axis), *loaded) if run.accepted else (),
+        frequency_responses=_responses(target, result, axis, run) if run.accepted else (),
+        notes=tuple(run.notes),
+        hardware_seconds=float(result.drive_seconds[axis]),
+        aborts=int(result.aborts[axis]),
+    )
+
+
+def _opening(run: AxisRun) -> str:
+    return "every check was passed" if not run.reservations else "every check that could be made was passed"
+
+
+def _steps(result: Result, axis: int) -> tuple[StepResponse, ...]:
+    """Return the move with the gains before, if it was made, and that with the new ones."""
+    moves = ((False, result.earlier), (True, result.shown))
+    return tuple(_step(shown, axis, tuned) for tuned, shown in moves if shown is not None and shown.where[axis])
+
+
+def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
+    # From where the axis began, and in the direction in which it went: moves go there and back.
+    way = 1.0 if shown.demand[-1, axis] >= shown.demand[0, axis] else -1.0
+    demand, actual = (way * values[:, axis] for values in (shown.demand, shown.actual))
+    size = max(float(np.abs(demand - demand[0]).max()), 1e-9)
+    beyond = actual - demand[-1]
+    late = np.flatnonzero(np.abs(actual - demand[-1]) > SETTLED * size)
+    there = np.flatnonzero(demand != demand[-1])
+    settled = len(actual) - 1 not in late
+    figures = {
+        # After the profile's end; less than nothing is nothing.
+        "settling [s]": max(float(shown.t[late[-1]] - shown.t[there[-1]]), 0.0) if settled and late.size else np.nan,
+        "overshoot [%]": 100.0 * max(float(beyond.max()), 0.0) / size,
+        "largest following error [rad]": float(np.abs(demand - actual).max()),
+        "error at the end [rad]": float(demand[-1] - actual[-1]),
+        "current at rest afterwards, RMS over rated [%]": 100.0 * float(shown.swing[axis]),
+    }
+    return StepResponse("move", tuned, "rad", shown.t, demand, actual, way * shown.current[:, axis], figures)
+
+
+def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple[FrequencyResponse, ...]:
+    """Return both outer loops as measured with the new gains, and as computed with those before."""
+    response = result.response
+    if response is None or not np.isfinite(response.open_loop[:, axis]).any():
+        return ()
+    # Too few lines are coherent for margins: then they are shown as what they are.
+    nothing = Margins(*(np.nan,) * len(Margins._fields))
+    loops, device = response.loops(run.after, axis, plant=run.plant, refined=False), target.device
+    changed = not np.array_equal(response.gains[axis], run.after)
+    sources = {
+        "velocity": "multisine, 1 kHz samples"
+        + (", with other gains, and by how much these differ" if changed else ""),
+        "position": "the measured velocity loop and position P",
+    }
+    closed = run.plant is not None and 0 not in (run.before.torque_p, run.before.velocity_p)
+    shown = []
+    for name, L in (("velocity", loops.velocity), ("position", loops.position)):
+        if name == "position" and name not in run.margins:
+            continue  # too little was seen, or an axis alone that never goes alone
+        if closed and not (name == "position" and run.before.position_p == 0) and not run.is_kept:
+            assert run.plant is not None, "it was looked for"
+            before = OPEN_LOOPS[name](device, run.plant, run.before, response.f)
+            shown.append(
+                frequency_response(
+                    f"{name} loop",
+                    response.f,
+                    before,
+                    margins(response.f, before),
+                    tuned=False,
+                    source="the linear model of what was identified, for the gains before",
+                )
+            )
+        shown.append(
+            frequency_response(
+                f"{name} loop",
+                response.f,
+                L,
+                run.margins.get(name, nothing),
+                at_least=run.at_least.get(name),
+                tuned=True,
+                coherence=response.coherence[:, axis],
+                source=sources[name],
+            )
+        )
+    return tuple(shown)

@@ -1,0 +1,66 @@
+"""What auto looks at before anything is risked: the wiring, and gains that others left in a drive."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tuning.response.linear_model import OPEN_LOOPS
+from tuning.response.margins import margins
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.gains import Gains
+    from tuning.identify.identification import Identification
+    from tuning.response.linear_model import Plant
+    from tuning.target import Target
+
+SAFE_GAIN_DB, SAFE_PHASE = 6.0, 25.0  # margins by the model, from which on gains are moved with
+LOOKED_AT = 400  # frequencies of the model
+# Greatest |1/(1+L)| that the position loop may have by the model, and by how much position P is lowered at a time, and
+# how often at most.
+SENSITIVITY, STEP, STEPS = 4.0, 0.85, 16
+
+
+def unsafe_gains(device: Device, plant: Plant, gains: Gains) -> str:
+    """Return why an axis is not to be moved with gains, "" if it may be."""
+    if 0 in (gains.torque_p, gains.velocity_p, gains.position_p):
+        return "a P gain is 0, and a loop open"
+    rates = {"current": device.current_rate}
+    for name, open_loop in OPEN_LOOPS.items():
+        f = np.geomspace(1.0, 0.49 * rates.get(name, device.velocity_rate), LOOKED_AT)
+        found = margins(f, open_loop(device, plant, gains, f))
+        # A loop whose gain is below 1 everywhere has all the phase there is.
+        if found.gain_db < SAFE_GAIN_DB or found.phase_deg < SAFE_PHASE:
+            return (
+                f"by the model the {name} loop has {found.gain_db:.0f} dB and {found.phase_deg:.0f} degrees of margin "
+                f"with them; {SAFE_GAIN_DB:g} dB and {SAFE_PHASE:g} degrees are needed"
+            )
+    return ""
+
+
+def sound_gains(device: Device, plant: Plant, gains: Gains) -> Gains:
+    """Return gains with position P as far down as the position loop needs it by the model; as they are if none helps.
+
+    A search by J alone may end with eight degrees of phase margin: where nothing disturbs that, it is the fastest.
+    """
+    f = np.geomspace(1.0, 0.49 * device.velocity_rate, LOOKED_AT)
+    for lowered in range(STEPS):
+        less = gains._replace(position_p=max(round(STEP**lowered * gains.position_p), 1))
+        if margins(f, OPEN_LOOPS["position"](device, plant, less, f)).ms <= SENSITIVITY:
+            return less
+    return gains
+
+
+def wrong_wiring(target: Target, identified: Identification) -> str:
+    """Return what is wrong with the wiring, "" if nothing is."""
+    direction, pairs = identified.estimates.get("encoder_direction"), identified.estimates.get("pole_pairs")
+    if direction is not None and direction.value < 0.0:
+        return "the encoder counts against the motor: swap two phases, or set the encoder's direction (2080h:01)"
+    if pairs is not None and pairs.is_known and round(pairs.value) != target.motor.n_p:
+        return (
+            f"the motor has {pairs.value:.0f} pole pairs, and {target.motor.name} has {target.motor.n_p}: "
+            "it is another motor; give --motor, or correct 2056h"
+        )
+    return ""

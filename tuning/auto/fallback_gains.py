@@ -1,0 +1,66 @@
+"""Drives that are calmed: what goes on shaking, even with the last good gains, gets gains that are slow.
+
+A trial stops what oscillates and returns to the last good gains. Good ones may be so near to the edge that an axis
+that has been shaken goes on for ever in a limit cycle with them; that is seen only here.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import write_gains
+from drive_env.trials.gain_trial import OSCILLATION
+from drive_env.trials.positioning import CURRENT, WATCH
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+WINDOWS = 3  # of 25 ms in a row: a trial has acted after the first, and good gains have had the second to calm it
+
+
+class CalmedDrives:
+    """Drives whose axes get calm gains when they shake for long; everything else is theirs.
+
+    Args:
+        drives: The drives.
+        rated_current: Of their motors [A].
+        windows: Of 25 ms in a row in which it shakes; a trial has acted after the first.
+
+    Attributes:
+        calm: Gains to calm with, (num_axes, 5), or None as long as none are known.
+        calmed: Axes that got them since the last `begin`, (num_axes,).
+    """
+
+    def __init__(self, drives: Any, rated_current: float, windows: int = WINDOWS) -> None:
+        self.calm: Integers | None = None
+        self.calmed: Mask = np.zeros(drives.num_axes, bool)
+        self._drives = drives
+        self._threshold = OSCILLATION * rated_current
+        self._most = windows
+        self._windows = np.zeros(drives.num_axes, np.int64)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._drives, name)
+
+    def begin(self) -> None:
+        """Forget what was before a trial."""
+        self.calmed[:] = False
+        self._windows[:] = 0
+
+    def record(self, objects: Any, duration: float, *arguments: Any, **options: Any) -> Any:
+        """Let time pass while objects are recorded; calm what has shaken too long."""
+        trace = self._drives.record(objects, duration, *arguments, **options)
+        if self.calm is not None and CURRENT in objects and len(trace) == WATCH:
+            change = np.diff(trace[CURRENT], axis=0) * 1e-3
+            shaking = np.sqrt(np.mean(change**2, axis=0)) > self._threshold
+            self._windows = np.where(shaking, self._windows + 1, 0)
+            late = self._windows >= self._most
+            if late.any():
+                write_gains(self._drives, self.calm, late)
+                self.calmed |= late
+                self._windows[late] = 0
+        return trace

@@ -1,0 +1,86 @@
+"""What a load step does to axes that stand still: on emulated machines only, for a certificate.
+
+Hardware has no load step. It is no experiment, and nothing is found by it; gains with which an axis does not come to
+rest after it are not accepted.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import detrend
+
+from drive_env import motion
+from drive_env.trials import response
+from drive_env.trials.positioning import CURRENT, CYCLE, POSITION, STATUS, wrapped
+from tuning.certificate.certificate import StepResponse
+
+if TYPE_CHECKING:
+    from tuning.target import Target
+
+Mask = NDArray[np.bool_]
+
+NAME = "load step of 0.3 rated torque at standstill"
+SHARE = 0.3  # of the rated torque
+# s: until the axis stands, then recorded before the step and after it, and at the end of that looked whether it stands.
+REST, BEFORE, AFTER, LOOKED_AT = 0.1, 0.02, 0.3, 0.1
+SWING = "current at rest afterwards, RMS over rated [%]"
+
+
+def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
+    """Return what a load step does to emulated axes with the gains they have; those that were off are off again.
+
+    What is drawn is the first of two, against each other; the swing is the worst after these and after their ends.
+
+    Args:
+        target: Emulated machines.
+        where: Axes, shape (num_axes,); only those of machines all of whose axes are chosen take part.
+    """
+    from mechanics.shaft import one, way
+
+    drives = target.drives
+    machines = where.reshape(-1, target.axes_per_machine).all(axis=1)
+    axes = np.repeat(machines, target.axes_per_machine)
+    if not axes.any():
+        return {}
+    packed = one(drives.load)
+    # On the load, where it disturbs: the axis with the longest lever feels the share.
+    lever = float(np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max())
+    mask, value = motion.OPERATION_ENABLED
+    off = axes & (drives.read(STATUS) & mask != value)
+    motion.enable(drives, mode="pp", where=axes)
+    drives.advance(REST)
+    try:
+        rest = drives.record([POSITION, CURRENT], BEFORE)
+        windows = []
+        # Both ways, and what it does when the load is gone: loose gears swing one way and stand the other.
+        for share in (-SHARE, 0.0, SHARE, 0.0):
+            drives.machine.load_torque = np.where(machines, share * target.motor.rated_torque / lever, 0.0)
+            windows.append(drives.record([POSITION, CURRENT], AFTER))
+    finally:
+        drives.machine.load_torque = 0.0
+        drives.advance(REST)
+        if off.any():
+            motion.disable(drives, where=off)
+    loaded = windows[0]
+    raw = np.concatenate([rest[POSITION], loaded[POSITION]])
+    angle = wrapped(raw - raw[0]) / target.increments()
+    current = np.concatenate([rest[CURRENT], loaded[CURRENT]]) * 1e-3
+    t = np.arange(len(angle), dtype=np.float64) * CYCLE
+    # An integrator that is still on its way is no swing.
+    ends = [detrend(1e-3 * window[CURRENT][-round(LOOKED_AT / CYCLE) :], axis=0).std(axis=0) for window in windows]
+    swing = np.max(ends, axis=0) / target.motor.rated_current
+    found = response.disturbance_metrics(t, angle, np.zeros(target.num_axes), t_load=BEFORE)
+    return {
+        axis: StepResponse(
+            NAME, True, "rad", t, np.zeros(len(t)), angle[:, axis], current[:, axis],
+            {
+                "disturbance dip [rad]": float(found.dip[axis]),
+                "recovery [s]": float(found.recovery_time[axis]),
+                SWING: 100.0 * float(swing[axis]),
+            },
+        )
+        for axis in map(int, np.flatnonzero(axes))
+    }  # fmt: skip

@@ -1,0 +1,243 @@
+"""The frequency response of the velocity loop with the new gains: what comes too near to instability is calmed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import Gains, scaled, write_gains
+from drive_env.master.errors import BusError
+from drive_env.safety.envelope import SafetyError
+from tuning.auto.moves import show
+from tuning.auto.run import MOVE_TIME, TRIAL_TIME
+from tuning.auto.trials import BY_TRIAL, FOLLOWING_WINDOW, watch_following
+from tuning.response.margins import Margins, margins
+from tuning.response.measured_loop import merged
+
+if TYPE_CHECKING:
+    from tuning.auto.result import AxisRun
+    from tuning.auto.run import Run
+    from tuning.response.measured_loop import AtLeast, MeasuredLoop
+
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+LEAST_LINES = 10  # of a frequency response, that are worth a judgement
+SENSITIVITY = 4.0  # greatest |1/(1+L)| that a measured loop may have
+CLOSE = {"phase": 14.0, "gain": 2.5}  # margins that this leaves at least [degrees, dB]
+SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # factors of gains by which a lively loop is calmed
+CALMED_NAMES = {"velocity": ("velocity P", "position P"), "position": ("position P",)}
+CALMED = {
+    loop: [Gains._fields.index(name.lower().replace(" ", "_")) for name in names]
+    for loop, names in CALMED_NAMES.items()
+}
+LONGER = 2  # times as long it is shaken where too little was seen
+LEAST_WAY = 1e-3  # rad; an axis without any way is shaken as little as can be, and its response says so
+ALONE = (
+    "its response is that of an axis that moves alone what all axes of its machine share, with the others let go: with "
+    "all of them moving it the loop's gain is higher, and the gain margin less, by as much as their share; nothing was "
+    "measured of the position loop"
+)
+FREE_WINDOW = 100  # turns of following error that trip a frequency response: it means nothing there
+
+
+def measure(run: Run) -> None:
+    """Measure the velocity loop's response with the new gains; what comes too near to instability is calmed."""
+    going = run.going
+    # A move with the gains before matters more: without it nobody knows whether the new ones are better.
+    late = going & ~run.affordable(run.response_time + run.look_back_time)
+    _without_response(run, late, "the drive time was used up")
+    going &= ~late
+    if not going.any():
+        return
+    from tuning.response import frequency_response
+
+    drives = run.target.drives
+    # Trials have left the axes somewhere in their travel: what is left of it is counted from there.
+    low, high = run.room()
+    here = replace(run.target, low=low, high=np.maximum(high, LEAST_WAY))
+    write_gains(drives, run.gains, going)
+    drives.write(FOLLOWING_WINDOW, FREE_WINDOW * drives.read((0x2058, 0)), where=going)
+    try:
+        with run.spending(going):
+            response = frequency_response.measure(here, "velocity", where=going)
+            if (longer := _unclear(run, response, going)).any():
+                again = frequency_response.measure(
+                    here, "velocity", where=longer, periods=LONGER * frequency_response.PERIODS
+                )
+                response = merged([response, again])
+        run.response = response
+    except SafetyError as error:
+        run.stop(going, f"the envelope stopped the frequency response: {error}")
+        return
+    except (ValueError, RuntimeError, TimeoutError) as error:
+        if isinstance(error, BusError):
+            raise
+        _without_response(run, going, str(error))
+        return
+    finally:
+        watch_following(run, going)
+    assert run.ground is not None, "proving makes it"
+    faults = run.faults()
+    run.ground.begin_here(going)
+    calmed = np.zeros(run.target.num_axes, bool)
+    for axis in map(int, np.flatnonzero(going & run.going)):
+        if axis not in faults:
+            calmed[axis] = _calm(run, axis, response)
+    _try_again(run, calmed & run.going)
+    _go_on_after_faults(run, faults)
+
+
+def _unclear(run: Run, response: MeasuredLoop, going: Mask) -> Mask:
+    """Return the axes of which too little was seen, and for which there is time to look longer, (num_axes,)."""
+    left = run.affordable(LONGER * run.response_time + run.response_time + run.look_back_time)
+    unclear = np.zeros(run.target.num_axes, bool)
+    for k in map(int, np.flatnonzero(going & left)):
+        found = _margins(run, response, run.gains[k], k)["velocity"] if _seen(response, k) >= LEAST_LINES else None
+        unclear[k] = found is None or not math.isfinite(found.phase_deg)
+    return unclear
+
+
+def _seen(response: MeasuredLoop, k: int) -> int:
+    """Return how many lines of an axis are coherent, together with their neighbours where a model fits."""
+    return round(float(response.refined(k)[2].mean()) * len(response.f))
+
+
+def _calm(run: Run, k: int, response: MeasuredLoop) -> bool:
+    """Lower the gains of an axis one of whose loops comes too near to instability; return whether it was so."""
+    axis = run.axes[k]
+    seen = _seen(response, k)
+    if seen < LEAST_LINES:
+        why = f"{seen} of its lines are coherent, and {LEAST_LINES} are needed"
+        _without_response(run, np.arange(run.target.num_axes) == k, "; ".join([why, *response.notes[k]]))
+        return False
+    gains = run.gains[k]
+    for loop, calmed in CALMED.items():
+        if loop not in _loops(run):
+            continue
+        for factor in SOFTER:
+            softer = gains.copy()
+            softer[calmed] = scaled(gains[calmed], factor)
+            found = _margins(run, response, softer, k)[loop]
+            if found.ms <= SENSITIVITY:
+                break
+        else:
+            axis.reason = (
+                f"the measured {loop} loop is {found.ms:.1f} times as sensitive as an open one: {SENSITIVITY:g} is most"
+            )
+            return False
+        if factor != 1.0:
+            axis.notes.append(
+                f"{' and '.join(CALMED_NAMES[loop])} calmed to {100.0 * factor:.0f} %: the measured {loop} loop came "
+                "too near to instability; margins are computed from that response"
+            )
+        gains = softer
+    if np.array_equal(gains, run.gains[k]):
+        return False
+    run.gains[k], run.spare[k] = gains, 0  # the second best would be as near
+    return True
+
+
+def _loops(run: Run) -> tuple[str, ...]:
+    """Return which loops a measured velocity loop shows; that of an axis alone, which never goes alone, only itself."""
+    return ("velocity",) if run.target.linked else tuple(CALMED)
+
+
+def _margins(run: Run, response: MeasuredLoop, gains: Integers, k: int) -> dict[str, Margins]:
+    """Return the margins of both outer loops of an axis, by its measured velocity loop."""
+    f, velocity, position, trusted = response.loops(gains, k, plant=run.axes[k].plant)
+    found = {"velocity": margins(f, velocity, trusted), "position": margins(f, position, trusted)}
+    # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
+    return {loop: one if math.isfinite(one.gain_db) else one._replace(gain_db=math.nan) for loop, one in found.items()}
+
+
+def sensitivity(run: Run, response: MeasuredLoop, gains: Integers, k: int) -> float:
+    """Return Ms of the outer loops of an axis by its measured velocity loop, the greater."""
+    found = _margins(run, response, gains, k)
+    return max(found[loop].ms for loop in _loops(run))
+
+
+def judge(run: Run) -> None:
+    """Say which margins the gains have that are to stay: as measured, or what they are at least."""
+    response = run.response
+    if response is None:
+        return
+    for k in map(int, np.flatnonzero(run.going & ~run.unseen)):
+        axis = run.axes[k]
+        gains = run.gains[k]
+        found = _margins(run, response, gains, k)
+        axis.margins = {loop: found[loop] for loop in _loops(run)}
+        axis.at_least = {loop: response.at_least(loop, gains, k) for loop in _loops(run)}
+        for loop in _loops(run):
+            _tell(axis, loop, axis.margins[loop], axis.at_least[loop])
+        axis.notes += [note for note in response.notes[k] if note not in axis.notes]
+        if run.target.linked:
+            axis.reservations.append(ALONE)
+        how = "by"
+        if not np.array_equal(gains, response.gains[k]):
+            how = "by margins with these gains computed from"
+        axis.verified = (
+            f"{axis.verified or BY_TRIAL}; and {how} the measured frequency response of the velocity loop, "
+            + ", ".join(f"Ms {one.ms:.1f} of the {loop} loop" for loop, one in axis.margins.items())
+        )
+
+
+def _tell(axis: AxisRun, loop: str, found: Margins, least: AtLeast) -> None:
+    """Say what was not seen of a loop's margins, and what it is at least."""
+    for name, value, bound, unit in (
+        ("phase", found.phase_deg, least.phase_deg, "degrees"),
+        ("gain", found.gain_db, least.gain_db, "dB"),
+    ):
+        if math.isfinite(value):
+            continue
+        if math.isnan(bound):
+            axis.reservations.append(
+                f"the {loop} loop's {name} margin was not seen: too few lines are coherent there, and no model fits"
+            )
+        elif not math.isinf(bound):
+            (axis.reservations if bound < CLOSE[name] else axis.notes).append(
+                f"the {loop} loop's {name} margin was not seen; by the model fitted to the response, with all that it "
+                f"leaves open, it is at least {bound:.0f} {unit}"
+            )
+
+
+def _try_again(run: Run, calmed: Mask) -> None:
+    """Try gains that were calmed, and record a move with them; without time for a trial, that move must do."""
+    where = calmed & run.affordable(TRIAL_TIME + MOVE_TIME + run.look_back_time)
+    run.reserve(calmed & ~where, "a move was the only trial of the calmed gains: the drive time was used up")
+    assert run.ground is not None, "proving makes it"
+    if where.any():
+        with run.spending(run.target.together(where)):
+            proof = run.ground.run(run.gains, where)
+        for k in map(int, np.flatnonzero(where)):
+            axis = run.axes[k]
+            axis.proof = float(proof.cost[k])
+            if not proof.passed[k]:
+                axis.reason = f"the calmed gains failed their trial: {proof.reason[k]}"
+    show(run, calmed & run.going)
+
+
+def _go_on_after_faults(run: Run, faults: Mapping[int, str]) -> None:
+    """Have axes move once more that were shaken into a fault: what the gains do by themselves was seen before."""
+    where = np.isin(np.arange(run.target.num_axes), list(faults))
+    if not where.any():
+        return
+    for axis, causes in faults.items():
+        only = np.arange(run.target.num_axes) == axis
+        _without_response(run, only, f"the drive went into fault while it was shaken for it ({causes})")
+    assert run.ground is not None, "proving makes it"
+    with run.spending(run.target.together(where)):
+        run.ground.recover(where)
+    run.drop_faults("its frequency response was measured, and stays in it")
+    show(run, where & run.going)
+
+
+def _without_response(run: Run, where: Mask, why: str) -> None:
+    """Say why there is no frequency response, and what was verified instead."""
+    run.unseen |= where
+    run.reserve(where, f"no margins were measured: {why}; verified {BY_TRIAL} instead")

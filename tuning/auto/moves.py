@@ -1,0 +1,210 @@
+"""Moves for the record, with the new gains and those before, and whether axes stand still after them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import write_gains
+from drive_env.safety.envelope import SafetyError
+from tuning.auto.load_step import SWING, load_step
+from tuning.auto.proving import RESTLESS
+from tuning.auto.run import MOVE_TIME, TRIAL_TIME
+from tuning.auto.trials import SCALED, faster
+
+if TYPE_CHECKING:
+    from tuning.auto.run import Run
+    from tuning.target import Target
+
+Mask = NDArray[np.bool_]
+
+SHOWINGS, AT_THE_EDGE = 3, 0.6  # moves for the record until one passes, and the factor of the gains between them
+CALMING = 0.5  # s after a load step that did not end, with gains that hold
+OVERTIME = 2.5  # s beyond the budget for axes that still shake: so near to the end they are not given up
+# How often the gains of an axis that shook at rest are eased, and the least and greatest factor of its bandwidth. The
+# noise of the encoder goes into the current by velocity P, so that it falls as the bandwidth does.
+# What swings by more than LIMIT_CYCLE is no noise, and may swing more with less gain.
+EASINGS, EASED_LEAST, EASED, EASED_TO, LIMIT_CYCLE = 3, 0.5, 0.8, 0.9, 0.2
+
+
+def show(run: Run, where: Mask | None = None) -> None:
+    """Record a move with the new gains, of all axes or some; one that fails is refused."""
+    going = run.going if where is None else run.target.together(where)
+    if not going.any():
+        return
+    assert run.ground is not None, "proving makes it"
+    eased = np.zeros(run.target.num_axes, bool)
+    for attempt in range(SHOWINGS):
+        try:
+            with run.spending(going):
+                shown = run.ground.show(run.gains, going)
+        except SafetyError as error:
+            run.stop(going, f"the envelope stopped the move with the new gains: {error}")
+            return
+        run.shown = shown if run.shown is None else run.shown.replaced(shown)
+        failed = going & np.array([bool(reason) for reason in shown.reason])
+        last = attempt == SHOWINGS - 1
+        # Time for a response, and for what may follow from it, is kept; what was calmed by one is not eased, too.
+        later = run.response_time + TRIAL_TIME + MOVE_TIME + run.look_back_time
+        again = going & ~failed & shown.restless & ~eased & run.affordable(MOVE_TIME + later) & (where is None)
+        for k in map(int, np.flatnonzero(again)):
+            swing = float(shown.swing[k])
+            _ease(run, k, swing, _shook(swing, "at rest"))
+        eased |= again
+        for k in map(int, np.flatnonzero(failed)):
+            axis, why = run.axes[k], shown.reason[k]
+            if last or not run.affordable(MOVE_TIME)[k]:
+                axis.reason = f"the move with the new gains failed: {why}"
+                continue
+            # What passed once and fails now is at its edge.
+            if run.spare[k].any():
+                run.gains[k], run.spare[k] = run.spare[k], 0
+                axis.notes.append(f"the second best of the trial: with the best, in one more move {why}")
+            elif axis.eased and not np.array_equal(run.gains[k], run.reference[k]):
+                run.gains[k] = run.reference[k]
+                axis.notes.append(f"the gains of the fitted rule: with the eased ones, in one more move {why}")
+            else:
+                run.gains[k] = faster(run.gains[k], AT_THE_EDGE)
+                axis.notes.append(f"slowed to {100.0 * AT_THE_EDGE:.0f} % after the trial: in one more move {why}")
+        # Axes of one machine pull at one load: one that is to move again has the others move with it.
+        lanes = run.target.axes_per_machine
+        going = np.repeat((failed | again).reshape(-1, lanes).any(axis=1), lanes) & run.going
+        if not going.any():
+            break
+    run.drop_faults("it moved with the new gains")
+
+
+def _ease(run: Run, k: int, swing: float, why: str) -> None:
+    """Take calmer gains for an axis that shook: the same, slowed by as much as it shook, or the fitted rule's.
+
+    Args:
+        run: The run.
+        k: The axis.
+        swing: Of its current over the rated one, RMS.
+        why: What it did, in words.
+    """
+    axis, rule = run.axes[k], run.reference[k]
+    factor = float(np.clip(EASED_TO * RESTLESS / swing, EASED_LEAST, EASED))
+    slowed = faster(run.gains[k], factor)
+    is_rule = np.array_equal(run.gains[k], rule)
+    is_slow = bool(np.all(slowed[SCALED] <= rule[SCALED]))
+    if not is_rule and (swing > LIMIT_CYCLE or axis.eased == EASINGS - 1 or is_slow):
+        run.gains[k] = rule
+        axis.notes.append(f"the gains of the fitted rule: with faster ones {why}")
+    else:
+        run.gains[k] = slowed
+        axis.notes.append(f"slowed to {100.0 * factor:.0f} %: {why}")
+    run.spare[k] = 0  # about as fast as the best, which shook
+    axis.eased += 1
+
+
+def _shook(swing: float, when: str) -> str:
+    allowed = f"{100.0 * RESTLESS:.0f} % is still"
+    return f"its current swung by {100.0 * swing:.1f} % of the rated one (RMS) {when}, and {allowed}"
+
+
+def stand(run: Run, target: Target) -> None:
+    """Have axes stand still: what shakes at rest, on emulated machines after a load step too, is softened or refused.
+
+    Args:
+        run: The run.
+        target: Its target, whose time is not counted: a load step is no part of tuning.
+    """
+    for attempt in range(EASINGS + 1):
+        shaking = _shaking(run, target)
+        last = attempt == EASINGS
+        again = np.zeros(run.target.num_axes, bool)
+        for k, (swing, why) in shaking.items():
+            axis = run.axes[k]
+            if last or axis.is_kept or not run.affordable(MOVE_TIME - OVERTIME)[k]:
+                axis.reason = f"it shakes at rest: {why}"
+            else:
+                _ease(run, k, swing, why)
+                again[k] = True
+        if not again.any():
+            return
+        show(run, again & run.going)
+
+
+def _shaking(run: Run, target: Target) -> dict[int, tuple[float, str]]:
+    """Return the axes that do not stand still: by how much their current swings over the rated one, and in words."""
+    going, shown = run.going, run.shown
+    if shown is None or not going.any():
+        return {}
+    found = {}
+    for k in np.flatnonzero(going & shown.restless).tolist():
+        swing = float(shown.swing[k])
+        found[k] = swing, _shook(swing, "at rest")
+    if target.drives.machine is not None:
+        still = run.whole_machines(going & ~shown.restless)
+        write_gains(target.drives, run.gains, still)
+        run.loaded |= load_step(target, still)
+        for k in np.flatnonzero(still).tolist():
+            swing = 0.01 * run.loaded[k].figures[SWING]
+            if swing > RESTLESS:
+                found[k] = swing, _shook(swing, "after a load step of 0.3 of the rated torque")
+        shook = run.whole_machines(~np.isin(np.arange(run.target.num_axes), list(found)))
+        if not shook[still].all():
+            # What the load step has set swinging says nothing of the next gains.
+            write_gains(target.drives, run.fallbacks[-1], still & ~shook)
+            target.drives.advance(CALMING)
+    return found
+
+
+def look_back(run: Run) -> None:
+    """Record a move with the gains before, where they are safe by the model; keep them where they do better."""
+    going = run.going
+    late = going & ~run.affordable(run.look_back_time)
+    reasons = [why or ("the drive time was used up" if late[k] else "") for k, why in enumerate(run.unsafe)]
+    able = run.whole_machines(going & np.array([not why for why in reasons]))
+    for k in map(int, np.flatnonzero(going & ~able)):
+        why = reasons[k] or "another axis of its machine could not make it"
+        run.axes[k].notes.append(f"no move with the gains before, for comparison: {why}")
+    if not able.any():
+        return
+    assert run.ground is not None, "proving makes it"
+    try:
+        with run.spending(able):
+            run.earlier = earlier = run.ground.show(run.before, able)
+    except SafetyError as error:
+        run.note(able, f"the envelope stopped the move with the gains before: {error}")
+        return
+    failed = np.array([bool(reason) for reason in earlier.reason])
+    for k, causes in run.faults().items():
+        if able[k]:
+            # That is those gains' doing, and speaks for the new ones.
+            failed[k] = True
+            run.axes[k].notes.append(f"the drive went into fault as it moved with the gains before: {causes}")
+        else:
+            run.axes[k].reason = f"the drive went into fault while it held its place: {causes}"
+    for k in map(int, np.flatnonzero(able & failed)):
+        if earlier.reason[k]:
+            run.axes[k].notes.append(f"the move with the gains before: {earlier.reason[k]}")
+    if (able & failed).any():
+        with run.spending(able & failed):
+            run.ground.recover(able & failed)
+    _keep_what_is_better(run, run.whole_machines(able & ~failed) & run.going)
+
+
+def _keep_what_is_better(run: Run, where: Mask) -> None:
+    """Keep the gains before on machines that moved better with them; one of several axes is as good as its worst."""
+    assert run.shown is not None and run.earlier is not None, "both moves are recorded"
+    lanes = run.target.axes_per_machine
+    now, before = (np.repeat(m.cost.reshape(-1, lanes).max(axis=1), lanes) for m in (run.shown, run.earlier))
+    # Gains with which an axis shakes at rest are nobody's choice.
+    kept = where & (before < now) & ~np.repeat(run.earlier.restless.reshape(-1, lanes).any(axis=1), lanes)
+    if not kept.any():
+        return
+    run.gains = np.where(kept[:, None], run.before, run.gains)
+    run.shown = run.shown.replaced(run.earlier._replace(where=kept))
+    run.earlier = run.earlier._replace(where=run.earlier.where & ~kept)
+    for k in map(int, np.flatnonzero(kept)):
+        axis = run.axes[k]
+        axis.is_kept, axis.proof = True, float(before[k])
+        axis.verified = "by a move, which was better than with the new ones: they are those before"
+        axis.notes.append(
+            f"the gains before are kept: J by the measured terms of a move was {now[k]:.2f} with the new ones, and "
+            f"{before[k]:.2f} with those before"
+        )

@@ -1,0 +1,174 @@
+"""One button: check, identify, compute, try, refine, verify, write and keep; or roll back and say why.
+
+Everything acts through the Drives interface, on all axes of a target side by side, inside a transaction (snapshot.py):
+the state before is in a file from the first moment on, and an axis that fails any check gets it back. Time is spent
+where it is cheap: gains are searched on digital twins (twin.py), and only the best few are tried on the drives.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tuning.auto.choice import choose
+from tuning.auto.loop_margins import judge, measure
+from tuning.auto.moves import look_back, show, stand
+from tuning.auto.run import Run
+from tuning.auto.search import compute, identify, prepare
+from tuning.auto.settings import begin, commission, write
+from tuning.auto.trials import prove
+from tuning.identify.quick_identification import identify_briefly
+from tuning.snapshot import Transaction
+from tuning.target import timed
+
+if TYPE_CHECKING:
+    from tuning.auto.result import Result
+    from tuning.auto.search import Identify
+    from tuning.compare.tuners import Outcome
+    from tuning.target import Target
+
+Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
+Files = Callable[["Result"], AbstractContextManager[object]]
+Find = Callable[[Run, Progress], None]  # finds gains for the axes that go on, and has tried them on the drives
+
+BUDGET = 10.0  # s of drive time
+
+
+def auto(
+    target: Target,
+    file: str | Path,
+    *,
+    seed: int = 0,
+    keep: bool = True,
+    progress: Progress | None = None,
+    experiments: Identify = identify_briefly,
+    budget: float = BUDGET,
+    files: Files = nullcontext,
+) -> Result:
+    """Tune the axes of a target; what fails is rolled back, and its reason is in the result.
+
+    Args:
+        target: The drives; they may have any gains, also none, and are off afterwards.
+        file: Where the state before is left.
+        seed: Of the search on twins.
+        keep: Whether drives on a bus are told to keep the new gains over a power cycle.
+        progress: Called with what is under way, and the share done.
+        experiments: What identifies.
+        budget: Most time that may pass on the drives for each axis of a machine [s]; what cannot be afforded is left
+            out, and said.
+        files: Writes down what was done, before the drives keep it; what it raises rolls everything back. Its files
+            are to vanish if the block in it fails.
+
+    Raises:
+        BusError: If the drives cannot be reached any more: what then holds is said, and how to bring back what was.
+        OSError: If a file cannot be written: the drives have then what they had before.
+    """
+    return prove_found(
+        target, file, on_twins, seed=seed, keep=keep, progress=progress, experiments=experiments, budget=budget,
+        files=files,
+    )  # fmt: skip
+
+
+def on_twins(run: Run, say: Progress) -> None:
+    """Search gains on digital twins, and try the best few on the drives."""
+    say("searching gains on digital twins", 0.3)
+    compute(run)
+    say("trying gains on the drives", 0.7)
+    prove(run)
+
+
+def prove_found(
+    target: Target,
+    file: str | Path,
+    find: Find,
+    *,
+    seed: int = 0,
+    keep: bool = True,
+    progress: Progress | None = None,
+    experiments: Identify = identify_briefly,
+    budget: float = BUDGET,
+    files: Files = nullcontext,
+) -> Result:
+    """Check and identify axes, have gains found, and prove, write and keep them; what fails is rolled back.
+
+    Args:
+        target: The drives, as `auto` takes them.
+        file: Where the state before is left.
+        find: What finds gains: it sets the run's gains and proving ground. What it raises ends the run, and everything
+            is as it was before.
+        seed: Of the run.
+        keep: Whether drives on a bus are told to keep the new gains over a power cycle.
+        progress: Called with what is under way, and the share done.
+        experiments: What identifies.
+        budget: Most time that may pass on the drives for each axis of a machine [s].
+        files: As `auto` takes it.
+    """
+    say = progress or (lambda what, share: None)
+    with Transaction(target, file) as transaction, timed(target) as (watched, clock):
+        run = Run(watched, seed, clock, budget)
+        say("checking the drives", 0.0)
+        begin(run)
+        say("identifying", 0.05)
+        identify(run, experiments)
+        commission(run)
+        prepare(run)
+        if run.going.any():
+            find(run, say)
+        say("a move for the record", 0.8)
+        show(run)
+        say("measuring the frequency response", 0.85)
+        measure(run)
+        choose(run)
+        say("comparing with the gains before", 0.93)
+        look_back(run)
+        stand(run, target)
+        judge(run)
+        tell_of_lateness(run)
+        say("writing", 0.96)
+        accepted = write(run, transaction)
+        kept = keep and bool(accepted.any()) and bool(target.bus)
+        result = run.result(transaction.path, kept)
+        # What cannot be written down is not left in the drives, and nothing is written of what they did not keep.
+        with files(result):
+            if kept:
+                transaction.store(accepted)
+        transaction.commit(accepted)
+    say("done", 1.0)
+    return result
+
+
+def tell_of_lateness(run: Run) -> None:
+    """Say of a bus in real time whether its SYNCs were late: moves and responses are distorted by that."""
+    drives = run.target.drives
+    if getattr(drives, "time_waits", True):
+        return
+    timing = drives.total_timing
+    worst = 1e3 * timing.worst
+    if timing.late:
+        run.reserve(
+            np.ones(run.target.num_axes, bool),
+            f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {worst:.1f} ms: "
+            "this computer is busy, and moves and responses are distorted by that; end other programs, or put "
+            "`chrt -f 10` before the command (Linux)",
+        )
+
+
+def tune(target: Target, rng: np.random.Generator) -> Outcome:
+    """Tune a target as `drive-tune rank` wants it."""
+    from tuning.compare.tuners import Outcome
+
+    with tempfile.TemporaryDirectory() as folder:
+        found = auto(target, Path(folder) / "before.toml", seed=int(rng.integers(2**31)), keep=False)
+    return Outcome(
+        np.array([axis.after for axis in found.axes], np.int64),
+        found.drive_seconds,
+        found.moves,
+        found.aborts,
+        found.violations,
+        tuple(axis.reason or "; ".join(axis.notes) for axis in found.axes),
+    )

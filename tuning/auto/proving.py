@@ -1,0 +1,455 @@
+"""Gains on trial: a move, its reversal and the gain probe on the drives themselves, and what they prove.
+
+What oscillates or trips is stopped within 50 ms and goes on with the gains that are known to hold. On a bus the
+envelope may be faster: it quick-stops all drives, so that the trial is repeated axis by axis to see which one it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import motion
+from drive_env.gains import small_time_constants, write_gains
+from drive_env.safety.envelope import SafetyError
+from drive_env.trials.gain_trial import OSCILLATION, PHASES, Trial, Trials, measured_cost, softness
+from drive_env.trials.positioning import (
+    CURRENT,
+    CYCLE,
+    DEMAND,
+    POSITION,
+    STATUS,
+    TRIAL,
+    WATCH,
+    Move,
+    move_terms,
+    plan_move,
+    start,
+    wrapped,
+    write_profile,
+)
+from drive_env.trials.score import TRIP, Terms, cost
+
+if TYPE_CHECKING:
+    from tuning.response.linear_model import Plant
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+ASTRAY = 0.2  # of the move: what is still farther away at a trial's end does not pass
+# Of the move, and of the encoder: an axis farther than both from where a trial starts is brought back first.
+NEAR, NEAR_COUNTS = 0.03, 5.0
+RETURN_MOVES, RETURN_SPEED = 3.0, 0.5  # moves that are as short a way as one; of the speed limit, on longer ones
+RECOVERIES = 6  # attempts to reset a fault, with such a time between them
+SETTLING = 0.03  # s at rest before a trial, once the set-point is where the axis is
+STOPPING, STOPPING_LOOK = 400, 20  # cycles: the longest wait for axes to stand, and how often it is looked
+HOLDING, PATIENCE = 400, 2  # before a move for the record: cycles to wait for rest, windows for which an axis may shake
+STEP_COUNTS = 1.5  # of the encoder: what is less is no motion, and no step
+RETURN_LOOKS, RETURN_LOOK = 8, 0.05  # looks whether it is back, and the time between them [s]
+OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
+ENABLING = 5.0  # s, the longest wait for an axis that is switched on: some align their encoder first
+TARGET_VELOCITY = 0x60FF
+SHORTEST = 16.0  # counts of the encoder: a move that is shorter proves nothing
+# After a move for the record it is looked whether the axis stands, in so many places of an encoder count: a loop at its
+# edge swings between two counts in one place, and stands in another. Windows of 25 ms in each, how many of them pass
+# before, and what the current may swing (RMS about its mean, over the rated one).
+PLACES, REST, SETTLED, RESTLESS = 3, 6, 2, 0.05
+
+
+class Proof(NamedTuple):
+    """What a trial showed of every axis, each of shape (num_axes,).
+
+    cost: J by measured terms. stopped: Whether it oscillated, tripped, or left its envelope in any phase.
+    culprit: Whether it did so itself: the other axes of its machine are stopped with it.
+    reason: Why it does not pass, "" if it does. ripple: RMS increment of the current over the rated one, of the worst
+    phase. overshoot: Of the move, the largest of move and reversal. settling: t_s/t_0, mean of move and reversal.
+    """
+
+    cost: Floats
+    stopped: Mask
+    culprit: Mask
+    reason: tuple[str, ...]
+    ripple: Floats
+    overshoot: Floats
+    settling: Floats
+
+    @property
+    def passed(self) -> Mask:
+        """Which axes passed, shape (num_axes,)."""
+        return np.array([not reason for reason in self.reason])
+
+
+class Shown(NamedTuple):
+    """A recorded move: times [s], (n,); demand and actual angle from its start [rad] and current [A], (n, num_axes).
+
+    where: Axes that made it, (num_axes,). reason: Of each axis, why it does not pass, "" if it does. cost: J by its
+    measured terms, (num_axes,). swing: Of the current at rest afterwards, over the rated one (RMS), where it was most
+    of several places of an encoder count, (num_axes,).
+    """
+
+    t: Floats
+    demand: Floats
+    actual: Floats
+    current: Floats
+    where: Mask
+    reason: tuple[str, ...]
+    cost: Floats
+    swing: Floats
+
+    @property
+    def restless(self) -> Mask:
+        """Which axes shook at rest, (num_axes,)."""
+        return self.where & (self.swing > RESTLESS)
+
+    def replaced(self, later: Shown) -> Shown:
+        """Return this with the axes of a later recording in their place."""
+        demand, actual, current, cost, swing = (
+            np.where(later.where, getattr(later, name), getattr(self, name))
+            for name in ("demand", "actual", "current", "cost", "swing")
+        )
+        both = zip(later.where, self.reason, later.reason, strict=True)
+        reason = tuple(new if made else old for made, old, new in both)
+        return Shown(self.t, demand, actual, current, self.where | later.where, reason, cost, swing)
+
+
+class ProvingGround:
+    """Trials on a target, from where its axes stand, the longer way, each in its own travel.
+
+    Args:
+        target: The drives.
+        plants: What each axis is; None where that is not known: such an axis takes no part.
+        room: How far each rotor may turn from here [rad], low and high, each (num_axes,).
+        safe: Gains that hold, (num_axes, 5): what is stopped goes on with them.
+        reference: Gains whose softness under a load counts as 1, (num_axes, 5).
+    """
+
+    def __init__(
+        self,
+        target: Target,
+        plants: Sequence[Plant | None],
+        room: tuple[Floats, Floats],
+        safe: Integers,
+        reference: Integers,
+    ) -> None:
+        self.target = target
+        self.safe = safe
+        self._reference = reference
+        low, high = room
+        self.reach: Floats = np.where(high >= -low, high, low)
+        motor, drives = target.motor, target.drives
+        inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
+        if target.linked:
+            # What pulls at one thing goes as far and as fast as its slowest end.
+            ends = (-1, target.axes_per_machine)
+            inertia = np.repeat(inertia.reshape(ends).max(axis=1), ends[1])
+            shortest = np.abs(self.reach).reshape(ends).argmin(axis=1)
+            self.reach = np.repeat(self.reach.reshape(ends)[np.arange(len(shortest)), shortest], ends[1])
+        corner = [target.device.stage["velocity_filter"].default if p is None else p.velocity_filter for p in plants]
+        self.move: Move = plan_move(motor, inertia, drives.read((0x2058, 0)), self.reach)
+        self._count: Floats = self.move.increments / self.move.counts  # increments
+        top = RETURN_SPEED * target.speed * self.move.increments
+        self._fastest: Floats = np.maximum(top / np.maximum(self.move.velocity, 1), 1.0)
+        self._t_0 = 4.0 * small_time_constants(target.device, np.array(corner))
+        self._trials = Trials(drives, motor, target.axes_per_machine, self._t_0)  # type: ignore[arg-type]
+        self._origin = drives.read(POSITION)
+        self._direction = np.ones(target.num_axes, np.int64)
+        self._shaken = np.zeros(target.num_axes, bool)
+        self.moves = np.zeros(target.num_axes, np.int64)
+        self.aborts = np.zeros(target.num_axes, np.int64)
+        self.violations = np.zeros(target.num_axes, np.int64)
+
+    def too_short(self) -> Mask:
+        """Return which axes have no way to go that would prove anything."""
+        counts = np.abs(self.move.distance) / self.move.increments * self.move.counts
+        return np.asarray(counts < SHORTEST)
+
+    def way_back(self) -> Floats:
+        """Return how long it may take to bring axes back before their next move [s], (num_axes,)."""
+        return np.where(self._shaken, RETURN_LOOKS * RETURN_LOOK + SETTLING, 0.0)
+
+    def begin_here(self, where: Mask) -> None:
+        """Take where axes are as where the next move begins, of those that turn freely; the others are brought back."""
+        free = where & np.isinf(self.target.low) & np.isinf(self.target.high)
+        self._origin = np.where(free, self.target.drives.read(POSITION), self._origin)
+
+    def recover(self, where: Mask) -> None:
+        """Reset faults of axes, and have them hold with gains that are known to; one that cannot stays as it is."""
+        where = self.target.together(where)
+        write_gains(self.target.drives, self.safe, where)
+        for _ in range(RECOVERIES):
+            self._trials.recover(where)
+            if not (where & self._trials.down()).any():
+                break
+            # What a brake has put into the link must leave it first.
+            self.target.drives.advance(RETURN_LOOK)
+        self._shaken |= where
+
+    def run(self, gains: Integers, where: Mask) -> Proof:
+        """Try gains, raw integers of shape (num_axes, 5), on some axes; the others' figures mean nothing.
+
+        Axes that pull at one thing move together, all of them with these gains.
+        """
+        where = self.target.together(where)
+        count, lanes = self.target.num_axes, self.target.axes_per_machine
+        try:
+            return self._proof(gains, self._run(gains, where), where)
+        except SafetyError as error:
+            if where.sum() <= lanes:
+                return self._refused(str(error), where)
+        proofs = []
+        for lane in range(count // lanes):
+            one = where & (np.arange(count) // lanes == lane)
+            if one.any():
+                try:
+                    proofs.append((one, self._proof(gains, self._run(gains, one), one)))
+                except SafetyError as error:
+                    proofs.append((one, self._refused(str(error), one)))
+        return _merged(proofs)
+
+    def show(self, gains: Integers, where: Mask) -> Shown:
+        """Record one move with gains, and judge it; what oscillates or trips gets gains that hold within 50 ms.
+
+        Axes that pull at one thing move together, all of them with these gains.
+        """
+        drives, rated = self.target.drives, self.target.motor.rated_current
+        where = self.target.together(where)
+        self._begin(where)
+        self._hold_still(where)
+        write_gains(drives, gains, where)
+        write_profile(drives, self.move, where)
+        away = self._origin + self._direction * self.move.distance
+        start(drives, wrapped(away).astype(np.int64), where)
+        self.moves[where] += 1
+        objects = [POSITION, DEMAND, CURRENT, STATUS]
+        traces, stopped = [], np.zeros(self.target.num_axes, bool)
+        for _ in range(TRIAL // WATCH):
+            traces.append(drives.record(objects, WATCH * CYCLE))
+            stopped |= self._stop(where & ~stopped & self._shakes(traces[-1]))
+        swing = self._swing(away, where & ~stopped)
+        position, demanded, current = (np.concatenate([part[name] for part in traces]) for name in objects[:3])
+        demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
+        way = np.sign(self._direction * self.move.distance)
+        error = wrapped(position - away) * way
+        size = np.maximum(np.abs(self.move.distance), 1)
+        reason = self._reasons(stopped[None], np.maximum(error.max(axis=0), 0.0) / size, np.abs(error[-1]) / size)
+        settling, noise, overshoot = move_terms(
+            position.astype(float), current * 1e-3, self.move, self._t_0, rated, away, way
+        )
+        # Of axes that take no part the gains may be none.
+        soft = softness(np.where(where[:, None], gains, self._reference)) / softness(self._reference)
+        costs = cost(Terms(settling, soft, noise, overshoot, stopped))
+        self.aborts[stopped] += 1
+        self._shaken |= stopped
+        self._origin = np.where(where, away, self._origin)
+        self._direction = np.where(where, -self._direction, self._direction)
+        t = np.arange(len(demand), dtype=np.float64) * CYCLE
+        return Shown(t, demand, actual, current * 1e-3, where, reason, costs, swing)
+
+    def _swing(self, at: Integers, where: Mask) -> Floats:
+        """Return how much the current swings at rest, over the rated one (RMS), the most of several places.
+
+        Args:
+            at: Where the axes are [inc]; they end within a count of it, on the side from which they came.
+            where: Axes that are looked at; one that oscillates is stopped.
+        """
+        drives, rated = self.target.drives, self.target.motor.rated_current
+        back = -np.sign(self._direction * self.move.distance)
+        worst = np.zeros(self.target.num_axes)
+        for place in range(PLACES):
+            if place:
+                # Increments may be as coarse as counts.
+                apart = np.maximum(np.rint(place * self._count / PLACES), place)
+                start(drives, wrapped(at + back * apart).astype(np.int64), where)
+            seen = []
+            for _ in range(REST):
+                window = drives.record([CURRENT, STATUS], WATCH * CYCLE)
+                stopped = self._stop(where & self._shakes(window))
+                worst[stopped] = OSCILLATION
+                self._shaken |= stopped
+                seen.append(window[CURRENT])
+            worst = np.maximum(worst, np.concatenate(seen[SETTLED:]).std(axis=0) * 1e-3 / rated)
+        return worst
+
+    def _hold_still(self, where: Mask) -> None:
+        """Come to rest with the gains there are, and take that for the beginning: a response leaves an axis turning.
+
+        What swings on beyond a second window of 25 ms is stopped.
+        """
+        windows = np.zeros(self.target.num_axes, np.int64)
+        for _ in range(HOLDING // WATCH):
+            seen = self.target.drives.record([POSITION, CURRENT, STATUS], WATCH * CYCLE)
+            windows = np.where(self._shakes(seen), windows + 1, 0)
+            self._stop(where & (windows == PATIENCE))
+            if not np.any(where & ~self._stands(seen[POSITION])):
+                break
+        self._begin_without_a_step(where)
+
+    def _shakes(self, seen: Mapping[object, Any]) -> Mask:
+        """Return which axes oscillated in a recording, or are off at its end."""
+        change = np.diff(seen[CURRENT], axis=0) * 1e-3
+        mask, enabled = motion.OPERATION_ENABLED
+        shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * self.target.motor.rated_current
+        return np.asarray(shaking | (seen[STATUS][-1] & mask != enabled))
+
+    def _stop(self, where: Mask) -> Mask:
+        """Give axes, and those that pull at the same thing, gains that hold; return which got them."""
+        where = self.target.together(where)
+        if where.any():
+            write_gains(self.target.drives, self.safe, where)
+        return where
+
+    def _stands(self, positions: Integers) -> Mask:
+        """Return which axes stood in a recording of their positions, (cycles, num_axes)."""
+        return np.asarray(np.abs(wrapped(positions - positions[-1])).max(axis=0) <= STEP_COUNTS * self._count)
+
+    def _run(self, gains: Integers, where: Mask) -> Trial:
+        self._begin(where)
+        self.moves[where] += len(PHASES)
+        tried = self._trials.run(gains, self.safe, self.move, self._origin, self._direction, where)
+        # A trial ends where its move did, and the next one goes the other way.
+        self._origin = np.where(where, self._origin + self._direction * self.move.distance, self._origin)
+        self._direction = np.where(where, -self._direction, self._direction)
+        return tried
+
+    def _begin(self, where: Mask) -> None:
+        """Enable axes with gains that hold where they are not enabled yet, and bring back what went astray."""
+        drives = self.target.drives
+        down = self.target.together(where & self._trials.down())
+        if down.any():
+            write_gains(drives, self.safe, down)
+            self._come_to_rest(down)
+        motion.select_mode(drives, "pp", where)
+        self._return(where)
+        self._begin_without_a_step(where)
+
+    def _come_to_rest(self, where: Mask) -> None:
+        """Enable axes and wait until they stand: what was switched off while it turned is taken over at its speed.
+
+        Slow gains stop it sooner by its velocity than by its position.
+        """
+        drives = self.target.drives
+        motion.enable(drives, mode="csv", where=where, timeout=ENABLING)
+        drives.write(TARGET_VELOCITY, 0, where=where)
+        for _ in range(STOPPING // STOPPING_LOOK):
+            seen = drives.record([POSITION], STOPPING_LOOK * CYCLE)[POSITION]
+            if not np.any(where & ~self._stands(seen)):
+                break
+        self.begin_here(where)
+
+    def _return(self, where: Mask) -> None:
+        """Bring back what is not where it should be: what was stopped went on with slower gains, or fell, or ran."""
+        drives = self.target.drives
+        near = np.maximum(NEAR * np.abs(self.move.distance), NEAR_COUNTS * self._count)
+        off = np.abs(wrapped(drives.read(POSITION) - self._origin))
+        # A long way is not to take long.
+        faster = np.clip(off / (RETURN_MOVES * np.maximum(np.abs(self.move.distance), 1)), 1.0, self._fastest)
+        back = self.move._replace(
+            velocity=np.ceil(self.move.velocity * faster).astype(np.int64),
+            acceleration=np.ceil(self.move.acceleration * faster).astype(np.int64),
+        )
+        astray = self.target.together(where & ((off > near) | self._shaken))
+        if not astray.any():
+            return
+        write_gains(drives, self.safe, astray)
+        write_profile(drives, back, astray)
+        start(drives, wrapped(self._origin).astype(np.int64), astray)
+        self.moves[astray] += 1
+        for _ in range(RETURN_LOOKS):
+            # All the while: a load that was shaken swings on, and would be taken for the next gains' doing.
+            seen = drives.record([POSITION], RETURN_LOOK)[POSITION]
+            if not np.any(astray & (np.abs(wrapped(seen - self._origin)).max(axis=0) > near)):
+                break
+        self._shaken &= ~astray
+
+    def _begin_without_a_step(self, where: Mask) -> None:
+        """Have the set-point go where axes are.
+
+        What slow gains have left of the way, or finding the poles has turned, would be a step for gains that are fast,
+        and its kick would pass for an oscillation.
+        """
+        drives = self.target.drives
+        here = drives.read(POSITION)
+        off = where & (np.abs(wrapped(here - self._origin)) > STEP_COUNTS * self._count)
+        if not off.any():
+            return
+        self._origin = np.where(off, here, self._origin)
+        write_profile(drives, self.move, off)
+        start(drives, wrapped(self._origin).astype(np.int64), off)
+        drives.advance(SETTLING)
+
+    def _refused(self, why: str, where: Mask) -> Proof:
+        """Take note that the envelope stopped a trial."""
+        write_gains(self.target.drives, self.safe, where)
+        self.violations[where] += 1
+        self.aborts[where] += 1
+        self._trials.recover(where)
+        count = self.target.num_axes
+        zero = np.zeros(count)
+        return Proof(zero + TRIP, zero == 0.0, zero == 0.0, (why,) * count, zero, zero, zero)
+
+    def _proof(self, gains: Integers, tried: Trial, where: Mask) -> Proof:
+        terms: Terms = tried.terms
+        costs = measured_cost(tried.costs(softness(gains) / softness(self._reference)))
+        stopped: Mask = np.asarray(tried.aborted.any(axis=0))
+        self.aborts[where & stopped] += 1
+        self._shaken |= where & stopped
+        overshoot = terms.overshoot[:2].max(axis=0)
+        # Behind its demand at the end of the move, or from where it should be now: a demand may stand still, too.
+        now = np.abs(wrapped(self.target.drives.read(POSITION) - self._origin)) / np.maximum(
+            np.abs(self.move.distance), 1
+        )
+        left = np.maximum(np.abs(tried.error[TRIAL - 1]), now)
+        return Proof(
+            costs,
+            stopped,
+            tried.culprit,
+            self._reasons(tried.aborted, overshoot, left),
+            terms.noise.max(axis=0),
+            overshoot,
+            terms.settling[:2].mean(axis=0),
+        )
+
+    def _reasons(self, stopped: Mask, overshoot: Floats, left: Floats) -> tuple[str, ...]:
+        """Return why axes do not pass, "" where they do.
+
+        Args:
+            stopped: Whether they were stopped, a row for each phase, (phases, num_axes).
+            overshoot: Of the move, (num_axes,).
+            left: Of the move, what was missing at its end, (num_axes,).
+        """
+        counts = np.maximum(np.abs(self.move.distance) / self.move.increments * self.move.counts, 1.0)
+        reasons = []
+        for axis in range(self.target.num_axes):
+            if stopped[:, axis].any():
+                phase = PHASES[int(stopped[:, axis].argmax())]
+                reason = f"it oscillated or tripped in the {phase} and was stopped within 50 ms"
+            elif overshoot[axis] > OVERSHOOT:
+                reason = (
+                    f"it overshot by {100.0 * overshoot[axis]:.0f} % of the move; {100.0 * OVERSHOOT:.0f} % is allowed"
+                )
+            elif left[axis] > max(ASTRAY, 5.0 / counts[axis]):
+                reason = (
+                    f"it was {100.0 * left[axis]:.0f} % of the move away at the end; {100.0 * ASTRAY:.0f} % is allowed"
+                )
+            else:
+                reason = ""
+            reasons.append(reason)
+        return tuple(reasons)
+
+
+def _merged(proofs: Sequence[tuple[Mask, Proof]]) -> Proof:
+    """Return one proof of those of single lanes; of axes that took part in none it says what the first one says."""
+    first = proofs[0][1]
+    reasons = list(first.reason)
+    columns: dict[str, Any] = {name: getattr(first, name).copy() for name in Proof._fields if name != "reason"}
+    for where, proof in proofs[1:]:
+        for name, column in columns.items():
+            column[where] = getattr(proof, name)[where]
+        for axis in map(int, np.flatnonzero(where)):
+            reasons[axis] = proof.reason[axis]
+    return Proof(reason=tuple(reasons), **columns)

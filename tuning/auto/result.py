@@ -1,0 +1,98 @@
+"""What auto did to axes, and what it cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import Gains
+from tuning.certificate.certificate import verdict
+
+if TYPE_CHECKING:
+    from tuning.auto.proving import Shown
+    from tuning.certificate.certificate import StepResponse
+    from tuning.identify.identification import Identification
+    from tuning.response.linear_model import Plant
+    from tuning.response.margins import Margins
+    from tuning.response.measured_loop import AtLeast, MeasuredLoop
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass
+class AxisRun:
+    """What became of one axis so far.
+
+    Attributes:
+        reason: Why it stopped; "" while it goes on.
+        reservations: What a user of the gains should not rely on; each takes the certificate's plain yes away.
+        notes: What else there is to say.
+        before, after: Raw gains.
+        identified: What its signals said, None before.
+        plant: What was made of that, None where nothing could be.
+        twin: Hidden J that the twin gives the gains it found.
+        proof: J by measured terms of the gains that were taken; nan before.
+        verified: How the gains were verified, in words; "" where they were not.
+        margins: Of the outer loops as measured, "velocity" and "position"; nothing where nothing was.
+        at_least: What margins are at least that were not seen, alike.
+        eased: How often it got calmer gains because it shook at rest.
+        is_kept: Whether the gains before were better, and are the ones after.
+    """
+
+    before: Gains
+    after: Gains
+    reason: str = ""
+    reservations: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    identified: Identification | None = None
+    plant: Plant | None = None
+    twin: float = np.nan
+    proof: float = np.nan
+    verified: str = ""
+    margins: dict[str, Margins] = field(default_factory=dict)
+    at_least: dict[str, AtLeast] = field(default_factory=dict)
+    eased: int = 0
+    is_kept: bool = False
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it got through everything, with reservations or without."""
+        return not self.reason
+
+    @property
+    def verdict(self) -> str:
+        """Which of `tuning.certificate.certificate.VERDICTS` it is."""
+        return verdict(self.accepted, self.reservations)
+
+
+class Result(NamedTuple):
+    """What auto did: the axes, and its costs.
+
+    drive_seconds, moves, aborts and violations: Of each axis, (num_axes,). shown: A recorded move with the new gains,
+    None if none was made. earlier: One with those before, likewise. response: The velocity loop's, likewise.
+    loaded: What a load step did to axes, of emulated machines.
+    file: The snapshot that brings everything back. kept: Whether drives on a bus keep the gains over a power cycle.
+    """
+
+    axes: tuple[AxisRun, ...]
+    drive_seconds: Floats
+    moves: Integers
+    aborts: Integers
+    violations: Integers
+    shown: Shown | None
+    earlier: Shown | None
+    response: MeasuredLoop | None
+    loaded: dict[int, StepResponse]
+    file: Path
+    kept: bool
+
+    @property
+    def accepted(self) -> Mask:
+        """Which axes have gains that passed, new ones or those before, shape (num_axes,)."""
+        return np.array([axis.accepted for axis in self.axes])

@@ -1,0 +1,162 @@
+"""What the stages of auto share: the axes that are tuned, what became of each so far, and the drive time it took."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import motion
+from drive_env.gains import GAIN_OBJECTS, Gains
+from drive_env.trials.positioning import POSITION, wrapped
+from tuning.auto.result import AxisRun, Result
+from tuning.auto.trial_order import OTHERS
+from tuning.stop_causes import stop_causes
+
+if TYPE_CHECKING:
+    from tuning.auto.proving import ProvingGround, Shown
+    from tuning.certificate.certificate import StepResponse
+    from tuning.response.measured_loop import MeasuredLoop
+    from tuning.target import DriveTime, Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+# Drive time of the parts [s]: a frequency response of an axis; a trial, with what recovery takes; a move for the
+# record; and one from where a response has ended.
+RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, LOOK_BACK_TIME = 2.3, 0.85, 0.8, 1.3
+MODE = 0x6060
+
+
+class Run:
+    """One run of auto; each stage takes out the axes that fail in it.
+
+    Args:
+        target: What is tuned; its time is counted.
+        seed: Of the search on twins.
+        clock: That counts the target's time.
+        budget: Most time that may pass on the drives [s].
+
+    Attributes:
+        axes: What became of every axis.
+        before: Raw gains that the drives came with, (num_axes, 5).
+        gains: The best so far, likewise.
+        others: What else was found, (2, num_axes, 5): the best if everything is as it was identified, and if friction
+            is less.
+        spare: The second best that passed a trial, likewise; zeros where none did.
+        reference: Those of the fitted rule, likewise.
+        fallbacks: What is tried when the twin's gains fail, (3, num_axes, 5): the fitted rule's; those before, or the
+            soft rule's; and those that are slow enough for any load, with which what is stopped goes on.
+        modes: 6060h as the drives came, (num_axes,).
+        unsafe: Why an axis is not to be moved with the gains before, "" where it may be.
+        fresh: Axes that came fresh from the factory, (num_axes,).
+        ground: Where gains are tried, None before.
+        shown, earlier, response, loaded: As in `Result`.
+        unseen: Axes of which the response says nothing, (num_axes,).
+        response_time: Drive time of a frequency response of all axes of a machine [s].
+        spent: Of each axis, what passed while it took part [s]: axes that are through wait for others at no cost of
+            their own.
+    """
+
+    def __init__(self, target: Target, seed: int, clock: DriveTime, budget: float) -> None:
+        drives, n = target.drives, target.num_axes
+        self.target = target
+        self.rng = np.random.default_rng(seed)
+        self.before: Integers = np.stack([drives.read(name) for name in GAIN_OBJECTS], axis=1)
+        self.axes = [AxisRun(Gains(*map(int, row)), Gains(*map(int, row))) for row in self.before]
+        self.gains, self.reference = (np.ones((n, len(Gains._fields)), np.int64) for _ in range(2))
+        self.others = np.ones((len(OTHERS), n, len(Gains._fields)), np.int64)
+        self.spare: Integers = np.zeros_like(self.gains)
+        self.fallbacks = np.ones((3, n, len(Gains._fields)), np.int64)
+        self.unsafe = ["not looked at"] * n
+        self.modes: Integers = drives.read(MODE)
+        self.fresh: Mask = np.zeros(n, bool)
+        self.ground: ProvingGround | None = None
+        self.shown: Shown | None = None
+        self.earlier: Shown | None = None
+        self.response: MeasuredLoop | None = None
+        self.unseen: Mask = np.zeros(n, bool)
+        self.loaded: dict[int, StepResponse] = {}
+        # Axes of one machine are shaken one after the other.
+        self.response_time = RESPONSE_TIME * target.axes_per_machine
+        self.spent: Floats = np.zeros(n)
+        self._origin = drives.read(POSITION)
+        # What one axis has, its machine's others have too: they are shaken one after the other.
+        self._clock, self._budget = clock, budget * target.axes_per_machine
+
+    @property
+    def going(self) -> Mask:
+        """Which axes nothing has stopped, nor another axis of their machine, (num_axes,)."""
+        alone = np.array([axis.accepted for axis in self.axes])
+        return self.whole_machines(alone)
+
+    def whole_machines(self, where: Mask) -> Mask:
+        """Return the axes of machines all of whose axes are chosen, (num_axes,)."""
+        lanes = self.target.axes_per_machine
+        return np.asarray(np.repeat(where.reshape(-1, lanes).all(axis=1), lanes))
+
+    def stop(self, where: Mask, reason: str) -> None:
+        """Take axes out; the first reason of an axis counts."""
+        for axis in np.flatnonzero(where):
+            self.axes[axis].reason = self.axes[axis].reason or reason
+
+    def note(self, where: Mask, text: str) -> None:
+        """Say something of axes."""
+        for axis in np.flatnonzero(where):
+            self.axes[axis].notes.append(text)
+
+    def reserve(self, where: Mask, text: str) -> None:
+        """Say of axes what nobody is to rely on."""
+        for axis in np.flatnonzero(where):
+            self.axes[axis].reservations.append(text)
+
+    def room(self) -> tuple[Floats, Floats]:
+        """Return how far the rotors may turn from where they are now [rad], down and up, each (num_axes,)."""
+        target = self.target
+        here = wrapped(target.drives.read(POSITION) - self._origin) / target.increments()
+        return np.minimum(target.low - here, 0.0), np.maximum(target.high - here, 0.0)
+
+    @property
+    def look_back_time(self) -> Floats:
+        """What a move with the gains before takes [s], where there is one to be made, (num_axes,)."""
+        safe = self.whole_machines(np.array([not why for why in self.unsafe]))
+        return np.where(safe, LOOK_BACK_TIME, 0.0)
+
+    def affordable(self, seconds: float | Floats) -> Mask:
+        """Return which axes have so much of their drive time left, (num_axes,)."""
+        return np.asarray(self.spent + seconds <= self._budget)
+
+    @contextmanager
+    def spending(self, where: Mask) -> Iterator[None]:
+        """Count what passes as drive time of some axes."""
+        before = self._clock.seconds
+        try:
+            yield
+        finally:
+            self.spent[where] += self._clock.seconds - before
+
+    def faults(self) -> dict[int, str]:
+        """Return the axes that went into fault while they took part, and which faults."""
+        drives = self.target.drives
+        mask, value = motion.FAULT_BIT
+        faulted = self.going & (drives.read(0x6041) & mask == value)
+        causes = stop_causes(drives)
+        return {axis: causes[axis] for axis in map(int, np.flatnonzero(faulted))}
+
+    def drop_faults(self, meanwhile: str) -> None:
+        """Take out axes that went into fault, and say which."""
+        for axis, causes in self.faults().items():
+            self.axes[axis].reason = f"the drive went into fault while {meanwhile}: {causes}"
+
+    def result(self, file: Path, kept: bool) -> Result:
+        """Return what was done."""
+        ground, zero = self.ground, np.zeros(self.target.num_axes, np.int64)
+        counts = (zero, zero, zero) if ground is None else (ground.moves, ground.aborts, ground.violations)
+        return Result(
+            tuple(self.axes), self.spent, *counts, self.shown, self.earlier, self.response, self.loaded, file, kept
+        )

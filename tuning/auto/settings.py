@@ -1,0 +1,94 @@
+"""What auto tells drives beside gains: a motor to one that has none, and at the end that all else is as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import motion
+from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
+from tuning.auto.run import MODE
+from tuning.identify.working_state import BOTH_ENDS, INPUTS, LIMIT_SWITCHES, MOTOR_TYPE
+from tuning.snapshot import Transaction, restore
+
+if TYPE_CHECKING:
+    from tuning.auto.run import Run
+    from tuning.target import Target
+
+Mask = NDArray[np.bool_]
+
+LEAST_WAY = 0.2  # rad between the ends of the travel: finding the poles alone turns a rotor so far
+ENCODER_INIT = "ABN Encoder Settings.Encoder Init Mode"  # presets take the encoder's offset as known; here nobody knows
+
+
+def begin(run: Run) -> None:
+    """Refuse what has no way to go, and disable what is enabled: identification begins at rest."""
+    drives, way = run.target.drives, run.target.high - run.target.low
+    for axis in np.flatnonzero(way < LEAST_WAY):
+        turns, least = (0.5 * x / np.pi for x in (way[axis], LEAST_WAY))
+        run.axes[axis].reason = (
+            f"the travel is too short: {way[axis]:.2g} rad, and {LEAST_WAY:g} are needed ({turns:.2g} and {least:.2g} "
+            "turns); allow more with --travel"
+        )
+    mask, value = motion.OPERATION_ENABLED
+    on = drives.read(0x6041) & mask == value
+    if on.any():
+        motion.disable(drives, where=on)
+
+
+def commission(run: Run) -> None:
+    """Tell a drive that is fresh from the factory which motor it has; identification looks after itself."""
+    target = run.target
+    run.fresh = run.going & (target.drives.read(MOTOR_TYPE) == 0)
+    if not run.fresh.any():
+        return
+    for name, value in _commissioning(target).items():
+        target.drives.write(name, value, where=run.fresh)
+    # No axis is at both ends: switches that say so are not there.
+    unwired = run.fresh & (target.drives.read(INPUTS) & BOTH_ENDS == BOTH_ENDS)
+    target.drives.write(LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
+    run.note(unwired, "both limit switches were active, which no axis can be at: they are ignored (2005h)")
+    run.note(run.fresh, f"fresh from the factory: commissioned for {target.motor.name} first")
+
+
+def write(run: Run, transaction: Transaction) -> Mask:
+    """Leave the accepted axes with their gains and everything else as it was; return which they are, (num_axes,)."""
+    going = run.going
+    run.stop(~going, "another axis of its machine was refused")
+    if not going.any():
+        return going
+    drives = run.target.drives
+    write_gains(drives, run.gains, going)
+    motion.disable(drives, where=going)
+    # 0, no mode, is what a drive has before its first; it cannot be written.
+    other = going & (run.modes != 0) & (drives.read(MODE) != run.modes)
+    if other.any():
+        drives.write(MODE, run.modes, where=other)
+    kept = dict(zip(((key[0], key[1]) for key in GAIN_OBJECTS), run.gains.T, strict=True))
+    axes = []
+    for k, values in enumerate(transaction.before.axes):
+        wanted = dict(values)
+        if run.fresh[k]:
+            commissioned = [*_keys(run.target, _commissioning(run.target)), (LIMIT_SWITCHES, 0)]
+            wanted |= {key: int(drives.read(key)[k]) for key in commissioned if key in values}
+        axes.append(wanted | {key: int(column[k]) for key, column in kept.items()})
+    restore(drives, replace(transaction.before, axes=tuple(axes)), going, whole=False)
+    for axis in np.flatnonzero(going):
+        run.axes[axis].after = Gains(*map(int, run.gains[axis]))
+    return going
+
+
+def _commissioning(target: Target) -> dict[str, int]:
+    """Return what a drive must be told of its motor; how its encoder finds its angle is left as it is."""
+    preset = target.device.preset(target.motor.name)
+    return {name: value for name, value in preset.items() if name != ENCODER_INIT}
+
+
+def _keys(target: Target, names: Iterable[Any]) -> list[tuple[int, int]]:
+    """Return the index and sub-index of objects by name."""
+    dictionary = target.device.new_dictionary()
+    return [(entry.index, entry.sub) for entry in map(dictionary.find, names)]

@@ -1,0 +1,376 @@
+"""Digital twins: emulated machines set to what was identified, on which gains cost wall time and no drive time.
+
+A twin is the generic machine that identification can know: a rotor with a disc, rigid or on one spring, with dry and
+viscous friction, the identified winding and velocity filter, and the encoder and power stage of the data sheets. Gains
+are scored on it by hidden J (drive_env/trials/score.py), many at once as lanes; of a real axis hidden J does not exist.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import RAW_MAX, Gains, rule_gains
+from drive_env.trials.gain_trial import OSCILLATION
+from drive_env.trials.positioning import Move, plan_move
+from drive_env.trials.score import HiddenScore
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.motors import Motor
+    from tuning.identify.identification import Identification
+    from tuning.response.linear_model import Plant
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# What a search may go down to. Without an integral part a constant load leaves an error for ever, which outlasts the
+# quarter of a second that hidden J looks at: 20 is a T_i of 0.65 s.
+LEAST = Gains(1, 1, 1, 20, 1)
+FASTEST_RESONANCE = 500.0  # Hz; a faster one is taken as rigid: the physics' step does not resolve it
+LEAST_LOAD = 0.05  # of the total inertia: what is left for a load where the rotor's data sheet value takes all
+LEAST_RATIO = 1.03  # of resonance over anti-resonance: nearer to each other they cancel
+BREAKAWAY = 1.5  # over sliding friction, of bearings
+SLOWEST_FILTER = 50.0  # Hz
+UNKNOWN_FILTER = 0.5  # relative: how far a velocity filter may be off that was not identified
+
+
+class Friction(NamedTuple):
+    """Friction at the rotor: dry [A], viscous [A*s/rad], as identified."""
+
+    coulomb: float = 0.0
+    viscous: float = 0.0
+
+
+class Spread(NamedTuple):
+    """How uncertain what was identified is: half widths of the 95 % intervals, relative."""
+
+    inertia: float = 0.0
+    anti_resonance: float = 0.0
+    resonance: float = 0.0
+    filter: float = 0.0
+
+
+class Known(NamedTuple):
+    """What a twin is made of: the axis, its friction, how far its rotor may turn, with the sign [rad]; and how sure.
+
+    offset: Current that gravity or another constant load takes [A].
+    """
+
+    plant: Plant
+    friction: Friction
+    reach: float
+    spread: Spread = Spread()
+    offset: float = 0.0
+
+
+def known_of(plant: Plant, identified: Identification, reach: float) -> Known:
+    """Return what an identification makes of an axis.
+
+    Args:
+        plant: The axis, as made of the identification.
+        identified: What was identified; friction that was refused counts as none.
+        reach: How far the rotor may turn, with the sign [rad].
+    """
+    found = (identified.estimates.get(name) for name in ("coulomb", "viscous", "offset"))
+    dry, viscous, offset = (0.0 if one is None or not one.is_known else one.value for one in found)
+    widths = {"filter": UNKNOWN_FILTER}
+    for field, name in _INTERVALS.items():
+        estimate = identified.estimates.get(name)
+        if estimate is not None and estimate.is_known:
+            widths[field] = 0.5 * (estimate.high - estimate.low) / estimate.value
+    return Known(plant, Friction(max(dry, 0.0), max(viscous, 0.0)), reach, Spread(**widths), offset)
+
+
+_INTERVALS = {
+    "inertia": "inertia",
+    "anti_resonance": "anti_resonance",
+    "resonance": "resonance",
+    "filter": "velocity_filter",
+}
+
+
+class World(NamedTuple):
+    """A guess at what no drive shows and no identification is sure of; a tuning must serve in all of them.
+
+    inertia, anti_resonance, resonance, filter: How far each is from what was identified, relative; as far as its
+    interval reaches if that is farther.
+    """
+
+    name: str
+    inertia: float = 0.0
+    anti_resonance: float = 0.0
+    resonance: float = 0.0
+    filter: float = 0.0
+    damping: float = 1.0  # over what was identified or taken
+    friction: float = 1.0  # dry, over what was identified
+    adc_noise: float | None = None  # A
+    cogging: float = 1.0  # over the data sheet's
+    supply_resistance: float | None = None  # ohm
+
+
+WORLDS = (
+    World("as identified"),
+    # Dry friction holds a shaking axis still, and is what two short moves tell worst: drag and sticking pass for it.
+    World("rough", 0.05, -0.04, -0.03, -0.1, 0.7, friction=0.4, adc_noise=0.05, cogging=1.7, supply_resistance=0.15),
+    World("smooth", -0.05, 0.03, 0.04, 0.1, damping=1.5, adc_noise=0.01, cogging=0.5),
+)
+# What the current may swing in a move, likewise of the rated one, and the power by which more than that counts.
+MOST_SWING, SWINGING = 0.8 * OSCILLATION, 2.0
+FARTHEST = 0.6  # relative: an interval that says less than this says nothing
+
+
+def is_elastic(plant: Plant) -> bool:
+    """Return whether a twin of this axis has a spring."""
+    return plant.anti_resonance < plant.resonance < FASTEST_RESONANCE
+
+
+def twin_parameters(device: Device, motor: Motor, known: Known, world: World = WORLDS[0]) -> dict[str, float]:
+    """Return the true parameters of the emulated machine that shows what was identified, with an inertia or two masses.
+
+    Torque constant is the data sheet's: inertia and friction are known over it only, and so it does not matter.
+    """
+    plant, spread = known.plant, known.spread
+    total = plant.inertia * _factor(world.inertia, spread.inertia)
+    anti_resonance = plant.anti_resonance * _factor(world.anti_resonance, spread.anti_resonance)
+    resonance = max(plant.resonance * _factor(world.resonance, spread.resonance), LEAST_RATIO * anti_resonance)
+    corner = _corner(device, plant) * _factor(world.filter, spread.filter)
+    values = {
+        "motor.R_s": plant.R,
+        "motor.L_d": plant.L,
+        "motor.L_q": plant.L,
+        "stage.velocity_filter": float(np.clip(corner, SLOWEST_FILTER, 0.4 * device.velocity_rate)),
+        "motor.cogging_torque": motor.cogging_torque * world.cogging,
+        "stage.adc_noise": device.stage["adc_noise"].default if world.adc_noise is None else world.adc_noise,
+        "stage.supply_resistance": device.stage["supply_resistance"].default
+        if world.supply_resistance is None
+        else world.supply_resistance,
+    }
+    if is_elastic(plant):
+        rotor = total * (anti_resonance / resonance) ** 2
+        load = total - rotor
+        stiffness = load * (2.0 * math.pi * anti_resonance) ** 2
+        values["load.stiffness"] = stiffness
+        values["load.damping"] = 2.0 * plant.damping * world.damping * stiffness / (2.0 * math.pi * resonance)
+    else:
+        load = max(total - motor.inertia, LEAST_LOAD * total)
+        rotor = total - load
+    values |= {"motor.inertia": rotor, "load.inertia": load}
+    dry = known.friction.coulomb * motor.torque_constant * world.friction
+    viscous = known.friction.viscous * motor.torque_constant
+    # The bearings of the data sheet are the motor's, what is more belongs to the load.
+    values["motor.coulomb"] = min(dry, motor.coulomb)
+    values["load.coulomb"] = dry - values["motor.coulomb"]
+    values["load.breakaway"] = BREAKAWAY * values["load.coulomb"]
+    values["motor.viscous"] = min(viscous, motor.viscous)
+    values["load.viscous"] = viscous - values["motor.viscous"]
+    return values
+
+
+def _corner(device: Device, plant: Plant) -> float:
+    """Return the corner of the velocity filter [Hz] that delays as much as filter and delay of an axis together.
+
+    An emulated drive has no other delay than its own; which of the two lags, low frequencies hardly tell.
+    """
+    from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING
+
+    lag = VELOCITY_FILTER_DAMPING / math.pi
+    more = plant.delay - 1.0 / device.velocity_rate
+    return lag / max(lag / plant.velocity_filter + more, 1e-6)
+
+
+def _factor(way: float, spread: float) -> float:
+    """Return what a world makes of a value that is known to within a relative half width."""
+    return 1.0 + math.copysign(max(abs(way), min(spread, FARTHEST)), way) if way else 1.0
+
+
+class Twins:
+    """Scores gains on twins, `lanes` sets of gains for every axis at once.
+
+    Args:
+        device: The drive.
+        motor: The motor, as its data sheet has it.
+        known: What each axis is, n of them.
+        scaler: 2058h of each axis, shape (n,).
+        lanes: Sets of gains per axis that are scored at once.
+        num_threads: Threads that run them; the number of cores by default.
+        worlds: In which gains must serve.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        motor: Motor,
+        known: Sequence[Known],
+        scaler: Floats,
+        lanes: int,
+        num_threads: int | None = None,
+        worlds: Sequence[World] = WORLDS,
+    ) -> None:
+        self.lanes = lanes
+        self.num_axes = len(known)
+        elastic = np.array([is_elastic(one.plant) for one in known])
+        self._parts = []
+        for load, mask in (("inertia", ~elastic), ("two_mass", elastic)):
+            if mask.any():
+                axes = np.flatnonzero(mask)
+                chosen = [known[int(k)] for k in axes]
+                part = _Part(device, motor, load, axes, chosen, scaler[mask], lanes, num_threads, worlds)
+                self._parts.append(part)
+
+    def score(self, gains: Integers) -> Floats:
+        """Return what gains, raw integers of shape (n, lanes, 5), are worth over the worlds, (n, lanes).
+
+        The mean of hidden J, in which gains count for worse that a trial would stop as oscillating.
+        """
+        hidden = np.empty(gains.shape[:2])
+        for part in self._parts:
+            hidden[part.axes] = part.score(gains[part.axes])
+        return hidden
+
+    def close(self) -> None:
+        """Give the emulated machines back."""
+        for part in self._parts:
+            part.close()
+
+    def __enter__(self) -> Twins:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _Part:
+    """Twins of one load."""
+
+    def __init__(
+        self,
+        device: Device,
+        motor: Motor,
+        load: str,
+        axes: NDArray[np.int64],
+        known: Sequence[Known],
+        scaler: Floats,
+        lanes: int,
+        num_threads: int | None,
+        worlds: Sequence[World],
+    ) -> None:
+        self.axes = axes
+        self._shape = (len(axes), lanes, len(worlds))
+        machines = math.prod(self._shape)
+        self._hidden = HiddenScore(device.name, load, motor.name, machines, num_threads=num_threads)
+        rows = [[twin_parameters(device, motor, one, world) for world in worlds] for one in known]
+        parameters = {
+            name: self._spread_worlds(np.array([[row[name] for row in axis] for axis in rows])) for name in rows[0][0]
+        }
+        supply = np.array([one.plant.supply for one in known])
+        self._hidden.set_machines(parameters, self._spread(supply))
+        # What the motor must push for is what the load pulls.
+        pull = np.array([-one.offset * motor.torque_constant for one in known])
+        self._hidden.set_constant_load(self._spread(pull))
+        inertia = np.array([one.plant.inertia for one in known])
+        move = plan_move(motor, inertia, scaler, np.array([one.reach for one in known]))
+        distance, velocity, acceleration, increments = (self._spread(np.asarray(values)) for values in move[:-1])
+        self._hidden.set_moves(Move(distance, velocity, acceleration, increments, move.counts))
+        self._hidden.set_reference(self._spread(rule_gains(device, motor, inertia)))
+
+    def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values per axis, (axes, ...), for all machines, (machines, ...)."""
+        trailing = values.shape[1:]
+        return np.broadcast_to(values[:, None, None], (*self._shape, *trailing)).reshape(-1, *trailing)
+
+    def _spread_worlds(self, values: Floats) -> Floats:
+        """Return values per axis and world, (axes, worlds), for all machines, (machines,)."""
+        return np.broadcast_to(values[:, None], self._shape).reshape(-1)
+
+    def score(self, gains: Integers) -> Floats:
+        """Return the mean worth over the worlds, geometric, of gains (axes, lanes, 5)."""
+        every = np.repeat(gains.reshape(-1, len(Gains._fields)), self._shape[2], axis=0)
+        found = self._hidden.score(every)
+        # A drive on which that swings would be stopped: a trial sees the move and the probe.
+        beyond = np.maximum(found.swing.max(axis=1) / MOST_SWING, 1.0)
+        return np.asarray(np.exp(np.log(found.hidden * beyond**SWINGING).reshape(self._shape).mean(axis=2)))
+
+    def close(self) -> None:
+        self._hidden.close()
+
+
+class Optimum(NamedTuple):
+    """What the search on twins found, of every axis, the best first.
+
+    gains: (n, found, 5) raw integers. hidden: their hidden J on the twin, (n, found). start: that of the best gains
+    that it started from, (n,).
+    """
+
+    gains: Integers
+    hidden: Floats
+    start: Floats
+
+
+def search(
+    twins: Twins,
+    starts: Integers,
+    rng: np.random.Generator,
+    *,
+    generations: int = 24,
+    keep: int = 12,
+    free: Sequence[str] = Gains._fields,
+    width: float = 1.0,
+) -> Optimum:
+    """Return the gains of the least hidden J on twins, found by an evolution strategy in the logarithms of the gains.
+
+    Every axis has a search of its own; they share nothing but the call. What is drawn for an axis depends on the
+    generator, and on how many axes there are.
+
+    Args:
+        twins: The twins.
+        starts: Gains to begin with, shape (n, starts, 5), at most as many as the twins have lanes.
+        rng: For drawing.
+        generations: How often a generation of `twins.lanes` sets is drawn and scored.
+        keep: Sets that are returned.
+        free: Gains that are searched; the others stay those of the best start.
+        width: First standard deviation of a gain's logarithm.
+    """
+    n, lanes, d = twins.num_axes, twins.lanes, len(free)
+    columns = [Gains._fields.index(name) for name in free]
+    least = np.array(LEAST)[columns]
+    first = starts[:, np.arange(lanes) % starts.shape[1]]
+    hidden = twins.score(first)
+    at = np.arange(n)
+    best = hidden.argmin(axis=1)
+    base = first[at, best]
+    start = hidden[at, best]
+    order = hidden.argsort(axis=1, kind="stable")
+    pool_hidden = np.take_along_axis(hidden, order, axis=1)
+    pool_gains = np.take_along_axis(first, order[:, :, None], axis=1)
+    mean = np.log(np.maximum(base[:, columns], 1).astype(float))
+    covariance = np.tile(np.eye(d) * width**2, (n, 1, 1))
+    parents = max(lanes // 4, 2)
+    weights = np.log(parents + 0.5) - np.log(np.arange(1, parents + 1))
+    weights /= weights.sum()
+    for _ in range(generations):
+        root = np.linalg.cholesky(covariance)
+        drawn = mean[:, None] + np.einsum("nij,nlj->nli", root, rng.standard_normal((n, lanes, d)))
+        drawn[:, 0] = mean
+        # The best so far is drawn again, so that a mean which lost it finds back.
+        drawn[:, 1] = np.log(np.maximum(pool_gains[:, 0, columns], 1).astype(float))
+        gains = np.repeat(base[:, None], lanes, axis=1)
+        gains[:, :, columns] = np.clip(np.rint(np.exp(np.clip(drawn, 0.0, math.log(RAW_MAX)))), least, RAW_MAX)
+        hidden = twins.score(gains)
+        order = hidden.argsort(axis=1)[:, :parents]
+        chosen = np.take_along_axis(drawn, order[:, :, None], axis=1)
+        step = chosen - mean[:, None]
+        spread = np.einsum("l,nli,nlj->nij", weights, step, step)
+        # Steps from the old mean, so that the ellipse stretches in the direction in which the mean moves.
+        covariance = 0.55 * covariance + 0.45 * spread + 1e-5 * np.eye(d)
+        mean = np.einsum("l,nli->ni", weights, chosen)
+        pool_gains = np.concatenate([pool_gains, gains], axis=1)
+        pool_hidden = np.concatenate([pool_hidden, hidden], axis=1)
+        order = pool_hidden.argsort(axis=1, kind="stable")[:, :keep]
+        pool_hidden = np.take_along_axis(pool_hidden, order, axis=1)
+        pool_gains = np.take_along_axis(pool_gains, order[:, :, None], axis=1)
+    return Optimum(pool_gains, pool_hidden, start)

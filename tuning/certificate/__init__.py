@@ -1,0 +1,1 @@
+"""What was found and changed, with the proof."""

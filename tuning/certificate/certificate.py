@@ -1,0 +1,386 @@
+"""The certificate of a tuning: what was found, what was changed, and the proof, with a hash that shows a change.
+
+The hash is over the content, not over the file: indented otherwise or with its keys in another order it is the same
+certificate. It tells that nothing was changed by accident or in passing; it is no signature.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, is_dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env.whole_file import content_hash, files_to_be
+from mechanics.untrusted import parse_json, read_text
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from tuning.identify.identification import Identification
+    from tuning.response.margins import Margins
+    from tuning.response.measured_loop import AtLeast
+    from tuning.target import Target
+
+FORMAT = 2
+HASH = "sha256"
+MAXIMUM_CURRENT = 0x2003
+
+Floats = NDArray[np.float64]
+
+
+VERDICTS = ("accepted", "accepted with reservations", "rejected")
+
+
+def verdict(accepted: bool, reservations: Sequence[str]) -> str:
+    """Return which of `VERDICTS` an axis has."""
+    return VERDICTS[2] if not accepted else VERDICTS[1] if reservations else VERDICTS[0]
+
+
+class CertificateError(ValueError):
+    """A file that is no certificate: one line with its remedy."""
+
+
+@dataclass(frozen=True)
+class StepResponse:
+    """A recorded move of one axis.
+
+    Attributes:
+        name: What was done, e.g. "velocity step 500 rpm" or "reversal".
+        tuned: Whether with the new gains; else with those before.
+        unit: Unit of `reference` and `actual`.
+        t: Sample times [s], shape (n,).
+        reference, actual: Set-point and what came of it, shape (n,).
+        current: Actual current [A, peak i_q], shape (n,).
+        figures: What it says: name with unit, e.g. "settling [s]", "overshoot [%]", "disturbance dip [rpm]" -> value;
+            nan where there is none. A disturbance exists on the emulator only.
+    """
+
+    name: str
+    tuned: bool
+    unit: str
+    t: Floats
+    reference: Floats
+    actual: Floats
+    current: Floats
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FrequencyResponse:
+    """An open loop of one axis.
+
+    Attributes:
+        name: Which, e.g. "velocity loop".
+        tuned: Whether with the new gains; else with those before.
+        frequency: [Hz], shape (n,).
+        magnitude_db, phase_deg: Of the open loop as measured, shape (n,).
+        coherence: 0 to 1, shape (n,); nan where it is a model's.
+        margins: What it says: name with unit, e.g. "phase margin [deg]" -> value.
+        source: Where it is from, e.g. "multisine over the bus" or "the emulator's trace".
+    """
+
+    name: str
+    tuned: bool
+    frequency: Floats
+    magnitude_db: Floats
+    phase_deg: Floats
+    coherence: Floats
+    margins: Mapping[str, float] = field(default_factory=dict)
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """An identified value with its interval of 95 % confidence; refused: nan and the reason."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class AxisCertificate:
+    """What became of one axis.
+
+    Attributes:
+        axis: Number of the axis.
+        accepted: Whether the new gains passed the checks and are in the drive; else those before are.
+        reason: Why it stopped, or how it was verified, in words: always said.
+        reservations: What could not be checked, or is near to a limit: the yes is none without them.
+        identified: Name -> parameter.
+        before, after: Raw integers in the order of `Gains`, of the drive before and now.
+        before_si, after_si: The same in SI, as `drive_env.gains.gains_in_si` has them: name with unit -> value.
+        steps: Recorded moves.
+        frequency_responses: Open loops.
+        notes: What no integer reached, limits met, what was left out.
+        hardware_seconds: Time that passed on the drive [s].
+        aborts: Trials that were stopped.
+    """
+
+    axis: int
+    accepted: bool
+    reason: str
+    reservations: tuple[str, ...]
+    identified: Mapping[str, Parameter]
+    before: tuple[int, ...]
+    after: tuple[int, ...]
+    before_si: Mapping[str, float]
+    after_si: Mapping[str, float]
+    steps: tuple[StepResponse, ...] = ()
+    frequency_responses: tuple[FrequencyResponse, ...] = ()
+    notes: tuple[str, ...] = ()
+    hardware_seconds: float = 0.0
+    aborts: int = 0
+
+    @property
+    def verdict(self) -> str:
+        """Which of `VERDICTS` it is."""
+        return verdict(self.accepted, self.reservations)
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A tuning of one or several axes.
+
+    Attributes:
+        tuner: What tuned, e.g. "auto".
+        device, motor: Names.
+        machine: What turns: an emulated load's name, or the bus and its node-IDs.
+        supply: Supply voltage as entered [V].
+        seed: Of everything random.
+        envelope: What the drive was held to: name with unit -> value, e.g. "speed [rad/s]", "travel low [rad]".
+        axes: One entry per axis.
+        versions: Of what computed it.
+        created: When [ISO 8601, UTC].
+    """
+
+    tuner: str
+    device: str
+    motor: str
+    machine: str
+    supply: float
+    seed: int
+    envelope: Mapping[str, float]
+    axes: tuple[AxisCertificate, ...]
+    versions: Mapping[str, str]
+    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
+
+    def content(self) -> dict[str, Any]:
+        """Return the certificate as JSON has it, without its hash; nan is null, infinity a text."""
+        found: dict[str, Any] = _plain(self)
+        return {"format": FORMAT} | found
+
+    def hash(self) -> str:
+        """Return the hash over the content."""
+        return content_hash(self.content())
+
+    def to_json(self) -> str:
+        """Return the file's text."""
+        return json.dumps(self.content() | {HASH: self.hash()}, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+    def save(self, folder: str | Path) -> tuple[Path, Path]:
+        """Write certificate.json and report.html into a folder, made if needed, and return their paths."""
+        with self.files(folder) as paths:
+            return paths
+
+    @contextmanager
+    def files(self, folder: str | Path) -> Iterator[tuple[Path, Path]]:
+        """Have certificate.json and report.html on the disk while a block runs; they vanish again if it fails.
+
+        Raises:
+            OSError: If they cannot be written, with the file and the reason.
+        """
+        from tuning.certificate.report import to_html
+
+        certificate, report = Path(folder) / "certificate.json", Path(folder) / "report.html"
+        with files_to_be({certificate: self.to_json(), report: to_html(self)}):
+            yield certificate, report
+
+
+# --- from what tuners have --------------------------------------------------------------------------------------------
+SI_NAMES = ("torque P [V/A]", "torque T_i [s]", "velocity P [A*s/rad]", "velocity T_i [s]", "position P [1/s]")
+MARGIN_NAMES = {
+    "phase_deg": "phase margin [deg]",
+    "gain_db": "gain margin [dB]",
+    "crossover_hz": "crossover [Hz]",
+    "bandwidth_hz": "bandwidth [Hz]",
+    "ms": "Ms",
+    "phase_hz": "phase margin at [Hz]",
+    "gain_hz": "gain margin at [Hz]",
+}
+
+
+def identified(identification: Identification) -> dict[str, Parameter]:
+    """Return what was identified as a certificate has it: nothing that a tuner only guessed."""
+    told = identification.estimates if identification.told is None else identification.told
+    return {name: Parameter(*estimate) for name, estimate in told.items()}
+
+
+def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, float]:
+    """Return raw gains, five integers in the order of `Gains`, in SI with their units in the names."""
+    from drive_env.gains import Gains, gains_in_si
+
+    return dict(zip(SI_NAMES, gains_in_si(device, supply, Gains(*map(int, gains))), strict=True))
+
+
+def envelope(target: Target) -> dict[str, float]:
+    """Return what a target allows; where it has several axes, each of them."""
+    allowed = target.drives.read(MAXIMUM_CURRENT) * 1e-3
+    rows = {
+        "travel low [rad]": target.low,
+        "travel high [rad]": target.high,
+        "speed while identified [rad/s]": np.full(target.num_axes, target.speed),
+        "current while identified [A]": np.full(target.num_axes, target.current),
+        "current in moves, 2003h [A]": allowed,
+    }
+    names = [""] if target.num_axes == 1 else [f"axis {axis}: " for axis in range(target.num_axes)]
+    return {f"{name}{what}": float(row[axis]) for axis, name in enumerate(names) for what, row in rows.items()}
+
+
+def frequency_response(
+    name: str,
+    f: ArrayLike,
+    open_loop: ArrayLike,
+    margins: Margins,
+    *,
+    tuned: bool,
+    at_least: AtLeast | None = None,
+    coherence: ArrayLike | None = None,
+    source: str = "",
+) -> FrequencyResponse:
+    """Return an open loop, complex of shape (n,) at frequencies [Hz], as a certificate has it; nan was not seen.
+
+    `at_least` says what those margins are at least that were not seen.
+    """
+    L = np.asarray(open_loop, complex)
+    seen = np.isfinite(L) & (L != 0.0)
+    magnitude, phase = np.full(L.shape, np.nan), np.full(L.shape, np.nan)
+    magnitude[seen] = 20.0 * np.log10(np.abs(L[seen]))
+    phase[seen] = np.degrees(np.unwrap(np.angle(L[seen])))
+    return FrequencyResponse(
+        name,
+        tuned,
+        np.asarray(f, float),
+        magnitude,
+        phase,
+        np.full(L.shape, np.nan) if coherence is None else np.asarray(coherence, float),
+        {MARGIN_NAMES[key]: float(value) for key, value in margins._asdict().items()} | _bounds(margins, at_least),
+        source,
+    )
+
+
+def _bounds(margins: Margins, least: AtLeast | None) -> dict[str, float]:
+    """Return what those margins are at least that were not seen."""
+    found = {} if least is None else least._asdict()
+    return {
+        MARGIN_NAMES[key].replace(" [", ", at least ["): float(value)
+        for key, value in found.items()
+        if math.isfinite(value) and not math.isfinite(getattr(margins, key))
+    }
+
+
+# --- reading and checking ---------------------------------------------------------------------------------------------
+def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
+    """Return the certificate of a JSON file, and whether it is unchanged since it was written.
+
+    Raises:
+        CertificateError: If the file is no certificate.
+    """
+    data = _read(Path(path))
+    stated = data.pop(HASH)
+    unchanged = content_hash(data) == stated
+    data.pop("format")
+    try:
+        return _built(Certificate, data), unchanged
+    except (KeyError, TypeError, ValueError) as error:
+        raise CertificateError(f"{path} is no certificate of this version: {error}") from None
+
+
+def is_unchanged(path: str | Path) -> bool:
+    """Return whether a certificate.json, or a report.html, is as it was written.
+
+    Raises:
+        CertificateError: If the file is neither.
+    """
+    where = Path(path)
+    if where.suffix == ".html":
+        from tuning.certificate.report import html_is_unchanged
+
+        return html_is_unchanged(_text(where))
+    data = _read(where)
+    return bool(content_hash({k: v for k, v in data.items() if k != HASH}) == data[HASH])
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        data = parse_json(_text(path))
+    except CertificateError:
+        raise
+    except ValueError as error:
+        raise CertificateError(f"{path} is no certificate: {error}; give a certificate.json of drive-tune") from None
+    if not isinstance(data, dict) or HASH not in data or data.get("format") != FORMAT:
+        raise CertificateError(f"{path} is no certificate of format {FORMAT}; give a certificate.json of drive-tune")
+    return data
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_text(path)
+    except OSError as error:
+        raise CertificateError(f"cannot read {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise CertificateError(f"{path} is no text; give a certificate.json of drive-tune") from None
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can have it."""
+    if is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else "inf" if value > 0 else "-inf"
+    return value
+
+
+def _built(kind: type, data: Mapping[str, Any]) -> Any:
+    """Return a dataclass from what `_plain` made of it."""
+    return kind(**{f.name: _value(str(f.type), data[f.name]) for f in fields(kind)})
+
+
+def _value(kind: str, value: Any) -> Any:
+    if kind in _NESTED:
+        return tuple(_built(_NESTED[kind], item) for item in value)
+    if kind == "Floats":
+        return np.array([_number(item) for item in value], float)
+    if kind == "float":
+        return _number(value)
+    if kind == "Mapping[str, float]":
+        return {name: _number(item) for name, item in value.items()}
+    if kind == "Mapping[str, Parameter]":
+        return {name: _built(Parameter, item) for name, item in value.items()}
+    return tuple(value) if kind.startswith("tuple[") else value
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
+
+
+_NESTED: dict[str, type] = {
+    "tuple[AxisCertificate, ...]": AxisCertificate,
+    "tuple[StepResponse, ...]": StepResponse,
+    "tuple[FrequencyResponse, ...]": FrequencyResponse,
+}

@@ -1,0 +1,102 @@
+"""Pictures of a certificate: a move with the gains before and after, and the Bode diagram of an open loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+if TYPE_CHECKING:
+    from tuning.certificate.certificate import FrequencyResponse, StepResponse
+
+TRUSTED = 0.95  # coherence; what lies below is shown as doubtful, not as truth
+BEFORE, AFTER, DOUBTFUL = "#d55e00", "#0072b2", "#b8b8b8"
+DPI = 110
+MARGINS = ("phase margin at [Hz]", "phase margin [deg]", "gain margin at [Hz]", "gain margin [dB]")
+PHASES = (-270.0, 90.0)  # degrees shown: about -180, and an anti-resonance, which leads, does not wrap
+
+
+def step_picture(steps: Sequence[StepResponse]) -> Figure:
+    """Return set-point, what came of it, and the current, of one move with one or several sets of gains."""
+    figure = Figure(figsize=(8.0, 4.8), dpi=DPI, layout="constrained")
+    motion, current = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    for step in steps:
+        color, label = _style(step.tuned)
+        motion.plot(1e3 * step.t, step.actual, color=color, linewidth=1.3, label=label)
+        current.plot(1e3 * step.t, step.current, color=color, linewidth=1.0)
+    shown = steps[-1]
+    motion.plot(1e3 * shown.t, shown.reference, color="black", linestyle="--", linewidth=0.9, label="set-point")
+    motion.set_ylabel(f"actual [{shown.unit}]")
+    motion.legend(loc="best")
+    current.set_ylabel("current [A]")
+    current.set_xlabel("time [ms]")
+    for axes in (motion, current):
+        axes.grid(True, alpha=0.3)
+    return figure
+
+
+def bode_picture(responses: Sequence[FrequencyResponse]) -> Figure:
+    """Return magnitude, phase and coherence; where the coherence is low the curves are grey."""
+    figure = Figure(figsize=(8.0, 6.6), dpi=DPI, layout="constrained")
+    magnitude, phase, coherence = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 1.5))
+    doubtful = False
+    for found in responses:
+        color, label = _style(found.tuned)
+        with np.errstate(invalid="ignore"):
+            trusted = np.isnan(found.coherence) | (found.coherence >= TRUSTED)
+        doubtful = doubtful or not trusted.all()
+        _curve(magnitude, found.frequency, found.magnitude_db, trusted, color, label)
+        turn = within_a_turn(found.phase_deg)
+        jumps = np.flatnonzero(np.abs(np.diff(turn)) > 180.0) + 1
+        f, turn = np.insert(found.frequency, jumps, np.nan), np.insert(turn, jumps, np.nan)
+        _curve(phase, f, turn, np.insert(trusted, jumps, False), color, label)
+        coherence.plot(found.frequency, found.coherence, color=color, linewidth=1.0)
+        read = [found.margins.get(name, np.nan) for name in MARGINS]
+        draw_margins(magnitude, phase, read[0], read[1], read[2], read[3], color)
+    magnitude.axhline(0.0, color="black", linewidth=0.8)
+    phase.axhline(-180.0, color="black", linewidth=0.8)
+    coherence.axhline(TRUSTED, color="black", linewidth=0.8, linestyle="--")
+    if doubtful:
+        magnitude.plot([], [], color=DOUBTFUL, label=f"coherence below {TRUSTED:g}")
+    magnitude.set_xscale("log")
+    coherence.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    coherence.xaxis.set_major_formatter("{x:g}")
+    magnitude.set_ylabel("magnitude [dB]")
+    magnitude.legend(loc="best")
+    phase.set_ylabel("phase [°]")
+    phase.set_ylim(*PHASES)
+    phase.set_yticks(range(int(PHASES[0]), int(PHASES[1]) + 1, 90))
+    coherence.set_ylabel("coherence")
+    coherence.set_ylim(0.0, 1.05)
+    coherence.set_xlabel("frequency [Hz]")
+    for axes in (magnitude, phase, coherence):
+        axes.grid(True, which="both", alpha=0.25)
+    return figure
+
+
+def within_a_turn(phase: np.ndarray) -> np.ndarray:
+    """Return phases [degrees] within PHASES: -540 degrees is as near to instability as -180."""
+    return np.asarray((phase - PHASES[0]) % 360.0 + PHASES[0])
+
+
+def draw_margins(
+    magnitude: Axes, phase: Axes, phase_hz: float, phase_deg: float, gain_hz: float, gain_db: float, color: str
+) -> None:
+    """Draw the phase margin from -180 degrees and the gain margin from 0 dB, each where it is read, if it was seen."""
+    for axes, at, line, size in ((phase, phase_hz, -180.0, phase_deg), (magnitude, gain_hz, 0.0, -gain_db)):
+        if np.isfinite(at) and np.isfinite(size):
+            axes.plot([at, at], [line, line + size], color=color, linewidth=2.2, marker="_", solid_capstyle="butt")
+
+
+def _curve(axes: Axes, f: np.ndarray, y: np.ndarray, trusted: np.ndarray, color: str, label: str) -> None:
+    """Draw a curve, the doubtful parts of it in grey."""
+    axes.plot(f, y, color=DOUBTFUL, linewidth=1.0)
+    axes.plot(f, np.where(trusted, y, np.nan), color=color, linewidth=1.4, label=label)
+
+
+def _style(tuned: bool) -> tuple[str, str]:
+    return (AFTER, "new gains") if tuned else (BEFORE, "gains before")

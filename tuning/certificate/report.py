@@ -1,0 +1,189 @@
+"""The report of a tuning: a certificate as one HTML file, pictures included, that needs nothing from anywhere."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from matplotlib.figure import Figure
+
+from drive_env.gains import GAIN_NAMES, GAIN_OBJECTS
+from tuning.certificate.certificate_pictures import bode_picture, step_picture
+
+if TYPE_CHECKING:
+    from tuning.certificate.certificate import AxisCertificate, Certificate
+
+SEAL = "<!-- sha256 of all before this line: "
+
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #1a1a1a; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ccc; }
+h3 { font-size: 1rem; margin-bottom: .3rem; }
+table { border-collapse: collapse; margin: .4rem 0 1rem; } th, td { padding: .15rem .8rem .15rem 0; text-align: left; }
+th { font-weight: 600; border-bottom: 1px solid #999; } td.number, th.number { text-align: right; }
+td { border-bottom: 1px solid #e6e6e6; font-variant-numeric: tabular-nums; }
+img { max-width: 100%; height: auto; } .refused { color: #777; } code { font-size: .85em; overflow-wrap: anywhere; }
+.accepted { color: #00693e; font-weight: 600; } .rejected { color: #a4001d; font-weight: 600; }
+.reserved { color: #8a5a00; font-weight: 600; } ul.reserved { font-weight: 400; }
+"""
+
+# Of a verdict: its class, and what holds then.
+COLOURS = {
+    "accepted": ("accepted", "new gains in the drive"),
+    "accepted with reservations": ("reserved", "new gains in the drive, with reservations"),
+    "rejected": ("rejected", "gains as before"),
+}
+
+
+def to_html(certificate: Certificate) -> str:
+    """Return the report; its last line is a hash over all before it."""
+    title = f"Tuning of {certificate.device} with {certificate.motor}"
+    body = [f"<h1>{escape(title)}</h1>", _summary(certificate)]
+    for axis in certificate.axes:
+        body += _axis(axis)
+    body += ["<h2>What it was made with</h2>", _pairs(certificate.versions)]
+    text = (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width">\n'
+        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        + "\n".join(body)
+        + "\n</body>\n</html>\n"
+    )
+    return f"{text}{SEAL}{_hash(text)} -->\n"
+
+
+def html_is_unchanged(text: str) -> bool:
+    """Return whether a report is as it was written.
+
+    Raises:
+        CertificateError: If the text is no report.
+    """
+    from tuning.certificate.certificate import CertificateError
+
+    content, seal, stated = text.rpartition(SEAL)
+    if not seal:
+        raise CertificateError("the file is no report of drive-tune: it does not end with its hash")
+    return stated == f"{_hash(content)} -->\n"
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+# --- the parts --------------------------------------------------------------------------------------------------------
+def _summary(certificate: Certificate) -> str:
+    axes = certificate.axes
+    rows = {
+        "machine": certificate.machine,
+        "tuner": certificate.tuner,
+        "supply as entered [V]": _figure(certificate.supply),
+        "seed": str(certificate.seed),
+        "made": certificate.created,
+        "time on the drive [s]": _figure(max((axis.hardware_seconds for axis in axes), default=0.0)),
+        "trials stopped": str(sum(axis.aborts for axis in axes)),
+        "axes with new gains": f"{sum(axis.accepted for axis in axes)} of {len(axes)}",
+        "of these with reservations": str(sum(axis.accepted and bool(axis.reservations) for axis in axes)),
+    } | {
+        f"limit: {name}": _figure(value) if math.isfinite(value) else "none"
+        for name, value in certificate.envelope.items()
+    }
+    return _pairs(rows) + f"<p>Hash of the certificate's content (SHA-256): <code>{certificate.hash()}</code></p>"
+
+
+def _axis(axis: AxisCertificate) -> list[str]:
+    colour, words = COLOURS[axis.verdict]
+    parts = [
+        f"<h2>Axis {axis.axis}: <span class='{colour}'>{words}</span></h2>",
+        f"<p>{escape(axis.reason)}</p>",
+        *([_list("reserved", axis.reservations)] if axis.reservations else []),
+        "<h3>Gains</h3>",
+        _gains(axis),
+    ]
+    if axis.notes:
+        parts.append(_list("notes", axis.notes))
+    if axis.identified:
+        parts += ["<h3>Identified, with intervals of 95 % confidence</h3>", _identified(axis)]
+    for name in dict.fromkeys(step.name for step in axis.steps):
+        steps = [step for step in axis.steps if step.name == name]
+        parts += [f"<h3>{escape(name)}</h3>", _image(step_picture(steps), f"{name} over time")]
+        parts.append(_before_and_after([(step.tuned, step.figures) for step in steps]))
+    for name in dict.fromkeys(found.name for found in axis.frequency_responses):
+        responses = [found for found in axis.frequency_responses if found.name == name]
+        sources = "; ".join(dict.fromkeys(found.source for found in responses if found.source))
+        parts += [f"<h3>Open {escape(name)}</h3>", _image(bode_picture(responses), f"Bode diagram of the open {name}")]
+        if sources:
+            parts.append(f"<p>From {escape(sources)}.</p>")
+        parts.append(_before_and_after([(found.tuned, found.margins) for found in responses], absent="not seen"))
+    return parts
+
+
+def _list(kind: str, lines: Iterable[str]) -> str:
+    return f'<ul class="{kind}">' + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
+
+
+def _gains(axis: AxisCertificate) -> str:
+    rows = []
+    si = list(zip(axis.before_si.items(), axis.after_si.values(), strict=True))
+    for k, (name, (index, sub)) in enumerate(zip(GAIN_NAMES, GAIN_OBJECTS, strict=True)):
+        (meaning, before), after = si[k] if k < len(si) else (("", math.nan), math.nan)
+        label = f"{index:04X}h:{sub:02X}"
+        cells = [name, label, axis.before[k], axis.after[k], meaning, _figure(before), _figure(after)]
+        rows.append([str(cell) for cell in cells])
+    return _table(("gain", "object", "before", "after", "in SI", "before", "after"), rows, numbers=(2, 3, 5, 6))
+
+
+def _identified(axis: AxisCertificate) -> str:
+    rows = []
+    for name, found in axis.identified.items():
+        words = name.replace("_", " ")
+        if math.isnan(found.value):
+            rows.append([words, "not identified", "", found.unit, found.reason])
+        else:
+            interval = f"{_figure(found.low)} to {_figure(found.high)}"
+            rows.append([words, _figure(found.value), interval, "" if found.unit == "1" else found.unit, found.reason])
+    return _table(("parameter", "value", "interval", "unit", ""), rows, numbers=(1,))
+
+
+def _before_and_after(found: Sequence[tuple[bool, Mapping[str, float]]], absent: str = "–") -> str:  # noqa: RUF001
+    """Return a table of figures with a column each for the gains before and the new ones; `absent` is no figure."""
+    names = list(dict.fromkeys(name for _, figures in found for name in figures))
+    if not names:
+        return ""
+    heads = [("new gains" if tuned else "gains before") for tuned, _ in found]
+    every = [[figures.get(name, math.nan) for _, figures in found] for name in names]
+    cells = [[_figure(value) if math.isfinite(value) else absent for value in row] for row in every]
+    rows = [[name, *row] for name, row in zip(names, cells, strict=True)]
+    return _table(("", *heads), rows, numbers=range(1, len(heads) + 1))
+
+
+def _pairs(rows: Mapping[str, str]) -> str:
+    return _table((), [[name, value] for name, value in rows.items()])
+
+
+def _table(heads: Iterable[str], rows: Iterable[Sequence[str]], numbers: Iterable[int] = ()) -> str:
+    right = set(numbers)
+
+    def cells(tag: str, row: Iterable[str]) -> str:
+        kinds = (' class="number"' if k in right else "" for k, _ in enumerate(list(heads) or [""] * 9))
+        return "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for cell, kind in zip(row, kinds, strict=False))
+
+    head = f"<thead><tr>{cells('th', heads)}</tr></thead>" if list(heads) else ""
+    return f"<table>{head}<tbody>" + "".join(f"<tr>{cells('td', row)}</tr>" for row in rows) + "</tbody></table>"
+
+
+def _figure(value: Any) -> str:
+    """Return a number with four digits; what there is none of is a dash."""
+    number = float(value)
+    return "–" if math.isnan(number) else f"{number:.4g}"  # noqa: RUF001  # the dash that a table has
+
+
+def _image(figure: Figure, text: str) -> str:
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    coded = base64.b64encode(data.getvalue()).decode()
+    return f'<img alt="{escape(text, quote=True)}" src="data:image/png;base64,{coded}">'

@@ -1,0 +1,56 @@
+"""The command `drive-tune`: it only puts together what lies in `commands`, one file per command."""
+
+from __future__ import annotations
+
+import typer
+
+from drive_env.commands.program import Quiet, Verbose, Version, say_as_much
+from tuning.commands.auto import auto
+from tuning.commands.identify import identify
+from tuning.commands.optimise import optimise
+from tuning.commands.options import interrupted
+from tuning.commands.rank import rank
+from tuning.commands.response import response
+from tuning.commands.rules import rules
+from tuning.commands.sweep import sweep
+from tuning.commands.undo import undo
+from tuning.commands.verify import verify
+
+app = typer.Typer(
+    name="drive-tune",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+PANELS = {
+    "A drive, emulated or on a bus": (identify, response, rules, optimise, auto),
+    "Many emulated machines": (sweep, rank),
+    "What a change leaves": (verify, undo),
+}
+for panel, commands in PANELS.items():
+    for command in commands:
+        app.command(rich_help_panel=panel)(command)
+
+
+@app.callback()
+def drive_tune(version: Version = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
+    """Tune servo drives: emulated ones, and with --bus real ones, inside the safety envelope.
+
+    Exit codes: 0 done, 1 the drive or the bus said no, 2 a mistake in the command, 130 Ctrl-C, 141
+    nobody takes the output any more.
+    """
+    say_as_much(quiet, verbose)
+
+
+def main() -> None:
+    """Run the command; Ctrl-C ends it with 130."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        interrupted()
+
+
+if __name__ == "__main__":
+    main()

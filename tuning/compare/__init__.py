@@ -1,0 +1,1 @@
+"""Tuners on the same machines."""

@@ -1,0 +1,394 @@
+"""Tuners compared on the same machines: what their gains are worth by hidden J, and what it took to find them.
+
+Every tuner gets every machine as it comes from the box, behind a meter that counts time, moves and violations. Gains
+are scored in the emulator by hidden J (drive_env/trials/score.py), relative to that of the fitted rule which knows the
+true inertia; a tuner never sees the score.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import warnings
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import Gains, rule_gains
+from drive_env.trials.positioning import plan_move
+from drive_env.trials.score import HiddenScore
+from mechanics.untrusted import parse_json
+from tuning.compare.suite import Machine, groups, open_group
+from tuning.compare.tuners import Outcome, RuleTuner, Tuner, find_tuner, identify_all
+from tuning.drive_audit import KINDS, MeteredDrives
+from tuning.identify.moved_inertia import moved_inertia
+from tuning.runs.shard_log import ShardLog
+from tuning.search.trial_bench import read_gains
+from tuning.target import Target
+from tuning.toml_tables import toml
+
+if TYPE_CHECKING:
+    from tuning.identify.identification import Identification
+    from tuning.runs.pools import Pool
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Progress = Callable[[str, float], None]
+
+WORSE = 1.05  # times the fitted rule's hidden J: from here on a tuning counts as worse
+
+
+@dataclass(frozen=True)
+class MachineRow:
+    """What a tuner made of a machine.
+
+    hidden, relative: Hidden J, and over that of the fitted rule. rule: That of the fitted rule.
+    drive_seconds: Until the drive was last written to or moved [s], waits for the machines beside it included.
+    moves: Of all its axes, each from standstill to standstill (moves.py). aborts: As the tuner says.
+    violations: Of all kinds. torque_p ... position_p: Raw gains of the machine's first axis.
+    note: What the tuner says, or why it failed; then the gains are those that it left behind.
+    """
+
+    tuner: str
+    machine: str
+    hidden: float
+    relative: float
+    rule: float
+    drive_seconds: float
+    moves: int
+    aborts: int
+    violations: int
+    kinds: str
+    failed: bool
+    torque_p: int
+    torque_i: int
+    velocity_p: int
+    velocity_i: int
+    position_p: int
+    note: str
+
+
+@dataclass(frozen=True)
+class TunerRow:
+    """What a tuner is worth over all machines.
+
+    median, p95: Of hidden J over the fitted rule's. worse: Share of machines that are more than 5 % worse.
+    drive_seconds, moves: Median of a machine. aborts, violations: Of all machines together. failed: Machines on which
+    it gave up with an error.
+    """
+
+    tuner: str
+    machines: int
+    median: float
+    p95: float
+    worse: float
+    drive_seconds: float
+    moves: float
+    aborts: int
+    violations: int
+    failed: int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Rows of every tuner and machine, and what each tuner is worth, the best median first."""
+
+    rows: tuple[MachineRow, ...]
+    tuners: tuple[TunerRow, ...]
+
+    def of(self, tuner: str) -> list[MachineRow]:
+        """Return a tuner's rows."""
+        return [row for row in self.rows if row.tuner == tuner]
+
+
+def compare(
+    machines: Sequence[Machine],
+    tuners: Mapping[str, Tuner],
+    *,
+    seed: int = 0,
+    num_threads: int | None = None,
+    log: ShardLog | None = None,
+    progress: Progress = lambda what, share: None,
+    pool: Pool | None = None,
+    trials: int | None = None,
+) -> Comparison:
+    """Have every tuner tune every machine.
+
+    Args:
+        machines: The suite.
+        tuners: By name.
+        seed: What the tuners draw from; the same machines and tuner see the same chances whatever else is compared.
+        num_threads: As `EmulatedDrives` takes it.
+        log: What tuners made of machines already, and where what is to come is kept.
+        progress: Called with what is under way and the share that is done.
+        pool: Where else it runs, which changes no digit; there the tuners are found by their names and `trials`.
+        trials: As `find_tuner` takes it.
+    """
+    tasks = [(indices, name) for indices in groups(machines) for name in tuners]
+    done = {} if log is None else {k: _rows_of(str(arrays["rows"])) for k, arrays in log.done.items()}
+    left = [k for k in range(len(tasks)) if k not in done]
+
+    def say(k: int) -> None:
+        machine = machines[tasks[k][0][0]]
+        progress(f"{tasks[k][1]} on {machine.load}, {machine.motor}", len(done) / len(tasks))
+
+    if pool is None:
+        fresh = _here(machines, tuners, tasks, left, seed, num_threads, say)
+    else:
+        fresh = _elsewhere(machines, tasks, left, seed, trials, pool, say)
+    for k, rows in fresh:
+        done[k] = rows
+        if log is not None:
+            log.append(k, {"rows": np.array(_text_of(rows))})
+    progress("", 1.0)
+    found = {(tasks[k][1], i): row for k, own in done.items() for i, row in zip(tasks[k][0], own, strict=True)}
+    ordered = tuple(found[name, i] for name in tuners for i in range(len(machines)))
+    summaries = [_summary(name, [row for row in ordered if row.tuner == name]) for name in tuners]
+    return Comparison(ordered, tuple(sorted(summaries, key=lambda row: (row.median, row.tuner))))
+
+
+class _Task(NamedTuple):
+    """A tuner on the machines of a group, for another process."""
+
+    group: list[Machine]
+    tuner: str
+    trials: int | None
+    seed: int
+
+
+def _run(task: _Task) -> str:
+    """Return what a tuner makes of the machines of a group, as text."""
+    with closing(Yardstick(task.group, 1)) as yardstick:
+        tuned = _Bench(task.group, task.seed, 1).tune(task.tuner, find_tuner(task.tuner, task.trials))
+        return _text_of(_rows(task.tuner, task.group, tuned, yardstick))
+
+
+def _here(
+    machines: Sequence[Machine],
+    tuners: Mapping[str, Tuner],
+    tasks: Sequence[tuple[Sequence[int], str]],
+    left: Sequence[int],
+    seed: int,
+    num_threads: int | None,
+    say: Callable[[int], None],
+) -> Iterator[tuple[int, list[MachineRow]]]:
+    """Give the number and the rows of each task as it is done, group by group: what a group needs is made once."""
+    with ExitStack() as open_now:
+        indices: Sequence[int] = ()
+        for k in left:
+            if tasks[k][0] is not indices:
+                open_now.close()
+                indices = tasks[k][0]
+                group = [machines[index] for index in indices]
+                yardstick, bench = Yardstick(group, num_threads), _Bench(group, seed, num_threads)
+                open_now.callback(yardstick.close)
+            name = tasks[k][1]
+            say(k)
+            yield k, _rows(name, group, bench.tune(name, tuners[name]), yardstick)
+
+
+def _elsewhere(
+    machines: Sequence[Machine],
+    tasks: Sequence[tuple[Sequence[int], str]],
+    left: Sequence[int],
+    seed: int,
+    trials: int | None,
+    pool: Pool,
+    say: Callable[[int], None],
+) -> Iterator[tuple[int, list[MachineRow]]]:
+    """Give the number and the rows of each task as it comes back."""
+    items = [_Task([machines[i] for i in tasks[k][0]], tasks[k][1], trials, seed) for k in left]
+    for place, text in pool.unordered(_run, items):
+        say(left[place])
+        yield left[place], _rows_of(text)
+
+
+def _text_of(rows: Sequence[MachineRow]) -> str:
+    return json.dumps([asdict(row) for row in rows])
+
+
+def _rows_of(text: str) -> list[MachineRow]:
+    return [MachineRow(**row) for row in parse_json(text)]
+
+
+class Yardstick:
+    """Hidden J of a group of machines, and that of the fitted rule with their true inertia."""
+
+    def __init__(self, group: Sequence[Machine], num_threads: int | None) -> None:
+        device, load, motor, friction = group[0].kind
+        self._hidden = HiddenScore(device, load, motor, len(group), num_threads=num_threads, friction=friction)
+        with open_group(group, num_threads) as target:
+            drives = target.drives
+            inertia = _true_inertia(target)
+            reach = np.where(target.high >= -target.low, target.high, target.low)
+            supply = target.supply.reshape(len(group), -1)[:, 0]
+            self._hidden.set_machines(drives.machine.parameters, supply)
+            self._hidden.set_moves(plan_move(target.motor, inertia, drives.read((0x2058, 0)), reach))
+            rule = np.concatenate(
+                [
+                    rule_gains(target.device, target.motor, J, supply=float(volts))
+                    for J, volts in zip(inertia, target.supply, strict=True)
+                ]
+            )
+        self.rule = self._hidden.set_reference(rule).hidden
+
+    def score(self, gains: Integers) -> Floats:
+        """Return hidden J of every machine, (num_machines,)."""
+        return self._hidden.score(gains).hidden
+
+    def close(self) -> None:
+        """Give the machines back."""
+        self._hidden.close()
+
+
+def _true_inertia(target: Target) -> Floats:
+    """Return the total inertia as a perfect identification finds it: over the true K_t, times the data sheet's.
+
+    The axes of a machine move together: an axis pushes its own inertia, and what the others' acceleration puts on it.
+    """
+    moved = np.concatenate([moved_inertia(group.load) for group in target.drives._groups])
+    share = target.drives.machine.parameters["motor.psi_m"] / target.motor.psi_m
+    return np.asarray(moved.reshape(-1) / np.repeat(share, target.axes_per_machine))
+
+
+class _Tuned(NamedTuple):
+    """What came of a tuner on the machines of a group: its outcome, or why there is none and the gains it left."""
+
+    outcome: Outcome | None
+    gains: Integers
+    failure: str
+    meter: MeteredDrives
+
+
+class _Bench:
+    """Has tuners tune the machines of a group, each time fresh from the box."""
+
+    def __init__(self, group: Sequence[Machine], seed: int, num_threads: int | None) -> None:
+        self._group, self._seed, self._num_threads = group, seed, num_threads
+        self._identified: tuple[list[Identification], float, Integers, MeteredDrives] | None = None
+
+    def tune(self, name: str, tuner: Tuner) -> _Tuned:
+        """Return what comes of a tuner."""
+        with open_group(self._group, self._num_threads) as target:
+            meter = MeteredDrives(target)
+            watched = replace(target, drives=meter)
+            machines = (zlib.crc32(machine.name.encode()) for machine in self._group)
+            rng = np.random.default_rng((self._seed, zlib.crc32(name.encode()), *machines))
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
+                try:
+                    if isinstance(tuner, RuleTuner):
+                        outcome, meter = self._propose(tuner, watched, meter)
+                    else:
+                        outcome = tuner(watched, rng)
+                    return _Tuned(outcome, _checked_gains(outcome, target), "", meter)
+                except Exception as error:  # a tuner is anybody's code; the others are to be compared all the same
+                    return _Tuned(None, read_gains(target), f"{type(error).__name__}: {error}", meter)
+
+    def _propose(self, tuner: RuleTuner, target: Target, meter: MeteredDrives) -> tuple[Outcome, MeteredDrives]:
+        """Return what a rule proposes, and the meter of the identification, which is the same for all rules."""
+        if self._identified is None:
+            before = read_gains(target)
+            found, seconds = identify_all(target)
+            self._identified = found, seconds, before, meter
+        found, seconds, before, meter = self._identified
+        return tuner.propose(target, found, before, seconds), meter
+
+
+def _rows(name: str, group: Sequence[Machine], tuned: _Tuned, yardstick: Yardstick) -> list[MachineRow]:
+    """Return what a tuner made of every machine of a group."""
+    hidden, outcome, meter = yardstick.score(tuned.gains), tuned.outcome, tuned.meter
+    per_machine = len(tuned.gains) // len(group)
+    rows = []
+    for k, machine in enumerate(group):
+        axes = slice(k * per_machine, (k + 1) * per_machine)
+        counts = meter.violations[:, axes].sum(axis=1)
+        notes = [tuned.failure] if outcome is None else [note for note in outcome.notes[axes] if note]
+        rows.append(
+            MachineRow(
+                tuner=name,
+                machine=machine.name,
+                hidden=float(hidden[k]),
+                relative=float(hidden[k] / yardstick.rule[k]),
+                rule=float(yardstick.rule[k]),
+                drive_seconds=round(float(meter.seconds[axes].max()), 3),
+                moves=int(meter.moves[axes].sum()),
+                aborts=0 if outcome is None else int(outcome.aborts[axes].sum()),
+                violations=int(counts.sum()),
+                kinds=", ".join(f"{kind} {count}" for kind, count in zip(KINDS, counts, strict=True) if count),
+                failed=outcome is None,
+                note=" | ".join(notes).replace("\n", " "),
+                **Gains(*map(int, tuned.gains[axes.start]))._asdict(),
+            )
+        )
+    return rows
+
+
+def _checked_gains(outcome: Any, target: Target) -> Integers:
+    """Return a tuner's gains; ValueError if they are none, which is the tuner's mistake."""
+    shape = (target.num_axes, len(Gains._fields))
+    gains = np.asarray(outcome.gains)
+    if not isinstance(outcome, Outcome) or gains.shape != shape or not np.issubdtype(gains.dtype, np.integer):
+        raise ValueError(
+            f"a tuner returns an Outcome with integer gains of shape {shape}, not {gains.dtype} {gains.shape}"
+        )
+    return gains.astype(np.int64)
+
+
+def _summary(name: str, rows: Sequence[MachineRow]) -> TunerRow:
+    relative = np.array([row.relative for row in rows])
+    return TunerRow(
+        name,
+        len(rows),
+        float(np.median(relative)),
+        float(np.percentile(relative, 95)),
+        float(np.mean(relative > WORSE)),
+        float(np.median([row.drive_seconds for row in rows])),
+        float(np.median([row.moves for row in rows])),
+        sum(row.aborts for row in rows),
+        sum(row.violations for row in rows),
+        sum(row.failed for row in rows),
+    )
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+def save(comparison: Comparison, folder: Path, settings: Mapping[str, Any]) -> None:
+    """Write tuners.csv, rivals.csv, machines.csv, comparison.png and settings.toml into a folder that exists."""
+    from tuning.compare.against_best import RivalRow, all_rivals
+    from tuning.compare.comparison_picture import draw
+
+    _write_csv(folder / "tuners.csv", comparison.tuners, TunerRow)
+    _write_csv(folder / "rivals.csv", all_rivals(comparison), RivalRow)
+    _write_csv(folder / "machines.csv", comparison.rows, MachineRow)
+    (folder / "settings.toml").write_text(settings_text(settings), encoding="utf-8", newline="\n")
+    draw(comparison, folder / "comparison.png")
+
+
+def settings_text(settings: Mapping[str, Any]) -> str:
+    """Return settings as TOML; what is None is left out."""
+    return "".join(f"{name} = {_toml(value)}\n" for name, value in settings.items() if value is not None)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"[{', '.join(map(toml, value))}]" if isinstance(value, list | tuple) else toml(value)
+
+
+def _write_csv(path: Path, rows: Sequence[Any], kind: type) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        names = [field.name for field in fields(kind)]
+        writer.writerow(names)
+        for row in rows:
+            writer.writerow([_cell(getattr(row, name)) for name in names])
+
+
+def _cell(value: Any) -> Any:
+    return f"{value:.6g}" if isinstance(value, float) else value

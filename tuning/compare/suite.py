@@ -1,0 +1,311 @@
+"""The machines that tuners are compared on: a public part in a TOML file, and one that is drawn for a seed.
+
+A suite is a file of `suites/`, or your own: tables of machines, one per load and motor, and which loads and motors the
+drawn part turns. A machine is known by its name: it is the same whatever else is opened beside it.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+import warnings
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.emulator.emulated_drives import EmulatedDrives
+from drive_env.emulator.inertia_check import MisfitWarning
+from drive_env.envs.randomisation import Distributions, shipped
+from drive_env.motors import find_motor
+from mechanics.loads import find_load
+from mechanics.shaft import one, way
+from mechanics.untrusted import read_toml
+from tuning.identify.linked_axes import are_linked
+from tuning.target import Target
+from tuning.toml_tables import ExperimentError, as_table, as_value, check_keys, kind_of
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+SHIPPED = Path(__file__).parent / "suites"
+FRICTION = "stribeck"
+_TRIES = 50  # draws until a machine is one that its motor can move
+_GROUP = ("load", "motor", "friction", "supply", "travel", "parameters")
+_SUPPLY = "supply.voltage"  # the law's name in a set of distributions
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A machine of a suite.
+
+    Attributes:
+        name: Its own in the suite.
+        device, load, motor: Names.
+        parameters: True parameters that are not their defaults, by the names of `drives.machine.parameters` [SI].
+        supply: Voltage [V].
+        friction: Model of the load's friction, as in EmulatedDrives.
+        travel: How far the rotor may turn from where it stands, to each side [rev]; inf is the load's own way.
+    """
+
+    name: str
+    device: str
+    load: str
+    motor: str
+    parameters: Mapping[str, float]
+    supply: float
+    friction: str = FRICTION
+    travel: float = math.inf
+
+    @property
+    def kind(self) -> tuple[str, str, str, str]:
+        """What machines must share to be lanes of one set of drives."""
+        return self.device, self.load, self.motor, self.friction
+
+
+def suite_names() -> list[str]:
+    """Return the names of the suites that ship."""
+    return sorted(path.stem for path in SHIPPED.glob("*.toml"))
+
+
+def load_suite(name_or_path: str | Path = "public", seed: int | None = None, count: int | None = None) -> tuple[
+    Machine, ...
+]:  # fmt: skip
+    """Return the machines of a suite: its public part, and with a seed the part that is drawn for it.
+
+    Args:
+        name_or_path: A shipped suite by its name, or a TOML file.
+        seed: Of the drawn part; None leaves it out.
+        count: How many machines at most, taken from all loads and motors in turn.
+
+    Raises:
+        ExperimentError: For a suite, key, name or number that is none, naming those that are.
+    """
+    path = _path(name_or_path)
+    try:
+        table = read_toml(path)
+    except OSError as error:
+        raise ExperimentError(f"cannot read the suite {path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ExperimentError(f"{path} is no TOML: {error}") from error
+    where = path.name
+    check_keys(where, table, ["device", "group", "generated"], optional=("generated", "group"))
+    device = as_value(f"{where}: device", table["device"], "str")
+    machines: list[Machine] = []
+    for row in table.get("group", []):
+        machines += _group(where, device, as_table(f"{where}: group", row))
+    if seed is not None:
+        machines += _generated(f"{where}: generated", device, table.get("generated", []), seed)
+    if not machines:
+        raise ExperimentError(f"{where}: there is no machine; add a [[group]], or [[generated]] and a seed")
+    _check_names(where, machines)
+    return tuple(machines) if count is None else _spread(machines, count)
+
+
+def groups(machines: Sequence[Machine]) -> list[list[int]]:
+    """Return the indices of machines that can be lanes of one set of drives, in the order of their first."""
+    found: dict[tuple[str, str, str, str], list[int]] = {}
+    for k, machine in enumerate(machines):
+        found.setdefault(machine.kind, []).append(k)
+    return list(found.values())
+
+
+def open_machines(machines: Sequence[Machine], num_threads: int | None = None) -> Iterator[tuple[Target, list[int]]]:
+    """Yield machines ready to be tuned, those of one load and motor as the lanes of one target, and their indices.
+
+    The drives come up commissioned for their motor and at rest; they are closed when the next ones are asked for.
+    """
+    for indices in groups(machines):
+        with open_group([machines[k] for k in indices], num_threads) as target:
+            yield target, indices
+
+
+def open_group(machines: Sequence[Machine], num_threads: int | None = None) -> Target:
+    """Return machines of one kind as one target.
+
+    Raises:
+        ValueError: If they are of several kinds, or one cannot be.
+    """
+    if len({machine.kind for machine in machines}) != 1:
+        kinds = ", ".join(sorted({f"{machine.load} on {machine.motor}" for machine in machines}))
+        raise ValueError(f"lanes of one set of drives turn one load with one motor, not {kinds}; open them apart")
+    device, load, motor, friction = machines[0].kind
+    defaults = _defaults(device, load, motor)
+    names = sorted({name for machine in machines for name in machine.parameters})
+    columns = {name: np.array([m.parameters.get(name, defaults[name]) for m in machines]) for name in names}
+    drives = EmulatedDrives(
+        device, load, motor, len(machines), parameters=columns, friction=friction, num_threads=num_threads
+    )
+    axes = drives.load.num_axes
+    supply = np.repeat([machine.supply for machine in machines], axes)
+    # A machine's noise is its own, whatever stands beside it.
+    drives.machine.seed_noise(np.array([1.0 + zlib.crc32(machine.name.encode()) % (2**32 - 2) for machine in machines]))
+    drives.machine.supply = supply
+    drives.machine.reset()  # charges the link from the supply
+    alone = one(drives.load)
+    own, turns = way(alone), np.repeat([machine.travel for machine in machines], axes)
+    return Target(
+        drives,
+        drives.device,
+        drives.motor,
+        supply,
+        np.maximum(np.tile(own.low, len(machines)), -2.0 * math.pi * turns),
+        np.minimum(np.tile(own.high, len(machines)), 2.0 * math.pi * turns),
+        speed=drives.motor.rated_speed,
+        current=drives.motor.rated_current,
+        axes_per_machine=axes,
+        linked=are_linked(alone),
+        machine=load,
+    )
+
+
+# --- reading ----------------------------------------------------------------------------------------------------------
+def _path(name_or_path: str | Path) -> Path:
+    if isinstance(name_or_path, Path) or str(name_or_path).endswith(".toml"):
+        path = Path(name_or_path)
+        if not path.is_file():
+            raise ExperimentError(f"there is no file {path} of machines; the suites that ship are {_names()}")
+        return path
+    if name_or_path not in suite_names():
+        raise ExperimentError(f"no suite is named {name_or_path!r}; there are {_names()}, or give a .toml")
+    return SHIPPED / f"{name_or_path}.toml"
+
+
+def _names() -> str:
+    return ", ".join(suite_names())
+
+
+def _group(where: str, device: str, row: dict[str, Any]) -> list[Machine]:
+    """Return the machines of a table whose columns they are."""
+    check_keys(f"{where}: group", row, list(_GROUP), optional=("friction", "travel"))
+    load, motor = (as_value(f"{where}: {key}", row[key], "str") for key in ("load", "motor"))
+    stem = f"{load}-{motor}"
+    where = f"{where}: {stem}"
+    friction = as_value(f"{where}: friction", row.get("friction", FRICTION), "str")
+    known = _checked_defaults(where, device, load, motor)
+    supply = _numbers(f"{where}: supply", row["supply"])
+    count = len(supply)
+    travel = _numbers(f"{where}: travel", row.get("travel", [math.inf] * count), count)
+    columns = {}
+    for name, values in as_table(f"{where}: parameters", row["parameters"]).items():
+        if name not in known:
+            raise ExperimentError(f"{where}: machines have no parameter {name!r}; they have {', '.join(known)}")
+        columns[name] = _numbers(f"{where}: {name}", values, count)
+    for k, (volts, turns) in enumerate(zip(supply, travel, strict=True)):
+        if not volts > 0.0 or not turns > 0.0:
+            raise ExperimentError(
+                f"{where}: supply {volts:g} V and travel {turns:g} rev of machine {k} must be above 0"
+            )
+    return [
+        Machine(
+            f"{stem}-{k}", device, load, motor, {name: values[k] for name, values in columns.items()}, supply[k],
+            friction, travel[k],
+        )
+        for k in range(count)
+    ]  # fmt: skip
+
+
+def _numbers(where: str, value: Any, count: int | None = None) -> list[float]:
+    """Return an array of numbers; count is how many there must be."""
+    if not isinstance(value, list) or not value:
+        raise ExperimentError(f"{where} = {value!r} must be an array of numbers, one per machine")
+    if count is not None and len(value) != count:
+        raise ExperimentError(f"{where} has {len(value)} numbers for {count} machines; give one per machine")
+    return [item if item == math.inf else as_value(where, item, "float") for item in value]
+
+
+def _check_names(where: str, machines: Sequence[Machine]) -> None:
+    seen: set[str] = set()
+    for machine in machines:
+        if machine.name in seen:
+            raise ExperimentError(
+                f"{where}: two machines are named {machine.name!r}; make one group of those of one load and motor"
+            )
+        seen.add(machine.name)
+
+
+def _checked_defaults(where: str, device: str, load: str, motor: str) -> dict[str, float]:
+    try:
+        return _defaults(device, load, motor)
+    except ValueError as error:
+        raise ExperimentError(f"{where}: {error}") from error
+
+
+def _defaults(device: str, load: str, motor: str) -> dict[str, float]:
+    """Return the default of every parameter of a machine."""
+    key = (device, load, motor)
+    if key not in _DEFAULTS:
+        find_motor(motor), find_load(load)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MisfitWarning)  # of the default machine, which may not be one of ours
+            with EmulatedDrives(device, load, motor, num_threads=1) as drives:
+                _DEFAULTS[key] = {name: float(value[0]) for name, value in drives.machine.parameters.items()}
+    return _DEFAULTS[key]
+
+
+_DEFAULTS: dict[tuple[str, str, str], dict[str, float]] = {}  # they never change, and take a load's compilation
+
+
+def _spread(machines: Sequence[Machine], count: int) -> tuple[Machine, ...]:
+    """Return so many machines, taken from the groups in turn, in the order they had."""
+    if count < 1:
+        raise ExperimentError(f"count must be 1 or more, not {count}")
+    members = groups(machines)
+    turns = [(turn, k) for group in members for turn, k in enumerate(group)]
+    chosen = sorted(k for _, k in sorted(turns)[:count])
+    return tuple(machines[k] for k in chosen)
+
+
+# --- drawing ----------------------------------------------------------------------------------------------------------
+def _generated(where: str, device: str, tables: Any, seed: int) -> list[Machine]:
+    """Return the machines that are drawn for a seed; one that its motor cannot move is drawn again."""
+    if seed < 0:
+        raise ExperimentError(f"seed must be 0 or more, not {seed}")
+    if not isinstance(tables, list):
+        raise ExperimentError(f"{where} is {kind_of(tables)}; write one table [[generated]] for machines of a kind")
+    machines: list[Machine] = []
+    for table in tables:
+        check_keys(where, as_table(where, table), ["count", "groups"])
+        count = as_value(f"{where}: count", table["count"], "int")
+        pairs = table["groups"]
+        if not isinstance(pairs, list) or not pairs or any(not isinstance(p, list) or len(p) != 2 for p in pairs):
+            raise ExperimentError(f"{where}: groups must be an array of [load, motor]")
+        # Numbered on from table to table: one that is added changes no machine of those before it.
+        first = len(machines)
+        for k in range(count):
+            load, motor = pairs[k % len(pairs)]
+            machines.append(_draw(where, device, load, motor, seed, first + k))
+    return machines
+
+
+def _draw(where: str, device: str, load: str, motor: str, seed: int, number: int) -> Machine:
+    """Return machine `number` of a seed; it does not depend on how many others are drawn."""
+    defaults = _checked_defaults(where, device, load, motor)
+    if load not in shipped():
+        raise ExperimentError(f"{where}: load {load!r} has no distributions; there are {', '.join(shipped())}")
+    laws = Distributions.load(load)
+    rng = np.random.default_rng((seed, number))
+    known = defaults | {_SUPPLY: find_motor(motor).voltage}
+    for _ in range(_TRIES):
+        drawn = laws.draw(rng, known)
+        supply = drawn.pop(_SUPPLY, known[_SUPPLY])
+        if _sound(device, load, motor, drawn):
+            return Machine(f"seed{seed}-{number:02d}-{load}-{motor}", device, load, motor, drawn, supply)
+    raise ExperimentError(
+        f"{where}: {_TRIES} draws of {load!r} gave no machine that {motor!r} can move; choose a stronger motor"
+    )
+
+
+def _sound(device: str, load: str, motor: str, parameters: Mapping[str, float]) -> bool:
+    """Return whether the motor can move the machine, and the machine can be stepped."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MisfitWarning)
+        try:
+            EmulatedDrives(device, load, motor, parameters=parameters, num_threads=1).close()
+        except (MisfitWarning, ValueError):
+            return False
+    return True

@@ -1,0 +1,235 @@
+"""The tuners there are, by name: each turns a target into gains, through its drives and nothing else.
+
+A tuner from elsewhere, a trained agent for one, registers in the entry-point group `drive_env.tuners`: a function of a
+`Target` and a random generator that returns an `Outcome`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import write_gains
+from tuning.search.optimise import Settings, optimise
+from tuning.search.samplers import check_installed
+from tuning.search.trial_bench import TrialBench, read_gains
+from tuning.target import Target, timed
+
+if TYPE_CHECKING:
+    from tuning.identify.identification import Identification
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+ENTRY_POINTS = "drive_env.tuners"
+
+
+class Outcome(NamedTuple):
+    """What a tuner did, of every axis.
+
+    gains: Raw integers in the order of `Gains`, shape (num_axes, 5).
+    drive_seconds: Time on the drive [s], (num_axes,).
+    moves: Moves and other excitations, (num_axes,).
+    aborts: What had to be stopped, (num_axes,).
+    violations: How often it left its limits, (num_axes,).
+    notes: What there is to say, one text per axis; "" is nothing.
+    """
+
+    gains: Integers
+    drive_seconds: Floats
+    moves: Integers
+    aborts: Integers
+    violations: Integers
+    notes: tuple[str, ...]
+
+
+Tuner = Callable[[Target, np.random.Generator], Outcome]
+
+
+class Row(NamedTuple):
+    """A tuner of the registry: what it is, in a line, and whether it thinks so long that it is asked for by name."""
+
+    name: str
+    meaning: str
+    make: Callable[..., Tuner]
+    slow: bool = False
+    searches: bool = False  # then `make` takes the number of trials
+
+
+class MissingTunerError(ValueError):
+    """A tuner that is none, or that lacks what it needs; the message has the remedy."""
+
+
+def tuner_rows() -> dict[str, Row]:
+    """Return all tuners by name: those of this package, the rules, and those that others have registered."""
+    rows = {row.name: row for row in _OWN}
+    rows |= {name: Row(name, f"rule {name}", partial(RuleTuner, name)) for name in _rule_names()}
+    rows |= {row.name: row for row in _AFTER}
+    for entry in sorted(importlib.metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
+        distribution = entry.dist.name if entry.dist else "an unknown package"
+        if entry.name in rows:
+            raise MissingTunerError(
+                f"{distribution} registers a tuner {entry.name!r}, and there is one of that name; rename it or "
+                f"uninstall {distribution}"
+            )
+        rows[entry.name] = Row(entry.name, f"from {distribution}", partial(_load, entry))
+    return rows
+
+
+def find_tuner(name: str, trials: int | None = None) -> Tuner:
+    """Return a tuner by name.
+
+    Args:
+        name: Its name.
+        trials: How many a search makes; its own number by default. What does not search has none.
+
+    Raises:
+        MissingTunerError: For a name that is none, listing those there are, or a package that is missing.
+    """
+    rows = tuner_rows()
+    if name not in rows:
+        raise MissingTunerError(f"no tuner is named {name!r}; there are {', '.join(rows)}")
+    row = rows[name]
+    return row.make(trials=trials) if row.searches and trials is not None else row.make()
+
+
+# --- tuners without a search ------------------------------------------------------------------------------------------
+def _factory(target: Target, rng: np.random.Generator) -> Outcome:
+    """Leave the gains that the drive was commissioned with."""
+    return _outcome(target, read_gains(target))
+
+
+def _fitted(target: Target, rng: np.random.Generator) -> Outcome:
+    """Take the fitted rule's gains for the inertia that two moves show."""
+    with timed(target) as (watched, clock):
+        bench = TrialBench(watched)
+        bench.identify()
+        bench.leave(bench.rule)
+    return _outcome(target, bench.rule, clock.seconds, bench.moves)
+
+
+class RuleTuner:
+    """A rule of `tuning.rules.rules_by_name` as a tuner: identify, compute, write.
+
+    What is identified does not depend on the rule: whoever has several rules tune the same machines identifies once and
+    asks each to propose.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._rule = importlib.import_module("tuning.rules.rules_by_name").RULES[name]
+
+    def __call__(self, target: Target, rng: np.random.Generator) -> Outcome:
+        """Tune a target."""
+        before = read_gains(target)
+        found, seconds = identify_all(target)
+        outcome = self.propose(target, found, before, seconds)
+        write_gains(target.drives, outcome.gains)
+        return outcome
+
+    def propose(
+        self, target: Target, found: Sequence[Identification], before: Integers, seconds: float = 0.0
+    ) -> Outcome:
+        """Return the gains for what was identified; an axis without a proposal keeps those before, and says why."""
+        from tuning.response.linear_model import Plant
+
+        gains, notes = before.copy(), []
+        for axis, identified in enumerate(found):
+            try:
+                plant = Plant.from_identification(target.device, target.motor, float(target.supply[axis]), identified)
+                proposal = self._rule(target.device, target.motor, plant)
+            except ValueError as error:  # what the rule needs was not identified
+                notes.append(f"no proposal: {error}")
+                continue
+            gains[axis] = proposal.gains
+            notes.append("; ".join(proposal.notes))
+        return _outcome(target, gains, seconds, notes=tuple(notes))
+
+
+def identify_all(target: Target) -> tuple[list[Identification], float]:
+    """Return what is identified of a target, and the drive time that it took [s]."""
+    from tuning.identify.identification import identify
+
+    with timed(target) as (watched, clock):
+        found = identify(watched)
+    return found, clock.seconds
+
+
+def _rule_names() -> tuple[str, ...]:
+    return tuple(importlib.import_module("tuning.rules.rules_by_name").RULES)
+
+
+def _auto() -> Tuner:
+    """Return the one button of `tuning.auto.one_button`."""
+    found: Tuner = importlib.import_module("tuning.auto.one_button").tune
+    return found
+
+
+# --- searches ---------------------------------------------------------------------------------------------------------
+def search_tuner(target: Target, rng: np.random.Generator, **settings: Any) -> Outcome:
+    """Search gains by trials; `settings` are those of `optimise.Settings`."""
+    found = optimise(target, Settings(seed=int(rng.integers(2**31)), **settings))
+    notes = tuple(note for note in found.notes for _ in range(target.axes_per_machine))
+    return _outcome(target, found.gains, found.drive_seconds, found.moves, found.aborts, notes)
+
+
+def _search(sampler: str, trials: int, safe: bool = False) -> Tuner:
+    try:
+        check_installed(sampler)
+    except ValueError as error:
+        raise MissingTunerError(str(error)) from None
+    return partial(search_tuner, sampler=sampler, trials=trials, safe=safe)
+
+
+def _load(entry: importlib.metadata.EntryPoint) -> Tuner:
+    """Return a registered tuner."""
+    try:
+        found: Tuner = entry.load()
+    except Exception as error:  # whatever somebody else's module does when it is imported
+        raise MissingTunerError(f"the tuner {entry.name!r} of {entry.value} cannot be loaded: {error}") from error
+    if not callable(found):
+        raise MissingTunerError(f"the tuner {entry.name!r} of {entry.value} is no function but {found!r}")
+    return found
+
+
+_OWN = (
+    Row("factory", "the gains that the drive comes with for its motor", lambda: _factory),
+    Row("fitted", "the fitted rule, for the inertia that two moves show", lambda: _fitted),
+)
+_AFTER = (
+    Row("auto", "one button: identify, compute, verify, refine", _auto),
+    Row("random", "20 trials drawn at random", partial(_search, "random", trials=20), searches=True),
+    Row("grid", "the fitted rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
+    Row("tpe", "20 trials by tree-structured Parzen estimators", partial(_search, "tpe", trials=20), searches=True),
+    Row("tpe-safe", "20 trials by TPE from safe gains, in small steps", partial(_search, "tpe", trials=20, safe=True),
+        searches=True),
+    Row("cmaes", "20 trials by CMA-ES", partial(_search, "cmaes", trials=20), searches=True),
+    Row("gp", "12 trials by a Gaussian process", partial(_search, "gp", trials=12), slow=True, searches=True),
+    Row("gp-safe", "12 trials by a Gaussian process from safe gains, in small steps",
+        partial(_search, "gp", trials=12, safe=True), slow=True, searches=True),
+)  # fmt: skip
+
+
+def _outcome(
+    target: Target,
+    gains: Integers,
+    seconds: float = 0.0,
+    moves: Integers | None = None,
+    aborts: Integers | None = None,
+    notes: tuple[str, ...] | None = None,
+) -> Outcome:
+    count = target.num_axes
+    zero = np.zeros(count, np.int64)
+    return Outcome(
+        gains,
+        np.full(count, seconds),
+        zero if moves is None else moves,
+        zero if aborts is None else aborts,
+        zero,
+        ("",) * count if notes is None else notes,
+    )

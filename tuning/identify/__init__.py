@@ -1,0 +1,1 @@
+"""What drives' own signals say of motor and machine."""

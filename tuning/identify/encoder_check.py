@@ -1,0 +1,216 @@
+"""Pole pairs and direction of the encoder: the field is turned in open loop, and the encoder must follow it.
+
+With commutation in open loop (2055h) the current of 2004h points along an angle that the velocity demand turns
+(2102h). The rotor follows: electrical turns of the field over turns that the encoder counts are the pole pairs, and
+the sign says whether it counts in the direction in which the field turns. Commutation by encoder needs both to be
+right before any torque is commanded: a reversed encoder makes a motor run away.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.identify.identification import Estimate, refused
+from tuning.identify.working_state import (
+    BY_FIELD,
+    COMMUTATION,
+    CYCLE,
+    OPEN_LOOP_CURRENT,
+    POLE_PAIRS,
+    POSITION,
+    SHAFT_DIRECTION,
+    STATUS,
+    TARGET_VELOCITY,
+    Working,
+    enable,
+    still_enabled,
+    switch_off,
+)
+from tuning.stop_causes import stop_causes
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FIELD_ANGLE, ENCODER_ANGLE = 0x2102, 0x2103  # 1/65536 electrical turn
+RAISE, REST, TURN = 20, 60, 240  # cycles: the current comes (gravity does not wait), the rotor rests, the field turns
+MOST_TURN, LEAST_TURN = 1.0, 0.2  # electrical turns of the field
+SHARE = 0.9  # of what current there is
+TOO_SHORT = "travel too short"  # how the reason begins where nothing was turned
+MARGIN = 0.1  # rad of room that stays free
+TOLERANCE = 0.35  # of a pole pair: from here on a ratio is no whole number
+STUCK = 0.25  # of the field's turn: a rotor that follows less does not follow
+
+
+class EncoderCheck(NamedTuple):
+    """What the check says of one axis."""
+
+    pole_pairs: Estimate
+    direction: Estimate
+    ratio: float = math.nan  # of the field's turns to the encoder's, where the rotor followed
+
+    @property
+    def is_good(self) -> bool:
+        """Whether torque may be commanded: nothing speaks against the drive's own settings."""
+        return not self.direction.is_known or self.direction.value > 0.0
+
+    def is_whole(self, configured: int) -> bool:
+        """Return whether the ratio is a whole number, or so near to the drive's own that it may be that."""
+        if self.pole_pairs.is_known or not math.isfinite(self.ratio):
+            return True
+        return abs(abs(self.ratio) - configured) <= _tolerance(configured)
+
+
+def check_encoders(working: Working) -> list[EncoderCheck]:
+    """Turn the fields of three-phase motors and return what the encoders say, axis by axis; all axes are off then."""
+    target, drives = working.target, working.target.drives
+    count = target.num_axes
+    if target.motor.kind == "dc":
+        none = refused("1", "a brushed motor has no pole pairs")
+        later = refused("1", "a brushed motor has no field to turn; see the current pulses")
+        return [EncoderCheck(none, later)] * count
+    configured = drives.read(POLE_PAIRS).astype(float)
+    commutation = drives.read(COMMUTATION)
+    where, reasons = able(working)
+    if not where.any():
+        return [EncoderCheck(refused("1", reason), refused("1", reason)) for reason in reasons]
+    try:
+        drives.write(COMMUTATION, BY_FIELD, where=where)
+        drives.write(OPEN_LOOP_CURRENT, 0, where=where)
+        enable(working, "csv", where)
+        away, back, field, reasons = _turn(working, where, configured)
+        alive = still_enabled(working, drives.read(STATUS))
+    finally:
+        switch_off(drives, where)
+        drives.write(OPEN_LOOP_CURRENT, 0, where=where)
+        drives.write(COMMUTATION, commutation, where=where)
+    # Counting up is the field's direction unless 2057h turns the sign of positions around.
+    shaft = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
+    found = []
+    causes = [] if alive.all() else stop_causes(drives)
+    for k in range(count):
+        if not where[k] or reasons[k]:
+            found.append(EncoderCheck(refused("1", reasons[k]), refused("1", reasons[k])))
+        elif not alive[k]:
+            reason = (
+                "the axis was switched off while the field turned: it left its travel, or the drive did it itself "
+                f"({causes[k]})"
+            )
+            found.append(EncoderCheck(refused("1", reason), refused("1", reason)))
+        else:
+            found.append(_judge(field[k], shaft[k] * away[k], shaft[k] * back[k], target.motor.n_p))
+    return found
+
+
+def able(working: Working) -> tuple[Mask, list[str]]:
+    """Return which axes have the room to swing to the field, to either side, and why the others have not."""
+    down, up = working.room()
+    # Switched on, the field pulls the rotor to itself: half an electrical turn at most. Wherever it then stands, the
+    # field can turn it back by as much.
+    needed = np.pi / working.target.motor.n_p + MARGIN
+    able = np.minimum(up, -down) >= needed
+    reasons = [
+        ""
+        if able[k]
+        else f"{TOO_SHORT}: the field may pull the rotor {needed:.2g} rad to either side, and there are {-down[k]:.2g} "
+        f"and {up[k]:.2g}; begin in the middle of the travel"
+        for k in range(working.target.num_axes)
+    ]
+    return np.asarray(working.where & able), reasons
+
+
+def _way(working: Working) -> tuple[Floats, Mask]:
+    """Return how far the fields turn from where the rotors stand now [electrical rad], and which of them can."""
+    n_p = working.target.motor.n_p
+    down, up = working.room()
+    sign = np.where(up >= -down, 1.0, -1.0)
+    way = np.minimum(np.where(sign > 0.0, up, -down) - MARGIN, MOST_TURN * 2.0 * np.pi / n_p)
+    return sign * way * n_p, np.asarray(way >= LEAST_TURN * 2.0 * np.pi / n_p)
+
+
+def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Floats, Floats, list[str]]:
+    """Turn the fields there and back.
+
+    Returns:
+        How far the rotors went [rad], there and back, and the fields [rad], and why an axis was not turned.
+    """
+    drives = working.target.drives
+    current = np.rint(1e3 * SHARE * working.current).astype(np.int64)
+    for k in range(1, 5):
+        drives.write(OPEN_LOOP_CURRENT, current * k // 4, where=where)
+        drives.advance(RAISE // 4 * CYCLE)
+        stay_inside(working, where)
+    stands = [_rest(working)]
+    turn, able = _way(working)
+    turn = np.where(able, turn, 0.0)
+    # Smooth, so that the rotor does not swing: a raised cosine of speed.
+    shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(TURN) + 0.5) / TURN)
+    fields = [_field(working)]
+    for sign in (1.0, -1.0):
+        speed = sign * turn / configured / (TURN * CYCLE) * shape[:, None]
+        raw = np.where(where, np.rint(speed * working.increments), 0).astype(np.int64)
+        raw[-1] = 0
+        passed = np.zeros(len(turn))
+        before = fields[-1]
+        for k in range(0, TURN, TURN // 10):
+            drives.record([POSITION], TURN // 10 * CYCLE, play={TARGET_VELOCITY: raw[k : k + TURN // 10]})
+            now = _field(working)
+            passed += (now - before + np.pi) % (2.0 * np.pi) - np.pi
+            before = now
+            stay_inside(working, where)
+        fields.append(before)
+        stands.append(_rest(working))
+        if sign > 0.0:
+            turned = passed
+    short = f"{TOO_SHORT}: the field pulled the rotor to where less than {LEAST_TURN:g} electrical turns are free"
+    reasons = [short if chosen and not can else "" for chosen, can in zip(where, able, strict=True)]
+    return stands[1] - stands[0], stands[2] - stands[1], turned, reasons
+
+
+def stay_inside(working: Working, where: Mask) -> None:
+    """Switch off an axis that left its travel: it slipped from the field, and falls."""
+    down, up = working.room()
+    out = where & ((up < 0.0) | (down > 0.0))
+    if out.any():
+        switch_off(working.target.drives, out)
+
+
+def _field(working: Working) -> Floats:
+    return np.asarray(working.target.drives.read(FIELD_ANGLE) * (2.0 * np.pi / 65536.0))
+
+
+def _rest(working: Working) -> Floats:
+    """Return where the rotors come to rest [rad]."""
+    trace = working.target.drives.record([POSITION], 2 * REST * CYCLE)
+    return np.asarray(working.angle(trace[POSITION])[REST:].mean(axis=0))
+
+
+def _judge(field: float, away: float, back: float, expected: int) -> EncoderCheck:
+    """Return what a turn of the field [electrical rad] and the rotor's ways there and back [rad] say."""
+    rotor = 0.5 * (away - back)
+    would = field / expected
+    if abs(rotor) < STUCK * abs(would) or abs(away + back) > 0.5 * abs(away - back):
+        reason = (
+            f"the rotor did not follow the field: it went {away:.2g} rad there and {back:.2g} rad back, and "
+            f"{would:.2g} rad were expected; is it blocked, a phase open, the current too weak?"
+        )
+        return EncoderCheck(refused("1", reason), refused("1", reason))
+    ratio = field / rotor
+    direction = Estimate(float(np.sign(ratio)), float(np.sign(ratio)), float(np.sign(ratio)), "1")
+    # Where the rotor rests depends on friction: by half of what it went differently there and back.
+    spread = abs(away + back) / 2.0 / abs(rotor) * abs(ratio)
+    nearest = round(abs(ratio))
+    if nearest < 1 or abs(abs(ratio) - nearest) + spread > _tolerance(nearest):
+        reason = (
+            f"the field's electrical turns are {abs(ratio):.2f} (give or take {spread:.2f}) of those that the encoder "
+            "counts, which is no whole number: check the encoder's steps, 2080h:02, or allow more travel and current"
+        )
+        return EncoderCheck(refused("1", reason), direction, ratio)
+    return EncoderCheck(Estimate(float(nearest), float(nearest), float(nearest), "1"), direction, ratio)
+
+
+def _tolerance(pole_pairs: int) -> float:
+    return max(TOLERANCE, 0.02 * pole_pairs)

@@ -1,0 +1,271 @@
+"""The order of the experiments of an identification: each needs what the ones before it found."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import gains_from_bandwidths, write_gains
+from drive_env.safety.envelope import swinging_allowed
+from tuning.identify.encoder_check import EncoderCheck, check_encoders
+from tuning.identify.identification import NAMES, Estimate, Identification, Progress, refused
+from tuning.identify.inertia import Mechanics, identify_mechanics
+from tuning.identify.standstill import standstill_resistances
+from tuning.identify.winding import Winding, identify_winding, pulse, to_torque_mode
+from tuning.identify.working_state import (
+    CURRENT,
+    CYCLE,
+    GUESS,
+    STATUS,
+    Working,
+    cautious_bandwidth,
+    cautious_gains,
+    enable,
+    go_back,
+    still_enabled,
+    working_state,
+)
+from tuning.oscillation_watch import OscillationError, WatchedDrives, shaken
+from tuning.response.frequency_response import measure
+from tuning.stop_causes import stop_causes
+from tuning.target import Target, timed
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+HOLD, STEADY = 160, 80  # cycles at rest before anything moves, and how many of them count
+FREQUENCY_CURRENT_HZ, FREQUENCY_VELOCITY_HZ = 800.0, 25.0  # of the loops in which the response is measured
+LEAST_ROOM = 1.2  # rad
+HIGHEST = 400.0  # Hz, of the response
+WORST_MISFIT = 2.0  # of the linear model, over what noise explains
+ELECTRICAL_ANGLE, SHAFT_DIRECTION, POLE_PAIRS = 0x2103, 0x2057, 0x2056
+UNITS = {
+    "resistance": "ohm", "inductance": "H", "pole_pairs": "1", "encoder_direction": "1", "inertia": "kg*m^2",
+    "coulomb": "A", "viscous": "A*s/rad", "offset": "A", "anti_resonance": "Hz", "resonance": "Hz",
+    "loop_delay": "s", "velocity_filter": "Hz",
+}  # fmt: skip
+MECHANICS, RESPONSE = NAMES[NAMES.index("inertia") :], NAMES[NAMES.index("anti_resonance") :]
+OSCILLATED = "the axis oscillated"  # how the reason begins where one did
+PULSED = 1.2  # of the current limit, RMS over 25 ms: beyond, the current loop does not pulse but oscillates
+
+
+class Experiments:
+    """One identification of some axes, side by side; `quick_identification` replaces what needs torque by less.
+
+    Attributes:
+        target, where, progress: As `tuning.identify.identification.identify` takes them.
+        found: What is known so far of each axis, by the names of `NAMES`.
+    """
+
+    thorough = True  # also what only tells better what is told
+
+    def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
+        self.target, self.where, self.progress = target, where, progress
+        self._at_rest: list[Estimate] = []  # resistances, where they are looked for
+        self._under_way: tuple[str, tuple[str, ...]] = ("", NAMES)
+        self.found: list[dict[str, Estimate]] = [
+            {name: refused(UNITS[name], "not asked for") for name in NAMES} for _ in range(target.num_axes)
+        ]
+
+    def run(self) -> list[Identification]:
+        """Do them all."""
+        with timed(self.target) as (target, clock):
+            noise = target.device.stage["adc_noise"].high
+            watched = WatchedDrives(target.drives, self.where, np.full(target.num_axes, target.current), noise)
+            with working_state(replace(target, drives=watched), self.where) as working:
+                watched.limit = working.current
+                with suppress(OscillationError):
+                    good = self.check(working)
+                    if good.any():
+                        self.turn(replace(working, where=good))
+                self.calm(working)
+        self.progress("done", 1.0)
+        return [Identification(found, clock.seconds if chosen else 0.0)
+                for found, chosen in zip(self.found, self.where, strict=True)]  # fmt: skip
+
+    def begin(self, what: str, share: float, names: tuple[str, ...]) -> None:
+        """Tell what is under way and the share done; what it and all after it are to say has these names."""
+        self.progress(what, share)
+        self._under_way = what, names
+
+    def calm(self, working: Working) -> Working:
+        """Return the axes that did not oscillate; what the others have no value of is refused with that reason."""
+        swung = working.where & working.target.drives.watch.swung
+        what, names = self._under_way
+        for k in np.flatnonzero(swung):
+            for name in names:
+                before = self.found[k][name]
+                if not before.is_known and not before.reason.startswith(OSCILLATED):
+                    self.found[k][name] = refused(UNITS[name], (
+                        f"{OSCILLATED} ({what}) and was switched off within 50 ms: is it another motor, or are current "
+                        "and inertia far from what its data sheet says?"
+                    ))  # fmt: skip
+        return replace(working, where=working.where & ~swung)
+
+    def check(self, working: Working) -> Mask:
+        """Check the encoders and return the axes whose torque may be commanded."""
+        self.begin("pole pairs and encoder", 0.0, NAMES)
+        checks: list[EncoderCheck] = check_encoders(working)
+        good = working.where.copy()
+        for k in np.flatnonzero(working.where):
+            check = checks[k]
+            self.found[k] |= {"pole_pairs": check.pole_pairs, "encoder_direction": check.direction}
+            reason = self._wrong(working, int(k), check)
+            if reason:
+                good[k] = False
+                self.refuse(int(k), NAMES, reason)
+        if good.any() and (self.thorough or _in_real_time(working)):
+            self._at_rest = standstill_resistances(replace(working, where=good))
+        return good
+
+    def _wrong(self, working: Working, k: int, check: EncoderCheck) -> str:
+        """Return why no torque may be commanded, if so."""
+        target = working.target
+        if not check.is_good:
+            return (
+                "the encoder counts against the field, and torque would make the motor run away: turn 2080h:01 (or "
+                "swap two motor phases), then identify again"
+            )
+        configured = int(target.drives.read(POLE_PAIRS)[k])
+        if check.pole_pairs.is_known and round(check.pole_pairs.value) != configured:
+            return (
+                f"the motor has {check.pole_pairs.value:.0f} pole pairs and 2056h says {configured}: torque would turn "
+                "with the angle; write the right number (or the right encoder steps, 2080h:02), then identify again"
+            )
+        if not check.is_whole(configured):
+            return f"{check.pole_pairs.reason}; torque would turn with the angle: correct it, then identify again"
+        if "did not follow" in check.direction.reason or "switched off" in check.direction.reason:
+            return check.direction.reason
+        if target.motor.kind != "dc" and not check.direction.is_known:
+            return f"{check.direction.reason}; torque with wiring that is not checked could make the motor run away"
+        return ""
+
+    def turn(self, working: Working) -> None:
+        """Do what needs torque."""
+        target, drives = working.target, working.target.drives
+        self.begin("current pulses", 0.15, NAMES)
+        enable(working, "csp")
+        go_back(working, "csp")
+        holding = self.hold(working)
+        electrical = drives.read(ELECTRICAL_ANGLE) * (2.0 * np.pi / 65536.0)
+        to_torque_mode(working, holding)
+        with swinging_allowed(drives), shaken(drives, PULSED * working.current):
+            pulses = pulse(working, holding)
+        working = self.calm(working)
+        gains = cautious_gains(target, GUESS * target.motor.inertia)
+        write_gains(drives, gains, working.where)
+        go_back(working, "csv")
+        sign = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
+        windings = identify_winding(working, pulses, electrical, float(target.motor.n_p) * float(sign[0]))
+        self.take_windings(working, windings)
+        self.begin("inertia and friction", 0.3, MECHANICS)
+        mechanics, inertia = identify_mechanics(working, holding)
+        self._take_mechanics(working, mechanics)
+        working = self.calm(working)
+        self.begin("resonance, delay, filter", 0.7, RESPONSE)
+        self.respond(working, inertia)
+        working = self.calm(working)
+        on = working.where & still_enabled(working, drives.read(STATUS))
+        if on.any():
+            go_back(replace(working, where=on), "csv", to=0.0)
+
+    def hold(self, working: Working) -> Floats:
+        """Return what holds the axes [A], at rest in csp."""
+        drives = working.target.drives
+        trace = drives.record([CURRENT], HOLD * CYCLE)
+        alive = still_enabled(working, drives.read(STATUS))
+        causes = [] if alive.all() else stop_causes(drives)
+        for k in np.flatnonzero(working.where & ~alive):
+            self.refuse(int(k), NAMES[4:], f"the drive switched off while it held the axis: {causes[k]}")
+        return np.asarray(trace[CURRENT][-STEADY:].mean(axis=0) * 1e-3)
+
+    def take_windings(self, working: Working, windings: list[Winding]) -> None:
+        """Take resistance and inductance."""
+        for k in np.flatnonzero(working.where):
+            both = [windings[k].resistance, *self._at_rest[k : k + 1]]
+            # In real time pulses say nothing, and why not is not what helps.
+            resistance = min(
+                (one for one in both if one.is_known), key=lambda one: one.high - one.low,
+                default=both[-1] if _in_real_time(working) else both[0],
+            )  # fmt: skip
+            self.found[k] |= {"resistance": resistance, "inductance": windings[k].inductance}
+            if working.target.motor.kind == "dc" and windings[k].follows:
+                # Speed followed torque: with a reversed encoder the loops would have run away by now.
+                self.found[k]["encoder_direction"] = Estimate(1.0, 1.0, 1.0, "1")
+
+    def _take_mechanics(self, working: Working, mechanics: list[Mechanics]) -> None:
+        for k in np.flatnonzero(working.where):
+            self.found[k] |= mechanics[k]._asdict()
+
+    def respond(self, working: Working, inertia: Floats) -> None:
+        """Measure the velocity loop's response, with loops fit for it, and take what it says."""
+        target, drives = working.target, working.target.drives
+        # Still enabled: an axis under gravity would fall between the experiments.
+        go_back(working, "csv")
+        able = working.where & still_enabled(working, drives.read(STATUS))
+        down, up = working.room()
+        causes = [] if able.all() else stop_causes(drives)
+        for k in np.flatnonzero(working.where):
+            if not able[k]:
+                self.refuse(int(k), RESPONSE, f"the drive switched off: {causes[k]}")
+            elif max(up[k], -down[k]) < LEAST_ROOM:
+                able[k] = False
+                self.refuse(int(k), RESPONSE, (
+                    f"travel too short: {LEAST_ROOM:g} rad are needed to shake the axis while it moves, and there are "
+                    f"{max(up[k], -down[k]):.2g}"
+                ))  # fmt: skip
+        if not able.any():
+            return
+        write_gains(drives, self.response_gains(working, inertia), able)
+        here = replace(target, low=np.minimum(down, 0.0), high=np.maximum(up, 1e-3))
+        with swinging_allowed(drives):
+            response = measure(
+                here, "velocity", where=able, high=HIGHEST, confirmed=True, softened=True,
+                progress=lambda share: self.progress("resonance, delay, filter", 0.7 + 0.29 * share),
+            )  # fmt: skip
+        for k in np.flatnonzero(able):
+            fit = response.fits[k]
+            if fit is None:
+                self.refuse(int(k), RESPONSE, "; ".join(response.notes[k]) or "the response was not measured")
+                continue
+            self.found[k] |= {name: fit.estimates[name] for name in RESPONSE}
+            if fit.misfit > WORST_MISFIT:
+                for name in RESPONSE:
+                    self.found[k][name] = refused(UNITS[name], (
+                        f"the response is not that of one spring: the model is off by {fit.misfit:.1f} times what "
+                        "noise explains (backlash, or several resonances)"
+                    ))  # fmt: skip
+
+    def response_gains(self, working: Working, inertia: Floats) -> NDArray[np.int64]:
+        """Return raw gains for measuring a response, (num_axes, 5), for total inertias [kg*m^2]."""
+        target, motor = working.target, working.target.motor
+        rows = []
+        for k in range(target.num_axes):
+            found = self.found[k]
+            R, L = found["resistance"], found["inductance"]
+            known = motor._replace(R_s=R.value if R.is_known else motor.R_s, L_q=L.value if L.is_known else motor.L_q)
+            rows.append(
+                gains_from_bandwidths(
+                    target.device,
+                    known,
+                    float(inertia[k]),
+                    current_hz=FREQUENCY_CURRENT_HZ,
+                    velocity_hz=cautious_bandwidth(motor, float(inertia[k]), FREQUENCY_VELOCITY_HZ),
+                    position_hz=5.0,
+                    supply=float(target.supply[k]),
+                )
+            )
+        return np.array(rows, np.int64)
+
+    def refuse(self, k: int, names: tuple[str, ...], reason: str) -> None:
+        """Refuse what has no value yet."""
+        for name in names:
+            if not self.found[k][name].is_known and self.found[k][name].reason in ("", "not asked for"):
+                self.found[k][name] = refused(UNITS[name], reason)
+
+
+def _in_real_time(working: Working) -> bool:
+    return not getattr(working.target.drives, "time_waits", True)

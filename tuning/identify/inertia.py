@@ -1,0 +1,491 @@
+"""Inertia, dry and viscous friction and constant load, all over K_t, from the momentum balance of moves there and back.
+
+Between two moments the charge that flowed is what the speed gained, and what friction and load took:
+
+    integral of i = J/K_t (omega_2 - omega_1) + c integral of sign(omega) + v (theta_2 - theta_1) + o (t_2 - t_1)
+
+Every equation is weighted by a smooth window, over a cruise or from the middle of one to the middle of the next, the
+other way; an elastic load's swinging averages out in them. From one speed to its opposite, what a transmission loses in
+proportion to what it carries cancels: half of the time it brakes, half of the time it helps the motor to brake.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.dictionary.units import RPM
+from drive_env.emulator.parameters import velocity_filter
+from drive_env.gains import write_gains
+from tuning.identify.confidence import gain_error, interval, t_quantile
+from tuning.identify.identification import Estimate, refused
+from tuning.identify.working_state import (
+    CURRENT,
+    CYCLE,
+    GUESS,
+    POSITION,
+    STATUS,
+    TARGET_VELOCITY,
+    Working,
+    cautious_gains,
+    go_back,
+    still_enabled,
+)
+from tuning.oscillation_watch import SOFTER, VELOCITY_I, VELOCITY_P, OscillationError
+from tuning.stop_causes import stop_causes
+from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+MOST_RATIO = 30.0  # over the rotor's: beyond, a cautious excitation hardly moves the load (Yaskawa: 15 to 30)
+SPEED_SHARE, CURRENT_SHARE, ROOM_SHARE, LINK_SHARE = 0.7, 0.5, 0.75, 0.6  # of the limits
+SHARES = (1.0, 0.65, 0.35)  # of the greatest speed, in turn
+COARSE, FINE = (1, (0.6, 0.3)), (2, SHARES)  # how often, at which shares of the greatest speed
+RAMP, CRUISE = (30, 250), (60, 140)  # cycles, shortest and longest
+CORRECTION, FOLLOW = 10, 5.0  # cycles between corrections of the way; 1/s
+STILL = 40  # cycles at rest in the beginning
+NUDGE = 1.0  # rad, of a move alone
+LINKED_CURRENT, LINKED_WAY = 0.08, 0.15  # of current and move: from here on another axis is pulled along
+LEAST_COUNTS = 40.0  # that a cruise must pass
+WIDEST, WIDEST_FRICTION = 0.25, 0.2  # half of an interval over its value: what is wider is no identification
+SLOPE, DRAG = 4, 5  # columns of the balance
+FEWEST_MOVES = 5  # with which more than the four is looked for
+CLEAR = 4.0  # times its deviation: from here on an effect that most loads do not have is one
+# Of what is over K_t, 95 %: commutation, temperature, the ripple that samples hide, a transmission's losses.
+TORQUE_MODEL = 0.018
+VISCOUS_MODEL = 0.02  # the same, of viscous friction besides: a transmission loses some of what lies behind it
+
+
+class Mechanics(NamedTuple):
+    """What the moves say of one axis, in data sheet units: J/K_t times the data sheet's K_t."""
+
+    inertia: Estimate
+    coulomb: Estimate
+    viscous: Estimate
+    offset: Estimate
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Moves of every axis: set-points of speed [rad/s], shape (rows, num_axes), and the cruises of each."""
+
+    speed: Floats
+    cruises: tuple[tuple[tuple[int, int, int], ...], ...]  # first and last row, and which move, for every axis
+
+
+def plan_moves(
+    working: Working, inertia: Floats, holding: Floats, times: int, shares: tuple[float, ...], linked: bool = False
+) -> Plan:
+    """Return moves that stay inside the axes' travel, speed and current, and do not overcharge the DC link.
+
+    Args:
+        working: The drives.
+        inertia: Total inertia as far as it is known [kg*m^2], shape (num_axes,).
+        holding: Current that holds the axis [A], shape (num_axes,).
+        times: How often each speed comes.
+        shares: Speeds over the greatest.
+        linked: Whether the axes of a machine move as one: by what all of them can.
+    """
+    target = working.target
+    down, up = working.room()
+    if linked:
+        down, up = _of_machines(target, down, np.max), _of_machines(target, up, np.min)
+        inertia, holding = _of_machines(target, inertia, np.max), _of_machines(target, np.abs(holding), np.max)
+    columns, cruises = [], []
+    for k in range(target.num_axes):
+        # To one side first where there is little room, and then over the whole of it.
+        sign = 1.0 if up[k] >= -down[k] else -1.0
+        longer, shorter = ROOM_SHARE * max(up[k], -down[k]), ROOM_SHARE * min(up[k], -down[k])
+        spare = CURRENT_SHARE * max(working.current[k] - abs(holding[k]), 0.1 * working.current[k])
+        acceleration = spare * target.motor.torque_constant / inertia[k]
+        limit = min(SPEED_SHARE * target.speed, _link_speed(working, k, float(inertia[k])))
+        cruise, speed = _fastest(acceleration, longer, limit)
+        first = 0.0
+        if speed < limit and shorter > 0.0 and np.isfinite(longer + shorter):
+            first = -sign * shorter
+            cruise, speed = _fastest(acceleration, longer + shorter, limit)
+        rows = [np.zeros(STILL), _bump(first)]
+        marks: list[tuple[int, int, int]] = []
+        number = 0
+        for _ in range(times):
+            for share in shares:
+                w = sign * share * speed
+                ramp = _ramp(w, acceleration)
+                at = sum(map(len, rows))
+                rise, level = _rise(ramp), np.ones(cruise)
+                parts = [rise, level, 1.0 - 2.0 * _rise(2 * ramp), -level, rise - 1.0]
+                rows += [w * part for part in parts]
+                marks.append((at + ramp, at + ramp + cruise, number))
+                second = at + 3 * ramp + cruise
+                marks.append((second, second + cruise, number))
+                number += 1
+        rows.append(_bump(-first))
+        columns.append(np.concatenate(rows))
+        cruises.append(tuple(marks))
+    longest = max(map(len, columns))
+    speed_rows = np.zeros((longest + STILL, target.num_axes))
+    for k, column in enumerate(columns):
+        speed_rows[: len(column), k] = column
+    return Plan(speed_rows, tuple(cruises))
+
+
+def _of_machines(target: Target, values: Floats, choose: Callable[..., Floats]) -> Floats:
+    """Return what each machine's axes have in common, shape (num_axes,)."""
+    axes = target.axes_per_machine
+    return np.repeat(choose(values.reshape(-1, axes), axis=1), axes)
+
+
+def _rise(cycles: int) -> Floats:
+    """Return a smooth way from 0 to 1: its edges do not shake an elastic load."""
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * (np.arange(cycles) + 1.0) / cycles))
+
+
+def _bump(way: float) -> Floats:
+    """Return a slow move by a way [rad] as speeds."""
+    if way == 0.0:
+        return np.zeros(0)
+    cycles = 2 * RAMP[1]
+    shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(cycles) + 0.5) / cycles)
+    return np.concatenate([way * shape / (cycles * CYCLE), np.zeros(STILL)])
+
+
+def _ramp(speed: float, acceleration: float) -> int:
+    """Return how many cycles a smooth ramp takes: in its middle it is pi/2 times as steep as on the whole."""
+    return int(np.clip(np.ceil(0.5 * np.pi * abs(speed) / acceleration / CYCLE), *RAMP))
+
+
+def _link_speed(working: Working, k: int, inertia: float) -> float:
+    """Return the speed whose energy the DC link can take when the axis brakes [rad/s]: a supply may not sink."""
+    device, supply = working.target.device, float(working.target.supply[k])
+    charge = 0.5 * device.stage["dc_capacitance"].low * max(device.overvoltage**2 - supply**2, 1.0)
+    return float(np.sqrt(2.0 * LINK_SHARE * charge / inertia))
+
+
+def _fastest(acceleration: float, way: float, limit: float) -> tuple[int, float]:
+    """Return for how long to cruise [cycles], and how fast [rad/s]: a way is half a ramp, a cruise, half a ramp."""
+    cruise, w = CRUISE[1], 0.0
+    steepness = acceleration / (0.5 * np.pi)
+    most = min(steepness * RAMP[1] * CYCLE, limit)
+    for cruise in range(CRUISE[1], CRUISE[0] - 1, -10):
+        # w (cruise + ramp) = way with ramp = max(w / steepness, shortest).
+        T = cruise * CYCLE
+        w = 0.5 * steepness * (np.sqrt(T**2 + 4.0 * way / steepness) - T) if np.isfinite(way) else most
+        w = min(w, way / (T + RAMP[0] * CYCLE), most)
+        if w >= most:
+            break
+    return cruise, float(w)
+
+
+def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
+    """Make the moves in csv; return angles [rad] and currents [A], (rows, num_axes), and which axes went through."""
+    drives = working.target.drives
+    # The velocity loop alone would drift by what every reversal of friction leaves: the way is looked after, slowly.
+    begin = working.angle(drives.read(POSITION))
+    way = begin + np.cumsum(plan.speed, axis=0) * CYCLE
+    fastest = np.abs(plan.speed).max(axis=0)
+    angles, currents, alive = [], [], working.where.copy()
+    error = np.zeros(len(begin))
+    for k in range(0, len(plan.speed), CORRECTION):
+        part = plan.speed[k : k + CORRECTION] + np.clip(FOLLOW * error, -0.3 * fastest, 0.3 * fastest)
+        raw = np.where(working.where, np.rint(part * working.increments), 0).astype(np.int64)
+        trace = drives.record([POSITION, CURRENT, STATUS], len(raw) * CYCLE, play={TARGET_VELOCITY: raw})
+        angles.append(working.angle(trace[POSITION]))
+        currents.append(trace[CURRENT] * 1e-3)
+        alive &= still_enabled(working, trace[STATUS][-1])
+        error = way[k + len(raw) - 1] - angles[-1][-1]
+    return np.concatenate(angles), np.concatenate(currents), alive
+
+
+def identify_mechanics(working: Working, holding: Floats) -> tuple[list[Mechanics], Floats]:
+    """Move the axes, which are enabled in csv at rest, and return what that says, and the total inertias [kg*m^2].
+
+    Machines move side by side. The axes of one move one after the other while the others hold, unless they pull at the
+    same thing: then they move together, and each inertia is what its drive has to move.
+    """
+    target = working.target
+    count = target.num_axes
+    results = [_none("") for _ in range(count)]
+    inertia = np.full(count, GUESS * target.motor.inertia)
+    position = np.arange(count) % target.axes_per_machine
+    linked = target.axes_per_machine > 1 and are_linked(working)
+    turns = [working.where] if linked else [working.where & (position == k) for k in range(target.axes_per_machine)]
+    for moving in turns:
+        if not moving.any():
+            continue
+        found = _identify_moving(replace(working, where=moving), holding, inertia, linked)
+        for k in np.flatnonzero(moving):
+            results[k] = found[k]
+    return results, inertia
+
+
+def are_linked(working: Working) -> bool:
+    """Return whether the axes of a machine pull at the same thing: one that moves alone is resisted by the others."""
+    target, drives = working.target, working.target.drives
+    first = working.where & (np.arange(target.num_axes) % target.axes_per_machine == 0)
+    down, up = working.room()
+    way = np.where(up >= -down, 1.0, -1.0) * np.minimum(NUDGE, 0.25 * np.maximum(up, -down))
+    shape = _bump(1.0)
+    pulled = np.zeros(target.num_axes, bool)
+    for sign in (1.0, -1.0):
+        raw = np.where(first, np.rint(sign * np.outer(shape, way) * working.increments), 0).astype(np.int64)
+        trace = drives.record([CURRENT, POSITION], len(raw) * CYCLE, play={TARGET_VELOCITY: raw})
+        if sign > 0.0:
+            current, angle = trace[CURRENT] * 1e-3, working.angle(trace[POSITION])
+            rise = current[-STILL // 2 :].mean(axis=0) - current[: STILL // 2].mean(axis=0)
+            pulled = np.abs(rise) > LINKED_CURRENT * working.current
+            pulled |= np.abs(angle[-1] - angle[0]) > LINKED_WAY * np.abs(way)
+    return bool(np.any(working.where & ~first & pulled))
+
+
+def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked: bool) -> list[Mechanics]:
+    """Move the axes there are and return what each says; `inertia` is brought up to date."""
+    target = working.target
+    results: list[Mechanics] = []
+    softness = np.ones(target.num_axes, np.int64)
+    for times, shares in (COARSE, FINE):
+
+        def plan() -> Plan:
+            return plan_moves(working, inertia, holding, times, shares, linked)  # noqa: B023
+
+        moves, angle, current, alive, gains = _moved(working, plan, cautious_gains(target, inertia), softness)
+        results = []
+        causes = [] if alive.all() else stop_causes(target.drives)
+        for k in range(target.num_axes):
+            if not alive[k]:
+                results.append(_none(f"the drive switched off during the moves: {causes[k]}"))
+                continue
+            found, rough = _balance(working, k, angle[:, k], current[:, k], moves, gains[k])
+            results.append(found)
+            inertia[k] = np.clip(rough, 0.7 * target.motor.inertia, 2.0 * MOST_RATIO * target.motor.inertia)
+    return results
+
+
+def _moved(
+    working: Working, plan: Callable[[], Plan], gains: Integers, softness: Integers
+) -> tuple[Plan, Floats, Floats, Mask, Integers]:
+    """Move, once more with softer gains if an axis oscillates; return plan, what `move` returns, and the gains."""
+    drives = working.target.drives
+    watch = getattr(drives, "watch", None)
+    for column in (VELOCITY_P, VELOCITY_I):
+        gains[:, column] = np.maximum(gains[:, column] // softness, 1)
+    write_gains(drives, gains, working.where)
+    for again in (True, False):
+        go_back(working, "csv")
+        moves = plan()
+        try:
+            angle, current, alive = move(working, moves)
+        except OscillationError:
+            if not again:
+                raise
+        if watch is None or not (again and (working.where & watch.swung).any()):
+            break
+        swung = working.where & watch.swung
+        gains = watch.soften(swung, gains, "csv")
+        softness[swung] *= SOFTER
+    return moves, angle, current, alive, gains
+
+
+def _none(reason: str) -> Mechanics:
+    return Mechanics(*(refused(unit, reason) for unit in ("kg*m^2", "A", "A*s/rad", "A")))
+
+
+def hidden_ripple(target: Target, k: int, gains: Integers, inertia: float) -> float:
+    """Return the mean current of an accelerating axis over that of its samples.
+
+    The velocity demand steps once a millisecond, and the current with it; every sample comes at the same moment of
+    that ripple, at its lowest. The velocity loop's windows, one millisecond after the other, say by how much.
+    """
+    device, motor = target.device, target.motor
+    supply = float(target.supply[k])
+    windows, ticks = round(device.velocity_rate * CYCLE), round(device.current_rate / device.velocity_rate)
+    dt, h = 1.0 / device.current_rate, 1.0 / device.velocity_rate
+    P_T, I_T = gains[0] / (256.0 * device.current_full_scale) * supply, gains[1] / 65536.0
+    P_V, I_V = gains[2] * device.current_full_scale / (256.0 * 32768.0 * RPM), gains[3] / 65536.0
+    b, a1, a2 = (float(x) for x in velocity_filter(np.asarray(device.stage["velocity_filter"].default), 1.0 / h))
+    decay = float(np.exp(-motor.R_s * dt / motor.L_q))
+    i = i_sum = omega = theta = before = z1 = z2 = total = applied = 0.0
+    samples = means = 0.0
+    for ms in range(80):
+        reference, mean, last = ms + 1.0, 0.0, 0.0
+        for _ in range(windows):
+            raw = (theta - before) / h
+            before = theta
+            filtered = b * raw + z1
+            z1 = 2.0 * b * raw - a1 * filtered + z2
+            z2 = b * raw - a2 * filtered
+            error = P_V * (reference - filtered)
+            total += I_V * error
+            asked = error + total
+            for _ in range(ticks):
+                last = i
+                deviation = P_T * (asked - i)
+                i_sum += I_T * deviation
+                i = decay * i + (1.0 - decay) / motor.R_s * applied
+                applied = deviation + i_sum
+                mean += i / (windows * ticks)
+                omega += dt * i * motor.torque_constant / inertia
+                theta += dt * omega
+        if ms >= 20:
+            samples, means = samples + last, means + mean
+    return means / samples
+
+
+def _balance(
+    working: Working, k: int, angle: Floats, current: Floats, plan: Plan, gains: Integers
+) -> tuple[Mechanics, float]:
+    """Return the estimates of one axis, and its inertia however rough [kg*m^2]."""
+    target = working.target
+    motor, K = target.motor, target.motor.torque_constant
+    cruises = plan.cruises[k]
+    columns, charge, duration, moves = _windows(angle, current, k, plan)
+    passed = abs(angle[cruises[0][1]] - angle[cruises[0][0]]) * motor.encoder_counts / (2.0 * np.pi)
+    fit = _fit(columns, charge, duration, moves)
+    J = float(fit.mean[0] * K)
+    J *= hidden_ripple(target, k, gains, max(J, 0.5 * motor.inertia))
+    down, up = working.room()
+    too_short = max(up[k], -down[k]) < np.pi
+    why = "travel too short" if too_short else "excitation too weak"
+    if passed < LEAST_COUNTS:
+        reason = (
+            f"{why}: a move passes {passed:.0f} counts of the encoder, and {LEAST_COUNTS:.0f} are needed; allow more "
+            f"{'travel' if too_short else 'current'} than {max(up[k], -down[k]):.2g} rad and {working.current[k]:.2g} A"
+        )
+        return _none(reason), J
+    t = t_quantile(fit.freedom)
+    scale = float(np.hypot(gain_error(target.device, motor), TORQUE_MODEL))
+    half = t * fit.spread
+    if MOST_RATIO * motor.inertia < J:
+        inertia = refused("kg*m^2", (
+            f"inertia ratio above {MOST_RATIO:.0f}: the moves say about {J / motor.inertia:.0f} rotor inertias, which "
+            "so slow a motion cannot tell from friction; take a gear or a larger motor, or enter the inertia"
+        ))  # fmt: skip
+    elif not J > 0.0 or half[0] * K > WIDEST * J:
+        inertia = refused("kg*m^2", f"{why}: the interval would be {half[0] * K:.2g} around {J:.2g} kg*m^2")
+    else:
+        inertia = interval(J, float(half[0] * K), float(np.hypot(scale, _periodic(working, k, J, plan))), "kg*m^2")
+    coulomb = _friction(float(fit.mean[1]), float(half[1]), scale, "A", why)
+    viscous = _friction(float(fit.mean[2]), float(half[2]), float(np.hypot(scale, VISCOUS_MODEL)), "A*s/rad", why)
+    # Offsets of the sensors turn with the field and average out; those of a brushed motor's one channel do not.
+    sensor = 0.95 * abs(target.device.stage["adc_offset_a"].high) if motor.kind == "dc" else 0.0
+    offset = interval(float(fit.mean[3]), float(half[3]), scale, "A", sensor)
+    return Mechanics(inertia, coulomb, viscous, offset), J
+
+
+def _periodic(working: Working, k: int, inertia: float, plan: Plan) -> float:
+    """Return what cogging and the sensors' offsets leave of the inertia's error, 95 %, as a share of it.
+
+    Both repeat with the angle: over many turns they average out, over a short way every move has the same of them.
+    """
+    target, motor = working.target, working.target.motor
+    offsets = [target.device.stage[name] for name in ("adc_offset_a", "adc_offset_b")]
+    # Uniform between their limits; a cosine of the angle.
+    sensors = np.hypot(*((row.high - row.low) / 12.0**0.5 for row in offsets)) / 2.0**0.5
+    ripple = np.hypot(motor.cogging_torque / motor.torque_constant, sensors) / 2.0**0.5
+    way = np.cumsum(plan.speed[:, k]) * CYCLE
+    turns = float(np.ptp(way)) * motor.n_p / (2.0 * np.pi)
+    steepest = float(np.abs(np.diff(plan.speed[:, k])).max()) / CYCLE
+    accelerating = 2.0 / np.pi * steepest * inertia / motor.torque_constant
+    averaged = np.sqrt(max(turns, 1.0) * len(SHARES))
+    return float(1.96 * ripple / max(accelerating, 1e-9) / averaged)
+
+
+def _friction(value: float, half: float, scale: float, unit: str, why: str) -> Estimate:
+    found = interval(value, half, scale, unit)
+    if not value > 0.0 or found.high - value > WIDEST_FRICTION * value:
+        return refused(unit, (
+            f"{why}: {value:.2g} {unit} may be off by {half:.2g}; it is at most {max(found.high, 0.0):.2g} {unit}"
+        ))  # fmt: skip
+    return found
+
+
+def _windows(angle: Floats, current: Floats, k: int, plan: Plan) -> tuple[Floats, Floats, Floats, Integers]:
+    """Return the balance's columns (n, 6), charges and durations (n,), and moves (n,).
+
+    Each row is the equation of motion under a smooth weight: one over every cruise, one over every change between two
+    cruises, which add up to 1. Smooth edges let an elastic load's swinging average out, which sharp ones do not.
+    """
+    t = np.arange(len(angle), dtype=float)
+    speed = np.gradient(angle) / CYCLE
+    smooth = np.convolve(np.pad(speed, 4, mode="edge"), np.ones(9) / 9.0, mode="valid")
+    demand = plan.speed[: len(angle), k]
+    # Where friction acts: the demand tells the sign, except about standstill.
+    sign = np.clip(smooth / max(0.02 * float(np.abs(demand).max()), 0.5), -1.0, 1.0)
+    rows, charges, durations, moves = [], [], [], []
+    middle = float(angle.mean())
+
+    def add(weight: Floats, number: int) -> None:
+        slope = np.gradient(weight) / CYCLE
+        rows.append((
+            -float(slope @ speed) * CYCLE, float(weight @ sign) * CYCLE, float(weight @ speed) * CYCLE,
+            float(weight.sum()) * CYCLE, float(weight @ (angle - middle)) * CYCLE,
+            float(weight @ (np.abs(speed) * speed)) * CYCLE,
+        ))  # fmt: skip
+        charges.append(float(weight @ current) * CYCLE)
+        durations.append(float(weight.sum()) * CYCLE)
+        moves.append(number)
+
+    cruises = plan.cruises[k]
+    for j, (first, last, number) in enumerate(cruises):
+        begin = first + (last - first) // 5  # the loop swings in
+        centre = 0.5 * (begin + last)
+        rise = _step(t, begin, centre)
+        fall = 1.0 - _step(t, centre, last)
+        add(np.minimum(rise, fall), number)
+        if j + 1 < len(cruises) and cruises[j + 1][2] == number:
+            a, b, _ = cruises[j + 1]
+            a += (b - a) // 5
+            add(_step(t, centre, last) * (1.0 - _step(t, a, 0.5 * (a + b))), number)
+    return np.array(rows), np.array(charges), np.array(durations), np.array(moves)
+
+
+def _step(t: Floats, begin: float, end: float) -> Floats:
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.clip((t - begin) / (end - begin), 0.0, 1.0)))
+
+
+class _Balance(NamedTuple):
+    mean: Floats  # J/K, coulomb, viscous, offset
+    spread: Floats
+    freedom: int
+
+
+def _fit(columns: Floats, charge: Floats, duration: Floats, moves: Integers) -> _Balance:
+    """Fit with what the data ask for: a fan's drag or a load that changes with position only if it is clear.
+
+    What is not clear may be there all the same: by what it would change, the intervals are wider.
+    """
+    chosen = [0, 1, 2, 3]
+    result = _solve(columns[:, chosen], charge, duration, moves)
+    doubts = np.zeros(4)
+    for extra in (DRAG, SLOPE) if len(np.unique(moves)) >= FEWEST_MOVES else ():
+        tried = _solve(columns[:, [*chosen, extra]], charge, duration, moves)
+        clearness = abs(tried.mean[-1]) / max(tried.spread[-1], 1e-30)
+        if clearness > CLEAR:
+            chosen.append(extra)
+            result = tried
+        else:
+            doubts += (np.clip(clearness - 1.0, 0.0, 1.0) * (tried.mean[:4] - result.mean[:4])) ** 2
+    t = t_quantile(result.freedom)
+    return _Balance(result.mean[:4], np.sqrt(result.spread[:4] ** 2 + doubts / t**2), result.freedom)
+
+
+def _solve(X: Floats, y: Floats, duration: Floats, moves: Integers) -> _Balance:
+    """Least squares, weighted by duration, with deviations for errors that are alike within a move."""
+    weight = 1.0 / np.sqrt(duration)
+    scale = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-15)
+    A, b = X / scale * weight[:, None], y * weight
+    inverse = np.linalg.pinv(A.T @ A)
+    mean = inverse @ A.T @ b
+    rest = b - A @ mean
+    names = np.unique(moves)
+    scores = np.array([A[moves == k].T @ rest[moves == k] for k in names])
+    freedom = max(len(y) - len(scale), 1)
+    robust = inverse @ (scores.T @ scores) @ inverse * len(names) / max(len(names) - 1, 1)
+    plain = inverse * float(rest @ rest) / freedom
+    spread = np.sqrt(np.maximum(np.diag(robust), np.diag(plain)))
+    return _Balance(mean / scale, spread / scale, max(min(len(names) - 1, freedom), 1))

@@ -1,0 +1,200 @@
+"""Identification in half the time, for tuning: the same checks and the same response, and moves that are soon over.
+
+Where `identify` moves an axis for five seconds to know inertia and friction within a few percent, two moves of a
+quarter of a second must do here; the frequency response then says the inertia again, and better.
+
+A tuner's twins are better off with a guess than with nothing, and their worlds are as far apart as guesses may be off:
+`Identification.estimates` has those. What is identified is in `Identification.told`: nothing that is guessed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import motion
+from drive_env.gains import write_gains
+from drive_env.trials.gain_trial import Identified, Trials
+from tuning.identify.experiments import MECHANICS, PULSED, RESPONSE, UNITS, WORST_MISFIT, Experiments
+from tuning.identify.identification import NAMES, Estimate, Identification, Progress, refused
+from tuning.identify.winding import BRIEFLY, identify_winding, pulse, to_torque_mode
+from tuning.identify.working_state import GUESS, STATUS, Working, cautious_gains, enable, switch_off
+from tuning.oscillation_watch import shaken
+from tuning.response.frequency_response import measure
+from tuning.stop_causes import stop_causes
+from tuning.target import Target
+
+if TYPE_CHECKING:
+    from tuning.response.plant_fit import PlantFit
+
+# Half of an interval over its value, for twins alone: of what two moves tell, and of what a fit refuses to state.
+INERTIA_ERROR, FRICTION_ERROR = 0.15, 0.3
+DOUBT = {"inertia": 0.2, "velocity_filter": 0.4, "anti_resonance": 0.1, "resonance": 0.1, "damping": 0.5}
+ANOTHER = 2.5  # times the inertia that two moves tell: a response that says more is that of another axis
+ELECTRICAL_ANGLE, SHAFT_DIRECTION = 0x2103, 0x2057
+# Of 46 axes of the suite one had its viscous friction and 13 their dry friction within FRICTION_ERROR.
+SHORT, LONGER = "two moves of a quarter of a second do not tell it from", "`drive-tune identify` moves for longer"
+NOT_TOLD = {
+    "inertia": "two moves of a quarter of a second tell it too roughly, and no response was measured",
+    "coulomb": f"{SHORT} viscous friction and drag; {LONGER}",
+    "viscous": f"{SHORT} dry friction; {LONGER}",
+    "offset": f"{SHORT} friction; {LONGER}",
+}
+OF_ALL = (
+    "in the response an axis moved what all axes of its machine share, and two moves of a quarter of a second tell its "
+    "own part too roughly"
+)
+# Dead time and friction make it up to 0.09 ms shorter here, to one side, which no scatter shows.
+NO_DELAY = "so short a response tells it to 0.1 ms, which is no better than the period of the drive's velocity loop"
+
+
+def identify_briefly(
+    target: Target, where: NDArray[np.bool_] | None = None, progress: Progress | None = None
+) -> list[Identification]:
+    """Identify axes, all by default, in about four seconds for each of a machine.
+
+    Otherwise as `identify`; those of one machine move one after the other, or all if linked.
+
+    Returns:
+        One per axis. Its `told` is what is identified; in place of most of what is refused there its `estimates` have
+        guesses, for twins.
+    """
+    axes = np.ones(target.num_axes, bool) if where is None else where
+    return _Brief(target, axes, progress or (lambda what, share: None)).run()
+
+
+class _Brief(Experiments):
+    """Those experiments, with another middle."""
+
+    thorough = False
+
+    def __init__(self, target: Target, where: NDArray[np.bool_], progress: Progress) -> None:
+        super().__init__(target, where, progress)
+        # What is told of each axis where `found` has a guess.
+        self._told: list[dict[str, Estimate]] = [{} for _ in range(target.num_axes)]
+
+    def run(self) -> list[Identification]:
+        every = zip(super().run(), self._told, strict=True)
+        return [replace(one, told={name: told.get(name, one.estimates[name]) for name in NAMES}) for one, told in every]
+
+    def turn(self, working: Working) -> None:
+        target, drives = working.target, working.target.drives
+        self.begin("current pulses", 0.3, NAMES)
+        enable(working, "csv")
+        holding = self.hold(working)
+        electrical = drives.read(ELECTRICAL_ANGLE) * (2.0 * math.pi / 65536.0)
+        to_torque_mode(working, holding)
+        with shaken(drives, PULSED * working.current):
+            pulses = pulse(working, holding, BRIEFLY)
+        working = self.calm(working)
+        sign = 1.0 - 2.0 * float(drives.read(SHAFT_DIRECTION)[0])
+        self.take_windings(working, identify_winding(working, pulses, electrical, target.motor.n_p * sign))
+        self.begin("inertia and friction", 0.45, MECHANICS)
+        write_gains(drives, cautious_gains(target, GUESS * target.motor.inertia), working.where)
+        motion.select_mode(drives, "pp", working.where)
+        down, up = working.room()
+        # t_0 scales a figure that is not asked for here.
+        trials = Trials(drives, target.motor, target.axes_per_machine, 1.0)
+        inertia = np.full(target.num_axes, GUESS * target.motor.inertia)
+        for moving in _turns(working):
+            found, _ = trials.identify(np.where(up >= -down, up, down), moving)
+            self._take_moved(found, moving)
+            inertia[moving] = found.inertia[moving]
+        working = self.calm(working)
+        self.begin("resonance, delay, filter", 0.55, RESPONSE)
+        switch_off(drives, working.where)
+        self.respond(working, inertia)
+
+    def _take_moved(self, found: Identified, where: NDArray[np.bool_]) -> None:
+        for k in map(int, np.flatnonzero(where)):
+            self.found[k] |= {
+                "inertia": _about(found.inertia[k], INERTIA_ERROR, "kg*m^2"),
+                "coulomb": _about(found.coulomb[k], FRICTION_ERROR, "A"),
+                "viscous": _about(found.viscous[k], FRICTION_ERROR, "A*s/rad"),
+                "offset": _about(found.offset[k], FRICTION_ERROR, "A"),
+            }
+            self._told[k] = {name: refused(UNITS[name], reason) for name, reason in NOT_TOLD.items()}
+
+    def respond(self, working: Working, inertia: NDArray[np.float64]) -> None:
+        target, drives = working.target, working.target.drives
+        fault = drives.read(STATUS) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1]
+        able = working.where & ~fault
+        causes = stop_causes(drives) if fault.any() else []
+        for k in map(int, np.flatnonzero(working.where & fault)):
+            self._no_response(k, f"the drive is in fault: {causes[k]}")
+        if not able.any():
+            return
+        write_gains(drives, self.response_gains(working, inertia), able)
+        down, up = working.room()
+        here = replace(target, low=np.minimum(down, 0.0), high=np.maximum(up, 1e-3))
+        response = measure(here, "velocity", where=able, softened=True)
+        for k in map(int, np.flatnonzero(able)):
+            fit = response.fits[k]
+            if fit is None or fit.reason:
+                why = "; ".join(response.notes[k]) or "the response was not measured"
+                self._no_response(k, why if fit is None else fit.reason)
+                continue
+            ratio = fit.plant.inertia / self.found[k]["inertia"].value
+            if not 1.0 / ANOTHER < ratio < ANOTHER:
+                # A fit of few lines may come to rest anywhere, and the two moves went well enough.
+                self._no_response(k, f"the response would be that of {ratio:.2g} times the inertia that was moved")
+                continue
+            moved = self.found[k]["inertia"]
+            self.found[k] |= _guessed(fit)
+            self._told[k] |= _told(fit, float(response.f[-1]))
+            if target.linked:
+                self.found[k]["inertia"] = moved
+                self._told[k]["inertia"] = refused(UNITS["inertia"], OF_ALL)
+
+    def _no_response(self, k: int, reason: str) -> None:
+        self.refuse(k, RESPONSE, reason)
+        self._told[k]["inertia"] = refused(UNITS["inertia"], (
+            f"two moves of a quarter of a second tell it too roughly, and the response does not: {reason}"
+        ))  # fmt: skip
+
+
+def _turns(working: Working) -> list[NDArray[np.bool_]]:
+    """Return which axes move when: those of a machine one after the other, since each pulls at the next; or linked."""
+    lanes = working.target.axes_per_machine
+    if working.target.linked:
+        return [working.where]
+    position = np.arange(working.target.num_axes) % lanes
+    return [turn for k in range(lanes) if (turn := working.where & (position == k)).any()]
+
+
+def _told(fit: PlantFit, highest: float) -> dict[str, Estimate]:
+    """Return what a fit says by itself, up to the highest frequency [Hz]; its refusals are what is told."""
+    told = {name: fit.estimates[name] for name in ("inertia", *RESPONSE)}
+    told["loop_delay"] = refused(UNITS["loop_delay"], NO_DELAY)
+    if fit.plant.is_elastic and fit.plant.resonance > highest:
+        # What lies there may as well be the filter's own lag.
+        reason = f"a resonance above {highest:.0f} Hz, up to which the axis could be seen, is not told from it"
+        told["velocity_filter"] = refused(UNITS["velocity_filter"], reason)
+    if fit.misfit > WORST_MISFIT:
+        reason = (
+            f"the response is not that of one spring: the model is off by {fit.misfit:.1f} times what noise explains"
+        )
+        told |= {name: refused(UNITS[name], reason) for name in RESPONSE}
+    return told
+
+
+def _guessed(fit: PlantFit) -> dict[str, Estimate]:
+    """Return what a fit says, with doubt in place of refusal: a twin is better off with a guess than with nothing."""
+    found = dict(fit.estimates)
+    values = {"inertia": fit.plant.inertia, "velocity_filter": fit.plant.velocity_filter}
+    if fit.plant.is_elastic:
+        values |= {name: getattr(fit.plant, name) for name in ("anti_resonance", "resonance", "damping")}
+    for name, value in values.items():
+        estimate = found[name]
+        if not estimate.is_known:
+            found[name] = _about(value, DOUBT[name], estimate.unit)
+    return found
+
+
+def _about(value: float, share: float, unit: str) -> Estimate:
+    half = share * abs(float(value))
+    return Estimate(float(value), float(value) - half, float(value) + half, unit)

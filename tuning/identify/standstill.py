@@ -1,0 +1,122 @@
+"""Winding resistance at rest, from readings that need no time of their own: for drives whose time does not wait.
+
+With commutation in open loop (2055h) the current of 2004h lies along a field that stands still, and the rotor lies in
+it: no torque acts and nothing turns. What the flux regulator's integrator 2041h:06 then holds is the whole duty,
+
+    V duty = R i + V t_dead f(i)
+
+and between two currents that are large enough for dead time to lose the same from both, R is what is left.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.identify.confidence import gain_error, interval, t_quantile
+from tuning.identify.dead_time import dead_time
+from tuning.identify.encoder_check import FIELD_ANGLE, able, stay_inside
+from tuning.identify.identification import Estimate, refused
+from tuning.identify.winding import SUPPLY_IDLE, WIDEST
+from tuning.identify.working_state import (
+    BY_FIELD,
+    COMMUTATION,
+    CYCLE,
+    OPEN_LOOP_CURRENT,
+    POSITION,
+    STATUS,
+    Working,
+    enable,
+    still_enabled,
+    switch_off,
+)
+from tuning.stop_causes import stop_causes
+
+Floats = NDArray[np.float64]
+
+FLUX_ERROR, FLUX_SUM = (0x2041, 5), (0x2041, 6)
+LEVELS = (0.9, 0.7, 0.5)  # over what may be asked for
+ROUNDS = 3  # there and back, and there again
+SETTLE, APART, READINGS = 60, 3, 8  # cycles until a current stands, and from reading to reading; how many
+MOST_ERROR = 0.05  # of the current: a larger mean error has not settled, or the voltage does not suffice
+MOST_TURN = 0.2  # electrical rad between readings: a rotor that goes on turning is not held
+MODEL = 0.013  # of R, 95 %: what is left out, as sag of the supply and the switches' own resistance
+GRID = 5  # values of what dead time may be
+
+
+def standstill_resistances(working: Working) -> list[Estimate]:
+    """Return the winding's resistance of every axis, per phase, or why not; all axes are off before and after."""
+    target, drives = working.target, working.target.drives
+    if target.motor.kind == "dc":
+        return [refused("ohm", (
+            "a brushed motor turns with its current, and while it turns the integrator of 2041h can only be read in "
+            "step with the drive: take the data sheet's, or identify an emulator in lockstep (--lockstep)"
+        ))] * target.num_axes  # fmt: skip
+    where, reasons = able(working)
+    if not where.any():
+        return [refused("ohm", reason) for reason in reasons]
+    commutation = drives.read(COMMUTATION)
+    levels = [share for k in range(ROUNDS) for share in LEVELS[:: 1 if k % 2 == 0 else -1]]
+    currents, duties, errors, angles = (np.zeros((len(levels), target.num_axes)) for _ in range(4))
+    try:
+        drives.write(COMMUTATION, BY_FIELD, where=where)
+        drives.write(OPEN_LOOP_CURRENT, 0, where=where)
+        enable(working, "csv", where)
+        for row, share in enumerate(levels):
+            raw = np.rint(1e3 * share * working.current).astype(np.int64)
+            drives.write(OPEN_LOOP_CURRENT, raw, where=where)
+            drives.advance(SETTLE * CYCLE)
+            stay_inside(working, where)
+            for _ in range(READINGS):
+                drives.advance(APART * CYCLE)
+                duties[row] += drives.read(FLUX_SUM) / (READINGS * 32768.0 * 256.0)
+                errors[row] += drives.read(FLUX_ERROR) * (1e-3 / READINGS)
+            currents[row] = raw * 1e-3
+            angles[row] = working.angle(drives.read(POSITION))
+        field = drives.read(FIELD_ANGLE) * (2.0 * np.pi / 65536.0)
+        alive = still_enabled(working, drives.read(STATUS))
+    finally:
+        switch_off(drives, where)
+        drives.write(OPEN_LOOP_CURRENT, 0, where=where)
+        drives.write(COMMUTATION, commutation, where=where)
+    found = []
+    causes = [] if alive.all() else stop_causes(drives)
+    for k in range(target.num_axes):
+        reason = reasons[k]
+        if where[k] and not alive[k]:
+            reason = f"the drive switched off while its current stood: {causes[k]}"
+        elif where[k] and np.ptp(angles[:, k]) * target.motor.n_p > MOST_TURN:
+            reason = "the rotor did not stay where its current holds it: it slipped from the field"
+        elif where[k] and np.any(np.abs(errors[:, k]) > MOST_ERROR * currents[:, k]):
+            reason = "the current did not settle: does the supply voltage suffice for it?"
+        found.append(refused("ohm", reason) if reason else _resistance(
+            working, k, currents[:, k], duties[:, k], float(field[k])
+        ))  # fmt: skip
+    return found
+
+
+def _resistance(working: Working, k: int, current: Floats, duty: Floats, field: float) -> Estimate:
+    """Return what duties at currents [A] say, shape (n,) each, the field standing at an angle [rad]."""
+    target, stage = working.target, working.target.device.stage
+    supply = float(target.supply[k])
+    link = supply - stage["supply_resistance"].default * (1.5 * np.maximum(duty * current, 0.0) + SUPPLY_IDLE)
+    X = np.stack([current, np.ones_like(current)], axis=1)
+    slopes = np.linalg.pinv(X)[0]
+    R = float(slopes @ (link * duty))
+    rest = link * duty - X @ np.linalg.lstsq(X, link * duty, rcond=None)[0]
+    freedom = len(current) - 2
+    scatter = t_quantile(freedom) * float(np.sqrt(rest @ rest / freedom)) * float(np.linalg.norm(slopes))
+    # What dead time takes more from the greater currents, by all that it may be; along d as along q a quarter before.
+    share = np.linspace(stage["dead_time"].low, stage["dead_time"].high, GRID) * target.device.current_rate
+    fades = np.geomspace(stage["dead_time_current"].low, stage["dead_time_current"].high, GRID)
+    lost = [float(slopes @ dead_time(np.full(len(current), field - 0.5 * np.pi), current, s, False)) for s in fades]
+    apparent = supply * np.outer(share, lost)
+    R -= float(apparent.mean())
+    systematic = float(np.hypot(gain_error(target.device, target.motor, turns=False), MODEL))
+    found = interval(R, scatter, systematic, "ohm", 1.96 * float(apparent.std()))
+    if not R > 0.0 or found.high - R > WIDEST * R:
+        return refused("ohm", (
+            f"excitation too weak: currents of {current.min():.2g} to {current.max():.2g} A leave an interval of "
+            f"{found.high - R:.2g} ohm around {R:.2g} ohm; allow a greater current"
+        ))  # fmt: skip
+    return found

@@ -1,0 +1,411 @@
+"""Winding resistance and inductance, seen through the integrator of 2041h and the entered supply voltage.
+
+The integrator adds P I e every tick, so its change over a millisecond is the sum of the current's error over all 25
+ticks, at far better resolution than a sample of the current has. Set-point less error is the mean current, P e plus
+the integrator the mean duty; what is left is the winding's balance of flux over each millisecond,
+
+    integral of V duty = R integral of i + L (i_end - i_start) + K_e (theta_end - theta_start) + V t_dead f(i) + c
+
+whose unknowns are found by least squares over some hundred milliseconds of current pulses, forth and back, that hardly
+move the rotor. f is what dead time loses: it saturates at a current that is not known either and is averaged over.
+K_e and the dead time have priors, the data sheet's and the stage's ranges: where the rotor hardly moves they matter
+little, and elsewhere the data says better.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import motion
+from tuning.identify.confidence import gain_error, interval, t_quantile
+from tuning.identify.dead_time import dead_time
+from tuning.identify.identification import Estimate, refused
+from tuning.identify.working_state import (
+    CURRENT,
+    CYCLE,
+    POSITION,
+    STATUS,
+    TARGET_TORQUE,
+    TORQUE_I,
+    TORQUE_P,
+    TORQUE_SUM,
+    Working,
+    still_enabled,
+)
+from tuning.stop_causes import stop_causes
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Amplitude of a pulse over what may be asked for, and the cycles that a level lasts; a pulse is +, -, -, +, so that
+# speed and way end at 0. Short ones hold as many changes of the current in a third of the time: they say the
+# inductance, long ones the resistance, and those of little current what dead time loses.
+PULSES = ((0.95, 3), (0.95, 1), (0.95, 1), (0.7, 3), (0.7, 1), (0.45, 3), (0.25, 3))
+REPEATS, BRIEFLY = 8, 6
+LOOP_GAIN, LOOP_HZ = 4.0, 600.0  # P of the loop: so many winding resistances, or this bandwidth if that is less
+INTEGRAL_SHARE = 0.1  # of the integral gain that cancels the winding's lag: an instrument, not a controller
+HOLD_HZ, HOLD_DAMPING = 7.0, 0.7  # our own slow position loop around the pulses
+# Over the data sheet's, centre and deviation: unit-to-unit spread and temperature.
+RESISTANCE_PRIOR, EMF_PRIOR = (1.1, 0.25), (0.965, 0.06)
+# Of R and L, 95 %: what the balance leaves out, as sag of the supply, lag of the encoder, what a tick hides.
+RESISTANCE_MODEL, INDUCTANCE_MODEL = 0.01, 0.02
+# The same, over the share that dead time loses of what drives the current: how it fades at small currents is unknown.
+RESISTANCE_LOSS, INDUCTANCE_LOSS = 0.12, 0.07
+LEAST_NOISE = 0.005  # of the flux: a better fit than that is not taken for knowledge
+SATURATIONS = 8  # currents at which dead time may saturate that are tried
+MOST_ROUNDS, SETTLED = 12, 2e-3  # of the fit, and the share by which values still change in the end
+SUPPLY_IDLE = 0.1  # A, what logic draws through the supply line
+WIDEST = 0.1  # half of an interval over its value: what is wider is no identification
+
+
+PROBE = 10  # rows at rest by which it is seen how long the reads take, on a bus in real time
+LATE, MOST_LATE = 1.5, 0.02  # cycles from row to row that are too many, and the share of rows that may have them
+
+TURN = 2  # column of the balance
+
+
+class Pulses(NamedTuple):
+    """What was recorded, one row per millisecond: n rows, or n + 1 where both ends count; (rows, num_axes)."""
+
+    demand: Floats  # A, n
+    current: Floats  # A, n + 1: the last tick's
+    angle: Floats  # rad, n + 1
+    duty_sum: Floats  # n + 1
+    block: NDArray[np.int64]  # n: which pulse
+    alive: Mask  # num_axes: enabled to the end
+    step: float = CYCLE  # s from row to row; more if the reads were out of step with the drive
+
+
+class Winding(NamedTuple):
+    """What pulses say of one axis."""
+
+    resistance: Estimate
+    inductance: Estimate
+    follows: bool  # whether speed follows charge, with its sign
+
+
+def loop_gains(working: Working) -> tuple[Floats, float]:
+    """Return raw torque P of every axis, and I, of the loop that serves as an instrument."""
+    target, motor = working.target, working.target.motor
+    volts_per_ampere = min(LOOP_GAIN * motor.R_s, 2.0 * np.pi * LOOP_HZ * motor.L_q)
+    P = np.rint(256.0 * target.device.current_full_scale * volts_per_ampere / target.supply)
+    cancels = 65536.0 * motor.R_s / motor.L_q / target.device.current_rate
+    return np.clip(P, 1, 32767), float(np.clip(np.rint(INTEGRAL_SHARE * cancels), 8, 32767))
+
+
+def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
+    """Give current pulses in cst around the holding currents [A]; the axes are enabled in cst, at rest."""
+    target, drives = working.target, working.target.drives
+    motor, count = target.motor, target.num_axes
+    P, integral = loop_gains(working)
+    drives.write(TORQUE_P, P.astype(np.int64), where=working.where)
+    drives.write(TORQUE_I, int(integral), where=working.where)
+    J = 3.0 * motor.inertia / motor.torque_constant
+    stiffness, damping = J * (2.0 * np.pi * HOLD_HZ) ** 2, 2.0 * HOLD_DAMPING * J * 2.0 * np.pi * HOLD_HZ
+    room = np.maximum(working.current - np.abs(holding), 0.0)
+    levels, blocks = _levels(repeats)
+    in_real_time = not getattr(drives, "time_waits", True)
+    # Where time does not wait for the reads, first only: how long do they take?
+    for played in (np.zeros(PROBE), levels) if in_real_time else (levels,):
+        rows = len(played)
+        demand = np.zeros((rows, count))
+        current, angle, duty_sum = (np.zeros((rows + 1, count)) for _ in range(3))
+        duty_sum[0] = drives.read(TORQUE_SUM)
+        angle[0] = working.angle(drives.read(POSITION))
+        times = np.zeros(rows + 1)
+        times[0] = time.perf_counter()
+        for k in range(rows):
+            speed = (angle[k] - angle[max(k - 2, 0)]) / (2 * CYCLE)
+            steer = -stiffness * (angle[k] - working.base) - damping * speed
+            asked = np.clip(holding + played[k] * room + steer, -working.current, working.current)
+            raw = np.where(working.where, np.rint(1e3 * asked), 0).astype(np.int64)
+            demand[k] = raw * 1e-3
+            trace = drives.record([POSITION, CURRENT], CYCLE, play={TARGET_TORQUE: raw[None, :]})
+            current[k] = trace[CURRENT][0] * 1e-3
+            duty_sum[k + 1] = drives.read(TORQUE_SUM)
+            angle[k + 1] = working.angle(drives.read(POSITION))
+            times[k + 1] = time.perf_counter()
+        late = float(np.mean(np.diff(times) > LATE * CYCLE)) if in_real_time else 0.0
+        if late > MOST_LATE:
+            break
+    current[rows] = drives.read(CURRENT) * 1e-3
+    alive = still_enabled(working, drives.read(STATUS))
+    step = (times[-1] - times[0]) / rows if late > MOST_LATE else CYCLE
+    return Pulses(demand, current, angle, duty_sum / (32768.0 * 256.0), blocks[:rows], alive, step)
+
+
+def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats, pole_pairs: float) -> list[Winding]:
+    """Return resistance and inductance of every axis.
+
+    Args:
+        working: The drives.
+        pulses: What `pulse` recorded.
+        electrical_angle: Where the rotors stood at the first row [rad], shape (num_axes,).
+        pole_pairs: Electrical turns per turn in the direction of counting.
+    """
+    if pulses.step > CYCLE:
+        return [_none(
+            f"the integrator of 2041h can only be read by SDO, and a cycle with its reads took {1e3 * pulses.step:.1f} "
+            f"ms instead of {1e3 * CYCLE:g}: in real time they are not in step with the current; the inductance "
+            "needs an emulator in lockstep (--lockstep) or a faster bus, or take the data sheet's"
+        )] * working.target.num_axes  # fmt: skip
+    able = working.where & pulses.alive
+    causes = [] if able.all() else stop_causes(working.target.drives)
+    return [
+        _winding(working, _of_axis(pulses, k), k, float(electrical_angle[k]), pole_pairs)
+        if able[k]
+        else _none(f"the drive switched off during the current pulses: {causes[k]}")
+        for k in range(working.target.num_axes)
+    ]
+
+
+class _Window(NamedTuple):
+    """Each millisecond's part of the balance, shape (n,), and what happened within it by the model, (n, ticks)."""
+
+    flux: Floats  # V s
+    charge: Floats  # A s
+    change: Floats  # A
+    turn: Floats  # rad
+    path: Floats  # A, current at every tick, and at the end
+    angle: Floats  # rad electrical
+
+
+class _Axis(NamedTuple):
+    demand: Floats
+    current: Floats
+    angle: Floats
+    duty_sum: Floats
+    block: NDArray[np.int64]
+
+
+def _of_axis(pulses: Pulses, k: int) -> _Axis:
+    return _Axis(pulses.demand[:, k], pulses.current[:, k], pulses.angle[:, k], pulses.duty_sum[:, k], pulses.block)
+
+
+def _levels(repeats: int) -> tuple[Floats, NDArray[np.int64]]:
+    levels: list[float] = []
+    blocks: list[int] = []
+    for repeat in range(repeats):
+        for share, cycles in PULSES:
+            level = share if repeat % 2 == 0 else -share
+            levels += [level] * cycles + [-level] * 2 * cycles + [level] * cycles
+            blocks += [blocks[-1] + 1 if blocks else 0] * 4 * cycles
+    return np.array(levels), np.array(blocks)
+
+
+def _winding(working: Working, axis: _Axis, k: int, electrical: float, pole_pairs: float) -> Winding:
+    target, motor = working.target, working.target.motor
+    supply = float(target.supply[k])
+    P_raw, I_raw = loop_gains(working)
+    P, share = P_raw[k] / (256.0 * target.device.current_full_scale), I_raw / 65536.0
+    emf = motor.torque_constant / (1.0 if motor.kind == "dc" else 1.5)
+    row = target.device.stage["dead_time_current"]
+    results: list[_Solved] = []
+    R, L, lost = motor.R_s, motor.L_q, 0.0
+    for saturation in np.geomspace(row.low, row.high, SATURATIONS):
+        # What happens within a millisecond is modelled with the values of the round before, until they stay.
+        for _ in range(MOST_ROUNDS):
+            before = np.array([R, L, lost])
+            window = _window(
+                working, axis, P, share, supply, R, L, emf, lost, float(saturation), electrical, pole_pairs
+            )
+            solved = _fit(working, window, axis.block, supply, emf, float(saturation))
+            R, L = max(float(solved.mean[0]), 0.2 * motor.R_s), max(float(solved.mean[1]), 0.2 * motor.L_q)
+            lost = float(solved.mean[3])
+            moved = np.abs(np.array([R, L, lost]) - before) / np.array([R, L, max(abs(lost), 0.01 * supply)])
+            if moved.max() < SETTLED:
+                break
+        results.append(solved)
+    return _judge(working, axis, _average(results, axis.block), window)
+
+
+def _window(
+    working: Working, axis: _Axis, P: float, share: float, supply: float, R: float, L: float, emf: float, lost: float,
+    saturation: float, electrical: float, pole_pairs: float,
+) -> _Window:  # fmt: skip
+    device, motor = working.target.device, working.target.motor
+    dt, ticks = 1.0 / device.current_rate, round(CYCLE * device.current_rate)
+    turn = np.diff(axis.angle)
+    middle = electrical + pole_pairs * (0.5 * (axis.angle[1:] + axis.angle[:-1]) - axis.angle[0])
+    r, s_0 = axis.demand, axis.duty_sum[:-1]
+    errors = np.diff(axis.duty_sum) / (P * share)  # sum over the ticks
+    # What happens tick by tick, by the model: from where the last millisecond ended.
+    start = axis.current[:-1].copy()
+    # A count is a large part of a millisecond's turn: smoothed, where it is only used to model.
+    back = emf * np.convolve(np.pad(turn, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid") / CYCLE
+    for _ in range(2):
+        path = _simulate(
+            r, s_0, start, back, P, share, supply, R, L, lost, saturation, middle, dt, ticks, motor.kind == "dc"
+        )
+        start = np.append(axis.current[0], path[:-1, ticks])
+    creep = np.append(0.0, path[:, ticks] - path[:, ticks - 1])  # between the last sample and the end
+    ends = axis.current + creep
+    modelled = r[:, None] - path[:, :ticks]
+    moment = (modelled * (ticks - np.arange(ticks))).sum(1) + 0.5 * (ticks + 1) * (errors - modelled.sum(1))
+    sums = ticks * s_0 + share * P * moment
+    last = np.append(0.0, P * (r - axis.current[1:])) + axis.duty_sum  # duty of the tick before each boundary
+    # A duty acts one tick late.
+    duty = P * errors + sums - last[1:] + last[:-1]
+    charge = dt * (ticks * r - errors + 0.5 * (ends[1:] - ends[:-1]))
+    # The encoder was read at the last window of the velocity loop: a turn is that much older than the charge. Speed
+    # follows charge, which counts do not blur; what else the rotor does is interpolated.
+    lag = 1.0 / device.velocity_rate
+    moved = charge - charge.mean()
+    gained = float(np.gradient(turn) @ moved) / float(moved @ moved) / CYCLE * charge
+    other = turn - CYCLE * (np.cumsum(gained) - 0.5 * gained)
+    turn = turn + lag * gained + lag / CYCLE * np.diff(other, append=other[-1])
+    # The supply line sags with what the stage draws; braking does not feed back.
+    factor = 1.0 if motor.kind == "dc" else 1.5
+    mean_duty, mean = duty / ticks, charge / CYCLE
+    drawn = np.maximum(factor * mean_duty * mean, 0.0) + SUPPLY_IDLE
+    link = supply - device.stage["supply_resistance"].default * drawn
+    return _Window(link * dt * duty, charge, np.diff(ends), turn, path, middle)
+
+
+def _simulate(
+    r: Floats, s_0: Floats, start: Floats, back: Floats, P: float, share: float, supply: float, R: float, L: float,
+    lost: float, saturation: float, angle: Floats, dt: float, ticks: int, brushed: bool,
+) -> Floats:  # fmt: skip
+    """Return the current at every tick of every millisecond and at its end, shape (n, ticks + 1)."""
+    path = np.empty((len(r), ticks + 1))
+    decay = np.exp(-R * dt / L)
+    i, s = start.copy(), s_0.copy()
+    applied = np.append(0.0, (P * (r[:-1] - start[1:]))) + s_0
+    for n in range(ticks):
+        path[:, n] = i
+        p = P * (r - i)
+        s = s + share * p
+        u = supply * applied - back - lost * dead_time(angle, i, saturation, brushed)
+        i = decay * i + (1.0 - decay) / R * u
+        applied = p + s
+    path[:, ticks] = i
+    return path
+
+
+class _Fit(NamedTuple):
+    mean: Floats  # R, L, K_e, volts lost to dead time, constant
+    spread: Floats
+    freedom: int
+
+
+class _Solved(NamedTuple):
+    """The balance solved for one saturation current."""
+
+    mean: Floats
+    spread: Floats
+    rest: float  # sum of squares
+    penalty: float  # what the priors say against it
+
+
+def _fit(
+    working: Working, window: _Window, blocks: NDArray[np.int64], supply: float, emf: float, saturation: float
+) -> _Solved:
+    stage, rate = working.target.device.stage, working.target.device.current_rate
+    low, high = stage["dead_time"].low, stage["dead_time"].high
+    R = working.target.motor.R_s
+    prior = np.array([RESISTANCE_PRIOR[0] * R, 0.0, EMF_PRIOR[0] * emf, 0.5 * (low + high) * rate * supply, 0.0])
+    deviation = np.array(
+        [RESISTANCE_PRIOR[1] * R, np.inf, EMF_PRIOR[1] * emf, (high - low) / 12**0.5 * rate * supply, np.inf]
+    )
+    brushed = working.target.motor.kind == "dc"
+    count = 2.0 * np.pi / working.target.motor.encoder_counts
+    lost = dead_time(window.angle[:, None], window.path[:, :-1], saturation, brushed).mean(1) * CYCLE
+    X = np.stack([window.charge, window.change, window.turn, lost, np.full(len(lost), CYCLE)], 1)
+    # A sample's noise is in change, the model's is not: instrument.
+    Z = X.copy()
+    Z[1:, 1] = window.path[1:, -1] - window.path[:-1, -1]
+    keep = blocks > 0  # the first pulse is left out: the loop settles
+    return _solve(X[keep], Z[keep], window.flux[keep], blocks[keep], prior, deviation, count)
+
+
+def _average(results: list[_Solved], blocks: NDArray[np.int64]) -> _Fit:
+    """Average over the saturation currents by their likelihood."""
+    rest, penalty = np.array([result.rest for result in results]), np.array([result.penalty for result in results])
+    # Chi square over degrees of freedom that pulses, not milliseconds, have; and what the priors say.
+    freedom = int(blocks.max()) - 4
+    misfit = freedom * rest / rest.min() + penalty
+    weight = np.exp(-0.5 * (misfit - misfit.min()))
+    weight /= weight.sum()
+    means, spreads = np.array([r.mean for r in results]), np.array([r.spread for r in results])
+    mean = weight @ means
+    spread = np.sqrt(weight @ (spreads**2 + (means - mean) ** 2))
+    return _Fit(mean, spread, freedom)
+
+
+def _solve(
+    X: Floats,
+    Z: Floats,
+    y: Floats,
+    blocks: NDArray[np.int64],
+    prior: Floats,
+    deviation: Floats,
+    count: float,
+) -> _Solved:
+    """Return coefficients, deviations for errors alike within a pulse, the rest's square, and the priors' misfit."""
+    scale = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-15)
+    A, B = X / scale, Z / scale
+    weight = np.zeros(X.shape[1])
+    b, variance, floor = np.zeros(X.shape[1]), 0.0, float(np.mean((LEAST_NOISE * y) ** 2))
+    known = np.isfinite(deviation)
+    # Turns are differences of counts, whose rounding would make K_e small: its known variance is taken out.
+    blur = np.zeros(X.shape[1])
+    blur[TURN] = min(len(y) * count**2 / 12.0 / scale[TURN] ** 2, 0.5 * float(A[:, TURN] @ A[:, TURN]))
+    for _ in range(3):
+        normal = B.T @ A + np.diag(weight - blur) + 1e-9 * len(y) * np.eye(len(scale))
+        b = np.linalg.solve(normal, B.T @ y + weight * prior * scale)
+        variance = float(np.mean((y - A @ b) ** 2)) + floor
+        weight = np.where(known, variance / (deviation * scale) ** 2, 0.0)
+    rest = y - A @ b
+    scores = np.array([B[blocks == k].T @ rest[blocks == k] for k in np.unique(blocks)])
+    inverse = np.linalg.inv(normal)
+    meat = scores.T @ scores + np.diag(weight) * variance
+    spread = np.sqrt(np.diag(inverse @ meat @ inverse.T))
+    b, spread = b / scale, spread / scale
+    penalty = float(np.sum(((b - prior)[known] / deviation[known]) ** 2))
+    return _Solved(b, spread, float(rest @ rest) + len(y) * floor, penalty)
+
+
+def _judge(working: Working, axis: _Axis, found: _Fit, window: _Window) -> Winding:
+    """Return the estimates with their intervals, or why there are none."""
+    target = working.target
+    t = t_quantile(found.freedom)
+    gain = gain_error(target.device, target.motor)
+    estimates = []
+    largest = float(dead_time(np.zeros(1), np.array([1.0]), 1e-9, target.motor.kind == "dc")[0])
+    driving = max(float(found.mean[0]), 0.2 * target.motor.R_s) * float(np.abs(axis.current).max())
+    lost = largest * abs(float(found.mean[3])) / max(driving, 1e-9)
+    for k, (unit, model, loss) in enumerate((
+        ("ohm", RESISTANCE_MODEL, RESISTANCE_LOSS), ("H", INDUCTANCE_MODEL, INDUCTANCE_LOSS),
+    )):  # fmt: skip
+        value, half = float(found.mean[k]), t * float(found.spread[k])
+        if not value > 0.0 or float(np.hypot(half / value, model)) > WIDEST:
+            swing = float(np.ptp(axis.current))
+            estimates.append(refused(unit, (
+                f"excitation too weak: the pulses of {swing:.2g} A peak to peak leave an interval of "
+                f"{half:.2g} {unit} around {value:.2g} {unit}; allow a greater current"
+            )))  # fmt: skip
+        else:
+            estimates.append(interval(value, half, float(np.linalg.norm([gain, model, loss * lost])), unit))
+    return Winding(estimates[0], estimates[1], _follows(window))
+
+
+def _follows(window: _Window) -> bool:
+    """Return whether the encoder counts up where the charge drives up: over the pulses, not over a count."""
+    gained = np.gradient(window.turn)
+    charge = window.charge - window.charge.mean()
+    return float(gained @ charge) > 0.3 * float(np.linalg.norm(gained) * np.linalg.norm(charge))
+
+
+def _none(reason: str) -> Winding:
+    return Winding(refused("ohm", reason), refused("H", reason), False)
+
+
+def to_torque_mode(working: Working, holding: Floats) -> None:
+    """Go from a velocity mode to cst, with the currents that hold the axes [A]."""
+    drives = working.target.drives
+    drives.write(TARGET_TORQUE, np.rint(1e3 * holding).astype(np.int64), where=working.where)
+    motion.select_mode(drives, "cst", working.where)

@@ -1,0 +1,110 @@
+"""How often an axis was moved: what an engineer beside the machine would count.
+
+A move is a commanded motion from standstill to standstill. In pp it is a set-point (bit 4 of the controlword rises). In
+the other modes it is a target that leaves rest, until it has rested for 20 ms: there and back without a stop is one
+move, and so is a frequency response, however many records it took.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env.trials.positioning import CYCLE
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Key = tuple[int, int]
+
+REST = 20  # cycles at rest that end a move
+SLOW, WEAK = 0.002, 0.02  # of the speed and the current that axes may be moved with: less holds a place
+CONTROLWORD, SET_POINT = (0x6040, 0), 0x10
+POSITIONS, SPEEDS, TORQUES = ((0x607A, 0), (0x60B0, 0)), ((0x60FF, 0), (0x60B1, 0)), ((0x6071, 0), (0x60B2, 0))
+
+
+class MoveCounter:
+    """Counts moves by what is written and played.
+
+    Args:
+        speed: Fastest that axes may be turned [pps], shape (num_axes,).
+        current: Most that may be asked for [mA].
+
+    Attributes:
+        moves: Of each axis so far, (num_axes,).
+    """
+
+    def __init__(self, speed: Floats, current: float) -> None:
+        count = len(speed)
+        self.moves = np.zeros(count, np.int64)
+        self._slow: dict[Key, Floats] = {
+            **dict.fromkeys(POSITIONS, SLOW * speed * CYCLE),
+            **dict.fromkeys(SPEEDS, SLOW * speed),
+            **dict.fromkeys(TORQUES, np.full(count, WEAK * current)),
+        }
+        self._word = np.zeros(count, np.int64)
+        self._standing: dict[Key, Integers] = {}  # targets as they were commanded last
+        self._running = {key: np.zeros(count, bool) for key in SPEEDS}  # where that is not rest
+        self._played: frozenset[Key] = frozenset()  # when time passed last
+        self._still = np.full(count, REST)  # cycles since a target moved last
+
+    def written(self, key: Key, value: ArrayLike, where: Mask) -> None:
+        """Take note of an object that is written on the axes where the mask is true."""
+        values = np.broadcast_to(np.asarray(value, np.int64), self.moves.shape)
+        if key == CONTROLWORD:
+            self.moves += where & (values & SET_POINT != 0) & (self._word & SET_POINT == 0)
+            self._word = np.where(where, values, self._word)
+        elif key in self._slow:
+            before = self._standing.get(key, np.zeros_like(values))
+            if key in SPEEDS:
+                runs = np.abs(values) > self._slow[key]
+                self._begin(where & runs & ~self._moving())
+                self._running[key] = np.where(where, runs, self._running[key])
+            elif key in TORQUES:
+                self._begin(where & (np.abs(values - before) > self._slow[key]))
+            self._standing[key] = np.where(where, values, before)
+
+    def passed(self, cycles: int, play: Mapping[Key, ArrayLike] | None = None) -> Mask:
+        """Take note of time that passes, while rows of objects are played; return which axes those move."""
+        count = len(self.moves)
+        moving = np.zeros((cycles, count), bool)
+        played = {key: rows for key, rows in (play or {}).items() if key in self._slow}
+        for key, rows in played.items():
+            values = np.asarray(rows, np.int64)
+            values = np.broadcast_to(values if values.ndim == 2 else values[:, None], (cycles, count))
+            before = self._standing.get(key, values[0])
+            if key in SPEEDS:
+                away = values
+                self._running[key] = np.abs(values[-1]) > self._slow[key]
+            elif key in TORQUES:  # what held the axis before, against gravity for one, moves nothing
+                away = values - before
+            else:  # where the first row goes on from is known if there was a row before it
+                away = np.diff(values, axis=0, prepend=(before if key in self._played else values[0])[None])
+            moving |= np.abs(away) > self._slow[key]
+            self._standing[key] = values[-1]
+        self._played = frozenset(played)
+        driven = np.asarray(moving.any(axis=0))
+        # A speed that stands is one until another is commanded.
+        for key, runs in self._running.items():
+            if key not in played:
+                moving |= runs
+        for axis in range(count):
+            at = np.flatnonzero(moving[:, axis])
+            if at.size == 0:
+                self._still[axis] += cycles
+                continue
+            rests = np.diff(at, prepend=-1) - 1  # cycles at rest before each
+            rests[0] += self._still[axis]
+            self.moves[axis] += np.count_nonzero(rests >= REST)
+            self._still[axis] = cycles - 1 - at[-1]
+        return driven
+
+    def _moving(self) -> Mask:
+        return np.asarray(np.any([*self._running.values()], axis=0))
+
+    def _begin(self, axes: Mask) -> None:
+        """Count moves that begin with a target written."""
+        self.moves += axes & (self._still >= REST)
+        self._still = np.where(axes, 0, self._still)

@@ -1,0 +1,1 @@
+"""Frequency responses, the plant fitted to them, and their margins."""

@@ -1,0 +1,263 @@
+"""Shakes axes that run at a steady speed, there and back, and says what went in and what came out.
+
+Dry friction is a constant while an axis keeps its direction: so the excitation rides on a speed that is larger than
+its own, within the travel. The excitation goes on through the reversal and repeats exactly; what is looked at begins
+when the reversal has died away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env import motion
+from drive_env.dictionary.entries import ObjectName
+from drive_env.trials.positioning import wrapped
+from tuning.response.excitation import Lines, periodic
+from tuning.target import POSITION_SCALER, Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+POSITION, VELOCITY, CURRENT, STATUS = 0x6064, 0x606C, 0x6077, 0x6041
+SET_POINT = {"velocity": (0x60FF, 0), "position": (0x607A, 0)}
+OFFSET = {"velocity": (0x60B1, 0), "position": (0x60B0, 0)}  # what the drive adds to the set-point
+SEEN = {"velocity": VELOCITY, "position": POSITION}
+MODE = {"velocity": "csv", "position": "csp"}
+INTERPOLATION = ((0x60C2, 1), (0x60C2, 2))
+CYCLE = 0.001  # s
+RAMP, SETTLING = 30, 70  # cycles: of a change of speed, and until what it left has died away
+FADE = 20  # cycles
+IN_RAMPS = 0.3  # share of the shaking while the speed changes
+REST, RETURN = 30, 50  # cycles in which an axis comes to rest, and goes back, or more where that would be too fast
+BACK = 0.8  # of the way back: an axis that overshoots must not leave its travel
+SETTLED = 200  # cycles until what was let go stands where the others have left it
+NEAR = 0.02  # rad from where it began at which an axis stays
+
+
+class Pass(NamedTuple):
+    """What a run showed while its speed was steady; periods one after the other, SI.
+
+    set_point: As played, less the steady motion, shape (periods * samples, axes).
+    answer: As seen on the bus, likewise.
+    current: 6077h [A], likewise.
+    fast_set_point, fast_answer: The same at the velocity loop's rate, of a trace; empty without one.
+    peak_current: 6077h at its highest, ramps included [A], shape (axes,).
+    enabled: Whether the axis was enabled all the time, shape (axes,).
+    """
+
+    set_point: Floats
+    answer: Floats
+    current: Floats
+    fast_set_point: Floats
+    fast_answer: Floats
+    peak_current: Floats
+    enabled: Mask
+
+
+class Shaker:
+    """Runs excitations on the axes of a target; a context that leaves states and modes, where there was one, as found.
+
+    Args:
+        target: The axes.
+        loop: "velocity" (csv) or "position" (csp).
+        where: Axes that are shaken, shape (num_axes,).
+        lines: Frequencies.
+        kind: "multisine" or "chirp".
+    """
+
+    def __init__(self, target: Target, loop: str, where: Mask, lines: Lines, kind: str) -> None:
+        self._target, self._drives, self._loop, self._where = target, target.drives, loop, where
+        self._lines, self._kind = lines, kind
+        self.radians = 2.0 * math.pi / np.maximum(np.asarray(self._drives.read(POSITION_SCALER), float), 1.0)
+        self.traced_time = 0.0  # s that passed in traces, which a target's clock does not see
+        self.fastest = np.full(target.num_axes, 0.4 * target.speed)  # on the way back [rad/s]
+
+    def __enter__(self) -> Shaker:
+        drives, where = self._drives, self._where
+        mask, value = motion.OPERATION_ENABLED
+        self._were_on = drives.read(STATUS) & mask == value
+        self._modes = drives.read(0x6060)
+        self._interpolation = [drives.read(name) for name in INTERPOLATION]
+        # A set-point is reached within a millisecond, which is when the next comes.
+        for name, value in zip(INTERPOLATION, (1, -3), strict=True):
+            drives.write(name, value, where=where)
+        self._offset = np.asarray(drives.read(OFFSET[self._loop]), float)
+        motion.enable(drives, mode=MODE[self._loop], where=where)
+        self._origin = drives.read(POSITION)
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        drives, where = self._drives, self._where
+        mask, value = motion.OPERATION_ENABLED
+        running = where & (drives.read(STATUS) & mask == value)
+        if running.any() and error[0] is None:
+            self._go_back(running)
+        off = where & ~self._were_on
+        if off.any():
+            motion.disable(drives, where=off & (drives.read(STATUS) & mask == value))
+        for name, values in zip(INTERPOLATION, self._interpolation, strict=True):
+            drives.write(name, values, where=where)
+        for mode in np.unique(self._modes[where]):
+            changed = where & (self._modes == mode) & (drives.read(0x6060) != mode)
+            if mode and changed.any():
+                drives.write(0x6060, mode, where=changed)
+
+    def run(self, amplitude: Floats, speed: Floats, passes: int, periods: int, *, traced: bool = False) -> Pass:
+        """Run there and back; the axes end at rest.
+
+        Args:
+            amplitude: Of each line's velocity [rad/s], shape (n, axes).
+            speed: Steady speed of the first pass, with its sign [rad/s], shape (axes,).
+            passes: Times that the travel is passed, each the other way.
+            periods: Of the excitation in each pass.
+            traced: Record at the velocity loop's rate as well; on emulated drives only.
+        """
+        steady, inside = self._steady(speed, passes, periods)
+        turning = np.any(np.diff(steady, axis=0, prepend=0.0) != 0.0, axis=1)
+        omega = 2.0 * math.pi * self._lines.f[:, None]
+        sized = amplitude if self._loop == "velocity" else amplitude / omega
+        wave = periodic(self._kind, self._lines, sized * self._where)
+        cycles = len(steady)
+        # While the speed changes, which takes current of its own, the shaking is less; it comes back as it settles.
+        from_end = np.minimum(np.arange(cycles), np.arange(cycles)[::-1])
+        level = np.convolve(np.where(turning, IN_RAMPS, 1.0), np.full(FADE, 1.0 / FADE), "same")
+        fade = (level * np.clip(from_end / FADE, 0.0, 1.0))[:, None]
+        path = steady if self._loop == "velocity" else self._position(steady)
+        # Every second pass it runs backwards: what is not linear then answers differently, and coherence shows it.
+        back = np.repeat(np.arange(passes) % 2 == 1, cycles // passes + 1)[:cycles, None]
+        row = np.arange(cycles) % self._lines.samples
+        shaking = np.where(back, wave[::-1][row], wave[row])
+        raw = np.rint((path + fade * shaking) / self.radians - self._offset)
+        seen, fast, enabled = self._play(raw.astype(np.int64), traced)
+        played = (raw + self._offset) * self.radians - path
+        chosen = np.flatnonzero(inside)
+        answer = seen[SEEN[self._loop]]
+        if self._loop == "position":
+            answer = wrapped(answer - self._origin) + self._origin
+        windows = 0 if fast is None else len(fast[0]) // cycles
+        quick = [np.empty((0, raw.shape[1]))] * 2
+        if fast is not None:
+            within = np.repeat(inside, windows)
+            quick = [(signal - np.repeat(path, windows, axis=0))[within] for signal in fast]
+        return Pass(
+            played[chosen],
+            (answer * self.radians - path)[chosen],
+            np.asarray(seen[CURRENT][chosen] * 1e-3),
+            quick[0],
+            quick[1],
+            np.abs(seen[CURRENT]).max(axis=0) * 1e-3,
+            enabled,
+        )
+
+    def _steady(self, speed: Floats, passes: int, periods: int) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the steady velocity of every cycle, (cycles, axes), and which cycles are looked at."""
+        rows, inside, before = [], [], np.zeros_like(speed)
+        long = SETTLING + periods * self._lines.samples
+        for k in range(passes + 1):
+            now = speed * (-1.0) ** k if k < passes else np.zeros_like(speed)
+            # A reversal is twice the change.
+            ramp = RAMP if k in (0, passes) else 2 * RAMP
+            share = (np.arange(1, ramp + 1) / ramp)[:, None]
+            rows.append(before + share * (now - before))
+            inside.append(np.zeros(ramp, bool))
+            if k < passes:
+                rows.append(np.tile(now, (long, 1)))
+                inside.append(np.arange(long) >= SETTLING)
+            before = now
+        return np.concatenate(rows), np.concatenate(inside)
+
+    def _position(self, velocity: Floats) -> Floats:
+        start = self._drives.read(POSITION) * self.radians
+        return np.asarray(start + np.cumsum(velocity, axis=0) * CYCLE)
+
+    def _play(self, raw: Integers, traced: bool) -> tuple[dict[int, Integers], tuple[Floats, Floats] | None, Mask]:
+        name = SET_POINT[self._loop]
+        duration = len(raw) * CYCLE
+        rest = self._drives.read(name)
+        play: dict[ObjectName, ArrayLike] = {name: np.where(self._where, raw, rest)}
+        if not traced:
+            objects = [SEEN[self._loop], CURRENT, STATUS]
+            trace = self._drives.record(objects, duration, play)
+            mask, value = motion.OPERATION_ENABLED
+            return {key: trace[key] for key in objects[:2]}, None, (trace[STATUS] & mask == value).all(axis=0)
+        from drive_env.emulator.loop_trace import trace_loops
+
+        self.traced_time += duration
+        signals = {"velocity": ("velocity_demand", "omega_meas"), "position": ("position_demand", "theta_meas")}
+        names = signals[self._loop]
+        fast = trace_loops(self._drives, [*names, "torque_meas"], duration, play).signals
+        windows = len(fast[names[0]]) // len(raw)
+        seen = {SEEN[self._loop]: np.rint(fast[names[1]][::windows] / self.radians).astype(np.int64)}
+        seen[CURRENT] = np.rint(fast["torque_meas"][::windows] * 1e3).astype(np.int64)
+        mask, value = motion.OPERATION_ENABLED
+        enabled = self._drives.read(STATUS) & mask == value
+        return seen, (fast[names[0]], fast[names[1]]), enabled
+
+    def _go_back(self, where: Mask) -> None:
+        """Bring the axes near to where they began."""
+        drives = self._drives
+        drives.advance(REST * CYCLE)
+        off = wrapped(drives.read(POSITION) - self._origin) * self.radians * where * BACK
+        if np.abs(off).max() < NEAR:
+            return
+        cycles = max(RETURN, math.ceil(float((np.abs(off) / self.fastest).max()) * 2.0 / CYCLE))
+        t = (np.arange(cycles) + 0.5) / cycles
+        shape = (1.0 - np.cos(2.0 * math.pi * t))[:, None]
+        velocity = -off / (cycles * CYCLE) * shape
+        velocity[-1] = 0.0
+        if self._loop == "position":
+            velocity = np.concatenate([velocity, np.zeros((SETTLING, velocity.shape[1]))])
+        path = velocity if self._loop == "velocity" else self._position(velocity)
+        name = SET_POINT[self._loop]
+        raw = np.rint(path / self.radians - self._offset).astype(np.int64)
+        drives.record([POSITION], len(raw) * CYCLE, {name: np.where(where, raw, drives.read(name))})
+
+
+@contextmanager
+def at_rest(target: Target, loop: str, where: Mask) -> Iterator[None]:
+    """Have axes enabled meanwhile, in the mode of a loop, so that each holds its place while another one is shaken."""
+    drives = target.drives
+    modes, off = drives.read(0x6060), where & ~_enabled(drives)
+    if loop == "velocity" and off.any():
+        drives.write(SET_POINT[loop], 0, where=off)
+    motion.enable(drives, mode=MODE[loop], where=where)
+    try:
+        yield
+    finally:
+        if (now := off & _enabled(drives)).any():
+            motion.disable(drives, where=now)
+        for mode in np.unique(modes[where]):
+            changed = where & (modes == mode) & (drives.read(0x6060) != mode)
+            if mode and changed.any():
+                drives.write(0x6060, mode, where=changed)
+
+
+@contextmanager
+def let_go(target: Target, where: Mask, shaken: Mask) -> Iterator[None]:
+    """Have axes off meanwhile: of a machine whose axes pull at one thing, those that are not shaken must run along."""
+    drives = target.drives
+    on = where & _enabled(drives)
+    if on.any():
+        motion.disable(drives, where=on)
+    try:
+        yield
+    finally:
+        if on.any():
+            # All come to rest and begin together: enabled under way they would stop askew and pull at each other, and
+            # gains that are fit for all of them need not be fit for one alone.
+            alone = shaken & _enabled(drives)
+            motion.disable(drives, where=alone)
+            drives.advance(SETTLED * CYCLE)
+            motion.enable(drives, where=on | alone)
+
+
+def _enabled(drives: motion.Drives) -> Mask:
+    mask, value = motion.OPERATION_ENABLED
+    return np.asarray(drives.read(STATUS) & mask == value)

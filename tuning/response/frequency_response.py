@@ -1,0 +1,408 @@
+"""Open loops of axes that stay in closed loop: a multisine or a chirp on the set-point, and what coherence says.
+
+The set-point is the instrument: it is known exactly and independent of noise, so that the open loop is the quotient of
+two cross-spectra with it, answer over error, without the bias that noise inside the loop gives to answer over input.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import GAIN_OBJECTS
+from drive_env.safety.envelope import swinging_allowed
+from tuning.identify.dead_time import dead_time_resistance
+from tuning.oscillation_watch import OscillationError, shaken
+from tuning.response.excitation import CREST, Lines, dimension, peak, plan_lines
+from tuning.response.excitation_run import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
+from tuning.response.held_samples import split, unhold
+from tuning.response.linear_model import Plant, controllers
+from tuning.response.measured_loop import COHERENT, GOOD_MISFIT, MeasuredLoop, merged
+from tuning.response.plant_fit import PlantFit, Seen, fit_plant
+from tuning.response.transfer import directions, transfer
+from tuning.rules.lags import velocity_noise
+from tuning.stop_causes import stop_causes
+from tuning.target import timed
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+LOOPS = ("velocity", "position")
+RANGE = {"velocity": (5.0, 400.0), "position": (5.0, 50.0)}  # Hz
+RESOLUTION = 5.0  # Hz
+# From which on a line is fitted, with the weight that its noise leaves it, once all together say as much as `WORTH`
+# lines that are trusted.
+FITTED, WORTH = 0.5, 4.0
+BUS_LIMIT = 400.0  # Hz; above, a bus's samples hold more of the images than of the line
+TRACED_TOP = 495.0  # Hz, of the set-points in a traced measurement
+TRACE_LIMIT = 1000.0  # Hz
+PASSES, PERIODS = 2, 3  # of a measurement; the trial before it has one of each
+SOFTER = 2  # how often the gains of an axis that oscillates are lowered
+CONFIRMING, LESS = 6, 0.5  # passes of one that is confirmed, and the share of its strength in the second half of them
+
+
+# How an axis is loaded, over its limits.
+TRIAL_SPEED, TRIAL_CURRENT = 0.1, 0.4
+SPEED, CURRENT = 0.45, 0.9
+TRIAL_SWING, SWING = 0.42, 0.65  # RMS over 25 ms, beyond which it is not the shaking but an oscillation
+RETURN_SHARE = 0.5  # of the speed from which the DC link holds what a stop gives back
+IN_RAMP = 0.5  # of what the shaking takes, for changing the speed
+TRAVEL = 0.85
+OVER_NOISE = 5.0  # least RMS of the shaken velocity over the encoder's noise, also where the motion then reverses
+
+
+def measure(
+    target: Target,
+    loop: str = "velocity",
+    *,
+    where: Mask | None = None,
+    kind: str = "multisine",
+    low: float | None = None,
+    high: float | None = None,
+    resolution: float = RESOLUTION,
+    traced: bool = False,
+    confirmed: bool = False,
+    softened: bool = False,
+    periods: int = PERIODS,
+    progress: Callable[[float], None] | None = None,
+) -> MeasuredLoop:
+    """Measure a loop's frequency response on its axes; they end where they began, as they were found.
+
+    Axes of one machine are shaken one after the other, machines side by side. The others hold their places; where all
+    pull at one thing, they are off and run along.
+
+    Args:
+        target: The axes.
+        loop: "velocity", in csv, or "position", in csp.
+        where: Axes that are measured; all by default. The others get nan.
+        kind: "multisine" or "chirp".
+        low: Lowest frequency [Hz].
+        high: Highest frequency [Hz], at most 400; a traced measurement always goes beyond. With 4,096 counts per turn
+            little is coherent above 200 Hz, and what excites there is missing below; what stands out there, as
+            resonances do, is still found.
+        resolution: Between two frequencies [Hz]; a period lasts its inverse.
+        traced: Look above 400 Hz too, through the emulator's trace at the velocity loop's rate.
+        confirmed: Look longer, and again with half the strength: a resonance that is then another is refused.
+        softened: Quarter the velocity gains, twice at most, of an axis that oscillates in the trial, and leave them so;
+            its drives are watched (`tuning.oscillation_watch`).
+        periods: Of every pass that are looked at: more of them are less noise, and more time.
+        progress: Called with the share done.
+
+    Raises:
+        ValueError: For a loop, a kind or frequencies that cannot be, or a trace on a bus.
+    """
+    if loop not in LOOPS:
+        raise ValueError(
+            f"no loop is named {loop!r}; there are {', '.join(LOOPS)}; the current loop is not seen on a bus"
+        )
+    if traced and target.drives.machine is None:
+        raise ValueError("a trace at the velocity loop's rate exists on emulated drives only; a bus shows up to 400 Hz")
+    bounds = RANGE[loop]
+    # A trace begins where a bus ends; a gap between the two could hide a margin.
+    top = BUS_LIMIT if traced else bounds[1] if high is None else high
+    if top > BUS_LIMIT:
+        raise ValueError(f"highest frequency {top:g} Hz must be at most {BUS_LIMIT:g} Hz, where a bus still sees it")
+    # In a trace, what is held at f is seen at 1000 Hz - f, too: lines up to nearly half of it leave no gap.
+    lines = plan_lines(bounds[0] if low is None else low, TRACED_TOP if traced else top, resolution, 1.0 / CYCLE)
+    axes = np.ones(target.num_axes, bool) if where is None else np.asarray(where, bool)
+    if not axes.any():
+        raise ValueError("no axis is chosen")
+    closed = _closed_loops(target, loop)
+    if not (axes & closed).any():
+        raise ValueError("a P gain is 0 on every axis and the loop is open: give the drives gains first")
+    position = np.arange(target.num_axes) % target.axes_per_machine
+    results = []
+    holds = target.axes_per_machine > 1 and not target.linked
+    with at_rest(target, loop, axes & closed) if holds else nullcontext():
+        for k in range(target.axes_per_machine):
+            chosen = axes & closed & (position == k)
+            if not chosen.any():
+                continue
+            measurement = _Measurement(target, loop, chosen, lines, top, kind, traced, confirmed, softened, periods)
+
+            def show(share: float, k: int = k) -> None:
+                if progress is not None:
+                    progress((k + share) / target.axes_per_machine)
+
+            free = let_go(target, axes & ~chosen, chosen) if target.linked else nullcontext()
+            with free, swinging_allowed(target.drives):
+                results.append(measurement.run(show))
+    whole = merged(results)
+    open_loop = "a gain is 0 and the loop is open: give the drive gains first"
+    notes = tuple(
+        (*own, open_loop) if without else own for own, without in zip(whole.notes, axes & ~closed, strict=True)
+    )
+    return replace(whole, notes=notes)
+
+
+def _closed_loops(target: Target, loop: str) -> Mask:
+    """Return which axes have the gains that the loop needs."""
+    needed = (0, 2) if loop == "velocity" else (0, 2, 4)
+    return np.asarray(np.all([target.drives.read(GAIN_OBJECTS[k]) > 0 for k in needed], axis=0))
+
+
+class _Measurement:
+    """One measurement of axes side by side: a trial, the run proper, and what they say."""
+
+    def __init__(
+        self, target: Target, loop: str, where: Mask, lines: Lines, top: float, kind: str, traced: bool,
+        confirmed: bool, softened: bool, periods: int,
+    ) -> None:  # fmt: skip
+        self._top, self._softened, self._periods = top, softened, periods
+        self._passes, self._confirmed = (CONFIRMING if confirmed else PASSES), confirmed
+        self._target, self._loop, self._lines, self._kind, self._traced = target, loop, lines, kind, traced
+        self._device: Device = target.device
+        self._notes: list[list[str]] = [[] for _ in range(target.num_axes)]
+        self._where = where
+        self._stoppable: Floats = np.full(target.num_axes, np.inf)  # speed from which the DC link bears a stop [rad/s]
+
+    def run(self, progress: Callable[[float], object]) -> MeasuredLoop:
+        target = self._target
+        self._gains = np.stack([target.drives.read(name) for name in GAIN_OBJECTS], axis=1)
+        where = self._where
+        with timed(target) as (counted, clock):
+            shaker = Shaker(counted, self._loop, where, self._lines, self._kind)
+            with shaker:
+                room = np.where(target.high >= -target.low, target.high, target.low) * TRAVEL
+                sign = np.sign(room)
+                limit = self._current_limit()
+                speed = self._trial_speed(np.abs(room))
+                trial = self._trial(shaker, limit, speed, sign)
+                progress(0.2)
+                rough = transfer(trial.set_point, trial.answer, self._lines)[0]
+                room = np.abs(room) - speed * _duration(1, self._lines)
+                amplitude, speed = self._amplitude(rough, trial, room, limit)
+                shaker.fastest = np.minimum(shaker.fastest, RETURN_SHARE * self._stoppable)
+                less = None
+                with shaken(counted.drives, SWING * limit):
+                    seen = shaker.run(amplitude, sign * speed, self._passes, self._periods, traced=self._traced)
+                    progress(0.5 if self._confirmed else 0.9)
+                    if self._confirmed:
+                        less = shaker.run(LESS * amplitude, sign * speed, self._passes, self._periods)
+        self._drive_time = clock.seconds + shaker.traced_time
+        stopped = where & ~seen.enabled
+        causes = stop_causes(target.drives) if stopped.any() else []
+        for axis in np.flatnonzero(stopped):
+            self._notes[axis].append(f"the drive stopped while it was shaken: {causes[axis]}")
+        self._note_limits(seen.peak_current, where)
+        result = self._evaluate(seen, less, where & seen.enabled)
+        progress(1.0)
+        return result
+
+    # --- how strongly ---------------------------------------------------------------------------------------------
+    def _current_limit(self) -> Floats:
+        """Return what may flow [A]: the user's limit, or the drive's own."""
+        own = self._target.drives.read(self._device.master.current_limit) * 1e-3
+        return np.asarray(np.minimum(self._target.current, own))
+
+    def _trial(self, shaker: Shaker, limit: Floats, speed: Floats, sign: Floats) -> Pass:
+        """Return what a weak shaking shows; an axis that oscillates gets softer gains first, if it may."""
+        drives = self._target.drives
+        watch = getattr(drives, "watch", None)
+        for left in reversed(range(SOFTER + 1)):
+            amplitude = self._trial_amplitude(speed, limit)
+            try:
+                with shaken(drives, TRIAL_SWING * limit):
+                    trial = shaker.run(amplitude, sign * speed, 1, 1)
+            except OscillationError:
+                if not (self._softened and left):
+                    raise
+            if watch is None or not self._softened or not (self._where & watch.swung).any() or not left:
+                break
+            self._gains = watch.soften(self._where & watch.swung, self._gains, MODE[self._loop])
+        return trial
+
+    def _trial_speed(self, room: Floats) -> Floats:
+        return np.minimum(TRIAL_SPEED * self._target.speed, 0.4 * room / _duration(1, self._lines))
+
+    def _trial_amplitude(self, speed: Floats, limit: Floats) -> Floats:
+        n = len(self._lines.f)
+        # What reverses the trial's motion does no harm to a rough first look; what cannot be seen does.
+        largest = np.maximum(0.8 * speed, OVER_NOISE * CREST * self._noise())
+        by_speed = largest / CREST / math.sqrt(n / 2.0)
+        by_current = (
+            TRIAL_CURRENT * limit / CREST / math.sqrt(n / 2.0) / np.maximum(np.abs(self._current_gain()), 1e-12)
+        )
+        return np.asarray(np.minimum(by_speed, by_current))
+
+    def _amplitude(self, rough: Complex, trial: Pass, room: Floats, limit: Floats) -> tuple[Floats, Floats]:
+        """Return amplitudes and steady speeds of the run proper by what the trial showed."""
+        lines, omega = self._lines, 2.0 * math.pi * self._lines.f[:, None]
+        gain, error = _bounded(rough, 1e-3, 10.0), _bounded(1.0 - rough, 0.02, 10.0)
+        current = _bounded(self._current_gain() * error, 1e-12, np.inf)
+        load = np.abs(trial.current.mean(axis=0))
+        available = np.maximum(CURRENT * (limit - load), 0.1 * limit)
+        # Speed per current at the lowest lines, times w: what a ramp of the steady speed takes.
+        low = slice(0, max(4, len(lines.f) // 10))
+        mobility = np.median(np.abs(gain / current * omega)[low], axis=0)
+        top = SPEED * self._target.speed
+        by_ramp = IN_RAMP * available * mobility * RAMP * CYCLE
+        by_way = room / _duration(self._periods, lines)
+        fastest = np.minimum(np.minimum(top, by_ramp), by_way)
+        # Where the way is short, a steady speed would be too slow for the encoder: the motion reverses then.
+        largest = np.minimum(np.maximum(0.9 * fastest, OVER_NOISE * CREST * self._noise()), 0.9 * top)
+        amplitude = dimension(lines, np.abs(current), np.abs(gain), available, largest)
+        way = peak(self._kind, lines, amplitude, gain / omega)
+        flowing, shaken = (peak(self._kind, lines, amplitude, answer) for answer in (current, gain))
+        tiny = np.finfo(float).tiny
+        # A stop gives back J w^2 / 2, and a swing 2 J w dw, which the DC link must hold; losses come on top.
+        energy = self._link_energy() / (self._target.motor.torque_constant / mobility)
+        self._stoppable, returned = np.sqrt(2.0 * energy), np.sqrt(energy / (2.0 * 1.1))
+        shares = [
+            available / (flowing + tiny), largest / (shaken + tiny), 0.5 * np.maximum(room, 1e-9) / (way + tiny),
+            returned / (shaken + tiny),
+        ]  # fmt: skip
+        fits = np.min(shares, axis=0)
+        amplitude, shaken = amplitude * fits, shaken * fits
+        speed = np.minimum(1.1 * shaken, fastest)
+        for axis in np.flatnonzero(self._where & (speed < 0.9 * shaken)):
+            why = "its way is too short" if by_way[axis] <= fastest[axis] else "its loop or its limits are too tight"
+            self._notes[axis].append(f"{why} for a steady speed: the motion reversed, friction is part of the response")
+        return amplitude, speed
+
+    def _link_energy(self) -> Floats:
+        """Return what the DC link takes until the drive cuts its stage [J], by the least capacitance of its class."""
+        device = self._device
+        return np.asarray(0.5 * device.stage["dc_capacitance"].low * (device.overvoltage**2 - self._target.supply**2))
+
+    def _current_gain(self) -> Complex:
+        """Return demanded current per velocity of the set-point, the loop being open, complex (n, axes)."""
+        f = self._lines.f
+        z = np.exp(2j * math.pi * f / self._device.velocity_rate)
+        columns = []
+        for row in self._gains:
+            regulator = controllers(self._device, row)
+            gain = regulator.velocity(z)
+            # Of a position loop, the velocity loop within answers up to 1.5 times as strongly.
+            columns.append(gain if self._loop == "velocity" else 1.5 * gain * regulator.position / (2j * math.pi * f))
+        return np.stack(columns, axis=1)
+
+    def _noise(self) -> float:
+        motor = self._target.motor
+        plant = Plant.from_data_sheet(self._device, motor, motor.voltage, motor.inertia)
+        return velocity_noise(self._device, plant)
+
+    def _note_limits(self, peak: Floats, where: Mask) -> None:
+        limit = self._target.drives.read(self._device.master.current_limit) * 1e-3
+        for axis in np.flatnonzero(where & (peak > 0.98 * limit)):
+            self._notes[axis].append(
+                f"the current reached its limit, {limit[axis]:.2f} A, beyond what was asked for: the loop oscillates, "
+                "or nearly so"
+            )
+
+    # --- what it says ---------------------------------------------------------------------------------------------
+    def _evaluate(self, seen: Pass, less: Pass | None, where: Mask) -> MeasuredLoop:
+        lines = self._lines._replace(f=self._lines.f[self._lines.f <= self._top])
+        f = lines.f
+        closed, coherence, spread = transfer(seen.set_point, seen.answer, lines)
+        parts, distortion = directions(seen.set_point, seen.answer, lines, self._passes)
+        weaker = None if less is None else transfer(less.set_point, less.answer, lines)
+        open_loop = np.full(closed.shape, np.nan, complex)
+        fits: list[PlantFit | None] = [None] * closed.shape[1]
+        for axis in map(int, np.flatnonzero(where)):
+            images = np.zeros(len(f), complex)
+            if self._loop == "velocity":
+                fit = self._fit(
+                    axis, f, (closed[:, axis], coherence[:, axis], spread[:, axis]), [part[:, axis] for part in parts],
+                    float(distortion[axis]), seen.current[:, axis],
+                    None if weaker is None else (weaker[0][:, axis], weaker[1][:, axis], weaker[2][:, axis]),
+                )  # fmt: skip
+                fits[axis] = fit
+                images = split(self._device, f, _closed_by(self._device, fit, self._gains[axis]))[1]
+            T = unhold(self._device, f, closed[:, axis], images)
+            open_loop[:, axis] = T / (1.0 - T)
+        coherence = np.where(where, coherence, 0.0)
+        traced = np.zeros(len(f), bool)
+        if self._traced:
+            fast = _fast(self._device, seen, self._lines)
+            f = np.concatenate([f, fast[0]])
+            open_loop = np.concatenate([open_loop, np.where(where, fast[1], np.nan)])
+            coherence = np.concatenate([coherence, np.where(where, fast[2], 0.0)])
+            traced = np.concatenate([traced, np.ones(len(fast[0]), bool)])
+        speed = np.abs(seen.answer).max(axis=0) if self._loop == "velocity" else np.full(len(where), np.nan)
+        return MeasuredLoop(
+            self._device, self._loop, f, open_loop, coherence, traced, self._gains, tuple(fits), speed,
+            seen.peak_current, self._drive_time, tuple(tuple(notes) for notes in self._notes),
+        )  # fmt: skip
+
+    def _fit(
+        self, axis: int, f: Floats, measured: _Transfer, parts: Sequence[Complex], distortion: float, current: Floats,
+        weaker: _Transfer | None,
+    ) -> PlantFit:  # fmt: skip
+        target, device = self._target, self._device
+        supply = float(target.supply[axis])
+        start = Plant.from_data_sheet(device, target.motor, supply, 3.0 * target.motor.inertia)
+        lines, good = _fitted(f, measured)
+        fit = fit_plant(
+            device, self._gains[axis], *lines, start, [part[good] for part in parts], distortion,
+            dead_time_resistance(device, target.motor, supply, current),
+            None if weaker is None else _fitted(f, weaker)[0],
+        )  # fmt: skip
+        if not fit.reason and fit.misfit > GOOD_MISFIT:
+            self._notes[axis].append(
+                f"the linear model is off by {fit.misfit:.1f} times the noise; margins are read from the lines alone"
+            )
+        if fit.reason:
+            self._notes[axis].append(f"excitation too weak: {fit.reason}")
+        return fit
+
+
+_Transfer = tuple[Complex, Floats, Floats]  # of one axis, as `transfer` returns it
+
+
+def _fitted(f: Floats, measured: _Transfer) -> tuple[Seen, Mask]:
+    """Return the lines that are fitted, and which they are: those that are trusted, or all that are not mere noise."""
+    closed, coherence, spread = measured
+    good = coherence >= FITTED
+    clear = np.minimum(coherence[good], COHERENT)
+    if np.sum(clear / (1.0 - clear)) < WORTH * COHERENT / (1.0 - COHERENT):
+        good = coherence >= COHERENT
+    return Seen(f[good], closed[good], spread[good]), good
+
+
+def _closed_by(device: Device, fit: PlantFit, gains: Integers) -> Callable[[Floats], Complex]:
+    def closed(at: Floats) -> Complex:
+        L = fit.open_loop(device, gains, at)
+        return np.asarray(L / (1.0 + L))
+
+    return closed
+
+
+def _bounded(value: Complex, low: float, high: float) -> Complex:
+    """Return complex numbers whose size lies within bounds; a first look is not trusted beyond them."""
+    size = np.maximum(np.abs(value), np.finfo(float).tiny)
+    return np.asarray(np.where(value == 0.0, low, value * np.clip(size, low, high) / size))
+
+
+def _duration(periods: int, lines: Lines) -> float:
+    """Return how long an axis goes one way [s], in full speeds."""
+    return (2 * RAMP + SETTLING + periods * lines.samples) * CYCLE
+
+
+def _fast(device: Device, seen: Pass, lines: Lines) -> tuple[Floats, Complex, Floats]:
+    """Return frequencies above the bus's, open loop and coherence there, from the trace.
+
+    What excites there are the images of the held set-points.
+    """
+    windows = len(seen.fast_answer) // len(seen.answer)
+    first = int(BUS_LIMIT / lines.rate * lines.samples) + 1
+    last = int(TRACE_LIMIT / lines.rate * lines.samples)
+    bins = np.arange(first, last + 1)
+    all_lines = Lines(bins * lines.rate / lines.samples, lines.samples * windows, lines.rate * windows)
+    closed, coherence, _ = transfer(seen.fast_set_point, seen.fast_answer, all_lines)
+    # What is excited are the lines and their images; multiples of the bus's rate the holding takes out.
+    folded = np.minimum(bins % lines.samples, -bins % lines.samples)
+    lit = np.isin(folded, lines.bins)
+    return all_lines.f[lit], (closed / (1.0 - closed))[lit], coherence[lit]

@@ -1,0 +1,377 @@
+"""The cascade as transfer functions, exact for its sampling: what the drive's firmware does, without its limits.
+
+The winding, the rotor and an elastic load are one linear system in continuous time. The current loop samples it every
+tick, computes a duty that acts during the next one, and repeats that as often as ticks make a window; the velocity and
+the position loop see it once a window. Left out are limits, friction, quantisation, noise, and what the d axis does.
+
+    current    C(z) = P (1 + I / (1 - z^-1))           "advanced" PI of the motion chip: I is a share of P e
+    velocity   C(z) = P (1 + I / (1 - z^-1)), F(z) the second-order filter of the difference of counts
+    position   P
+
+All angles are the rotor's; f is in Hz throughout.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from drive_env.dictionary.units import UNITS, Context
+from drive_env.gains import Gains
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.motors import Motor
+    from tuning.identify.identification import Identification
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+RawGains = Sequence[int] | NDArray[np.int64]  # in the order of `Gains`
+
+
+@dataclass(frozen=True)
+class Plant:
+    """One axis as its loops see it.
+
+    Attributes:
+        R, L: Resistance [ohm] and inductance [H] of a phase, in the torque-making axis.
+        supply: Supply voltage [V].
+        torque_constant: Torque per ampere of peak i_q [N*m/A].
+        inertia: Total inertia at the rotor [kg*m^2].
+        viscous: Viscous friction at the rotor [N*m*s/rad].
+        anti_resonance, resonance: Of rotor and load on a shaft that twists [Hz]; infinite if rigid.
+        damping: Damping ratio of the resonance.
+        delay: What the velocity loop waits besides its current loop and its filter [s]: a period of it, half for the
+            difference of counts and half for holding its output.
+        velocity_filter: Corner of the velocity filter [Hz].
+        counts: Of the encoder, per turn.
+        emf_constant: Voltage per speed [V*s/rad]; nan for that of a PMSM, torque_constant / 1.5.
+
+    Raises:
+        ValueError: If a value is none that an axis can have.
+    """
+
+    R: float
+    L: float
+    supply: float
+    torque_constant: float
+    inertia: float
+    viscous: float = 0.0
+    anti_resonance: float = math.inf
+    resonance: float = math.inf
+    damping: float = 0.02
+    delay: float = 200e-6
+    velocity_filter: float = 400.0
+    counts: int = 4096
+    emf_constant: float = math.nan
+
+    def __post_init__(self) -> None:
+        for name in ("R", "L", "supply", "torque_constant", "inertia", "velocity_filter"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be above 0 and finite, not {getattr(self, name):g}")
+        if self.is_elastic and not 0.0 < self.anti_resonance < self.resonance:
+            raise ValueError(
+                f"the anti-resonance, {self.anti_resonance:g} Hz, must lie above 0 and below the resonance, "
+                f"{self.resonance:g} Hz; give inf for both if the load is rigid"
+            )
+
+    @property
+    def is_elastic(self) -> bool:
+        """Whether the load hangs on a spring."""
+        return math.isfinite(self.anti_resonance) and math.isfinite(self.resonance)
+
+    @property
+    def rotor_inertia(self) -> float:
+        """Return the share of the inertia that the spring leaves to the rotor [kg*m^2]; all of it if rigid."""
+        return self.inertia * (self.anti_resonance / self.resonance) ** 2 if self.is_elastic else self.inertia
+
+    @classmethod
+    def from_data_sheet(cls, device: Device, motor: Motor, supply: float, inertia: float, **more: Any) -> Plant:
+        """Return a rigid axis with a motor's catalogue values and the device's own delay and filter.
+
+        Args:
+            device: The drive.
+            motor: The motor.
+            supply: Supply voltage [V].
+            inertia: Total inertia at the rotor [kg*m^2].
+            more: Fields that are known better.
+        """
+        return cls(**_data_sheet(device, motor) | {"supply": supply, "inertia": inertia} | more)
+
+    @classmethod
+    def from_identification(cls, device: Device, motor: Motor, supply: float, identification: Identification) -> Plant:
+        """Return an axis as identified; what was refused is taken from the data sheet, an elastic pair as rigid.
+
+        Raises:
+            ValueError: If the inertia was refused, since no loop can be computed without one.
+        """
+        found = {name: estimate.value for name, estimate in identification.estimates.items()}
+        inertia = found.get("inertia", math.nan)
+        if not math.isfinite(inertia):
+            reason = getattr(identification.estimates.get("inertia"), "reason", "") or "it was not measured"
+            raise ValueError(f"the axis has no identified inertia: {reason}")
+        fields = {"R": "resistance", "L": "inductance", "delay": "loop_delay", "velocity_filter": "velocity_filter",
+                  "damping": "damping"}  # fmt: skip
+        known = {field: found[name] for field, name in fields.items() if math.isfinite(found.get(name, math.nan))}
+        pair = [found.get(name, math.nan) for name in ("anti_resonance", "resonance")]
+        if all(math.isfinite(frequency) for frequency in pair):
+            known |= {"anti_resonance": pair[0], "resonance": pair[1]}
+        viscous = found.get("viscous", math.nan)
+        if math.isfinite(viscous):
+            known["viscous"] = max(viscous, 0.0) * motor.torque_constant
+        return cls.from_data_sheet(device, motor, supply, inertia, **known)
+
+    @classmethod
+    def from_machine(cls, drives: Any, axis: int = 0) -> Plant:
+        """Return what an emulated axis truly is, linearised at its start; for tests.
+
+        Raises:
+            ValueError: For drives on a bus, whose truth nobody knows, and for a machine with several axes.
+        """
+        from tuning.identify.true_plant import true_plant
+
+        return true_plant(drives, axis)
+
+
+# --- the loops --------------------------------------------------------------------------------------------------------
+def current_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) -> Complex:
+    """Return the open loop of the current loop at frequencies below half its rate, with the rotor free to turn.
+
+    Args:
+        device: The drive.
+        plant: The axis.
+        gains: Raw integers in the order of `Gains`.
+        f: Frequencies [Hz], shape (n,).
+    """
+    raw, at = Gains(*gains), _below(f, device.current_rate)
+    A, B = _machine(plant)
+    T = 1.0 / device.current_rate
+    Phi, Gamma, _, _ = _held(A, B, T)
+    z = np.exp(2j * math.pi * at * T)
+    winding = _response(Phi, Gamma, np.eye(len(B))[_CURRENT], z)
+    return np.asarray(controllers(device, raw).current(z) * plant.supply * winding / z)
+
+
+def velocity_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) -> Complex:
+    """Return the open loop of the velocity loop at frequencies below half its rate.
+
+    Args:
+        device: The drive.
+        plant: The axis.
+        gains: Raw integers in the order of `Gains`.
+        f: Frequencies [Hz], shape (n,).
+    """
+    raw, at = Gains(*gains), _below(f, device.velocity_rate)
+    z = np.exp(2j * math.pi * at / device.velocity_rate)
+    return np.asarray(controllers(device, raw).velocity(z) * velocity_plant(device, plant, raw, at))
+
+
+def velocity_plant(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) -> Complex:
+    """Return what the velocity loop regulates: filtered velocity [rad/s] per demanded current [A].
+
+    Of the gains, those of the current loop matter.
+    """
+    at = _below(f, device.velocity_rate)
+    return np.asarray(mean_velocity(device, plant, Gains(*gains), at) * velocity_filter_response(device, plant, at))
+
+
+def position_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) -> Complex:
+    """Return the open loop of the position loop, the velocity loop closed within, below half its rate.
+
+    Args:
+        device: The drive.
+        plant: The axis.
+        gains: Raw integers in the order of `Gains`.
+        f: Frequencies [Hz], shape (n,).
+    """
+    raw, at = Gains(*gains), _below(f, device.velocity_rate)
+    z = np.exp(2j * math.pi * at / device.velocity_rate)
+    regulator = controllers(device, raw)
+    # What the position loop reads is the angle itself: the differences, added up.
+    angle = mean_velocity(device, plant, raw, at) / device.velocity_rate / (1.0 - 1.0 / z)
+    inner = regulator.velocity(z) * angle
+    return np.asarray(regulator.position * inner / (1.0 + velocity_open_loop(device, plant, raw, at)))
+
+
+def outer_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike, velocity: Complex) -> Complex:
+    """Return the open loop of the position loop around a velocity loop that is known, measured or not.
+
+    Args:
+        device: The drive.
+        plant: The axis; its velocity filter matters, which the position loop does not see.
+        gains: Raw integers in the order of `Gains`.
+        f: Frequencies [Hz], shape (n,).
+        velocity: Open loop of the velocity loop there, shape (n,).
+    """
+    at = _below(f, device.velocity_rate)
+    z = np.exp(2j * math.pi * at / device.velocity_rate)
+    speed = velocity / (1.0 + velocity) / velocity_filter_response(device, plant, at)
+    return np.asarray(controllers(device, gains).position * speed / (device.velocity_rate * (1.0 - 1.0 / z)))
+
+
+OPEN_LOOPS = {"current": current_open_loop, "velocity": velocity_open_loop, "position": position_open_loop}
+
+
+# --- their parts ------------------------------------------------------------------------------------------------------
+class Controllers(NamedTuple):
+    """The regulators in SI: duty per A, A per rad/s, 1/s; the integral gains are shares of P e per sample."""
+
+    current_p: float
+    current_i: float
+    velocity_p: float
+    velocity_i: float
+    position: float
+
+    def current(self, z: Complex) -> Complex:
+        """Return the current regulator at z, duty per A."""
+        return np.asarray(self.current_p * (1.0 + self.current_i / (1.0 - 1.0 / z)))
+
+    def velocity(self, z: Complex) -> Complex:
+        """Return the velocity regulator at z, A per rad/s."""
+        return np.asarray(self.velocity_p * (1.0 + self.velocity_i / (1.0 - 1.0 / z)))
+
+
+def controllers(device: Device, gains: RawGains) -> Controllers:
+    """Return raw gains in SI."""
+    raw = Gains(*(int(gain) for gain in gains))
+    context = Context(65536.0, device.current_full_scale / 32768.0)
+    names = ("current P", "I", "velocity P", "I", "position P")
+    return Controllers(*(value * float(UNITS[name].factor(context)) for value, name in zip(raw, names, strict=True)))
+
+
+def velocity_filter_response(device: Device, plant: Plant, f: ArrayLike) -> Complex:
+    """Return the velocity filter, and what the axis delays beyond the loop's own period, at frequencies [Hz]."""
+    from drive_env.emulator.parameters import velocity_filter
+
+    at = np.asarray(f, float)
+    b, a1, a2 = velocity_filter(np.asarray(plant.velocity_filter), device.velocity_rate)
+    back = np.exp(-2j * math.pi * at / device.velocity_rate)
+    more = np.exp(-2j * math.pi * at * (plant.delay - 1.0 / device.velocity_rate))
+    return np.asarray(b * (1.0 + back) ** 2 / (1.0 + a1 * back + a2 * back**2) * more)
+
+
+def mean_velocity(device: Device, plant: Plant, gains: RawGains, f: Floats) -> Complex:
+    """Return the difference of rotor angles over a window [rad/s] per demanded current [A], held for the window."""
+    regulator = controllers(device, gains)
+    at = np.ascontiguousarray(f, float).tobytes()
+    return _mean_velocity(
+        device.current_rate, device.velocity_rate, regulator.current_p, regulator.current_i, plant, at
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=256)
+def _mean_velocity(
+    current_rate: float, velocity_rate: float, P: float, share: float, plant: Plant, frequencies: bytes
+) -> Complex:
+    A, B = _machine(plant)
+    Phi, Gamma, angle_of_state, angle_of_voltage = _held(A, B, 1.0 / current_rate)
+    n = len(B)
+    # States: the machine's, the voltage that is computed and not yet applied, the regulator's integral.
+    tick, drive = np.zeros((n + 2, n + 2)), np.zeros(n + 2)
+    tick[:n, :n] = Phi
+    tick[:n, n] = Gamma
+    tick[n, _CURRENT] = -plant.supply * P * (1.0 + share)
+    tick[n, n + 1] = plant.supply
+    drive[n] = plant.supply * P * (1.0 + share)
+    tick[n + 1, _CURRENT] = -P * share
+    tick[n + 1, n + 1] = 1.0
+    drive[n + 1] = P * share
+    turned = np.concatenate([angle_of_state, [angle_of_voltage, 0.0]])
+    window, held = np.eye(n + 2), np.zeros(n + 2)
+    angle, angle_of_demand = np.zeros(n + 2), 0.0
+    for _ in range(round(current_rate / velocity_rate)):
+        angle, angle_of_demand = angle + turned @ window, angle_of_demand + float(turned @ held)
+        window, held = tick @ window, tick @ held + drive
+    z = np.exp(2j * math.pi * np.frombuffer(frequencies) / velocity_rate)
+    result = velocity_rate / z * (_response(window, held, angle, z) + angle_of_demand)
+    result.setflags(write=False)  # it is handed out to every caller
+    return np.asarray(result)
+
+
+_CURRENT, _SPEED = 0, 1  # states
+
+
+def _machine(plant: Plant) -> tuple[Floats, Floats]:
+    """Return A, B of the states current, rotor speed, and of an elastic load its twist and its speed; input: voltage.
+
+    The rotor's angle is no state: with it the system would have two poles at 0 and no basis of modes.
+    """
+    emf = plant.torque_constant / 1.5 if math.isnan(plant.emf_constant) else plant.emf_constant
+    J = plant.rotor_inertia
+    size = 4 if plant.is_elastic else 2
+    A = np.zeros((size, size))
+    A[_CURRENT, :2] = -plant.R / plant.L, -emf / plant.L
+    A[_SPEED, :2] = plant.torque_constant / J, -plant.viscous / J
+    if plant.is_elastic:
+        load = plant.inertia - J
+        stiffness = load * (2.0 * math.pi * plant.anti_resonance) ** 2
+        friction = 2.0 * plant.damping * stiffness / (2.0 * math.pi * plant.resonance)
+        # States 2 and 3: angle of the load ahead of the rotor, speed of the load.
+        A[1, 2], A[1, 3] = stiffness / J, friction / J
+        A[1, 1] -= friction / J
+        A[2, 3], A[2, 1] = 1.0, -1.0
+        A[3, 2], A[3, 3], A[3, 1] = -stiffness / load, -friction / load, friction / load
+    B = np.zeros(size)
+    B[_CURRENT] = 1.0 / plant.L
+    return A, B
+
+
+def _held(A: Floats, B: Floats, T: float) -> tuple[Floats, Floats, Floats, float]:
+    """Return Phi, Gamma of a system whose input is held for T [s], and what the rotor turns meanwhile, likewise."""
+    n = len(B)
+    block = np.zeros((n + 2, n + 2))
+    block[:n, :n], block[:n, n] = A * T, B * T
+    block[n + 1, _SPEED] = T
+    step = exponential(block)
+    return step[:n, :n], step[:n, n], step[n + 1, :n], float(step[n + 1, n])
+
+
+def exponential(X: Floats) -> Floats:
+    """Return exp(X) of a small matrix to rounding: Taylor's series of X / 2^k, squared k times.
+
+    SciPy's takes 20 ms instead of 0.1 where cores are busy, for its threads; a fit needs hundreds.
+    """
+    norm = float(np.abs(X).sum(axis=0).max())
+    halvings = max(0, math.ceil(math.log2(norm)) + 1) if norm > 0.0 else 0
+    small = X / 2.0**halvings
+    result = np.eye(len(X))
+    for k in range(_TERMS, 0, -1):
+        result = np.eye(len(X)) + small @ result / k
+    for _ in range(halvings):
+        result = result @ result
+    return np.asarray(result)
+
+
+_TERMS = 14  # of |X| <= 1/2: 2e-17 are left
+
+
+def _response(Phi: Floats, Gamma: Floats, row: Floats, z: Complex) -> Complex:
+    """Return row (z - Phi)^-1 Gamma, in the shape of z, by the modes of Phi, which are simple."""
+    poles, shapes = np.linalg.eig(Phi)
+    residues = (row @ shapes) * np.linalg.solve(shapes, Gamma.astype(complex))
+    return np.asarray((residues / (z[:, None] - poles)).sum(axis=1))
+
+
+def _below(f: ArrayLike, rate: float) -> Floats:
+    at = np.asarray(f, float)
+    if at.ndim != 1 or (at.size and not (at.min() > 0.0 and at.max() < 0.5 * rate)):
+        raise ValueError(f"frequencies must be one row above 0 and below {0.5 * rate:g} Hz, half the loop's rate")
+    return at
+
+
+def _data_sheet(device: Device, motor: Motor) -> dict[str, Any]:
+    return {
+        "R": motor.R_s,
+        "L": motor.L_q,
+        "torque_constant": motor.torque_constant,
+        "emf_constant": motor.n_p * motor.psi_m,
+        "delay": 1.0 / device.velocity_rate,
+        "velocity_filter": device.stage["velocity_filter"].default,
+        "counts": motor.encoder_counts,
+    }

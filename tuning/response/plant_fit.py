@@ -1,0 +1,482 @@
+"""An axis's plant from a measured velocity loop: inertia, resonance, delay and velocity filter, with their intervals.
+
+The linear model is fitted to what was measured, images of held set-points included, so nothing need be known above
+half the bus's rate. Weights are what coherence says of the noise. A rigid axis has four unknowns, one whose load
+swings has seven, one with two springs in a row ten; which it is, the data decide, by Bayes's information criterion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+from scipy.optimize import least_squares
+from scipy.stats import t as student
+
+from tuning.response.held_samples import seen_by_bus
+from tuning.response.linear_model import Plant, controllers, velocity_open_loop, velocity_plant
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from tuning.identify.identification import Estimate
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Mask = NDArray[np.bool_]
+
+LINEAR = 0.01  # share by which the linear model may be off at a line for reasons that repeat: friction, cogging
+VALLEY, NEIGHBOURS = 0.02, 5  # the same, of the greatest among so many neighbours
+FEWEST = 12  # lines
+LEAST_GAIN = 10.0  # by which the criterion must improve for a resonance to be believed
+SURE = 3.0  # standard deviations of a resonance's distance from its anti-resonance, at least
+# What repeats and is not in the linear model, as standard deviations: logarithms, and s of the delay. The bridge's dead
+# time swallows some of what small currents ask for, friction broadens a resonance.
+SYSTEMATIC = {
+    "inertia": 0.02, "velocity_filter": 0.04, "loop_delay": 15e-6, "anti_resonance": 0.008, "resonance": 0.004,
+    "damping": 0.15,
+}  # fmt: skip
+# Half of an interval over the value, above which it is no identification.
+WIDEST = {
+    "inertia": 0.3, "velocity_filter": 0.3, "loop_delay": 0.4, "anti_resonance": 0.1, "resonance": 0.1, "damping": 2.0,
+}  # fmt: skip
+# s, standard deviation of what is expected of the delay before it is measured: without any, a few low frequencies
+# cannot tell it from the velocity filter, and both get lost.
+EXPECTED_DELAY = 50e-6
+# Share of what dead time may add to the winding's resistance that is expected, and its deviation: currents that swing
+# through zero seldom see all of it, and it is told from the lag of the velocity filter by this alone.
+EXPECTED_LOSS, LOSS_SPREAD = 0.5, 0.4
+LEVEL = 0.03  # by which a resonance may move with the strength of the shaking, unless noise explains more
+DISTORTED = 0.13  # share by which passes may differ beyond noise
+PAIR = ("anti_resonance", "resonance", "damping")
+DAMPED = {"anti_resonance": 0.03, "resonance": 0.03, "damping": 0.0}  # share of the damping that may move a pair
+SECONDS, SPACING = 6, 0.25  # beginnings that are tried for a second pair, and their distance, a logarithm
+RATIOS = (1.15, 1.4, 1.8, 2.6)  # of a resonance over its anti-resonance, where the search begins
+RIGID_ENOUGH = 1.5  # misfit up to which no further resonance is looked for
+NAMES = ("inertia", "velocity_filter", "loop_delay", "anti_resonance", "resonance", "damping")
+_UNITS = dict(zip(NAMES, ("kg*m^2", "Hz", "s", "Hz", "Hz", "1"), strict=True))
+_FIELDS = {"loop_delay": "delay"}  # names of estimates that a plant calls otherwise
+NORMAL_95 = 1.96  # standard deviations to either side that hold 95 %
+_LOWEST_FILTER, _HIGHEST_FILTER, _LONGEST_DELAY = 50.0, 2000.0, 5e-3
+
+
+class Pair(NamedTuple):
+    """An anti-resonance and the resonance above it [Hz], and their damping, beyond those of a plant."""
+
+    anti_resonance: float
+    resonance: float
+    damping: float
+
+    def response(self, f: Floats) -> Complex:
+        """Return by what the pair multiplies the velocity that a torque makes; 1 far below."""
+        swing = 2.0 * self.damping * 1j * f / self.resonance
+        return np.asarray((1.0 - (f / self.anti_resonance) ** 2 + swing) / (1.0 - (f / self.resonance) ** 2 + swing))
+
+
+class PlantFit(NamedTuple):
+    """The fitted plant, and each parameter with its interval; `reason` says why there is none.
+
+    The plant has the first pair of anti-resonance and resonance; a second one, above it, is in `second`.
+    """
+
+    plant: Plant
+    estimates: dict[str, Estimate]
+    misfit: float  # RMS of the residuals over what noise and LINEAR explain; about 1 if the model fits
+    reason: str = ""
+    second: Pair | None = None
+    lost: float = 0.0  # what dead time adds to the resistance of a winding that is shaken [ohm]
+
+    def open_loop(self, device: Device, gains: NDArray[np.int64], f: Floats) -> Complex:
+        """Return the velocity loop's open loop at frequencies [Hz], shape (n,)."""
+        return _open_loop(device, _Model(self.plant, self.second), gains, f, self.lost)
+
+    def drawn(self, rng: np.random.Generator, count: int) -> Iterator[PlantFit]:
+        """Yield fits whose parameters lie as the intervals say, each on its own; what was refused stays as it is."""
+        for _ in range(count):
+            values = {}
+            for name, estimate in self.estimates.items():
+                if math.isfinite(estimate.value) and math.isfinite(estimate.high - estimate.low):
+                    at = rng.normal(estimate.value, (estimate.high - estimate.low) / (2.0 * NORMAL_95))
+                    values[_FIELDS.get(name, name)] = max(at, 0.1 * estimate.value)
+            if values.get("anti_resonance", 0.0) < values.get("resonance", math.inf):
+                yield self._replace(plant=replace(self.plant, **values))  # type: ignore[arg-type]  # none of them is counts
+
+
+class _Model(NamedTuple):
+    plant: Plant
+    second: Pair | None = None
+    loss: float = EXPECTED_LOSS  # of what dead time may add to the resistance, the share that it does
+
+
+class _Solution(NamedTuple):
+    model: _Model
+    residuals: Floats
+    jacobian: Floats  # their derivatives by the parameters, as `_unpack` takes them
+
+
+def _open_loop(device: Device, model: _Model, gains: NDArray[np.int64], f: Floats, lost: float) -> Complex:
+    # The winding of a model is the data sheet's: what dead time adds to it comes here.
+    L = velocity_open_loop(device, replace(model.plant, R=model.plant.R + lost), gains, f)
+    return L if model.second is None else L * model.second.response(f)
+
+
+def fit_plant(
+    device: Device, gains: NDArray[np.int64], f: Floats, seen: Complex, spread: Floats, start: Plant,
+    parts: Sequence[Complex] = (), distortion: float = 0.0, lost: float = 0.0, less: Seen | None = None,
+) -> PlantFit:  # fmt: skip
+    """Fit the plant of one axis to its closed velocity loop as a bus sees it.
+
+    Args:
+        device: The drive.
+        gains: Raw gains in force, shape (5,).
+        f: Frequencies that are trusted [Hz], shape (n,).
+        seen: Set-point to velocity, both as on the bus, shape (n,).
+        spread: Standard deviation of each line over its size, shape (n,).
+        start: What the data sheet says.
+        parts: What single passes saw, which differ in direction, shape (n,) each. By what they differ, intervals are
+            wider.
+        distortion: Share by which passes differ beyond noise; above `DISTORTED` resonances are refused.
+        lost: What dead time may add to the resistance [ohm]: see `dead_time_resistance`.
+        less: The same axis shaken less. Where that says another resonance it is refused, and where it says none.
+    """
+    if len(f) < FEWEST:
+        return _refusal(start, f"only {len(f)} frequencies are coherent, of {FEWEST} that are needed")
+    rough = _rough_loop(device, gains, f, seen)
+    begin = _with_inertia(start, device, gains, f, rough)
+    loop = _Loop(device, gains, f, seen, _weight(seen, spread), lost)
+    best = rigid = _solve(loop, _Model(begin))
+    # What will be confirmed may be looked for where a rigid axis would explain it, too.
+    if _misfit(rigid) > RIGID_ENOUGH or less is not None:
+        ones = [_solve(loop, _Model(pair)) for pair in _candidate_pairs(loop, rough, begin)]
+        best = _better(rigid, ones)
+        if _misfit(best) > RIGID_ENOUGH and len(f) > 2 * FEWEST:
+            best = _better(best, [_solve(loop, model) for model in _candidate_seconds(loop, ones)])
+    scatter, doubt = _scatter(loop, best, spread, parts), ""
+    if less is not None and best.model.plant.is_elastic:
+        change, doubt = _by_level(loop, best, less)
+        scatter = np.hypot(scatter, change)
+    fit = _with_intervals(best, f, scatter, lost)
+    # What is confirmed may differ from pass to pass for other reasons.
+    if (doubt or less is None) and distortion > DISTORTED:
+        why = (
+            f"the response is another when it is shaken the other way round, by {100.0 * distortion:.0f} % beyond "
+            "noise: with backlash, or friction that sticks, a resonance depends on how strongly it is shaken"
+        )
+        doubt = f"{doubt}; {why}" if doubt else why
+    return _doubted(fit, doubt) if doubt else fit
+
+
+def _weight(seen: Complex, spread: Floats) -> Floats:
+    size = np.abs(seen)
+    # In the valley of an anti-resonance what is not linear, small elsewhere, is all that is left.
+    around = maximum_filter1d(size, NEIGHBOURS)
+    return np.asarray(1.0 / np.sqrt(size**2 * (spread**2 / 2.0 + LINEAR**2) + (VALLEY * around) ** 2))
+
+
+def _by_level(loop: _Loop, found: _Solution, less: Seen) -> tuple[Floats, str]:
+    """Return by how much parameters differ beyond noise where an axis is shaken less, and why its pair is refused."""
+    p = _with_resonance(_pack(found.model))
+    if len(less.f) < FEWEST:
+        return np.zeros(len(p)), (
+            f"shaken less, only {len(less.f)} frequencies are coherent, of {FEWEST} that are needed to confirm it"
+        )
+    weight = _weight(less.seen, less.spread)
+    again = _solve(loop._replace(f=less.f, seen=less.seen, weight=weight), found.model)
+    q = _with_resonance(_pack(again.model))
+    deviation = _deviations(again)
+    change = np.abs(q - p)
+    doubt = 2.0 * deviation[-1]
+    if doubt > WIDEST["resonance"]:
+        return np.zeros(len(p)), f"shaken less, it can only be told to {100.0 * doubt:.0f} %, which does not confirm it"
+    if change[-1] > max(LEVEL, doubt):
+        return np.zeros(len(p)), (
+            f"it lies at {math.exp(p[-1]):.4g} Hz, and at {math.exp(q[-1]):.4g} Hz where the axis is shaken less: with "
+            "backlash, or friction that sticks, there is no such thing as one resonance"
+        )
+    return np.sqrt(np.maximum(change**2 - deviation**2, 0.0)), ""
+
+
+def _with_resonance(p: Floats) -> Floats:
+    """Return parameters and, of an elastic axis, the logarithm of its resonance, which is the sum of two."""
+    return np.append(p, p[FIRST] + p[FIRST + 1]) if len(p) > FIRST else np.append(p, 0.0)
+
+
+def _deviations(solution: _Solution) -> Floats:
+    """Return the standard deviations of the parameters, and of the resonance's logarithm."""
+    covariance = _covariance(solution)
+    own = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if len(own) <= FIRST:
+        return np.append(own, 0.0)
+    both = covariance[FIRST : FIRST + 2, FIRST : FIRST + 2]
+    return np.append(own, math.sqrt(max(float(both.sum()), 0.0)))
+
+
+def _covariance(solution: _Solution) -> Floats:
+    jacobian = solution.jacobian
+    return np.asarray(np.linalg.pinv(jacobian.T @ jacobian) * max(_misfit(solution), 1.0) ** 2)
+
+
+def _better(simple: _Solution, found: list[_Solution]) -> _Solution:
+    """Return the best of what was found, or the simpler one if the data do not clearly ask for more."""
+    sure = [solution for solution in found if _is_sure(solution)]
+    best = min(sure, key=_criterion, default=simple)
+    return best if _criterion(best) < _criterion(simple) - LEAST_GAIN else simple
+
+
+def _scatter(loop: _Loop, found: _Solution, spread: Floats, parts: Sequence[Complex]) -> Floats:
+    """Return by how much parameters differ between single passes, and between quiet lines and all: half of it each.
+
+    Those of the model, and of the resonance in the end, shape (parameters + 1,).
+    """
+    p = _with_resonance(_pack(found.model))
+    if not parts:
+        return np.zeros(len(p))
+
+    def parameters(part: _Loop) -> Floats:
+        return _with_resonance(_pack(_solve(part, found.model).model))
+
+    passes = [parameters(loop._replace(seen=part, weight=loop.weight / math.sqrt(len(parts)))) for part in parts]
+    quiet = spread <= np.median(spread)
+    fewer = parameters(loop._replace(f=loop.f[quiet], seen=loop.seen[quiet], weight=loop.weight[quiet]))
+    return np.asarray(0.5 * np.hypot(np.ptp(passes, axis=0), fewer - p))
+
+
+def _doubted(fit: PlantFit, reason: str) -> PlantFit:
+    """Return a fit without its pair."""
+    from tuning.identify.identification import refused
+
+    return fit._replace(estimates=fit.estimates | {name: refused(_UNITS[name], reason) for name in PAIR})
+
+
+class Seen(NamedTuple):
+    """What was seen of a closed velocity loop at its trusted frequencies, as `fit_plant` takes it, shape (n,) each."""
+
+    f: Floats  # Hz
+    seen: Complex
+    spread: Floats
+
+
+class _Loop(NamedTuple):
+    """A closed velocity loop as the bus sees it, and the weight of each line."""
+
+    device: Device
+    gains: NDArray[np.int64]
+    f: Floats
+    seen: Complex
+    weight: Floats
+    lost: float  # ohm, as `fit_plant` takes it
+
+
+def _solve(loop: _Loop, start: _Model) -> _Solution:
+    def residuals(p: Floats) -> Floats:
+        off = _residuals(loop, _unpack(p, start))
+        delay = (p[2] / _SCALE - 1.0 / loop.device.velocity_rate) / EXPECTED_DELAY
+        return np.concatenate([off, [delay, (p[3] - EXPECTED_LOSS) / LOSS_SPREAD]])
+
+    p, f = _pack(start), loop.f
+    pair = (math.log(f[0] / 2), 0.005, math.log(1e-3)), (math.log(2 * f[-1]), 3.0, 0.0)
+    low = np.array([p[0] - 5.0, math.log(_LOWEST_FILTER), -_SCALE * 1e-3, 0.0, *pair[0], *pair[0]])[: len(p)]
+    high = np.array([p[0] + 5.0, math.log(_HIGHEST_FILTER), _SCALE * _LONGEST_DELAY, 2.0, *pair[1], *pair[1]])[: len(p)]
+    result = least_squares(
+        residuals,
+        np.clip(p, low + 1e-6, high - 1e-6),
+        bounds=(low, high),
+        loss="soft_l1",
+        max_nfev=30 if len(p) < FIRST + 6 else 60,
+        x_scale=np.array([0.1, 0.1, 0.1, 0.3, 0.02, 0.05, 0.3, 0.02, 0.05, 0.3])[: len(p)],
+    )
+    found, jacobian = _unpack(result.x, start), np.asarray(result.jac)
+    if found.second is not None and found.second.anti_resonance < found.plant.anti_resonance:
+        first = Pair(found.plant.anti_resonance, found.plant.resonance, found.plant.damping)
+        found = _Model(replace(found.plant, **found.second._asdict()), first, found.loss)
+        own = list(range(FIRST))
+        jacobian = jacobian[:, [*own, *range(FIRST + 3, FIRST + 6), *range(FIRST, FIRST + 3)]]
+    return _Solution(found, np.asarray(result.fun), jacobian)
+
+
+def _residuals(loop: _Loop, model: _Model) -> Floats:
+    def closed(at: Floats) -> Complex:
+        L = _open_loop(loop.device, model, loop.gains, at, model.loss * loop.lost)
+        return np.asarray(L / (1.0 + L))
+
+    off = (seen_by_bus(loop.device, loop.f, closed) - loop.seen) * loop.weight
+    return np.asarray(np.nan_to_num(np.concatenate([off.real, off.imag]), nan=1e6, posinf=1e6, neginf=-1e6))
+
+
+_BEYOND = 20.0  # uncertainty of a logarithm that is as good as infinite
+_SCALE = 1e4  # of the delay's parameter, 1/s
+FIRST = 4  # parameter: of the first pair; before it those of a rigid axis
+
+
+def _pack(model: _Model) -> Floats:
+    plant = model.plant
+    p = [math.log(plant.inertia), math.log(plant.velocity_filter), plant.delay * _SCALE, model.loss]
+    if plant.is_elastic:
+        p += _packed_pair(plant.anti_resonance, plant.resonance, plant.damping)
+    if model.second is not None:
+        p += _packed_pair(*model.second)
+    return np.array(p)
+
+
+def _packed_pair(anti_resonance: float, resonance: float, damping: float) -> list[float]:
+    return [math.log(anti_resonance), math.log(resonance / anti_resonance), math.log(damping)]
+
+
+def _unpack(p: Floats, like: _Model) -> _Model:
+    known = {"inertia": math.exp(p[0]), "velocity_filter": math.exp(p[1]), "delay": p[2] / _SCALE}
+    pairs = [Pair(math.exp(p[k]), math.exp(p[k] + p[k + 1]), math.exp(p[k + 2])) for k in range(FIRST, len(p), 3)]
+    if pairs:
+        known |= pairs[0]._asdict()
+    return _Model(replace(like.plant, **known), pairs[1] if len(pairs) > 1 else None, float(p[3]))
+
+
+def _misfit(solution: _Solution) -> float:
+    residuals, jacobian = solution.residuals, solution.jacobian
+    return math.sqrt(float(np.sum(residuals**2)) / max(len(residuals) - jacobian.shape[1], 1))
+
+
+def _is_sure(solution: _Solution) -> bool:
+    """Return whether every resonance is apart from its anti-resonance for certain."""
+    covariance = _covariance(solution)
+    p = _pack(solution.model)
+    return all(bool(p[k] > SURE * math.sqrt(max(covariance[k, k], 0.0))) for k in range(FIRST + 1, len(p), 3))
+
+
+def _criterion(solution: _Solution) -> float:
+    n = len(solution.residuals)
+    return float(n * math.log(float(np.mean(solution.residuals**2))) + solution.jacobian.shape[1] * math.log(n))
+
+
+# --- where to begin ---------------------------------------------------------------------------------------------------
+def _rough_loop(device: Device, gains: NDArray[np.int64], f: Floats, seen: Complex) -> Complex:
+    """Return velocity per demanded current with the images still in it."""
+    from tuning.response.held_samples import unhold
+
+    closed = unhold(device, f, seen, np.zeros(f.shape, complex))
+    z = np.exp(2j * math.pi * f / device.velocity_rate)
+    return np.asarray(closed / (1.0 - closed) / controllers(device, gains).velocity(z))
+
+
+def _with_inertia(plant: Plant, device: Device, gains: NDArray[np.int64], f: Floats, rough: Complex) -> Plant:
+    ratio = np.abs(velocity_plant(device, plant, gains, f)) / np.abs(rough)
+    return replace(plant, inertia=plant.inertia * float(np.median(ratio[: max(4, len(f) // 4)])))
+
+
+def _candidate_pairs(loop: _Loop, rough: Complex, rigid: Plant) -> list[Plant]:
+    """Return plants with a pair to begin with: the deepest swing of the response, and the best of a coarse grid."""
+    device, gains, f = loop.device, loop.gains, loop.f
+    level = 20.0 * np.log10(np.abs(rough / velocity_plant(device, rigid, gains, f)))
+    pairs = []
+    for valley in range(len(f) - 1):
+        peak = valley + int(np.argmax(level[valley:]))
+        pairs.append((level[peak] - level[valley], f[valley], f[peak]))
+    _, low, high = max(pairs)
+    plants = [replace(rigid, anti_resonance=float(low), resonance=float(high), damping=0.03)] if high > low else []
+
+    def scaled(plant: Plant) -> Plant:
+        ratio = float(np.median(np.abs(velocity_plant(device, plant, gains, f) / rough)))
+        return replace(plant, inertia=plant.inertia * ratio)
+
+    grid = [
+        scaled(replace(rigid, anti_resonance=float(low), resonance=float(low * ratio), damping=0.03))
+        for low in np.geomspace(f[0], f[-1] * 0.8, 16)
+        for ratio in RATIOS
+    ]
+    return plants + sorted(grid, key=lambda plant: _cost(loop, _Model(plant)))[:3]
+
+
+def _candidate_seconds(loop: _Loop, ones: list[_Solution]) -> list[_Model]:
+    """Return models with two pairs to begin with: that of one spring, as it was found, and another below or above."""
+    models = []
+    for plant in {round(one.model.plant.resonance): one.model.plant for one in ones}.values():
+        mine = Pair(plant.anti_resonance, plant.resonance, min(plant.damping, 0.05))
+        for low in np.geomspace(2.0 * loop.f[0], loop.f[-1] * 0.9, 24):
+            for ratio in (1.08, *RATIOS):
+                first, second = sorted((mine, Pair(float(low), float(low * ratio), 0.03)))
+                models.append(_Model(replace(plant, **first._asdict()), second))
+    # Of two springs in a row the first resonance lies below the second anti-resonance.
+    apart = [m for m in models if m.second is not None and m.second.anti_resonance > m.plant.resonance]
+    chosen: list[_Model] = []
+    for model in sorted(apart, key=lambda model: _cost(loop, model)):
+        # From all over the range: the cheapest beginnings are often neighbours that lead nowhere.
+        if all(abs(math.log(_middle(model) / _middle(other))) > SPACING for other in chosen):
+            chosen.append(model)
+    return chosen[:SECONDS]
+
+
+def _middle(model: _Model) -> float:
+    """Return where a beginning puts its pairs [Hz^2]."""
+    assert model.second is not None
+    return model.second.anti_resonance * model.plant.anti_resonance
+
+
+def _cost(loop: _Loop, model: _Model) -> float:
+    return float(np.sum(np.log1p(_residuals(loop, model) ** 2)))  # a resonance a line off is not quite wrong
+
+
+# --- intervals --------------------------------------------------------------------------------------------------------
+def _with_intervals(solution: _Solution, f: Floats, scatter: Floats, lost: float) -> PlantFit:
+    from tuning.identify.identification import Estimate, refused
+
+    (plant, second, loss), residuals, jacobian = solution
+    freedom = max(len(residuals) - jacobian.shape[1], 1)
+    misfit = _misfit(solution)
+    covariance = _covariance(solution)
+    reach = float(student.ppf(0.975, freedom))
+    p = _pack(solution.model)
+
+    def positive(name: str, row: list[float], unit: str) -> Estimate:
+        direction = np.array(row + [0.0] * (len(p) - len(row)))
+        variance = max(float(direction @ covariance @ direction), 0.0) + SYSTEMATIC[name] ** 2
+        variance += float(scatter[-1] if name == "resonance" else scatter[int(np.flatnonzero(direction)[0])]) ** 2
+        if name in PAIR:
+            # Which bearing or spring takes the energy is not known: it moves a pair that is damped well.
+            variance += (DAMPED[name] * plant.damping) ** 2
+        spread = math.sqrt(variance)
+        half = min(reach * spread, _BEYOND)
+        middle = float(direction @ p)
+        return Estimate(math.exp(middle), math.exp(middle - half), math.exp(middle + half), unit)
+
+    estimates = {
+        "inertia": positive("inertia", [1.0, 0.0, 0.0], "kg*m^2"),
+        "velocity_filter": positive("velocity_filter", [0.0, 1.0, 0.0], "Hz"),
+    }
+    half = reach * math.hypot(math.sqrt(max(float(covariance[2, 2]), 0.0)) / _SCALE, SYSTEMATIC["loop_delay"])
+    estimates["loop_delay"] = Estimate(plant.delay, plant.delay - half, plant.delay + half, "s")
+    if plant.is_elastic:
+        own = [0.0] * FIRST
+        estimates["anti_resonance"] = positive("anti_resonance", [*own, 1.0], "Hz")
+        estimates["resonance"] = positive("resonance", [*own, 1.0, 1.0], "Hz")
+        estimates["damping"] = positive("damping", [*own, 0.0, 0.0, 1.0], "1")
+    else:
+        reason = f"none shows between {f[0]:.0f} and {f[-1]:.0f} Hz"
+        if misfit > RIGID_ENOUGH:
+            reason = f"the response from {f[0]:.0f} to {f[-1]:.0f} Hz is not that of a rigid axis, one spring or two"
+        estimates |= {name: refused(_UNITS[name], reason) for name in PAIR}
+    estimates |= {name: _checked(name, estimate) for name, estimate in estimates.items()}
+    if plant.is_elastic and plant.resonance > f[-1]:
+        reason = f"it lies above {f[-1]:.0f} Hz, up to which the axis could be seen"
+        estimates |= {name: refused(_UNITS[name], reason) for name in ("resonance", "damping")}
+    return PlantFit(plant, estimates, misfit, second=second, lost=loss * lost)
+
+
+def _checked(name: str, estimate: Estimate) -> Estimate:
+    """Return an estimate, or its refusal if its interval says nothing."""
+    from tuning.identify.identification import refused
+
+    if not estimate.is_known or (estimate.high - estimate.low) / 2.0 <= WIDEST[name] * abs(estimate.value):
+        return estimate
+    return refused(
+        estimate.unit,
+        f"excitation too weak: {estimate.value:.4g} lies anywhere between {estimate.low:.4g} and {estimate.high:.4g}",
+    )
+
+
+def _refusal(plant: Plant, reason: str) -> PlantFit:
+    from tuning.identify.identification import refused
+
+    return PlantFit(plant, {name: refused(_UNITS[name], reason) for name in NAMES}, math.nan, reason)

@@ -1,0 +1,58 @@
+"""What whole periods of an excitation say at its lines: response, coherence, noise, and how two directions differ."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal, stats
+
+from tuning.response.excitation import Lines
+
+Floats = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+STANDS = 1e-9  # of the set-point: an axis that answers less was not shaken
+DISTORTION_HIGH, TRIMMED = 200.0, 0.1  # Hz up to which passes are compared, and the share of lines left out at each end
+DIRECTIONS = 2  # of the excitation in time, from pass to pass
+
+
+def transfer(set_point: Floats, answer: Floats, lines: Lines) -> tuple[Complex, Floats, Floats]:
+    """Return set-point to answer at the lines, its coherence, and its standard deviation over its size, (n, axes)."""
+    periods = len(set_point) // lines.samples
+
+    def cross(x: Floats, y: Floats) -> Complex:
+        # Whole periods need no window.
+        spectrum = signal.csd(x, y, lines.rate, "boxcar", lines.samples, 0, detrend="constant", axis=0)[1]
+        return np.asarray(spectrum)[lines.bins]
+
+    error = set_point - answer
+    power, answers, errors = (np.abs(cross(x, x)) for x in (set_point, answer, error))
+    to_answer, to_error = cross(set_point, answer), cross(set_point, error)
+    tiny = 1e-30  # of what was not shaken
+    with_answer = np.abs(to_answer) ** 2 / np.maximum(power * answers, tiny)
+    with_error = np.abs(to_error) ** 2 / np.maximum(power * errors, tiny)
+    freedom = max(periods - 1, 1)
+    spread = np.sqrt(np.maximum(1.0 - with_answer, 0.0) / np.maximum(with_answer, tiny) / freedom)
+    return to_answer / np.maximum(power, tiny), np.minimum(with_answer, with_error), spread
+
+
+def directions(set_point: Floats, answer: Floats, lines: Lines, count: int) -> tuple[list[Complex], Floats]:
+    """Return set-point to answer of the passes of either direction, and the share by which passes differ beyond noise.
+
+    Within a pass periods repeat but for noise; from pass to pass the excitation runs backwards, and what is not linear
+    answers otherwise (Pintelon and Schoukens, System Identification, 2nd ed., chapter 4).
+    """
+    periods = len(set_point) // lines.samples
+    if periods < 2 * count:
+        return [], np.zeros(set_point.shape[1])
+    shape = (count, periods // count, lines.samples, -1)
+    into, out = (np.fft.rfft(x.reshape(shape), axis=2)[:, :, lines.bins] for x in (set_point, answer))
+    each = out / np.where(into == 0.0, np.inf, into)
+    passes = each.mean(axis=1)
+    noise = np.sum(np.abs(each - passes[:, None]) ** 2, axis=(0, 1)) / (count * (shape[1] - 1)) / shape[1]
+    between = np.sum(np.abs(passes - passes.mean(axis=0)) ** 2, axis=0) / (count - 1)
+    size = np.abs(passes.mean(axis=0))
+    excess = ((between - noise) / np.where(size > STANDS, size, np.inf) ** 2)[lines.f <= DISTORTION_HIGH]
+    distortion = np.sqrt(np.maximum(stats.trim_mean(excess, TRIMMED, axis=0), 0.0))
+    # Passes of one direction show the same but for noise.
+    return [passes[k::DIRECTIONS].mean(axis=0) for k in range(DIRECTIONS)], distortion

@@ -1,0 +1,74 @@
+"""The small lags that rules count, each loop's own, and how slow an elastic load makes a loop."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING, velocity_filter
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from tuning.response.linear_model import Plant
+    from tuning.rules.proposal import Workbench
+
+ANTI_RESONANCE_SHARE = (
+    0.5  # crossover of a velocity loop over the first anti-resonance, at most: what makers' tools reach
+)
+_RESPONSE = 4096  # samples in which a velocity filter's impulse response has died away, from 5 Hz up
+
+
+def current_lag(device: Device) -> float:
+    """Return the sum of the current loop's small time constants [s]: one PWM period computing, half a one holding."""
+    return 1.5 / device.current_rate
+
+
+def velocity_lag(device: Device, plant: Plant, current: float) -> float:
+    """Return the sum of the velocity loop's small time constants [s].
+
+    Args:
+        device: The drive.
+        plant: The axis: its delay, and the corner of its velocity filter.
+        current: The closed current loop as a lag [s].
+    """
+    return current + plant.delay + 2.0 * VELOCITY_FILTER_DAMPING / (2.0 * math.pi * plant.velocity_filter)
+
+
+def slow_enough(bench: Workbench, plant: Plant, small: float, share: float) -> float:
+    """Return the small time constant, or a larger one with which a crossover of share/small stays below the limit.
+
+    Above half the first anti-resonance, a load on a spring answers for its rotor alone.
+    """
+    if not math.isfinite(plant.anti_resonance):
+        return small
+    highest = ANTI_RESONANCE_SHARE * plant.anti_resonance
+    wanted = share / small / (2.0 * math.pi)
+    if wanted <= highest:
+        return small
+    bench.note(
+        f"velocity loop held to {highest:.0f} Hz, half the anti-resonance at {plant.anti_resonance:.0f} Hz; "
+        f"the lags alone would allow {wanted:.0f} Hz"
+    )
+    return share / (2.0 * math.pi * highest)
+
+
+def velocity_noise(device: Device, plant: Plant) -> float:
+    """Return the RMS noise that the encoder's counts leave in the filtered velocity of a turning axis [rad/s].
+
+    Positions are off by up to half a count, evenly, from sample to sample at random; velocity is their difference,
+    filtered.
+    """
+    from scipy.signal import lfilter
+
+    b, a1, a2 = (
+        float(x) for x in velocity_filter(np.asarray(min(plant.velocity_filter, 0.45 * device.velocity_rate)),
+                                          device.velocity_rate)
+    )  # fmt: skip
+    impulse = np.zeros(_RESPONSE)
+    impulse[0] = device.velocity_rate
+    impulse[1] = -device.velocity_rate
+    answer = lfilter(b * np.array([1.0, 2.0, 1.0]), [1.0, a1, a2], impulse)
+    count = 2.0 * math.pi / plant.counts
+    return float(count / math.sqrt(12.0) * math.sqrt(np.sum(answer**2)))

@@ -1,0 +1,95 @@
+"""Modulus optimum and symmetrical optimum: the current loop by the first, the velocity loop by either.
+
+Both take all small lags together as one time constant T (Kessler 1955, 1958). With a plant k / ((1 + s T_1)(1 + s T))
+the modulus optimum cancels T_1 and leaves a damping of 0.707: 4.3 % overshoot. With k / (s (1 + s T)) the symmetrical
+optimum puts the crossover at 1/(a T), in the middle between 1/(a^2 T) and 1/T: a = 2 has 36.9 degrees of phase margin
+and, without a filter of the set-point, 43.4 % overshoot.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from tuning.rules.lags import current_lag, slow_enough, velocity_lag
+from tuning.rules.proposal import Proposal, Workbench
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.motors import Motor
+    from tuning.response.linear_model import Plant
+
+SPREAD = 2.0  # a of the symmetrical optimum
+POSITION = 0.5  # k_v over the velocity loop's crossover: modulus optimum, the velocity loop as one lag
+POSITION_SYMMETRICAL = 0.25  # of a velocity loop that overshoots
+
+
+class PI(NamedTuple):
+    """A controller p (1 + 1/(s time)); an infinite time is none."""
+
+    p: float
+    time: float
+
+
+def modulus_optimum(gain: float, large: float, small: float) -> PI:
+    """Return the controller of a plant gain / ((1 + s large)(1 + s small)).
+
+    Args:
+        gain: Of the plant [output per input].
+        large: Time constant that is cancelled [s].
+        small: Sum of what remains [s].
+    """
+    return PI(large / (2.0 * gain * small), large)
+
+
+def symmetrical_optimum(slope: float, small: float, spread: float = SPREAD) -> PI:
+    """Return the controller of a plant slope / (s (1 + s small)).
+
+    Args:
+        slope: Rate of the output per input [output per input and s].
+        small: Sum of the small time constants [s].
+        spread: a; the phase margin is asin((a^2 - 1)/(a^2 + 1)).
+    """
+    return PI(1.0 / (spread * slope * small), spread**2 * small)
+
+
+def modulus_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
+    """Propose the modulus optimum for all three loops.
+
+    Of an axis without viscous friction the velocity loop has no lag to cancel: its integral part is none then, and a
+    constant load leaves an error.
+    """
+    bench = Workbench(device, plant)
+    lag = take_current(bench, device, plant)
+    small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 0.5)
+    slope = plant.torque_constant / plant.inertia
+    if plant.viscous > 0.0:
+        found = modulus_optimum(plant.torque_constant / plant.viscous, plant.inertia / plant.viscous, small)
+    else:
+        found = PI(1.0 / (2.0 * slope * small), float("inf"))
+        bench.note("without viscous friction the modulus optimum has no integral part: a constant load leaves an error")
+    reached = bench.p("velocity", found.p)
+    bench.time("velocity", found.time)
+    bench.p("position", POSITION * reached * slope)
+    return bench.proposal()
+
+
+def symmetrical_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
+    """Propose the symmetrical optimum for the velocity loop, around a current loop of the modulus optimum."""
+    bench = Workbench(device, plant)
+    lag = take_current(bench, device, plant)
+    small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 1.0 / SPREAD)
+    slope = plant.torque_constant / plant.inertia
+    reached = bench.p("velocity", symmetrical_optimum(slope, small).p)
+    crossover = reached * slope
+    # The integration time keeps its place below the crossover that is reached.
+    bench.time("velocity", SPREAD / crossover)
+    bench.p("position", POSITION_SYMMETRICAL * crossover)
+    return bench.proposal()
+
+
+def take_current(bench: Workbench, device: Device, plant: Plant) -> float:
+    """Take a current loop of the modulus optimum; return the lag that it is to the loops around it [s]."""
+    found = modulus_optimum(1.0 / plant.R, plant.L / plant.R, current_lag(device))
+    reached = bench.p("torque", found.p)
+    bench.time("torque", found.time)
+    return plant.L / reached

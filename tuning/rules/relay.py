@@ -1,0 +1,240 @@
+"""Relay feedback after Astrom and Hagglund (1984): an axis is made to swing by a relay, and its swing gives the gains.
+
+The relay works in cyclic torque mode: the current is +h or -h by the sign of the velocity's error, once a communication
+cycle, and the axis swings at the frequency where axis, bus and relay together turn the phase by 180 degrees. What is
+evaluated is the axis alone: fundamentals of the recorded velocity and current, whose ratio is a point of its frequency
+response. An axis is an integrator with lags, so the point gives its slope K_t/J and the sum of its lags, and these the
+ultimate gain and period that the drive's own, faster loop has.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import motion
+from drive_env.trials.positioning import CURRENT, CYCLE, POSITION, VELOCITY, wrapped
+from tuning.rules.lags import slow_enough, velocity_lag
+from tuning.rules.optima import take_current
+from tuning.rules.proposal import Proposal, Workbench
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.motors import Motor
+    from tuning.response.linear_model import Plant
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TARGET_TORQUE, CURRENT_LIMIT, STATUS = 0x6071, 0x2003, 0x6041
+TIME, TRANSIENT = 0.3, 0.1  # of the experiment, and of it what is left out at its beginning [s]
+SHARE = 0.4  # of the rated current, at least: the relay's height
+# Of the drive's current limit, at most: an envelope takes half of it, swung through, for a shaking loop.
+OF_LIMIT = 0.45
+OVER_FRICTION = 2.0  # the relay's height over the dry friction, where the limits allow
+TRAVEL_SHARE = 0.8  # of the way that there is: beyond it the relay is off
+OFF = 1.5  # factor by which the inertia of the swing may be another than the axis's
+LEAST_COUNTS = 0.5  # of the encoder: the amplitude of a swing that is more than noise
+LEAST_SWINGS = 6  # periods that are worth evaluating
+# The current of a cycle is held for it: recorded at the cycle's end, it acted half a cycle earlier on the mean.
+HELD = 0.5 * CYCLE
+# PI gains from the ultimate point (Tyreus, Luyben 1992): half of Ziegler's and Nichols's gain, well damped.
+GAIN_SHARE, TIME_SHARE = 1.0 / 3.2, 2.2
+POSITION_SHARE = 0.25  # k_v over the velocity loop's crossover
+
+
+class Ultimate(NamedTuple):
+    """Where a P velocity loop would swing: its gain [A*s/rad] and its period [s]."""
+
+    gain: float
+    period: float
+
+
+class Swing(NamedTuple):
+    """What a relay experiment says of every axis, each of shape (num_axes,); nan and a reason where nothing.
+
+    frequency: Of the swing [Hz]. amplitude: Of the velocity [rad/s]. slope: Acceleration per current [rad/(A*s^2)],
+    K_t/J. lag: Sum of the small lags from current to measured velocity [s]. reason: Why there is nothing, else "".
+    """
+
+    frequency: Floats
+    amplitude: Floats
+    slope: Floats
+    lag: Floats
+    reason: tuple[str, ...]
+
+    def ultimate(self, axis: int) -> Ultimate:
+        """Return the ultimate point of an integrator with this slope and a dead time of these lags."""
+        return ultimate_of_integrator(float(self.slope[axis]), float(self.lag[axis]))
+
+
+def ultimate_of_integrator(slope: float, lag: float) -> Ultimate:
+    """Return the ultimate point of slope e^(-s lag) / s: it swings where the lag turns by 90 degrees."""
+    w = math.pi / (2.0 * lag)
+    return Ultimate(w / slope, 2.0 * math.pi / w)
+
+
+def relay_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
+    """Propose the gains of a relay experiment on this axis, computed: the ultimate point is the model's.
+
+    `relay_experiment` measures it instead.
+    """
+    bench = Workbench(device, plant)
+    lag = velocity_lag(device, plant, take_current(bench, device, plant))
+    lag = slow_enough(bench, plant, lag, 0.5 * math.pi * GAIN_SHARE)
+    slope = plant.torque_constant / plant.inertia
+    return finish(bench, ultimate_of_integrator(slope, lag), slope)
+
+
+def gains_from_swing(device: Device, plant: Plant, slope: float, ultimate: Ultimate) -> Proposal:
+    """Propose gains from a measured ultimate point.
+
+    Args:
+        device: The drive.
+        plant: The axis; of it the winding and the supply matter, which a relay does not see, and the inertia, by which
+            it is told that the axis did not swing with its load's resonance.
+        slope: Acceleration per current [rad/(A*s^2)].
+        ultimate: The point.
+
+    Raises:
+        ValueError: If the axis swung like another inertia than its own.
+    """
+    expected = plant.torque_constant / plant.inertia
+    if not 1.0 / OFF < slope / expected < OFF:
+        raise ValueError(
+            f"the axis swung like {1.0 / slope * plant.torque_constant:.2g} kg*m^2, and its inertia is "
+            f"{plant.inertia:.2g}: it swings with its load's resonance, of which a relay says nothing; take margin_45"
+        )
+    bench = Workbench(device, plant)
+    take_current(bench, device, plant)
+    return finish(bench, ultimate, slope)
+
+
+def finish(bench: Workbench, ultimate: Ultimate, slope: float) -> Proposal:
+    """Take velocity and position gains from an ultimate point and return the proposal."""
+    crossover = bench.p("velocity", GAIN_SHARE * ultimate.gain) * slope
+    bench.time("velocity", TIME_SHARE * ultimate.period)
+    bench.p("position", POSITION_SHARE * crossover)
+    return bench.proposal()
+
+
+def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats | None = None) -> Swing:
+    """Swing axes by a relay and return what that says; the drives are enabled in cst meanwhile and off afterwards.
+
+    The current loop must work: write its gains first. An axis that nears the end of its travel is left alone.
+
+    Args:
+        target: The drives.
+        where: Axes that take part; all by default.
+        coulomb: Dry friction [A], shape (num_axes,), which takes its share of the relay's height; 0 by default.
+    """
+    drives, n = target.drives, target.num_axes
+    axes = np.ones(n, bool) if where is None else where
+    dry = np.zeros(n) if coulomb is None else np.nan_to_num(np.asarray(coulomb, float))
+    limit = OF_LIMIT * drives.read(CURRENT_LIMIT) * 1e-3
+    height = np.minimum(
+        np.maximum(SHARE * target.motor.rated_current, OVER_FRICTION * dry), np.minimum(limit, target.current)
+    )
+    scale, origin = target.increments(), drives.read(POSITION)
+    low, high = TRAVEL_SHARE * target.low * scale, TRAVEL_SHARE * target.high * scale
+    drives.write(TARGET_TORQUE, 0, where=axes)
+    motion.enable(drives, mode="cst", where=axes)
+    cycles = round(TIME / CYCLE)
+    speed, current = np.zeros((cycles, n)), np.zeros((cycles, n))
+    inside = axes & (height > 0.0)
+    bias = np.zeros(n)
+    torque = np.where(inside, height, 0.0)
+    try:
+        for k in range(cycles):
+            played = {TARGET_TORQUE: np.rint(1e3 * torque)[None].astype(np.int64)}
+            trace = drives.record([VELOCITY, CURRENT, POSITION], CYCLE, play=played)
+            speed[k] = trace[VELOCITY][0] / scale
+            current[k] = trace[CURRENT][0] * 1e-3
+            way = wrapped(trace[POSITION][0] - origin)
+            inside &= (way > low) & (way < high)
+            # A constant load shifts the swing; what holds it is the mean current that keeps the mean speed at 0.
+            bias += np.where(inside, -0.02 * height * np.tanh(way / (0.05 * 2.0 * math.pi * scale)), 0.0)
+            bias = np.clip(bias, -0.5 * height, 0.5 * height)
+            torque = np.where(inside, bias - height * np.sign(speed[k] + (speed[k] == 0.0)), 0.0)
+        drives.record([VELOCITY], 5 * CYCLE, play={TARGET_TORQUE: np.zeros((5, n), np.int64)})
+    finally:
+        motion.disable(drives, where=axes)
+    count = 2.0 * math.pi / target.motor.encoder_counts
+    return evaluate(speed, current, dry, axes, inside, count)
+
+
+def evaluate(speed: Floats, current: Floats, coulomb: Floats, axes: Mask, inside: Mask, count_angle: float) -> Swing:
+    """Return what recorded swings say.
+
+    Args:
+        speed: Velocity once a cycle [rad/s], shape (n, num_axes).
+        current: Actual current, likewise [A].
+        coulomb: Dry friction [A], shape (num_axes,).
+        axes: Which axes took part.
+        inside: Which of them kept away from the ends of their travel.
+        count_angle: What a count of the encoder is [rad].
+    """
+    count = speed.shape[1]
+    result = {name: np.full(count, math.nan) for name in ("frequency", "amplitude", "slope", "lag")}
+    reasons = [""] * count
+    first = round(TRANSIENT / CYCLE)
+    for axis in range(count):
+        if not axes[axis]:
+            reasons[axis] = "not asked for"
+            continue
+        if not inside[axis]:
+            reasons[axis] = "the travel is too short: the relay drove the axis to its end"
+            continue
+        v, i = speed[first:, axis], current[first:, axis]
+        found = fundamental(v)
+        periods = found * len(v) * CYCLE
+        if not periods >= LEAST_SWINGS:
+            reasons[axis] = f"the axis did not swing {LEAST_SWINGS} times: friction holds it, or it is too heavy"
+            continue
+        V, amps = line(v, found), line(i, found)
+        w = 2.0 * math.pi * found
+        if abs(V) / w < LEAST_COUNTS * count_angle:
+            reasons[axis] = (
+                f"the axis swung by less than {LEAST_COUNTS:g} counts: friction holds it, or it is too heavy"
+            )
+            continue
+        # Dry friction brakes with the velocity's sign: a square wave in its phase.
+        amps -= 4.0 / math.pi * coulomb[axis] * V / abs(V)
+        G = V / amps
+        phase = np.angle(G * 1j)  # beyond the 90 degrees of the integrator
+        result["frequency"][axis], result["amplitude"][axis] = found, abs(V)
+        result["slope"][axis] = abs(G) * w
+        lag = -phase / w + HELD
+        if lag <= 0.0:
+            reasons[axis] = f"the phase at {found:.0f} Hz leads an integrator's: the swing is not the axis's own"
+            result["slope"][axis] = math.nan
+            continue
+        result["lag"][axis] = lag
+    return Swing(result["frequency"], result["amplitude"], result["slope"], result["lag"], tuple(reasons))
+
+
+def fundamental(x: Floats) -> float:
+    """Return the frequency of the strongest line [Hz], nan of a signal that rests."""
+    y = (x - x.mean()) * np.hanning(len(x))
+    if not np.any(y):
+        return math.nan
+    size = 16 * len(x)
+    spectrum = np.abs(np.fft.rfft(y, size))
+    k = int(spectrum.argmax())
+    if 0 < k < len(spectrum) - 1:
+        a, b, c = np.log(np.maximum(spectrum[k - 1 : k + 2], 1e-300))
+        k = k + 0.5 * (a - c) / (a - 2.0 * b + c)
+    return float(k / (size * CYCLE))
+
+
+def line(x: Floats, frequency: float) -> complex:
+    """Return the complex amplitude of a line, by least squares with a constant and a slope."""
+    t = np.arange(len(x)) * CYCLE
+    w = 2.0 * math.pi * frequency * t
+    columns = np.stack([np.cos(w), np.sin(w), np.ones_like(t), t], axis=1)
+    a, b, *_ = np.linalg.lstsq(columns, x, rcond=None)[0]
+    return complex(a, -b)

@@ -1,0 +1,59 @@
+"""The rules by name: from what is known of an axis to raw integers of 2041h to 2043h.
+
+A rule proposes; nothing is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from tuning.rules.cascade_chain import chain_rule
+from tuning.rules.internal_model import imc_rule, simc_rule
+from tuning.rules.margin_targets import TARGETS, margin_rule
+from tuning.rules.optima import modulus_rule, symmetrical_rule
+from tuning.rules.pole_placement import pole_rule
+from tuning.rules.proposal import Proposal as Proposal
+from tuning.rules.proposal import Rule as Rule
+from tuning.rules.relay import relay_rule
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.motors import Motor
+    from tuning.response.linear_model import Plant
+
+RULES: Mapping[str, Rule] = {
+    "modulus_optimum": modulus_rule,
+    "symmetrical_optimum": symmetrical_rule,
+    "imc": imc_rule,
+    "simc": simc_rule,
+    "pole_placement": pole_rule,
+    "relay": relay_rule,
+    **{name: margin_rule(*target) for name, target in TARGETS.items()},
+    "chain": chain_rule,
+}
+
+MEANINGS: Mapping[str, str] = {
+    "modulus_optimum": "Kessler 1955: cancel the large lag, damping 0.707",
+    "symmetrical_optimum": "Kessler 1958: crossover in the middle, 36.9 degrees of phase margin",
+    "imc": "internal model, closed loops clear of what the model leaves out",
+    "simc": "Skogestad 2003: dead time counted, shorter integration for load disturbances",
+    "pole_placement": "two well damped poles in each PI loop",
+    "relay": "Astrom and Hagglund 1984: ultimate point, Tyreus and Luyben's gains",
+    **{
+        name: f"greatest integers with {phase:g} degrees and {gain:g} dB in every loop"
+        for name, (phase, gain) in TARGETS.items()
+    },
+    "chain": "the classical chain: lags, anti-resonance and encoder counts limit the velocity loop",
+}
+
+
+def propose(name: str, device: Device, motor: Motor, plant: Plant) -> Proposal:
+    """Return what a rule proposes.
+
+    Raises:
+        ValueError: For an unknown rule, naming those there are.
+    """
+    if name not in RULES:
+        raise ValueError(f"no rule is named {name!r}; there are {', '.join(RULES)}")
+    return RULES[name](device, motor, plant)

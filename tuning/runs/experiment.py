@@ -1,0 +1,350 @@
+"""The experiment of a sweep: one TOML, checked key by key before anything runs."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.devices import Device, find_device
+from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.entries import Entry, ObjectDictionary
+from drive_env.motors import find_motor
+from mechanics.loads import find_load
+from mechanics.untrusted import read_toml
+from tuning.runs.metrics import TRACKING, metric_names
+from tuning.toml_tables import ExperimentError as ExperimentError
+from tuning.toml_tables import as_table, as_value, check_keys, kind_of, read_table, toml, toml_lines
+
+DEFAULT = Path(__file__).parent / "sweep.toml"
+MAX_POINTS = 262_144
+MAX_DURATION = 60.0  # s
+MIN_SAMPLES = 20  # in each of the two windows; fewer say nothing about ringing
+GAIN_UNITS = frozenset({"current P", "velocity P", "position P", "I"})  # of dictionary/units.py
+POSITION_SCALER, TARGET_VELOCITY, ACCELERATION = (0x2058, 0), (0x60FF, 0), (0x6083, 0)
+_INDEX = re.compile(r"(?:0x)?([0-9a-f]{4})h?:(?:0x)?([0-9a-f]{1,2})h?", re.IGNORECASE)
+_SPACINGS = ("lin", "log")
+_PAIRS = (("velocity_rpm", "velocity_pps"), ("acceleration_rpm_per_s", "acceleration_pps2"))
+
+
+@dataclass(frozen=True)
+class SweptObject:
+    """One axis of the grid: an object and its raw values from low to high, both included."""
+
+    object: str
+    low: int
+    high: int
+    count: int
+    spacing: str
+
+    def values(self) -> NDArray[np.int64]:
+        """Return the raw values in rising order; what is equal after rounding counts once."""
+        spaced = np.geomspace if self.spacing == "log" else np.linspace
+        raw = np.rint(spaced(self.low, self.high, self.count)).astype(np.int64)
+        return np.unique(np.clip(raw, self.low, self.high))
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """What every point gets; exactly one of each pair of units is set. Times [s] from the start of the recording."""
+
+    velocity_time: float
+    load_torque: float  # N*m on the load
+    load_time: float
+    duration: float
+    sampling_period: float
+    velocity_rpm: float | None = None
+    velocity_pps: float | None = None
+    acceleration_rpm_per_s: float | None = None
+    acceleration_pps2: float | None = None
+
+    def raw_velocity(self, position_scaler: int) -> int:
+        """Return the step as 60FFh wants it [pps], for a scaler [inc/rev]."""
+        return _raw(self.velocity_rpm, self.velocity_pps, position_scaler)
+
+    def raw_acceleration(self, position_scaler: int) -> int:
+        """Return the profile acceleration as 6083h wants it [pps^2]."""
+        return _raw(self.acceleration_rpm_per_s, self.acceleration_pps2, position_scaler)
+
+
+@dataclass(frozen=True)
+class MetricChoice:
+    """What ranks: a metric, and its weights if it is a combination."""
+
+    name: str
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Everything a sweep is: the run repeats from this to the last digit. `versions` are those of an earlier run."""
+
+    device: str
+    motor: str
+    load: str
+    seed: int
+    sweep: tuple[SweptObject, ...]
+    excitation: Excitation
+    metric: MetricChoice
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    def points(self) -> NDArray[np.int64]:
+        """Return the grid, shape (points, objects), the last object changing fastest."""
+        axes = np.meshgrid(*(swept.values() for swept in self.sweep), indexing="ij")
+        return np.stack([axis.ravel() for axis in axes], axis=1)
+
+    def shape(self) -> tuple[int, ...]:
+        """Return the number of values of each object."""
+        return tuple(len(swept.values()) for swept in self.sweep)
+
+    def size(self) -> int:
+        """Return the number of points."""
+        return math.prod(self.shape())
+
+    def to_toml(self, versions: Mapping[str, str]) -> str:
+        """Return the experiment as TOML, with the versions of what ran it."""
+        lines = [f"{name} = {toml(getattr(self, name))}" for name in ("device", "motor", "load", "seed")]
+        for swept in self.sweep:
+            lines += ["", "[[sweep]]", *toml_lines(swept)]
+        lines += ["", "[excitation]", *toml_lines(self.excitation)]
+        lines += ["", "[metric]", f"name = {toml(self.metric.name)}"]
+        if self.metric.weights:
+            weights = ", ".join(f"{name} = {toml(weight)}" for name, weight in self.metric.weights.items())
+            lines.append(f"weights = {{ {weights} }}")
+        if versions:
+            lines += ["", "[versions]", *(f"{json.dumps(k)} = {toml(v)}" for k, v in versions.items())]
+        return "\n".join(lines) + "\n"
+
+
+class Resolved(NamedTuple):
+    """A checked experiment with its names looked up: device, the swept entries, and raw integers to write."""
+
+    device: Device
+    entries: tuple[Entry, ...]
+    position_scaler: int  # inc/rev
+    velocity: int  # pps
+    acceleration: int  # pps^2
+
+
+def load_experiment(config: str | Path | None = None, **overrides: Any) -> Experiment:
+    """Return the experiment of a TOML file, by default the one that ships, checked.
+
+    Args:
+        config: The file.
+        overrides: device, motor, load or seed in place of the file's; None keeps the file's.
+
+    Raises:
+        ExperimentError: With the key, its value, the limit and the remedy.
+    """
+    path = DEFAULT if config is None else Path(config)
+    try:
+        data = read_toml(path)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise ExperimentError(f"cannot read the experiment {path}: {reason}; give --config a TOML file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ExperimentError(
+            f"{path} is not valid TOML: {error}; compare it with drive-tune sweep --show-config"
+        ) from None
+    experiment = replace(_parse(data), **{key: value for key, value in overrides.items() if value is not None})
+    resolve(experiment)
+    return experiment
+
+
+def resolve(experiment: Experiment) -> Resolved:
+    """Check an experiment against what there is and look its names up.
+
+    Raises:
+        ExperimentError: For a name that does not exist, or a value beyond its limits.
+    """
+    try:
+        device, motor = find_device(experiment.device), find_motor(experiment.motor)
+        find_load(experiment.load)
+        preset = device.preset(motor.name)
+    except ValueError as error:
+        raise ExperimentError(str(error)) from None
+    if not 0 <= experiment.seed < 2**63:
+        raise ExperimentError(f"seed = {experiment.seed} lies outside 0...2^63 - 1; give a whole number in it")
+    dictionary = device.new_dictionary()
+    entries = tuple(_swept_entry(device, dictionary, k, swept) for k, swept in enumerate(experiment.sweep, 1))
+    _check_grid(experiment, entries)
+    _check_metric(experiment.metric)
+    _check_times(experiment.excitation, 1.0 / device.profile_rate)
+    scaler = int(dictionary.find(POSITION_SCALER).default)
+    scaler = {dictionary.find(name).label: value for name, value in preset.items()}.get(
+        dictionary.find(POSITION_SCALER).label, scaler
+    )
+    velocity = experiment.excitation.raw_velocity(scaler)
+    acceleration = experiment.excitation.raw_acceleration(scaler)
+    for key, raw, target in (("velocity", velocity, TARGET_VELOCITY), ("acceleration", acceleration, ACCELERATION)):
+        entry = dictionary.find(target)
+        assert entry.low is not None and entry.high is not None, "both are numbers"
+        if not entry.low <= raw <= entry.high:
+            raise ExperimentError(
+                f"excitation: {key} is {raw} as {entry.label}, outside {entry.low}...{entry.high}; lower it"
+            )
+    if velocity == 0 or acceleration <= 0:
+        raise ExperimentError(
+            f"excitation: velocity is {velocity} and acceleration {acceleration} as raw integers; a step needs a "
+            "velocity other than 0 and an acceleration above 0"
+        )
+    return Resolved(device, entries, scaler, velocity, acceleration)
+
+
+def gain_objects(device: Device, dictionary: ObjectDictionary) -> list[Entry]:
+    """Return the entries that a sweep can vary: the writable gains."""
+    return [
+        entry
+        for entry in dictionary
+        if entry.access not in ("ro", "const")
+        and (entry.index, entry.sub) in device.bindings
+        and device.bindings[entry.index, entry.sub].unit in GAIN_UNITS
+    ]
+
+
+def label(entry: Entry) -> str:
+    """Return index and sub-index as tables show them, e.g. `2042h:01`."""
+    return f"{entry.index:04X}h:{entry.sub:02X}"
+
+
+# --- checks -----------------------------------------------------------------------------------------------------------
+def _swept_entry(device: Device, dictionary: ObjectDictionary, number: int, swept: SweptObject) -> Entry:
+    where = f"sweep {number}"
+    match = _INDEX.fullmatch(swept.object.strip())
+    try:
+        entry = dictionary.find((int(match[1], 16), int(match[2], 16)) if match else swept.object)
+    except ObjectAccessError as error:
+        raise ExperimentError(f"{where}: object: {str(error).rsplit(' (abort code', 1)[0]}") from None
+    gains = gain_objects(device, dictionary)
+    if entry not in gains:
+        raise ExperimentError(
+            f"{where}: object = {swept.object!r} is {entry.label}, no writable gain; "
+            f"gains of {device.name} are {', '.join(label(gain) for gain in gains)}"
+        )
+    assert entry.low is not None and entry.high is not None, "gains are numbers"
+    for key, value in (("low", swept.low), ("high", swept.high)):
+        if not entry.low <= value <= entry.high:
+            raise ExperimentError(
+                f"{where}: {key} = {value} lies outside the range {entry.low}...{entry.high} of {entry.label}; "
+                "choose it within"
+            )
+    if swept.low > swept.high:
+        raise ExperimentError(f"{where}: low = {swept.low} is above high = {swept.high}; swap them")
+    if swept.count < 1:
+        raise ExperimentError(f"{where}: count = {swept.count} is below 1; give the number of values")
+    if swept.count > MAX_POINTS:
+        raise ExperimentError(f"{where}: count = {swept.count} is above the limit of {MAX_POINTS} points; lower it")
+    if swept.spacing not in _SPACINGS:
+        raise ExperimentError(f"{where}: spacing = {swept.spacing!r} is unknown; there are {', '.join(_SPACINGS)}")
+    if swept.spacing == "log" and swept.low <= 0:
+        raise ExperimentError(f"{where}: low = {swept.low} has no logarithm; use low = 1 or spacing = 'lin'")
+    return entry
+
+
+def _check_grid(experiment: Experiment, entries: tuple[Entry, ...]) -> None:
+    if not entries:
+        raise ExperimentError("nothing is swept; add at least one table [[sweep]]")
+    for k, entry in enumerate(entries):
+        if entry in entries[:k]:
+            raise ExperimentError(f"sweep {k + 1}: {entry.label} is swept already; remove one of the two tables")
+    points = experiment.size()
+    if points > MAX_POINTS:
+        product = " x ".join(map(str, experiment.shape()))
+        raise ExperimentError(f"the grid has {product} = {points} points; the limit is {MAX_POINTS}: lower a count")
+
+
+def _check_metric(metric: MetricChoice) -> None:
+    if metric.name not in metric_names():
+        raise ExperimentError(f"metric: name = {metric.name!r} is unknown; there are {', '.join(metric_names())}")
+    wanted = TRACKING.weights if metric.name == TRACKING.name else {}
+    if set(metric.weights) != set(wanted):
+        needed = f"the weights {', '.join(wanted)}" if wanted else "no weights"
+        raise ExperimentError(
+            f"metric: {metric.name} takes {needed}; weights has {', '.join(metric.weights) or 'none'}"
+        )
+    for name, weight in metric.weights.items():
+        if weight < 0.0:
+            raise ExperimentError(f"metric: weight {name} = {weight:g} is negative; give 0 or more")
+    if wanted and not any(metric.weights.values()):
+        raise ExperimentError("metric: all weights are 0, so that all points are equal; give one above 0")
+
+
+def _check_times(excitation: Excitation, cycle: float) -> None:
+    period, duration = excitation.sampling_period, excitation.duration
+    if period < cycle or not _is_multiple(period, cycle):
+        raise ExperimentError(
+            f"excitation: sampling_period = {period:g} s is no whole number of communication cycles of {cycle:g} s; "
+            f"use {max(1, round(period / cycle)) * cycle:g} s"
+        )
+    if not 0.0 < duration <= MAX_DURATION:
+        raise ExperimentError(f"excitation: duration = {duration:g} s lies outside 0...{MAX_DURATION:g} s; change it")
+    for key in ("velocity_time", "load_time", "duration"):
+        value = getattr(excitation, key)
+        if not _is_multiple(value, period):
+            raise ExperimentError(
+                f"excitation: {key} = {value:g} s is no whole number of sampling periods of {period:g} s; "
+                f"use {round(value / period) * period:g} s"
+            )
+    if not 0.0 <= excitation.velocity_time < excitation.load_time < duration:
+        raise ExperimentError(
+            f"excitation: velocity_time = {excitation.velocity_time:g} s, load_time = {excitation.load_time:g} s and "
+            f"duration = {duration:g} s must follow each other, from 0 s on"
+        )
+    windows = (("load_time", excitation.velocity_time, excitation.load_time),
+               ("duration", excitation.load_time, duration))  # fmt: skip
+    for key, start, end in windows:
+        if round((end - start) / period) < MIN_SAMPLES:
+            raise ExperimentError(
+                f"excitation: {key} = {end:g} s leaves {round((end - start) / period)} samples after {start:g} s; at "
+                f"least {MIN_SAMPLES} are needed: use {start + MIN_SAMPLES * period:g} s or more"
+            )
+
+
+def _is_multiple(value: float, unit: float) -> bool:
+    return abs(round(value / unit) * unit - value) < 1e-9
+
+
+def _raw(in_rpm: float | None, in_pps: float | None, position_scaler: int) -> int:
+    """Return pps from rpm, or pps^2 from rpm/s."""
+    value = in_rpm * position_scaler / 60.0 if in_rpm is not None else in_pps
+    assert value is not None, "the parser lets exactly one through"
+    return round(value)
+
+
+# --- the TOML ---------------------------------------------------------------------------------------------------------
+def _parse(data: Mapping[str, Any]) -> Experiment:
+    """Return the experiment of TOML data; keys and types are checked, names and limits are not."""
+    check_keys("the experiment", data, [f.name for f in fields(Experiment)], optional={"versions"})
+    tables = data["sweep"]
+    if not isinstance(tables, list):
+        raise ExperimentError(f"sweep is {kind_of(tables)}; write one table [[sweep]] per object")
+    sweep = tuple(SweptObject(**read_table(f"sweep {k}", table, SweptObject)) for k, table in enumerate(tables, 1))
+    pairs = {name for pair in _PAIRS for name in pair}
+    excitation = read_table("excitation", data["excitation"], Excitation, optional=pairs)
+    for first, second in _PAIRS:
+        if (first in excitation) == (second in excitation):
+            found = "both" if first in excitation else "none"
+            raise ExperimentError(f"excitation: needs {first} or {second}; it has {found}")
+    metric = as_table("metric", data["metric"])
+    check_keys("metric", metric, ["name", "weights"], optional={"weights"})
+    given = as_table("metric: weights", metric.get("weights", {}))
+    name = as_value("metric: name", metric["name"], "str")
+    combined = dict(TRACKING.weights) if name == TRACKING.name and not given else {}
+    weights = combined | {key: as_value(f"metric: weight {key}", value, "float") for key, value in given.items()}
+    versions = as_table("versions", data.get("versions", {}))
+    return Experiment(
+        **{name: as_value(name, data[name], "str") for name in ("device", "motor", "load")},
+        seed=as_value("seed", data["seed"], "int"),
+        sweep=sweep,
+        excitation=Excitation(**excitation),
+        metric=MetricChoice(name, weights),
+        versions={key: as_value(f"versions: {key}", value, "str") for key, value in versions.items()},
+    )

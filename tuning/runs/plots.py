@@ -1,0 +1,206 @@
+"""Pictures of a sweep: the score over the grid, and the best response."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullLocator
+from numpy.typing import NDArray
+
+from mechanics.loads import find_load
+from tuning.runs import metrics
+from tuning.runs.experiment import SweptObject
+
+if TYPE_CHECKING:
+    from tuning.runs.sweep import SweepResult
+
+Floats = NDArray[np.float64]
+UNUSABLE, NO_FIGURE = "#d0d0d0", "#f8ddc4"
+BEST: dict[str, Any] = {
+    "marker": "*",
+    "markersize": 17,
+    "markerfacecolor": "#e6194b",
+    "markeredgecolor": "white",
+    "linestyle": "none",
+}
+DPI = 150
+
+
+def heat_map(result: SweepResult) -> Figure:
+    """Return the score over the grid: a line for one swept object, a map for two.
+
+    With more objects the map is over the first two, each cell showing the best over the others.
+    """
+    figure = Figure(figsize=(8.0, 6.0), dpi=DPI, layout="constrained")
+    axes = figure.add_subplot()
+    if len(result.objects) == 1:
+        _line(axes, result)
+    else:
+        _map(figure, axes, result)
+    figure.suptitle(_title(result), fontsize=11)
+    return figure
+
+
+def best_response(result: SweepResult) -> Figure:
+    """Return set-point and velocity, current and load torque of the best point over time."""
+    recording, excitation = result.response, result.experiment.excitation
+    figure = Figure(figsize=(8.0, 7.0), dpi=DPI, layout="constrained")
+    speed, current, load = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1))
+    t = 1e3 * recording.t
+    speed.plot(t, recording.speed_rpm[:, 0], color="#0072b2", linewidth=1.4, label="actual")
+    speed.plot(t, recording.reference_rpm, color="black", linewidth=1.0, linestyle="--", label="set-point")
+    speed.set_ylabel("velocity [rpm]")
+    speed.legend(loc="lower right")
+    current.plot(t, recording.current[:, 0], color="#d55e00", linewidth=1.2, label="actual current")
+    limit = float(recording.current_limit[0])
+    if np.abs(recording.current[:, 0]).max() > 0.7 * limit:
+        for sign in (1.0, -1.0):
+            current.axhline(sign * limit, color="black", linewidth=0.8, linestyle=":",
+                            label="limit (2003h)" if sign > 0 else None)  # fmt: skip
+        current.legend(loc="best")
+    current.set_ylabel("current i_q [A]")
+    torque = np.where(recording.t >= recording.t_load - 1e-9, excitation.load_torque, 0.0)
+    load.plot(t, torque, color="#009e73", linewidth=1.4, drawstyle="steps-post")
+    unit = find_load(result.experiment.load).disturbance_unit
+    load.set_ylabel(f"load\n{'force' if unit == 'N' else 'torque'} [{unit.replace('*', '·')}]")
+    load.set_xlabel("time [ms]")
+    load.set_xlim(0.0, 1e3 * excitation.duration)
+    load.margins(y=0.2)
+    for axes in (speed, current, load):
+        axes.grid(color="0.9")
+        for event in (recording.t_step, recording.t_load):
+            axes.axvline(1e3 * event, color="0.6", linewidth=0.8)
+    figure.align_ylabels()
+    figure.suptitle(_title(result), fontsize=11)
+    return figure
+
+
+def _title(result: SweepResult) -> str:
+    experiment, row = result.experiment, result.best(1)[0]
+    metric = experiment.metric.name
+    point = ", ".join(f"{name} = {row[name]}" for name in result.objects)
+    others = [name for name in ("settling", "overshoot", "dip") if name != metric]
+    values = [row[result.score_column], *(row[f"{name} [{metrics.unit_of(name)}]"] for name in others)]
+    figures = ", ".join(
+        f"{name} {_number(value, metrics.unit_of(name))}" for name, value in zip([metric, *others], values, strict=True)
+    )
+    first = "best" if np.isfinite(row[result.score_column]) else "no usable point; first"
+    return (
+        f"{experiment.device}, {experiment.motor}, {experiment.load}, seed {experiment.seed}: "
+        f"{len(result.order)} points\n{first}: {point}\n{figures}"
+    )
+
+
+def _number(value: float, unit: str) -> str:
+    if unit == "s" and np.isfinite(value):
+        return f"{1e3 * value:.3g} ms"
+    return f"{value:.3g} {unit}" if np.isfinite(value) else "none"
+
+
+def _scale(result: SweepResult) -> tuple[float, str]:
+    """Return factor and label of the score in pictures: seconds are shown as milliseconds."""
+    name = result.experiment.metric.name
+    unit = metrics.unit_of(name)
+    return (1e3, f"{name} [ms]") if unit == "s" else (1.0, f"{name} [{unit}]")
+
+
+def _line(axes: Axes, result: SweepResult) -> None:
+    swept = result.experiment.sweep[0]
+    factor, text = _scale(result)
+    values, score, edges = swept.values(), factor * result.score, _edges(swept)
+    valued = np.isfinite(score)
+    for k in np.flatnonzero(~valued):
+        axes.axvspan(edges[k], edges[k + 1], color=NO_FIGURE if result.usable[k] else UNUSABLE, linewidth=0, zorder=0)
+    axes.plot(values, np.where(valued, score, np.nan), color="#0072b2", marker="o", markersize=4)
+    axes.set_xscale("log" if swept.spacing == "log" else "linear")
+    axes.set_xlim(edges[0], edges[-1])
+    _label(axes.xaxis, f"{result.names[0]} [raw]", swept.spacing == "log")
+    wide = _wide(score[valued])
+    axes.set_yscale("log" if wide else "linear")
+    _label(axes.yaxis, f"{text}, less is better", wide)
+    if valued.any():
+        axes.plot(values[result.order[0]], score[result.order[0]], **BEST)
+    else:
+        axes.set_yticks([])
+    axes.grid(color="0.9")
+    _legend(axes, result)
+
+
+def _map(figure: Figure, axes: Axes, result: SweepResult) -> None:
+    first, second = result.experiment.sweep[:2]
+    factor, text = _scale(result)
+    shape = result.experiment.shape()
+    # The best over the other objects; a cell in which every one fails is unusable.
+    score = factor * result.score.reshape(*shape[:2], -1).min(axis=2)
+    usable = result.usable.reshape(*shape[:2], -1).any(axis=2)
+    valued = np.isfinite(score)
+    axes.set_facecolor(UNUSABLE)
+    x, y = _edges(first), _edges(second)
+    axes.set_xscale("log" if first.spacing == "log" else "linear")
+    axes.set_yscale("log" if second.spacing == "log" else "linear")
+    if (usable & ~valued).any():
+        axes.pcolormesh(x, y, np.ma.masked_where(~usable, usable).T, cmap=ListedColormap([NO_FIGURE]))
+    if valued.any():
+        low, high = float(score[valued].min()), float(score[valued].max())
+        wide = _wide(score[valued])
+        norm = LogNorm(low, high) if wide else Normalize(low, max(high, low + 1e-12))
+        mesh = axes.pcolormesh(x, y, np.ma.masked_where(~valued, score).T, norm=norm, cmap=colormaps["viridis_r"])
+        bar = figure.colorbar(mesh, ax=axes)
+        _label(bar.ax.yaxis, f"{text}, less is better", wide)
+        best = np.unravel_index(int(result.order[0]), shape)
+        axes.plot(first.values()[best[0]], second.values()[best[1]], **BEST)
+    axes.set_xlim(x[0], x[-1])
+    axes.set_ylim(y[0], y[-1])
+    _label(axes.xaxis, f"{result.names[0]} [raw]", first.spacing == "log")
+    _label(axes.yaxis, f"{result.names[1]} [raw]", second.spacing == "log")
+    if len(shape) > 2:
+        axes.set_title(f"each cell: the best over {', '.join(result.objects[2:])}", fontsize=10)
+    _legend(axes, result)
+
+
+def _legend(axes: Axes, result: SweepResult) -> None:
+    handles: list[Any] = []
+    if np.isfinite(result.score).any():
+        handles.append(Line2D([], [], **BEST, label="best"))
+    flagged = int((~result.usable).sum())
+    if flagged:
+        text = f"oscillating, in fault or diverged ({flagged} points)"
+        handles.append(Patch(facecolor=UNUSABLE, edgecolor="0.6", label=text))
+    missing = int((result.usable & ~np.isfinite(result.score)).sum())
+    if missing:
+        text = f"no {result.experiment.metric.name} ({missing} points)"
+        handles.append(Patch(facecolor=NO_FIGURE, edgecolor="0.6", label=text))
+    axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
+
+
+def _label(axis: Any, text: str, log: bool) -> None:
+    """Label an axis; a logarithmic one has its ticks at 1, 2 and 5."""
+    axis.set_label_text(text)
+    if log:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter("{x:g}")
+
+
+def _edges(swept: SweptObject) -> Floats:
+    """Return the edges of the cells around the values, in the middle between neighbours on the axis's own scale."""
+    values = swept.values().astype(float)
+    on_scale = np.log(values) if swept.spacing == "log" else values
+    if len(values) == 1:
+        half = 0.5
+        edges = np.array([on_scale[0] - half, on_scale[0] + half])
+    else:
+        middle = 0.5 * (on_scale[1:] + on_scale[:-1])
+        edges = np.concatenate(([2 * on_scale[0] - middle[0]], middle, [2 * on_scale[-1] - middle[-1]]))
+    return np.exp(edges) if swept.spacing == "log" else edges
+
+
+def _wide(score: Floats) -> bool:
+    return bool(score.size and score.min() > 0.0 and score.max() > 5.0 * score.min())

@@ -1,0 +1,356 @@
+"""Where work runs: in this process, on processes of this machine, or on a Dask cluster.
+
+A task is a function of a module, called with one item; what it returns must depend on the item alone, so that it
+matters to no result where and in which order tasks ran. Every task outside this process carries the hash of our sources
+and is refused by a worker that has others, whenever that worker came.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import pickle
+import re
+import signal
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+from urllib.parse import parse_qsl
+
+from tuning.runs import provenance
+
+Say = Callable[[str], None]
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
+FIRST_RESULT = "waiting for the first result (a worker that never ran before compiles for half a minute)"
+# Files of a tls:// address, and what Dask's security calls them.
+TLS_FILES = {"ca": "tls_ca_file", "cert": "tls_client_cert", "key": "tls_client_key"}
+WORKERS_PERIOD = 3.0  # s, between two looks at whether a cluster has workers
+
+logger = logging.getLogger(__name__)
+
+
+class PoolError(RuntimeError):
+    """Work could not be done where it was to run: one line with its remedy."""
+
+
+def _silent(_what: str) -> None:
+    pass
+
+
+class Pool(Protocol):
+    """Somewhere for work to run."""
+
+    width: int  # tasks that run at a time, about
+    shares_disk: bool  # whether tasks can go on from files of this machine
+
+    def unordered(
+        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+    ) -> Iterator[tuple[int, Result]]:
+        """Give the number of an item and its result as each is done.
+
+        Args:
+            function: Of a module.
+            items: What it is called with.
+            say: Called with what is waited for, "" when the work goes on; from any thread.
+        """
+
+    def differences(self) -> list[str]:
+        """Return a line for each way in which the workers are not like this process: last digits may then differ."""
+
+
+def in_order(pool: Pool, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """Return the results of all items in their order."""
+    found = dict(pool.unordered(function, items))
+    return [found[k] for k in range(len(items))]
+
+
+@contextmanager
+def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
+    """Give somewhere for work to run.
+
+    Args:
+        workers: Processes of this machine; None for this process itself.
+        cluster: Address of the scheduler of a running Dask cluster, as `parse_cluster` reads it.
+
+    Raises:
+        ValueError: For both, or fewer than one worker.
+        PoolError: If the cluster cannot be reached, or `distributed` is not installed.
+    """
+    if workers is not None and cluster is not None:
+        raise ValueError("workers and a cluster exclude each other; choose --workers or --cluster")
+    if cluster is not None:
+        with _cluster(cluster) as pool:
+            yield pool
+    elif workers is not None:
+        if workers < 1:
+            raise ValueError(f"--workers {workers} is below 1; give the number of processes")
+        # Spawned: after threads have run compiled code, a fork may hang.
+        context = multiprocessing.get_context("spawn")
+        executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_as_worker)
+        try:
+            yield _Processes(executor, workers)
+        finally:
+            executor.shutdown(wait=True, cancel_futures=True)
+    else:
+        yield _Here()
+
+
+class _Here:
+    width = 1
+    shares_disk = True
+
+    def unordered(
+        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+    ) -> Iterator[tuple[int, Result]]:
+        for k, item in enumerate(items):
+            yield k, function(item)
+
+    def differences(self) -> list[str]:
+        return []
+
+
+class _Processes:
+    shares_disk = True
+
+    def __init__(self, executor: ProcessPoolExecutor, width: int) -> None:
+        self._executor = executor
+        self.width = width
+
+    def unordered(
+        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+    ) -> Iterator[tuple[int, Result]]:
+        checked = partial(_checked, provenance.SOURCES, function)
+        futures = {self._executor.submit(checked, item): k for k, item in enumerate(items)}
+        say(FIRST_RESULT)
+        try:
+            for future in as_completed(futures):
+                say("")
+                yield futures[future], future.result()
+        except BrokenProcessPool:
+            raise PoolError(
+                "a worker process ended on its own, perhaps for want of memory; take fewer --workers and go on with "
+                "--resume"
+            ) from None
+
+    def differences(self) -> list[str]:
+        return []
+
+
+class _Dask:
+    shares_disk = False
+
+    def __init__(self, client: Any, width: int, address: str = "") -> None:
+        self._client = client
+        self.width = width
+        self._address = address
+
+    def unordered(
+        self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
+    ) -> Iterator[tuple[int, Result]]:
+        from concurrent.futures import CancelledError
+
+        from distributed import as_completed as as_completed_there
+        from distributed.scheduler import KilledWorker
+
+        # Not pure: equal items of two runs on one cluster are computed twice rather than taken from its memory.
+        futures = {
+            self._client.submit(pickle.loads, _call(_checked, provenance.SOURCES, function, item), pure=False): k
+            for k, item in enumerate(items)
+        }
+        say(FIRST_RESULT)
+        try:
+            with self._told_of_no_workers(say):
+                for future in as_completed_there(list(futures), loop=self._client.loop):
+                    result = future.result()
+                    say("")
+                    yield futures[future], result
+                    future.release()
+        except ImportError as error:
+            raise self._without_package(error) from None
+        except KilledWorker as error:
+            raise PoolError(f"workers of the cluster died over and over: {error}; go on with --resume") from None
+        except (CancelledError, OSError) as error:
+            raise PoolError(
+                f"the connection to the Dask scheduler at {self._address} was lost: start it again, with its workers, "
+                "and go on with --resume"
+            ) from error
+
+    def _without_package(self, error: Exception, worker: str = "a worker") -> PoolError:
+        return PoolError(
+            f"{worker} of the cluster at {self._address} cannot run this: {error}; install drive-env where it runs, "
+            "and go on with --resume"
+        )
+
+    @contextmanager
+    def _told_of_no_workers(self, say: Say) -> Iterator[None]:
+        """Say it if the last worker goes: the work waits for another one, for ever if need be."""
+        ended = threading.Event()
+
+        def watch() -> None:
+            told = False
+            while not ended.wait(WORKERS_PERIOD):
+                try:
+                    there = self._client.nthreads()
+                except Exception:  # of a scheduler that is gone, which the futures tell
+                    return
+                if not there:
+                    say(f"waiting for a worker: `dask worker {self._address}`")
+                elif told:
+                    say("")
+                if not there and not told:
+                    logger.warning(
+                        "the cluster at %s has no workers left; waiting for one: `dask worker %s`", self._address,
+                        self._address,
+                    )  # fmt: skip
+                told = not there
+
+        thread = threading.Thread(target=watch, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+
+    def differences(self) -> list[str]:
+        here, lines = provenance.versions(), set()
+        there: Mapping[str, Any] = self._client.run(pickle.loads, _call(_versions), on_error="return")
+        for address, found in there.items():
+            if isinstance(found, Exception):
+                raise self._without_package(found, f"worker {address}")
+            if found.get("sources") != here["sources"]:
+                raise PoolError(
+                    f"worker {address} has sources {found.get('sources', 'unknown')}, here they are {here['sources']}, "
+                    "and results are not mixed: install the same files there and start it again"
+                )
+            for name, version in found.items():
+                if here.get(name) != version:
+                    lines.add(f"worker {address} has {name} {version}, here it is {here.get(name)}: last digits may "
+                              "differ")  # fmt: skip
+        return sorted(lines)
+
+
+def parse_cluster(text: str) -> tuple[str, dict[str, Any]]:
+    """Return the address of a scheduler, and of tls:// the files that `?ca=...&cert=...&key=...` names.
+
+    Without them Dask's own configuration counts (distributed.comm.tls).
+
+    Raises:
+        ValueError: For what is no address, or a file that is not there.
+    """
+    address, _, query = text.partition("?")
+    if not re.fullmatch(r"[a-z]+://.+:\d+", address):
+        raise ValueError(
+            f"--cluster {text} must be the address of a Dask scheduler, as tcp://host:port, or "
+            f"tls://host:port?{'&'.join(f'{name}=FILE' for name in TLS_FILES)}"
+        )
+    if not query:
+        return address, {}
+    given = dict(parse_qsl(query, keep_blank_values=True))
+    if not address.startswith("tls://") or set(given) != set(TLS_FILES):
+        raise ValueError(
+            f"--cluster {text}: after the ? of tls:// stand the files {', '.join(TLS_FILES)}, each with its path, and "
+            "of other protocols nothing"
+        )
+    for name, path in given.items():
+        if not Path(path).is_file():
+            raise ValueError(f"--cluster {text}: there is no file {path}, which {name} names")
+    return address, {"require_encryption": True} | {TLS_FILES[name]: path for name, path in given.items()}
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Pool]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise PoolError('--cluster needs dask.distributed; pip install "drive-env[cluster]"') from None
+    address, certificates = parse_cluster(address)
+    try:
+        client = Client(address, security=certificates or None, timeout=CONNECT_TIMEOUT, set_as_default=False)
+    except TypeError:  # Dask's, of tls:// without any
+        files = "&".join(f"{name}=FILE" for name in TLS_FILES)
+        raise PoolError(f"--cluster {address} needs certificates: {address}?{files}") from None
+    except (OSError, TimeoutError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise PoolError(
+            f"no Dask scheduler answers at {address}: {reason}; start one with `dask scheduler`, and workers with "
+            "`dask worker`"
+        ) from None
+    with _quiet_dask(), client:
+        threads = client.nthreads()
+        if not threads:
+            raise PoolError(f"the cluster at {address} has no workers; start some with `dask worker {address}`")
+        yield _Dask(client, sum(threads.values()), address)
+
+
+@contextmanager
+def _quiet_dask() -> Iterator[None]:
+    """Let Dask log no tracebacks of a connection that is lost: PoolError says it in a line."""
+    loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    levels = [each.level for each in loggers]
+    for each in loggers:
+        each.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for each, level in zip(loggers, levels, strict=True):
+            each.setLevel(level)
+
+
+class _Call:
+    """A call that is made where it is unpickled."""
+
+    def __init__(self, *call: Any) -> None:
+        self._call = call
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        function, *arguments = self._call
+        return function, tuple(arguments)
+
+
+def _call(function: Callable[..., Any], *arguments: Any) -> bytes:
+    """Return what `pickle.loads` makes a call of.
+
+    Dask itself unpickles functions of tasks before they run, and a worker without our packages then ends, once and
+    again, with no word to whoever gives the work. This one is unpickled within the task, whose failure comes back.
+    """
+    return pickle.dumps(_Call(function, *arguments))
+
+
+def _checked(sources: str, function: Callable[[Item], Result], item: Item) -> Result:
+    """Do a task on a worker, if its sources are those of the process that gives the work."""
+    try:
+        provenance.check_sources(sources)
+    except ValueError as error:
+        raise PoolError(str(error)) from None
+    return function(item)
+
+
+def _versions() -> dict[str, str]:
+    """Return the versions of a worker, its sources as they lie there now if they were edited since it began."""
+    found, now = provenance.versions(), provenance.hash_of_sources()
+    return found if now == found["sources"] else found | {"sources": now}
+
+
+def _as_worker() -> None:
+    """Leave Ctrl-C and warnings to the process that gives the work, and end with it, whatever ends it."""
+    warnings.simplefilter("ignore")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        # At once: whoever waits in a queue that nobody fills any more would wait for ever.
+        os._exit(1)

@@ -1,0 +1,136 @@
+"""Where results go and what made them: run folders that are complete or absent, versions and a hash of the sources."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+import platform
+import shutil
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from drive_env.whole_file import keep_names
+
+HEADER = "# The whole experiment of this run. It repeats from this file: drive-tune sweep --config settings.toml\n"
+_PACKAGES = ("drive-env", "numpy", "numba", "llvmlite", "mujoco")
+_ROOT = Path(__file__).parents[2]
+_OURS = tuple(_ROOT / name for name in ("drive_env", "mechanics", "tuning", "agents"))
+
+
+def hash_of_sources(folders: Iterable[Path] = _OURS) -> str:
+    """Return a hash of the names and contents of all files of our packages, data files included."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted(folder.rglob("*")):
+            parts = path.relative_to(folder.parent).parts
+            # What Python or an editor leaves there decides nothing.
+            if path.suffix == ".pyc" or any(part.startswith(".") for part in parts) or not path.is_file():
+                continue
+            content = path.read_bytes()
+            digest.update(f"{'/'.join(parts)} {len(content)}\n".encode() + content)
+    return digest.hexdigest()[:16]
+
+
+# As this process was loaded: a file that is edited later changes what it reads, but not what it runs.
+SOURCES = hash_of_sources()
+
+
+def check_sources(expected: str) -> None:
+    """Raise ValueError, with both hashes, if this process was loaded from other sources, or its files are others now.
+
+    Args:
+        expected: The hash of the process that gives the work.
+    """
+    for found in (SOURCES, hash_of_sources()):
+        if found != expected:
+            raise ValueError(
+                f"a worker has sources {found}, the run was begun with {expected}, and their results are not mixed: "
+                "install the same files there, start the worker again, and go on with --resume"
+            )
+
+
+def versions() -> dict[str, str]:
+    """Return what decides the digits: packages, our sources, Python, the processor for which kernels are compiled."""
+    import llvmlite.binding
+
+    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    found["sources"] = SOURCES
+    return found | {"python": platform.python_version(), "processor": str(llvmlite.binding.get_host_cpu_name())}
+
+
+def differences(recorded: Mapping[str, str]) -> list[str]:
+    """Return a line for each version that is not the recorded one: the last digits may then differ."""
+    if not recorded:
+        return []
+    here = versions()
+    return [
+        f"the run was made with {name} {version}, this is {here.get(name, 'none')}: last digits may differ"
+        for name, version in recorded.items()
+        if here.get(name) != version
+    ]
+
+
+def run_folder(kind: str, parent: str | Path = "runs") -> Path:
+    """Return a folder name that does not exist yet: runs/<date>-<time>-<kind>."""
+    stem = f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}"
+    name, k = Path(parent) / stem, 2
+    while name.exists():
+        name, k = Path(parent) / f"{stem}-{k}", k + 1
+    return name
+
+
+def nearest_place(path: Path) -> tuple[Path, bool]:
+    """Return the nearest thing above a new file or folder that exists, and whether one may write there."""
+    place = path.absolute().parent
+    while not place.exists():
+        place = place.parent
+    return place, os.access(place, os.W_OK | os.X_OK)
+
+
+def check_folder(folder: str | Path) -> None:
+    """Raise OSError unless results can be written into the folder: new or empty, and its place writable.
+
+    Raises:
+        FileExistsError: If something is there already.
+        PermissionError: If the place cannot be written.
+        NotADirectoryError: If a file stands in the way.
+    """
+    path = Path(folder)
+    if path.is_dir():
+        if any(path.iterdir()):
+            raise FileExistsError(f"the folder {path} is not empty; choose another --out or remove it")
+    elif path.exists():
+        raise FileExistsError(f"{path} is a file; choose another --out")
+    place, writable = nearest_place(path)
+    if not place.is_dir():
+        raise NotADirectoryError(f"{place} is a file, so that {path} cannot be a folder; choose another --out")
+    if not writable:
+        raise PermissionError(f"the folder {place} cannot be written; choose another --out or change its permissions")
+
+
+@contextmanager
+def new_folder(folder: str | Path) -> Iterator[Path]:
+    """Give a partial folder to write into; it takes its name once all is written, and vanishes if anything fails."""
+    path = Path(folder)
+    check_folder(path)
+    partial = path.absolute().with_name(f".{path.absolute().name}.{os.getpid()}.partial")
+    try:
+        partial.mkdir(parents=True)
+    except OSError as error:
+        raise OSError(f"the folder {path} cannot be made: {error.strerror}; choose another --out") from None
+    try:
+        yield partial
+        if path.is_dir():
+            path.rmdir()  # empty; a rename onto a folder fails on Windows
+        partial.rename(path)
+        keep_names(path.absolute().parent)
+    except BaseException as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        if isinstance(error, OSError) and error.errno is not None:  # it names the partial folder, or nothing
+            named = None if error.filename is None else Path(error.filename)
+            name = path if named is None else path / named.name if named.is_relative_to(partial) else named
+            raise OSError(error.errno, error.strerror, str(name)) from None
+        raise

@@ -1,0 +1,386 @@
+"""The sweep: every point of a grid of gains on a machine of its own, all of them the same machine, in parallel."""
+
+from __future__ import annotations
+
+import csv
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import EmulatedDrives, motion
+from drive_env.drives.trace import Trace
+from mechanics.loads import find_load
+from mechanics.model import COPIES_PER_MODEL
+from tuning.runs import metrics, provenance
+from tuning.runs.experiment import Experiment, Resolved, label, resolve
+from tuning.runs.experiment import load_experiment as load_experiment
+from tuning.runs.metrics import Recording
+from tuning.runs.pools import Pool
+from tuning.runs.shard_log import Arrays, ShardLog
+
+VELOCITY, CURRENT, CURRENT_LIMIT = 0x606C, 0x6077, 0x2003
+FLAGS = ("diverged", "oscillates", "fault")
+PIECE = 0.02  # s of simulation between two reports of progress
+MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
+MAX_MACHINES = 1024  # of a shard: small enough for little to be lost when a run is killed
+SHARDS_PER_WORKER = 4  # at least, where there are points enough: for the last to end soon after the first
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What a sweep found.
+
+    Attributes:
+        experiment: The experiment.
+        objects: Labels of the swept objects, e.g. `2042h:01`.
+        names: The same with their names.
+        columns: Every column of the table by name, each of shape (points,), in the order of the grid.
+        order: The points from best to worst.
+        response: The recording of the best point.
+        simulated: Simulated time of all machines together, without what was resumed [s].
+        wall: Wall time of that [s].
+    """
+
+    experiment: Experiment
+    objects: tuple[str, ...]
+    names: tuple[str, ...]
+    columns: dict[str, NDArray[Any]]
+    order: NDArray[np.int64]
+    response: Recording
+    simulated: float
+    wall: float
+
+    @property
+    def score_column(self) -> str:
+        """Name of the column that ranks; inf where a point oscillates, tripped, diverged or has no such figure."""
+        return f"score [{metrics.unit_of(self.experiment.metric.name)}]"
+
+    @property
+    def score(self) -> NDArray[np.float64]:
+        """What ranks, shape (points,)."""
+        return np.asarray(self.columns[self.score_column])
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Which points neither oscillate nor tripped nor diverged, shape (points,)."""
+        return np.asarray(~np.any([self.columns[flag] for flag in FLAGS], axis=0))
+
+    def best(self, count: int = 10) -> list[dict[str, Any]]:
+        """Return the best rows of the table, best first, as column name -> value."""
+        return [{name: column[k].item() for name, column in self.columns.items()} for k in self.order[:count]]
+
+    def without_effect(self) -> list[str]:
+        """Return the swept objects that change nothing at all in this excitation."""
+        shape = self.experiment.shape()
+        names = [name for name in self.columns if name not in self.objects and name != "rank"]
+        found = []
+        for axis, swept in enumerate(self.objects):
+            grids = [np.moveaxis(self.columns[name].reshape(shape), axis, 0) for name in names]
+            if shape[axis] > 1 and all(np.array_equal(g, np.broadcast_to(g[:1], g.shape), g.dtype.kind == "f")
+                                       for g in grids):  # fmt: skip
+                found.append(swept)
+        return found
+
+    def save(self, folder: str | Path) -> Path:
+        """Write results.csv, heatmap.png, best_response.png and settings.toml into a new folder and return it.
+
+        The files are complete or absent: they are written beside the folder and moved.
+
+        Raises:
+            FileExistsError: If the folder holds something already.
+            OSError: If it cannot be written.
+        """
+        from tuning.runs import plots
+
+        with provenance.new_folder(folder) as partial:
+            with (partial / "results.csv").open("w", newline="", encoding="utf-8") as file:
+                self._write_csv(file)
+            plots.heat_map(self).savefig(partial / "heatmap.png")
+            plots.best_response(self).savefig(partial / "best_response.png")
+            settings = provenance.HEADER + self.experiment.to_toml(provenance.versions())
+            (partial / "settings.toml").write_text(settings, encoding="utf-8")
+        return Path(folder)
+
+    def _write_csv(self, file: Any) -> None:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(self.columns)
+        # Python's floats are written with as many digits as tell them apart: nothing is lost, and inf and nan say so.
+        columns = [column.astype(int) if column.dtype == bool else column for column in self.columns.values()]
+        writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+
+
+class Shard(NamedTuple):
+    """A part of a grid: what a sweep is split into, whatever it runs on."""
+
+    experiment: Experiment
+    first: int  # its points, of those of the grid
+    last: int  # the first that is not its own
+    num_threads: int | None
+
+
+def shards(
+    experiment: Experiment,
+    num_threads: int | None = None,
+    *,
+    width: int = 1,
+    done: Mapping[int, int] = MappingProxyType({}),
+) -> list[Shard]:
+    """Return the parts of a grid that are still to do; how it is cut changes no digit.
+
+    Args:
+        experiment: The experiment.
+        num_threads: Threads that simulate each.
+        width: How many can be worked on at a time: for many, parts are smaller.
+        done: First point of each part that is done -> the point after its last.
+    """
+    samples = round(experiment.excitation.duration / experiment.excitation.sampling_period)
+    axes = find_load(experiment.load).num_axes
+    points = experiment.size()
+    fair = points // (width * SHARDS_PER_WORKER) if width > 1 else MAX_MACHINES
+    fit = min(MAX_SAMPLES // (samples * axes), fair)
+    # Whole packed models, from the same points in every cut: a constraint solver works on all copies of one at once.
+    size = int(np.clip(fit, COPIES_PER_MODEL, MAX_MACHINES)) // COPIES_PER_MODEL * COPIES_PER_MODEL
+    parts, first = [], 0
+    while first < points:
+        if first in done:
+            first = done[first]
+            continue
+        last = min([first + size, points, *(other for other in done if other > first)])
+        parts.append(Shard(experiment, first, last, num_threads))
+        first = last
+    return parts
+
+
+def run(
+    experiment: Experiment,
+    progress: Progress | None = None,
+    num_threads: int | None = None,
+    *,
+    pool: Pool | None = None,
+    log: ShardLog | None = None,
+) -> SweepResult:
+    """Simulate every point of an experiment and rank them.
+
+    Args:
+        experiment: The experiment.
+        progress: Called with what is being done and its share done so far.
+        num_threads: Threads that simulate, in this process; the number of cores by default. It changes no digit.
+        pool: Where shards run; in this process by default. It changes no digit either.
+        log: Shards that are done already, and where those to come are kept.
+
+    Raises:
+        ExperimentError: If the experiment cannot be.
+        PoolError: If shards could not be run where they were to.
+    """
+    report = progress or (lambda _what, _share: None)
+    resolved = resolve(experiment)
+    found: dict[int, Arrays] = {} if log is None else dict(log.done)
+    done = {first: first + len(arrays["score"]) for first, arrays in found.items()}
+    threads, width = (num_threads, 1) if pool is None else (1, pool.width)
+    left = shards(experiment, threads, width=width, done=done)
+    report("compiling", 0.0)
+    if left:
+        # Of workers as well: they find the kernels compiled, and what there is to warn of is said once and here.
+        _compile(experiment)
+    started = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)  # a flag of the table
+        for part, arrays in _done(left, experiment.size(), pool, report):
+            found[part.first] = arrays
+            if log is not None:
+                log.append(part.first, arrays)
+    wall = time.perf_counter() - started
+    simulated = experiment.excitation.duration * sum(part.last - part.first for part in left)
+    in_order = [found[first] for first in sorted(found)]
+    columns = {name: np.concatenate([arrays[name] for arrays in in_order]) for name in _column_names()}
+    return _ranked(experiment, resolved, columns, _best(in_order, experiment), simulated, wall)
+
+
+def _done(left: list[Shard], points: int, pool: Pool | None, report: Progress) -> Iterator[tuple[Shard, Arrays]]:
+    """Give each shard and its result as it is done."""
+    shares = [0.0] * len(left)
+    sizes = [part.last - part.first for part in left]
+
+    def done() -> float:
+        return 1.0 - sum((1.0 - share) * size for share, size in zip(shares, sizes, strict=True)) / points
+
+    def say(k: int, share: float) -> None:
+        shares[k] = share
+        report("simulating", done())
+
+    if pool is not None:
+        for k, arrays in pool.unordered(simulate, left, lambda what: report(what or "simulating", done())):
+            say(k, 1.0)
+            yield left[k], arrays
+        return
+    # Two at a time: what builds and judges machines holds the interpreter's lock, what simulates does not.
+    with ThreadPoolExecutor(2) as executor:
+        futures = {executor.submit(simulate, part, partial(say, k)): part for k, part in enumerate(left)}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def simulate(shard: Shard, report: Callable[[float], None] = lambda _share: None) -> Arrays:
+    """Return the columns of a shard, and under `best.` the recording of its best point."""
+    experiment = shard.experiment
+    points = experiment.points()[shard.first : shard.last]
+    axes = find_load(experiment.load).num_axes
+    with _machines(experiment, len(points), shard.num_threads) as drives:
+        recording, fault = _record(drives, experiment, resolve(experiment), points, report)
+        columns = _evaluate(experiment, recording) | {"fault": fault}
+        columns["diverged"] = np.asarray(columns["diverged"] | np.repeat(drives.machine.diverged, axes))
+    # All axes of a machine have the point's gains; it is as good as its worst axis.
+    worst = np.argmax(_score(columns).reshape(-1, axes), axis=1) + np.arange(len(points)) * axes
+    columns = {name: values[worst] for name, values in columns.items()}
+    best = recording.point(int(worst[np.argmin(_score(columns))]))
+    return columns | {f"best.{name}": np.asarray(getattr(best, name)) for name in _RECORDED}
+
+
+_RECORDED = ("t", "reference_rpm", "speed_rpm", "current", "current_limit")
+
+
+def _column_names() -> list[str]:
+    return ["score", *metrics.METRICS, *FLAGS]
+
+
+def _best(found: list[Arrays], experiment: Experiment) -> Recording:
+    """Return the recording of the best point; of equals that of the first shard."""
+    shard = found[int(np.argmin([_score(arrays).min() for arrays in found]))]
+    recorded = {name: shard[f"best.{name}"] for name in _RECORDED}
+    excitation = experiment.excitation
+    return Recording(**recorded, t_step=excitation.velocity_time, t_load=excitation.load_time)
+
+
+def _compile(experiment: Experiment) -> None:
+    """Compile the kernels, or load them, here and now: from a thread, Ctrl-C would have to wait for the compiler."""
+    with _machines(experiment, 1, 1) as drives:
+        motion.enable(drives, mode="pv")
+        drives.record([VELOCITY, CURRENT], 0.001)
+
+
+def _machines(experiment: Experiment, count: int, num_threads: int | None) -> EmulatedDrives:
+    return EmulatedDrives(
+        experiment.device,
+        load=experiment.load,
+        motor=experiment.motor,
+        num_machines=count,
+        seed=experiment.seed,
+        identical=True,
+        num_threads=num_threads,
+    )
+
+
+def _record(
+    drives: EmulatedDrives,
+    experiment: Experiment,
+    resolved: Resolved,
+    points: NDArray[np.int64],
+    report: Callable[[float], None],
+) -> tuple[Recording, NDArray[np.bool_]]:
+    """Return the recording of every point, and which ended in fault."""
+    excitation = experiment.excitation
+    # Enabled with the preset's gains, which are stable, so that the point's gains meet every axis in the same state.
+    motion.enable(drives, mode="pv")
+    drives.write((0x6083, 0), resolved.acceleration)
+    for column, entry in enumerate(resolved.entries):
+        drives.write((entry.index, entry.sub), np.repeat(points[:, column], drives.num_axes // len(points)))
+    traces: list[Trace] = []
+    for start, end in _pieces(excitation.velocity_time, excitation.load_time, excitation.duration, PIECE,
+                              excitation.sampling_period):  # fmt: skip
+        if start == excitation.velocity_time:
+            drives.write(0x60FF, resolved.velocity)
+        if start == excitation.load_time:
+            drives.machine.load_torque = excitation.load_torque
+        period = excitation.sampling_period
+        traces.append(drives.record([VELOCITY, CURRENT], round((end - start) / period) * period, period=period))
+        report(end / excitation.duration)
+    t = np.arange(sum(map(len, traces)), dtype=np.float64) * excitation.sampling_period
+    rpm = 60.0 / resolved.position_scaler
+    ramp = np.clip((t - excitation.velocity_time) * resolved.acceleration, 0.0, abs(resolved.velocity))
+    recording = Recording(
+        t=t,
+        reference_rpm=np.sign(resolved.velocity) * ramp * rpm,
+        speed_rpm=np.concatenate([trace[VELOCITY] for trace in traces]) * rpm,
+        current=np.concatenate([trace[CURRENT] for trace in traces]) * 1e-3,
+        current_limit=drives.read(CURRENT_LIMIT).astype(np.float64) * 1e-3,
+        t_step=excitation.velocity_time,
+        t_load=excitation.load_time,
+    )
+    mask, value = motion.FAULT_BIT  # fault, or the reaction that leads to it
+    tripped = drives.read(0x6041) & mask == value
+    for message in drives.emergencies():
+        tripped[message.axis] = True  # a limit of travel too: what follows it says nothing of the gains
+    return recording, tripped
+
+
+def _pieces(step: float, load: float, end: float, piece: float, period: float) -> list[tuple[float, float]]:
+    """Return the pieces [s] in which a run is recorded: of whole sampling periods, cut at the two events."""
+    edges = [0.0, step, load, end]
+    size = max(1, round(piece / period)) * period
+    pieces = []
+    for first, last in pairwise(edges):
+        start = first
+        while last - start > 1e-9:
+            stop = min(start + size, last) if last - start - size > 1e-9 else last
+            pieces.append((start, stop))
+            start = stop
+    return pieces
+
+
+def _evaluate(experiment: Experiment, recording: Recording) -> dict[str, NDArray[Any]]:
+    """Return the score before the flags count, every metric, and the flags but the fault's."""
+    found = metrics.figures(recording)
+    choice = experiment.metric
+    columns: dict[str, NDArray[Any]] = {"score": metrics.score(choice.name, choice.weights, found)}
+    for row in metrics.METRICS.values():
+        columns[row.name] = np.asarray(row.function(found), np.float64)
+    columns["diverged"] = np.asarray(~np.isfinite(recording.speed_rpm).all(axis=0))
+    columns["oscillates"] = metrics.oscillates(found)
+    return columns
+
+
+def _score(columns: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """Return what ranks: inf for a point with a flag, or without the figure."""
+    flagged = np.any([columns[flag] for flag in FLAGS], axis=0) | np.isnan(columns["score"])
+    return np.where(flagged, np.inf, columns["score"])
+
+
+def _ranked(
+    experiment: Experiment,
+    resolved: Resolved,
+    found: dict[str, NDArray[Any]],
+    best: Recording,
+    simulated: float,
+    wall: float,
+) -> SweepResult:
+    points = experiment.points()
+    score = _score(found)
+    order = np.argsort(score, kind="stable")
+    rank = np.empty(len(points), np.int64)
+    rank[order] = np.arange(1, len(points) + 1)
+    objects = tuple(label(entry) for entry in resolved.entries)
+    columns: dict[str, NDArray[Any]] = {name: points[:, k] for k, name in enumerate(objects)}
+    columns["rank"] = rank
+    columns[f"score [{metrics.unit_of(experiment.metric.name)}]"] = score
+    for row in metrics.METRICS.values():
+        columns[f"{row.name} [{row.unit}]"] = found[row.name]
+    for flag in FLAGS:
+        columns[flag] = found[flag]
+    names = tuple(entry.label for entry in resolved.entries)
+    return SweepResult(experiment, objects, names, columns, order, best, simulated, wall)

@@ -1,0 +1,82 @@
+"""A run that is under way: a folder beside the one that its results will have, from which it goes on if it is killed.
+
+The folder of the results is complete or absent. Beside it, named `<folder>.unfinished`, lie the settings of the run and
+the results of the shards that are done, and for shards that can go on from where they were, what they have so far; it
+vanishes with the last step of the run.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tuning.runs.shard_log import ShardLog, ShardLogError
+
+SUFFIX, SETTINGS, SHARDS, PART = ".unfinished", "settings.toml", "shards", "part-"
+
+
+def unfinished_folder(folder: str | Path) -> Path:
+    """Return where a run keeps what it has while its folder is absent."""
+    path = Path(folder)
+    return path.with_name(path.name + SUFFIX)
+
+
+def settings_of(folder: str | Path) -> Path | None:
+    """Return the settings of an unfinished run, None if there is none."""
+    path = unfinished_folder(folder) / SETTINGS
+    return path if path.is_file() else None
+
+
+@contextmanager
+def shard_log(folder: str | Path, settings: str, *, resume: bool) -> Iterator[ShardLog]:
+    """Give the shards of a run that are done, and keep those to come; leave nothing behind if there are none.
+
+    Args:
+        folder: Where the results will be.
+        settings: What the run repeats from: with other settings it is another run.
+        resume: Go on with an unfinished run if there is one.
+
+    Raises:
+        ShardLogError: If an unfinished run is there and is not to be resumed, or is another one.
+        OSError: If it cannot be written.
+    """
+    place = unfinished_folder(folder)
+    if place.exists() and not resume:
+        raise ShardLogError(f"{place} holds an unfinished run; go on with it by --resume, or remove it")
+    place.mkdir(parents=True, exist_ok=True)
+    with ShardLog(place / SHARDS, settings) as log:
+        if not (place / SETTINGS).exists():
+            (place / SETTINGS).write_text(settings, encoding="utf-8", newline="\n")
+        try:
+            yield log
+        finally:
+            if not log.holds_results and not has_parts(log):
+                discard(folder)
+
+
+def has_parts(log: ShardLog) -> bool:
+    """Return whether shards of a run have begun, and kept what they have."""
+    return any(log.path.parent.glob(f"{PART}*"))
+
+
+def part_path(log: ShardLog, shard: int) -> Path:
+    """Return the file in which a shard of a run keeps what it has so far."""
+    return log.path.with_name(f"{PART}{shard}")
+
+
+@contextmanager
+def part_log(path: Path, key: str) -> Iterator[ShardLog]:
+    """Give what a shard has done so far, and keep what is to come; leave no file behind if there is nothing."""
+    with ShardLog(path, key) as log:
+        try:
+            yield log
+        finally:
+            if not log.holds_results:
+                path.unlink(missing_ok=True)
+
+
+def discard(folder: str | Path) -> None:
+    """Remove what an unfinished run has left."""
+    shutil.rmtree(unfinished_folder(folder), ignore_errors=True)

@@ -1,0 +1,404 @@
+"""Optimisation of gains on drives: a generation of trials at a time, costed from what a drive shows.
+
+Optimisers search the logarithms of gains about the fitted rule's, each machine by itself or, where the lanes are one
+and the same emulated machine, one search whose generation fills them. The safe search starts at gains that are slow and
+proved, goes on from what has been proved in small steps, and never beyond what oscillated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import RAW_MAX, Gains
+from tuning.runs.shard_log import ShardLog
+from tuning.search.samplers import SAMPLERS, Proposer, new_proposer
+from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
+from tuning.search.trial_log import LoggedTrials
+from tuning.target import Target, timed
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+COST = "cost"
+WIDTH = math.log(6.0)  # the search reaches from a sixth to six times the rule's gains
+SAFE_STEP = 0.4  # of a gain's logarithm, from the nearest gains that were proved
+SAFE_STARTS = 3  # times that the safe gains are halved before the search gives up
+SAFE_HALVINGS = 3  # of a step that would lead to what oscillated, before it is not taken at all
+PULLED = 0.2  # what a point costs per unit of the way that the safe search held it back
+SHUNNED = 1.0  # and what a stopped trial costs the safe search besides
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How gains are searched.
+
+    Attributes:
+        sampler: One of `samplers.SAMPLERS`.
+        trials: Of every search, the first ones included.
+        objectives: ("cost",), or several of "speed", "robustness" and "current" (trial_bench.py).
+        gains: Names of those that are searched; the others are the rule's.
+        width: How far the search reaches, as the logarithm of a factor of the rule's gains.
+        safe: Start from safe gains and go on from what was proved.
+        seed: Of everything random.
+        journal: File of Optuna's journal, in which the search is kept and from which it goes on.
+    """
+
+    sampler: str = "tpe"
+    trials: int = 30
+    objectives: tuple[str, ...] = (COST,)
+    gains: tuple[str, ...] = ("velocity_p", "velocity_i", "position_p")
+    width: float = WIDTH
+    safe: bool = False
+    seed: int = 0
+    journal: Path | None = None
+
+    def __post_init__(self) -> None:
+        _check("sampler", [self.sampler], SAMPLERS)
+        _check("gain", self.gains, Gains._fields)
+        _check("objective", self.objectives, (COST, *OBJECTIVES))
+        if self.trials < 1:
+            raise ValueError(f"trials must be 1 or more, not {self.trials}")
+        if not 0.0 < self.width <= math.log(RAW_MAX):
+            raise ValueError(f"width must lie above 0 and up to {math.log(RAW_MAX):.1f}, not {self.width:g}")
+
+
+class Row(NamedTuple):
+    """A trial that was made.
+
+    search, number: Which search, and the trial's number in it.
+    gains: Of the machine's axes, raw integers, (axes_per_machine, 5).
+    cost: ln J by measured terms.
+    objectives: In the order of `OBJECTIVES`.
+    aborted: Stopped, for it oscillated or tripped.
+    fragile: Not kept, for the axis went on shaking with these gains once something else had shaken it.
+    """
+
+    search: int
+    number: int
+    gains: Integers
+    cost: float
+    objectives: tuple[float, ...]
+    aborted: bool
+    fragile: bool = False
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the gains could be kept."""
+        return not (self.aborted or self.fragile)
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """What a search found.
+
+    Attributes:
+        gains: The best of every machine, raw integers, (num_axes, 5); that of the safe search was never stopped.
+        rule: The fitted rule's, from what was identified, (num_axes, 5).
+        cost: ln J by measured terms of the best, (num_machines,).
+        rows: Every trial, in the order in which they were told.
+        drive_seconds: Time that passed on the drives [s].
+        moves, aborts: Of every axis, (num_axes,).
+        notes: What was in the way, of every machine; "" for nothing.
+        t_0: What the objective speed tells settling times over [s].
+    """
+
+    gains: Integers
+    rule: Integers
+    cost: Floats
+    rows: tuple[Row, ...]
+    drive_seconds: float
+    moves: Integers
+    aborts: Integers
+    notes: tuple[str, ...]
+    t_0: float
+
+    def front(self, objectives: Sequence[str], search: int = 0) -> list[Row]:
+        """Return the accepted trials of a search that no other of them beats in every objective."""
+        return pareto([row for row in self.rows if row.search == search and row.accepted], objectives)
+
+
+def optimise(
+    target: Target,
+    settings: Settings,
+    *,
+    shared: bool = False,
+    anew: bool = False,
+    log: ShardLog | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Optimised:
+    """Search gains; afterwards the drives have the best ones.
+
+    Args:
+        target: What is tuned; the drives may have any gains.
+        settings: How.
+        shared: The machines are one and the same: one search, whose generation fills them.
+        anew: As `TrialBench` takes it.
+        log: Trials that were made already, and where those to come are kept; with `anew` only, and without a journal.
+        progress: Called with the share that is done.
+
+    Raises:
+        ValueError: For a sampler that lacks a package or does not take several objectives.
+        ShardLogError: If the log is of another search.
+    """
+    if log is not None and (not anew or settings.journal is not None):
+        raise ValueError("a search goes on from its log if every trial begins anew, and if it has no journal besides")
+    with timed(target) as (watched, clock):
+        bench = TrialBench(watched, anew=anew)
+        bench.identify()
+        search = _Search(bench, settings, shared, bench if log is None else LoggedTrials(bench, clock, log))
+        while search.generation():
+            progress(search.share())
+        gains, cost = search.best()
+        bench.leave(gains)
+    return Optimised(
+        gains, bench.rule, cost, search.judged(), clock.seconds, bench.moves, bench.aborts, tuple(search.notes),
+        bench.t_0,
+    )  # fmt: skip
+
+
+class _Search:
+    """Searches of the machines of a bench, side by side; a point is the logarithms of gains over the rule's.
+
+    All axes of a machine have the same factors of their rules: the rule knows what tells the axes apart, and a search
+    of three numbers finds something in twenty trials where one of eighteen does not.
+    """
+
+    def __init__(self, bench: TrialBench, settings: Settings, shared: bool, trials: TrialBench | LoggedTrials) -> None:
+        machines, axes = bench.num_machines, bench.target.axes_per_machine
+        self.rows: list[Row] = []
+        self.notes = [""] * machines
+        self._bench, self._trials, self._settings, self._axes = bench, trials, settings, axes
+        self._columns = np.array([Gains._fields.index(name) for name in settings.gains])
+        # Machines of a search: they are its generation.
+        self._members = [np.arange(machines)] if shared else [np.array([k]) for k in range(machines)]
+        self._start = self._points(bench.safe if settings.safe else bench.rule)
+        self._proved: list[list[Floats]] = [[] for _ in self._members]
+        self._refuted: list[list[Floats]] = [[] for _ in self._members]
+        self._fragile: list[set[bytes]] = [set() for _ in self._members]
+        self._least = np.full(machines, np.inf)
+        self._halted = [False] * len(self._members)
+        self._proposers = [self._proposer(k) for k in range(len(self._members))]
+        for k, proposer in enumerate(self._proposers):
+            for fact in proposer.history():
+                self._take(k, np.array(fact["point"]), _row(k, fact))
+        if settings.safe:
+            self._prove()
+
+    def generation(self) -> bool:
+        """Try a generation; return whether there was anything left to try."""
+        asked = {}
+        for k, members in enumerate(self._members):
+            left = self._settings.trials - self._proposers[k].told
+            if left > 0 and not self._halted[k] and (points := self._proposers[k].ask(min(len(members), left))):
+                asked[k] = points
+        if not asked:
+            return False
+        held = {k: [self._held_back(k, point) for point in points] for k, points in asked.items()}
+        tried, gains = self._run(held)
+        self._drop_fragile(tried)
+        for k, points in asked.items():
+            self._tell(k, points, held[k], tried, gains)
+        return True
+
+    def share(self) -> float:
+        """Return the share of the trials that is done."""
+        told = [proposer.told for proposer, halted in zip(self._proposers, self._halted, strict=True) if not halted]
+        return min(told) / self._settings.trials if told else 1.0
+
+    def best(self) -> tuple[Integers, Floats]:
+        """Return the best gains of every machine, (num_axes, 5), and what they cost, (num_machines,)."""
+        bench = self._bench
+        gains = (bench.safe if self._settings.safe else bench.rule).copy()
+        cost = np.full(bench.num_machines, np.nan)
+        for k, members in enumerate(self._members):
+            row = self._best_row(k)
+            for machine in members:
+                if row is not None:
+                    gains[self._axes_of(machine)], cost[machine] = row.gains, row.cost
+        return gains, cost
+
+    def judged(self) -> tuple[Row, ...]:
+        """Return every trial, those marked whose gains were found fragile later."""
+        return tuple(row._replace(fragile=row.gains.tobytes() in self._fragile[row.search]) for row in self.rows)
+
+    def _best_row(self, k: int) -> Row | None:
+        unstopped = self._unstopped(k)
+        if not unstopped:
+            rows = [row for row in self.rows if row.search == k]
+            if rows and not self._settings.safe:
+                self._note(k, "every trial was stopped; these are the gains that cost least")
+                return min(rows, key=lambda row: row.cost)
+            return None
+        return min(pareto(unstopped, self._settings.objectives), key=lambda row: row.cost)
+
+    # --- a generation -------------------------------------------------------------------------------------------------
+    def _run(self, held: dict[int, list[Floats]]) -> tuple[Tried, Integers]:
+        """Try points of the searches, each in a machine of its own."""
+        gains, where = self._bench.incumbent.copy(), np.zeros(self._bench.num_machines, bool)
+        for k, points in held.items():
+            for machine, point in zip(self._members[k], points, strict=False):
+                gains[self._axes_of(machine)] = self._gains(machine, point)
+                where[machine] = True
+        return self._trials.run(gains, where), gains
+
+    def _tell(self, k: int, asked: list[Floats], held: list[Floats], tried: Tried, gains: Integers) -> None:
+        values, facts = [], []
+        for place, (point, own) in enumerate(zip(asked, held, strict=True)):
+            machine = int(self._members[k][place])
+            row = Row(
+                k,
+                self._proposers[k].told + place,
+                gains[self._axes_of(machine)].copy(),
+                float(tried.cost[machine]),
+                tuple(map(float, tried.objectives[machine])),
+                bool(tried.aborted[machine]),
+            )
+            self._take(k, own, row)
+            pulled = PULLED * float(np.abs(point - own).max()) + SHUNNED * (self._settings.safe and row.aborted)
+            values.append([value + pulled for value in objective_values(row, self._settings.objectives)])
+            facts.append({"point": own.tolist()} | {**row._asdict(), "gains": row.gains.tolist()})
+        self._proposers[k].tell(values, facts)
+
+    def _drop_fragile(self, tried: Tried) -> None:
+        """Forget the last good gains where they could not end an oscillation; those before them are the last good."""
+        for k, members in enumerate(self._members):
+            for machine in map(int, members[tried.fragile[members]]):
+                axes = self._axes_of(machine)
+                self._fragile[k].add(self._bench.incumbent[axes].tobytes())
+                left = min(self._unstopped(k), key=lambda row: row.cost, default=None)
+                self._bench.incumbent[axes] = self._bench.safe[axes] if left is None else left.gains
+                self._least[machine] = np.inf if left is None else left.cost
+                self._note(k, "gains of a good trial went on shaking once something else had shaken the axis: not kept")
+
+    def _unstopped(self, k: int) -> list[Row]:
+        """Return a search's trials that were not stopped, and whose gains have not been found fragile since."""
+        return [
+            row
+            for row in self.rows
+            if row.search == k and not row.aborted and row.gains.tobytes() not in self._fragile[k]
+        ]
+
+    def _take(self, k: int, point: Floats, row: Row) -> None:
+        """Remember a trial; what is better than all before and was not stopped is what the next ones go back to."""
+        self.rows.append(row)
+        (self._refuted if row.aborted else self._proved)[k].append(point)
+        for machine in map(int, self._members[k]):
+            if not row.aborted and row.cost < self._least[machine]:
+                self._least[machine] = row.cost
+                self._bench.incumbent[self._axes_of(machine)] = row.gains
+
+    # --- the safe search ----------------------------------------------------------------------------------------------
+    def _prove(self) -> None:
+        """Try the safe gains first, slower ones where they are not, and give a machine up that shakes with those."""
+        searches = [k for k in range(len(self._members)) if not self._proved[k]]
+        point = {k: self._start[self._members[k][0]] for k in searches}
+        for _ in range(SAFE_STARTS):
+            if not searches:
+                return
+            for k in searches:
+                self._proposers[k].ask(1)
+            tried, gains = self._run({k: [point[k]] for k in searches})
+            for k in searches:
+                self._tell(k, [point[k]], [point[k]], tried, gains)
+            searches = [k for k in searches if not self._proved[k]]
+            for k in searches:
+                point[k] = point[k] - math.log(2.0)
+        for k in searches:
+            self._halted[k] = True
+            self._note(
+                k, f"the safe gains were stopped, and so were those of 1/{2 ** (SAFE_STARTS - 1)}: no safe start"
+            )
+
+    def _held_back(self, k: int, point: Floats) -> Floats:
+        """Return the point, in the safe search drawn near to what was proved and away from what was refuted."""
+        if not self._settings.safe:
+            return point
+        proved = np.array(self._proved[k])
+        nearest = proved[np.abs(proved - point).max(axis=1).argmin()]
+        step = np.clip(point - nearest, -SAFE_STEP, SAFE_STEP)
+        for _ in range(SAFE_HALVINGS):
+            # Not beyond gains that oscillated: every gain as large, or nearer to them than half a step.
+            if not any(
+                np.all(nearest + step >= bad) or np.abs(nearest + step - bad).max() < 0.5 * SAFE_STEP
+                for bad in self._refuted[k]
+            ):
+                return np.asarray(nearest + step)
+            step = 0.5 * step
+        return np.asarray(nearest)
+
+    # --- points and gains ---------------------------------------------------------------------------------------------
+    def _proposer(self, k: int) -> Proposer:
+        settings, start = self._settings, self._start[self._members[k][0]]
+        low = np.minimum(np.full(start.shape, -settings.width), start)
+        return new_proposer(
+            settings.sampler,
+            low,
+            np.full(start.shape, settings.width),
+            seed=settings.seed + 7919 * k,
+            objectives=len(settings.objectives),
+            trials=settings.trials,
+            first=[start],
+            generation=len(self._members[k]),
+            journal=settings.journal,
+            name=f"machine {k}",
+        )
+
+    def _points(self, gains: Integers) -> Floats:
+        """Return gains as points of the machines, (num_machines, dimensions)."""
+        logs = np.log(gains[:, self._columns] / self._bench.rule[:, self._columns])
+        return np.asarray(logs.reshape(self._bench.num_machines, self._axes, -1).mean(axis=1))
+
+    def _gains(self, machine: int, point: Floats) -> Integers:
+        """Return the gains of a machine's axes at a point, (axes_per_machine, 5)."""
+        gains = self._bench.rule[self._axes_of(machine)].copy()
+        gains[:, self._columns] = np.clip(np.rint(gains[:, self._columns] * np.exp(point)), 1, RAW_MAX)
+        return gains
+
+    def _axes_of(self, machine: int) -> slice:
+        return slice(int(machine) * self._axes, (int(machine) + 1) * self._axes)
+
+    def _note(self, k: int, text: str) -> None:
+        for machine in self._members[k]:
+            self.notes[machine] = text
+
+
+def pareto(rows: Sequence[Row], objectives: Sequence[str]) -> list[Row]:
+    """Return the trials that no other is better than in every objective, ordered by the first one."""
+    values = np.array([objective_values(row, objectives) for row in rows]).reshape(len(rows), -1)
+    best = [
+        k for k, own in enumerate(values) if not np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1))
+    ]
+    return sorted((rows[k] for k in best), key=lambda row: objective_values(row, objectives))
+
+
+def objective_values(row: Row, objectives: Sequence[str]) -> tuple[float, ...]:
+    """Return what a trial is worth in each objective, less is better."""
+    return tuple(row.cost if name == COST else row.objectives[OBJECTIVES.index(name)] for name in objectives)
+
+
+def _row(search: int, fact: Mapping[str, Any]) -> Row:
+    """Return a trial that a journal remembers."""
+    return Row(
+        search,
+        int(fact["number"]),
+        np.array(fact["gains"], np.int64),
+        float(fact["cost"]),
+        tuple(fact["objectives"]),
+        bool(fact["aborted"]),
+    )
+
+
+def _check(what: str, names: Sequence[str], known: Sequence[str]) -> None:
+    """Raise ValueError unless the names are different ones of those known."""
+    for name in names:
+        if name not in known:
+            raise ValueError(f"no {what} is named {name!r}; there are {', '.join(known)}")
+    if not names or len(set(names)) != len(names):
+        raise ValueError(f"give different ones of {what}: {', '.join(known)}, not {', '.join(names) or 'none'}")

@@ -1,0 +1,176 @@
+"""Independent searches of the same emulated machine, each with its own seed: the shards into which optimising splits.
+
+A search is a sequence of generations, each from what the last one showed, so that it runs in one place. Several with
+other seeds guard against the luck of one, and run anywhere. One that is killed goes on from its last generation where
+its file can be reached, or else from its seed: to the same digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.runs.pools import Pool
+from tuning.runs.shard_log import Arrays, ShardLog
+from tuning.runs.unfinished import part_log, part_path
+from tuning.search.optimise import Optimised, Row, Settings, optimise
+from tuning.target import emulated
+from tuning.toml_tables import toml
+
+
+class Search(NamedTuple):
+    """A search on an emulated machine: what `emulated` takes, and how it is searched."""
+
+    machine: Mapping[str, Any]
+    settings: Settings
+
+
+class _Task(NamedTuple):
+    """A search to be run, and the file from which it goes on with its key; None if there is none."""
+
+    search: Search
+    path: Path | None
+    key: str
+
+
+def searches(machine: Mapping[str, Any], settings: Settings, count: int) -> list[Search]:
+    """Return searches with the seeds from that of the settings on; the machine is the same.
+
+    Raises:
+        ValueError: For fewer than one, or several that share a journal.
+    """
+    if count < 1:
+        raise ValueError(f"--searches {count} is below 1; give the number of searches")
+    if count > 1 and settings.journal is not None:
+        raise ValueError("a journal keeps one search; leave --journal out, or take --searches 1")
+    return [Search(machine, replace(settings, seed=settings.seed + k)) for k in range(count)]
+
+
+def description(shards: list[Search]) -> str:
+    """Return what makes these searches what they are, as TOML lines."""
+    lines = [f"searches = {len(shards)}"]
+    lines += [f"machine.{name} = {_text(value)}" for name, value in shards[0].machine.items() if value is not None]
+    settings = {f.name: getattr(shards[0].settings, f.name) for f in fields(Settings)}
+    lines += [f"{name} = {_text(value)}" for name, value in settings.items() if value is not None]
+    return "\n".join(lines) + "\n"
+
+
+def run(
+    shards: list[Search],
+    pool: Pool | None,
+    log: ShardLog,
+    progress: Callable[[float], None] = lambda share: None,
+) -> list[Optimised]:
+    """Run what is not in the log yet, and return what every search found, in their order.
+
+    Args:
+        shards: The searches.
+        pool: Where they run; in this process by default. It changes no digit.
+        log: Searches that are done already, and where those to come are kept.
+        progress: Called with the share that is done.
+    """
+    found = dict(log.done)
+    left = [k for k in range(len(shards)) if k not in found]
+    # A journal remembers by itself; a cluster's workers do not see this machine's files.
+    here = shards[0].settings.journal is None and (pool is None or pool.shares_disk)
+    tasks = [
+        _Task(shard, part_path(log, k) if here else None, f"{log.key}search {k}") for k, shard in enumerate(shards)
+    ]
+    for k, arrays in _done(tasks, left, pool, progress):
+        found[k] = arrays
+        log.append(k, arrays)
+        part_path(log, k).unlink(missing_ok=True)
+    return [_optimised(found[k], search=k) for k in range(len(shards))]
+
+
+def _done(
+    tasks: list[_Task], left: list[int], pool: Pool | None, progress: Callable[[float], None]
+) -> Iterator[tuple[int, Arrays]]:
+    """Give the number and the result of each search as it is done."""
+    before = len(tasks) - len(left)
+    if pool is None:
+        for done, k in enumerate(left, before):
+
+            def report(share: float, done: int = done) -> None:
+                progress((done + share) / len(tasks))
+
+            yield k, _run(tasks[k], report)
+        return
+    for done, (place, arrays) in enumerate(pool.unordered(_run, [tasks[k] for k in left]), before + 1):
+        progress(done / len(tasks))
+        yield left[place], arrays
+
+
+def joined(found: list[Optimised]) -> Optimised:
+    """Return searches as one: gains (searches * axes, 5) and cost (searches,) of each, the counts of all lanes."""
+    return Optimised(
+        np.concatenate([one.gains for one in found]),
+        np.concatenate([one.rule for one in found]),
+        np.concatenate([one.cost for one in found]),
+        tuple(row for one in found for row in one.rows),
+        sum(one.drive_seconds for one in found),
+        np.concatenate([one.moves for one in found]),
+        np.concatenate([one.aborts for one in found]),
+        tuple(note for one in found for note in one.notes),
+        found[0].t_0,
+    )
+
+
+def _run(task: _Task, progress: Callable[[float], None] = lambda share: None) -> Arrays:
+    """Return what a search found, of the machine that its lanes are, as arrays."""
+    search = task.search
+    kept = nullcontext() if task.path is None else part_log(task.path, task.key)
+    with emulated(**search.machine) as target, kept as log:
+        found = optimise(target, search.settings, shared=True, anew=True, log=log, progress=progress)
+        axes = target.axes_per_machine
+    rows = found.rows
+    return {
+        "gains": found.gains[:axes],
+        "rule": found.rule[:axes],
+        "cost": found.cost[:1],
+        "number": np.array([row.number for row in rows], np.int64),
+        "tried": np.array([row.gains for row in rows], np.int64).reshape(len(rows), axes, 5),
+        "costs": np.array([row.cost for row in rows], float),
+        "objectives": np.array([row.objectives for row in rows], float).reshape(len(rows), -1),
+        "aborted": np.array([row.aborted for row in rows], bool),
+        "fragile": np.array([row.fragile for row in rows], bool),
+        "drive_seconds": np.array(found.drive_seconds),
+        "moves": found.moves,
+        "aborts": found.aborts,
+        "notes": np.array(found.notes[:1]),
+        "t_0": np.array(found.t_0),
+    }
+
+
+def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
+    rows = tuple(
+        Row(search, int(number), gains, float(cost), tuple(objectives.tolist()), bool(aborted), bool(fragile))
+        for number, gains, cost, objectives, aborted, fragile in zip(
+            *(arrays[name] for name in ("number", "tried", "costs", "objectives", "aborted", "fragile")), strict=True
+        )
+    )
+    return Optimised(
+        arrays["gains"],
+        arrays["rule"],
+        arrays["cost"],
+        rows,
+        float(arrays["drive_seconds"]),
+        arrays["moves"],
+        arrays["aborts"],
+        tuple(map(str, arrays["notes"])),
+        float(arrays["t_0"]),
+    )
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_text, value))}]"
+    return toml(value if isinstance(value, str | int | float) else str(value))

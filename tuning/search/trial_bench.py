@@ -1,0 +1,289 @@
+"""Trials of gains on what is to be tuned: identified first, then tried in moves, and costed from what a drive shows.
+
+The bench is where optimisers meet drives: it starts from gains that are safe, keeps each axis within its travel, has
+what oscillates stopped within 50 ms, and counts what the drives had to do.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import (
+    FITTED_RULE,
+    GAIN_OBJECTS,
+    Rule,
+    gains_from_bandwidths,
+    rule_gains,
+    small_time_constants,
+    write_gains,
+)
+from drive_env.safety.envelope import SafetyError
+from drive_env.trials.gain_trial import Identified, Trial, Trials, measured_cost, softness
+from drive_env.trials.positioning import (
+    CYCLE,
+    POSITION,
+    PROFILE,
+    SETTLED,
+    TRIAL,
+    plan_move,
+    start,
+    wrapped,
+    write_profile,
+)
+from drive_env.trials.score import TRIP, cost
+from tuning.auto.fallback_gains import CalmedDrives
+from tuning.oscillation_watch import SOFTER, VELOCITY_P, OscillationError, WatchedDrives
+from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL = 2, 3
+# What moves an axis of which nothing is known but its motor: the commissioning presets' bandwidths, three rotors.
+FIRST_HZ = {"current_hz": 1000.0, "velocity_hz": 20.0, "position_hz": 5.0}
+# The fitted rule at a third of its speed and with three times its integration time: where a safe search begins.
+SAFE_RULE = FITTED_RULE._replace(
+    speed=FITTED_RULE.speed / 3.0, integration=3.0 * FITTED_RULE.integration, position=0.3 * FITTED_RULE.position
+)
+
+CALM = 0.1  # s until what an axis did before has died away
+ASTRAY = 0.2  # of the move: an axis farther than that from where a trial starts is brought back first
+SOFTENINGS = 3  # of gains from the data sheet, with which an axis may oscillate
+MOST_STOPS = 3  # by the safety envelope, one trial after the other, before the search ends
+BEYOND = 0.1  # how fast the cost grows where J has come to its end
+E_D_EXPONENT = 0.4  # of E_d/E_0 in J (drive_env/trials/score.py)
+_UNCUT = 1e-3
+
+OBJECTIVES = ("speed", "robustness", "current")
+
+
+class Tried(NamedTuple):
+    """What a trial of the machines' gains showed.
+
+    cost: ln J by measured terms, of the worst axis of each machine, (num_machines,); above ln 30, where J ends, it goes
+        on growing a tenth as fast.
+    objectives: In the order of `OBJECTIVES`, all to be small, (num_machines, 3): ln t_s/t_0 of the slower of move and
+        reversal; ln of how much worse the worst phase is than move and reversal, the probe with velocity P x 1.5
+        among them; RMS increment of the current over the rated one [%].
+    aborted: Stopped in any phase, (num_machines,).
+    fragile: Shook on with the incumbent's gains after it had been stopped, (num_machines,): those are none to keep.
+    """
+
+    cost: Floats
+    objectives: Floats
+    aborted: Mask
+    fragile: Mask
+
+
+class TrialBench:
+    """Trials of gains on a target, all of its machines at once.
+
+    Args:
+        target: What is tuned; the drives may have any gains, also none.
+        anew: Put emulated machines to rest at zero before every trial, so that a trial follows from machine, gains
+            and its number alone; drives on a bus go on from where they are.
+
+    Attributes:
+        t_0: What settling times are told over [s].
+    """
+
+    def __init__(self, target: Target, *, anew: bool = False) -> None:
+        self.target = target
+        self.num_machines = target.num_axes // target.axes_per_machine
+        self.aborts = np.zeros(target.num_axes, np.int64)
+        self.moves = np.zeros(target.num_axes, np.int64)
+        self._anew = anew and target.drives.machine is not None
+        device, motor = target.device, target.motor
+        self.t_0 = 4.0 * float(small_time_constants(device, device.stage["velocity_filter"].default))
+        self._drives = CalmedDrives(target.drives, motor.rated_current)
+        self._trials = Trials(self._drives, motor, target.axes_per_machine, self.t_0)
+        self._reach = np.where(target.high >= -target.low, target.high, target.low)
+        self._where = np.ones(target.num_axes, bool)
+        self._direction = np.ones(target.num_axes, np.int64)
+        self._was_enabled = ~self._trials.down()
+        self._profile = {name: target.drives.read(name) for name in (0x6081, 0x6083, 0x6084)}
+        self._stops = 0
+
+    def identify(self) -> None:
+        """Find inertia and friction with gains from the data sheet alone; plan the moves, the rule's and safe gains."""
+        target, drives = self.target, self.target.drives
+        if self._anew:
+            drives.machine.reset()
+        gains = first_gains(target)
+        write_gains(drives, gains)  # before anything is enabled: the drives may have any
+        self._trials.recover(self._where)
+        drives.advance(CALM)
+        self.identified, self._origin = self._moved(gains)
+        self._trials.recover(self._where)
+        self.move = plan_move(target.motor, self.identified.inertia, drives.read((0x2058, 0)), self._reach)
+        self.rule, self.safe = (_rule_gains(target, self.identified.inertia, rule) for rule in (FITTED_RULE, SAFE_RULE))
+        self.incumbent = self.safe.copy()
+        write_gains(drives, self.safe)
+        drives.advance(TRIAL * CYCLE)  # the first gains may leave an axis swinging
+        self._drives.calm = self.safe
+
+    def _moved(self, gains: Integers) -> tuple[Identified, Integers]:
+        """Move there and back for identification; an axis that oscillates is switched off, and moves with softer gains.
+
+        Raises:
+            RuntimeError: If one oscillates with any.
+        """
+        target, drives = self.target, self.target.drives
+        noise = target.device.stage["adc_noise"].high
+        scaler = drives.read((0x2058, 0))
+        for _ in range(SOFTENINGS):
+            began = drives.read(POSITION)
+            watched = WatchedDrives(self._drives, self._where, np.full(target.num_axes, target.current), noise)
+            trials = Trials(watched, target.motor, target.axes_per_machine, self.t_0)
+            self.moves += MOVES_OF_IDENTIFICATION
+            with suppress(OscillationError):
+                found = trials.identify(self._reach, self._where)
+            if not watched.swung.any():
+                return found
+            gains[watched.swung, VELOCITY_P:] = np.maximum(gains[watched.swung, VELOCITY_P:] // SOFTER, 1)
+            write_gains(drives, gains, watched.swung)
+            self._trials.recover(self._where)
+            drives.advance(CALM)
+            self._reach = self._reach - wrapped(drives.read(POSITION) - began) / scaler * 2.0 * np.pi
+        axis = int(np.flatnonzero(watched.swung)[0])
+        raise RuntimeError(
+            f"axis {axis} oscillates in the moves of identification, even with 1/{SOFTER ** (SOFTENINGS - 1)} of the "
+            "gains that its motor's data sheet gives; check motor and wiring"
+        )
+
+    def run(self, gains: Integers, where: Mask | None = None) -> Tried:
+        """Try gains in a move, its reversal and the gain probe; what is stopped gets the incumbent back.
+
+        Args:
+            gains: Raw integers, shape (num_axes, 5) in the order of `Gains`.
+            where: Machines that take part, (num_machines,); the others' figures mean nothing.
+        """
+        target = self.target
+        axes = self._where if where is None else np.repeat(where, target.axes_per_machine)
+        self._start_trial()
+        self._return(axes)
+        self._drives.begin()
+        try:
+            tried = self._trials.run(gains, self.incumbent, self.move, self._origin, self._direction, axes)
+        except SafetyError as error:  # the envelope has stopped all drives
+            return self._stopped(axes, error)
+        self._stops = 0
+        # Until the next trial, and not those of the probe.
+        write_gains(target.drives, np.where(self._drives.calmed[:, None], self.safe, self.incumbent), axes)
+        self._trials.recover(axes)
+        if not self._anew:  # a trial ends where its move did, and the next one goes the other way
+            self._origin = np.where(axes, self._origin + self._direction * self.move.distance, self._origin)
+            self._direction = np.where(axes, -self._direction, self._direction)
+        self.moves[axes] += MOVES_OF_TRIAL
+        stopped = tried.aborted.any(axis=0)
+        self.aborts[axes & stopped] += 1
+        objectives = self._objectives(tried)
+        shape = (self.num_machines, target.axes_per_machine)
+        fragile = axes & self._drives.calmed
+        return Tried(
+            self._cost(gains, tried).reshape(shape).max(axis=1),
+            objectives.reshape(*shape, -1).max(axis=1),
+            np.any(stopped.reshape(shape), axis=1),
+            np.any(fragile.reshape(shape), axis=1),
+        )
+
+    def _stopped(self, axes: Mask, error: SafetyError) -> Tried:
+        """Return what there is to say of a trial that the envelope ended: everything that took part is stopped."""
+        self._stops += 1
+        if self._stops > MOST_STOPS:
+            raise error
+        write_gains(self.target.drives, self.incumbent, axes)
+        self._trials.recover(axes)
+        self.moves[axes] += 1
+        self.aborts[axes] += 1
+        shape = (self.num_machines, self.target.axes_per_machine)
+        worst = np.array([np.log(1.0 + (SETTLED - PROFILE) * CYCLE / self.t_0), np.log(TRIP), 100.0])
+        machines = np.any(axes.reshape(shape), axis=1)
+        return Tried(
+            np.full(shape[0], np.log(TRIP)),
+            np.tile(worst, (shape[0], 1)),
+            machines,
+            np.zeros(shape[0], bool),
+        )
+
+    def _cost(self, gains: Integers, tried: Trial) -> Floats:
+        """Return the cost of every axis, (num_axes,): what is slow beyond J's end is still told from what is slower."""
+        relative = softness(gains) / softness(self.rule)
+        # J is cut off at 30; with less of E_d, which enters as a factor, it is not.
+        uncut = tried.costs(relative * _UNCUT) * _UNCUT**-E_D_EXPONENT
+        worth = np.log(measured_cost(np.where(tried.aborted, TRIP, uncut)))
+        end = np.log(TRIP)
+        return np.asarray(np.where(worth > end, end + BEYOND * (worth - end), worth))
+
+    def _objectives(self, tried: Trial) -> Floats:
+        """Return the objectives of every axis, (num_axes, 3)."""
+        terms, moves = tried.terms, tried.aborted[:2].any(axis=0)
+        # Of a move that was stopped it is known only that it is no good: the slowest there is.
+        slowest = 1.0 + (SETTLED - PROFILE) * CYCLE / self.t_0
+        speed = np.log(np.where(moves, slowest, terms.settling[:2].max(axis=0)))
+        # Without E_d/E_0, of which a probe with 1.5 times the gain has less in any case.
+        j = cost(terms._replace(tripped=tried.aborted))
+        worse = np.log(np.where(tried.aborted.any(axis=0), TRIP, j.max(axis=0) / j[:2].mean(axis=0)))
+        return np.stack([speed, worse, 100.0 * terms.noise[:2].mean(axis=0)], axis=-1)
+
+    def leave(self, gains: Integers) -> None:
+        """Leave the drives with gains, otherwise as they were found, at standstill."""
+        drives = self.target.drives
+        write_gains(drives, gains)
+        for name, values in self._profile.items():
+            drives.write(name, values)
+        if (off := ~self._was_enabled).any():
+            drives.write(0x6040, 0x06, where=off)  # shutdown: a set-point is not taken up again when enabled anew
+
+    def _start_trial(self) -> None:
+        if self._anew:
+            self.target.drives.machine.reset()
+        self._trials.recover(self._where)
+
+    def _return(self, axes: Mask) -> None:
+        """Bring axes back with the incumbent that are not where the next trial starts: one tripped, and fell or ran."""
+        drives = self.target.drives
+        way = np.abs(wrapped(drives.read(POSITION) - self._origin))
+        astray = axes & (way > ASTRAY * np.maximum(np.abs(self.move.distance), 1))
+        if not astray.any():
+            return
+        write_gains(drives, self.incumbent, astray)
+        write_profile(drives, self.move, astray)
+        start(drives, wrapped(self._origin).astype(np.int64), astray)
+        # The ramp takes at most as long as the farthest way at the profile's speed, and a trial's time.
+        longest = np.max(way / self.move.velocity, where=astray, initial=0.0)
+        drives.advance((TRIAL + math.ceil(longest / CYCLE)) * CYCLE)
+        self.moves[astray] += 1
+        self._trials.recover(astray)
+
+
+def first_gains(target: Target) -> Integers:
+    """Return gains from the data sheet alone, for a total inertia of three rotors, shape (num_axes, 5)."""
+    motor = target.motor
+    return np.array(
+        [
+            gains_from_bandwidths(target.device, motor, 3.0 * motor.inertia, supply=float(volts), **FIRST_HZ)
+            for volts in target.supply
+        ],
+        np.int64,
+    )
+
+
+def read_gains(target: Target) -> Integers:
+    """Return the gains that the drives have, shape (num_axes, 5)."""
+    return np.stack([target.drives.read(name) for name in GAIN_OBJECTS], axis=-1)
+
+
+def _rule_gains(target: Target, inertia: Floats, rule: Rule) -> Integers:
+    return np.concatenate(
+        [
+            rule_gains(target.device, target.motor, J, rule, supply=float(volts))
+            for J, volts in zip(inertia, target.supply, strict=True)
+        ]
+    )

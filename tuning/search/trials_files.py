@@ -1,0 +1,180 @@
+"""The files of a search: every trial as a row, a picture of how it went, and the settings that repeat it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from drive_env.gains import Gains
+from drive_env.whole_file import write_whole
+from mechanics.untrusted import read_toml
+from tuning.search.optimise import COST, Optimised, Row, Settings, objective_values, pareto
+from tuning.search.trial_bench import OBJECTIVES
+from tuning.toml_tables import check_keys, toml
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+KEPT, STOPPED, FRAGILE, FRONT = "#0072b2", "#d55e00", "#cc79a7", "black"
+# What each objective is told as, less is better; the search itself knows the first three as logarithms.
+TITLES = {COST: "J", "speed": "settles [ms]", "robustness": "worst J over J", "current": "ripple [%]"}
+MEANINGS = {
+    COST: "J by measured terms",
+    "speed": "settling time, the slower of move and reversal [ms]",
+    "robustness": "J of the worst phase over that of the moves",
+    "current": "ripple of the current [% of rated]",
+}
+
+HEADER = "# The whole search. It repeats from this file: drive-tune optimise --config settings.toml\n"
+_SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed")
+_MACHINE = ("device", "motor", "load", "supply", "travel", "lanes", "searches", "interface", "channel", "nodes",
+            "bitrate", "lockstep", "pace")  # fmt: skip
+
+
+def save(
+    found: Optimised, settings: Settings, folder: Path, machine: Mapping[str, Any], versions: Mapping[str, str]
+) -> None:
+    """Write trials.csv, trials.png and settings.toml into a folder that exists.
+
+    Args:
+        found: What was found.
+        settings: How it was searched.
+        folder: Where to write.
+        machine: What was searched: options of the command, by the names of `load_options`.
+        versions: What computed it.
+
+    Raises:
+        OSError: If one cannot be written, with its name and the reason.
+    """
+    table = io.StringIO()
+    writer = csv.writer(table)
+    names = (COST, *OBJECTIVES)
+    writer.writerow(
+        ["search", "trial", "axis", *Gains._fields, *(TITLES[name] for name in names), "stopped", "fragile"]
+    )
+    for row in found.rows:
+        values = [f"{value:.6g}" for value in figures(row, names, found.t_0)]
+        for axis, gains in enumerate(row.gains.tolist()):
+            writer.writerow([row.search, row.number, axis, *gains, *values, row.aborted, row.fragile])
+    write_whole(folder / "trials.csv", table.getvalue())
+    lines = _lines({name: getattr(settings, name) for name in _SEARCH})
+    if settings.journal is not None:
+        lines.append(f"# journal: {settings.journal}")
+    lines += ["", "[machine]", *_lines(machine)]
+    lines += ["", "[versions]", *(f"{toml(name)} = {toml(value)}" for name, value in versions.items())]
+    write_whole(folder / "settings.toml", HEADER + "\n".join(lines) + "\n")
+    picture = io.BytesIO()
+    trials_figure(found, settings).savefig(picture, dpi=120)
+    write_whole(folder / "trials.png", picture.getvalue())
+
+
+def figures(row: Row, objectives: Sequence[str], t_0: float) -> list[float]:
+    """Return what a trial reached in each objective, in the units of `TITLES`; `t_0` is that of the search [s]."""
+    scales = {COST: 1.0, "speed": 1e3 * t_0, "robustness": 1.0}
+    values = zip(objectives, objective_values(row, objectives), strict=True)
+    return [scales[name] * math.exp(value) if name in scales else value for name, value in values]
+
+
+def load_options(path: str | Path) -> dict[str, Any]:
+    """Return the options of `drive-tune optimise` by which a search repeats, from its settings.toml.
+
+    Whether the drives are on a bus is not among them: a motor turns only if --bus is said again.
+
+    Raises:
+        ValueError: If the file cannot be read, or is not of a search.
+    """
+    try:
+        table = read_toml(path)
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}; give settings.toml of drive-tune optimise") from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ValueError(f"{path} is no TOML: {error}; give settings.toml of drive-tune optimise") from None
+    if "machine" not in table:
+        raise ValueError(f"{path} is of no search; give settings.toml of drive-tune optimise")
+    check_keys(str(path), table, [*_SEARCH, "machine", "versions"], optional=["versions", *_SEARCH])
+    machine = dict(table["machine"]) if isinstance(table["machine"], dict) else {}
+    check_keys(f"{path}: machine", machine, list(_MACHINE), optional=_MACHINE)
+    machine.pop("pace", None)  # what lockstep says
+    return {name: table[name] for name in _SEARCH if name in table} | machine
+
+
+def _lines(values: Mapping[str, Any]) -> list[str]:
+    return [f"{name} = {_text(value)}" for name, value in values.items() if value is not None]
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"[{', '.join(map(toml, value))}]" if isinstance(value, tuple | list) else toml(value)
+
+
+def trials_figure(found: Optimised, settings: Settings) -> Figure:
+    """Return the searches as a picture: cost by trial, or the first two objectives of every trial with the front."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    rows, names = list(found.rows), settings.objectives
+    searches = [[row for row in rows if row.search == k] for k in sorted({row.search for row in rows})]
+    values = np.array([figures(row, names[:2], found.t_0) for row in rows])
+    if len(names) == 1:
+        for k, own in enumerate(searches):
+            label = "best accepted so far" + (", of each search" if len(searches) > 1 else "")
+            _draw_best(axes, own, [figures(row, names, found.t_0)[0] for row in own], label if k == 0 else None)
+        axes.set_xlabel("trial")
+        x, y = np.array([row.number for row in rows]), values[:, 0]
+        _scale(axes.yaxis, axes.set_yscale, names[0])
+    else:
+        x, y = values.T
+        front = [figures(row, names[:2], found.t_0) for row in pareto([row for row in rows if row.accepted], names)]
+        if front:
+            axes.plot(*np.array(front).T, color=FRONT, marker="o", markersize=9, fillstyle="none", linestyle="none",
+                      label="accepted, and beaten by none in every objective")  # fmt: skip
+        axes.set_xlabel(MEANINGS[names[0]])
+        _scale(axes.xaxis, axes.set_xscale, names[0])
+        _scale(axes.yaxis, axes.set_yscale, names[1])
+    axes.set_ylabel(MEANINGS[names[min(1, len(names) - 1)]])
+    stopped, fragile = (np.array([getattr(row, name) for row in rows]) for name in ("aborted", "fragile"))
+    for where, color, marker, label in (
+        (~stopped & ~fragile, KEPT, "o", "trial"),
+        (stopped, STOPPED, "x", "stopped: it oscillated or tripped"),
+        (fragile & ~stopped, FRAGILE, "s", "not kept: it went on shaking once something had shaken it"),
+    ):
+        if where.any():
+            axes.scatter(x[where], y[where], s=18, color=color, marker=marker, label=label)
+    several = f", {len(searches)} searches" if len(searches) > 1 else ""
+    title = f"{settings.sampler}{', safe' if settings.safe else ''}, seed {settings.seed}{several}; less is better"
+    axes.set_title(title, fontsize=10)
+    axes.grid(color="0.9")
+    axes.set_axisbelow(True)
+    axes.legend(fontsize=8)
+    return figure
+
+
+def _scale(axis: Any, set_scale: Any, name: str) -> None:
+    """Scale an axis of a picture: what is a factor by its logarithm, with plain numbers at the lines."""
+    if name == "current":
+        return
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    set_scale("log")
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _draw_best(axes: Any, rows: list[Row], values: list[float], label: str | None) -> None:
+    """Draw what a search had found by each of its trials, of those that were accepted."""
+    accepted = [value if row.accepted else np.inf for row, value in zip(rows, values, strict=True)]
+    best = np.minimum.accumulate(accepted)
+    axes.step([row.number for row in rows], np.where(np.isfinite(best), best, np.nan), where="post", color=FRONT,
+              linewidth=1.2, alpha=0.8, label=label)  # fmt: skip
