@@ -42,10 +42,10 @@ from fault_injection import (
     eds_read_once,
 )
 
-from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, motion
+from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, cia402, motion
 from drive_env.canopen.frames import Frame
+from drive_env.cia402 import State
 from drive_env.devices import find_device
-from drive_env.firmware.fsa import State
 
 # --- the numbers of the verdict -----------------------------------------------------------------------------------
 REACTION = 0.025  # from the end of the travel to the beginning of the ramp: 20 ms, and the cycles at both ends [s]
@@ -228,7 +228,7 @@ def controlword(attack: Attack) -> None:
 
 
 def change_mode(attack: Attack) -> None:
-    attack.write(0x6060, attack.rng.choice((*motion.MODES.values(), 0, 2, 7, -1)))
+    attack.write(0x6060, attack.rng.choice((*cia402.MODES.values(), 0, 2, 7, -1)))
 
 
 def set_target(attack: Attack) -> None:

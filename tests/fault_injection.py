@@ -27,13 +27,13 @@ from itertools import pairwise
 import can
 import numpy as np
 
-from drive_env import CanDrives, Limits, ObjectAccessError, SafetyError, motion
+from drive_env import CanDrives, Limits, ObjectAccessError, SafetyError, cia402, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
+from drive_env.cia402 import State
 from drive_env.dictionary import entries
-from drive_env.firmware.fsa import State
 from drive_env.firmware.record import LANES
 from drive_env.master import description
 from drive_env.master.errors import BusError
@@ -405,7 +405,7 @@ def stop_by_ramp(drives):
     motion.quick_stop(drives)
     for _ in range(100):
         drives.advance(0.005)
-        if (drives.read(0x6041) & motion.SWITCH_ON_DISABLED[0] == motion.SWITCH_ON_DISABLED[1]).all():
+        if cia402.matches(drives.read(0x6041), cia402.SWITCH_ON_DISABLED).all():
             return
     raise TimeoutError("the ramp of the quick stop did not end in 0.5 s")
 

@@ -28,8 +28,8 @@ from adversary import (
 from fault_injection import eds_read_once
 
 from drive_env import Limits
+from drive_env.cia402 import State
 from drive_env.cores import usable_cores
-from drive_env.firmware.fsa import State
 
 SAMPLE, MANY = 40, 600
 ON, OFF = 4, 1  # of the automaton

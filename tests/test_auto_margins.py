@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.gains import Gains, write_gains
-from drive_env.trials.positioning import POSITION
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.result import AxisRun
 from tuning.auto.run import Run
@@ -40,7 +39,7 @@ def test_the_response_is_measured_within_what_is_left_of_the_travel(moved, left,
     with emulated(load="inertia", travel=travel, num_threads=1) as target, timed(target) as (watched, clock):
         run = Run(watched, 0, clock, 60.0)
         motion.enable(target.drives, mode="pp")
-        motion.move_to(target.drives, target.drives.read(POSITION) + round(moved * 65536))
+        motion.move_to(target.drives, target.drives.read(cia402.POSITION_ACTUAL) + round(moved * 65536))
         run.gains = np.array([[4000, 1500, 500, 300, 100]])
         run.ground = SimpleNamespace(move=SimpleNamespace(distance=np.array([16384])))
         auto_margins.measure(run)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from test_auto import gains, standing_in
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.gains import Gains, rule_gains, write_gains
 from drive_env.master.pace import Timing
-from drive_env.trials.positioning import CURRENT, WATCH
+from drive_env.trials.positioning import WATCH
 from tuning.auto import moves as auto_moves
 from tuning.auto import one_button as auto_module
 from tuning.auto import proving as proving_module
@@ -327,8 +327,8 @@ class CurrentsSeen:
 
     def record(self, objects, duration, *arguments, **options):
         trace = self._drives.record(objects, duration, *arguments, **options)
-        if CURRENT in objects and len(trace) == WATCH:
-            self.windows.append(float(np.sqrt(np.mean(np.diff(trace[CURRENT][:, 0] * 1e-3) ** 2))))
+        if cia402.TORQUE_ACTUAL in objects and len(trace) == WATCH:
+            self.windows.append(float(np.sqrt(np.mean(np.diff(trace[cia402.TORQUE_ACTUAL][:, 0] * 1e-3) ** 2))))
         return trace
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drive_env import EmulatedDrives, motion
+from drive_env import EmulatedDrives, cia402, motion
 from drive_env.firmware.record import get_lanes
 
 TURN = 65536  # increments
@@ -477,7 +477,7 @@ def test_changing_the_mode_in_motion_does_not_jump(drives, before, after):
     speed = 500_000
     run_up(drives, before, speed)
     here = drives.read(0x6062)
-    drives.write(0x6060, motion.MODES[after])
+    drives.write(0x6060, cia402.MODES[after])
     play = {}
     if after == "csp":
         # The master continues from the demand that it reads back.

@@ -9,7 +9,7 @@ import pytest
 from scripted_drive import ScriptedBus, ScriptedDrive
 from test_parity import served
 
-from drive_env import CanDrives, Limits, SafetyError, motion
+from drive_env import CanDrives, Limits, SafetyError, cia402, motion
 from drive_env.devices import find_device
 from drive_env.safety.error_control import MASTERS
 
@@ -167,9 +167,9 @@ def test_it_is_so_at_a_change_of_mode_and_of_the_ramp(bus, drive, mode, key):
         motion.enable(drives, mode="pp")
         drive.values[key] = (10 * TURN + 1, 4)
         with pytest.raises(SafetyError, match=r"its drive has .*Write less there first"):
-            drives.write(0x6060, motion.MODES[mode])
+            drives.write(0x6060, cia402.MODES[mode])
         drive.values[key] = (5 * TURN, 4)
-        drives.write(0x6060, motion.MODES[mode])
+        drives.write(0x6060, cia402.MODES[mode])
         with pytest.raises(SafetyError, match=f"its drive has .* = {5 * TURN}, beyond the limit {4 * TURN}"):
             drives.write(0x6085, 4 * TURN)
         drives.write(0x6085, 5 * TURN)

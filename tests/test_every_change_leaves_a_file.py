@@ -15,7 +15,7 @@ from test_serve import environment
 from typer.testing import CliRunner
 
 from agents.commands.cli import app as drive_agent
-from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env import CanDrives, EmulatedDrives, cia402
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
@@ -113,7 +113,7 @@ def killed(machine, command, bus, folder):
 
     def is_under_way():
         # A response is measured with the gains and ramps that there are: it changes PDOs alone.
-        return status_is(machine, motion.OPERATION_ENABLED) and (
+        return status_is(machine, cia402.OPERATION_ENABLED) and (
             command == "response" or any(differences(machine, file) for file in files(folder))
         )
 

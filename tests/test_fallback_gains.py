@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from drive_env import cia402
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.trials.gain_trial import OSCILLATION
-from drive_env.trials.positioning import CURRENT, WATCH
+from drive_env.trials.positioning import WATCH
 from tuning.auto.fallback_gains import CalmedDrives
 
 RATED = 4.0  # A
@@ -28,7 +29,7 @@ class TwoAxes:
         self.window += 1
         step = 1e3 * OSCILLATION * RATED * self.strength * (self.shaking[self.window] == "S")  # mA from cycle to cycle
         second = np.where(np.arange(WATCH) % 2, step, 0.0)
-        return _Trace({CURRENT: np.stack([np.full(WATCH, 3000.0), 2000.0 + second], axis=1)})
+        return _Trace({cia402.TORQUE_ACTUAL: np.stack([np.full(WATCH, 3000.0), 2000.0 + second], axis=1)})
 
     def write(self, name, value, where=None):
         self.written[name] = (self.window, np.asarray(value).tolist(), np.asarray(where).tolist())
@@ -54,7 +55,7 @@ def test_an_axis_is_calmed_after_three_windows_in_a_row(windows, calmed_in):
     drives = CalmedDrives(own, RATED)
     drives.calm = CALM
     for _ in windows:
-        drives.record([CURRENT], WATCH * 0.001)
+        drives.record([cia402.TORQUE_ACTUAL], WATCH * 0.001)
     if calmed_in is None:
         assert own.written == {}
         assert not drives.calmed.any()
@@ -73,7 +74,7 @@ def test_less_than_shaking_a_new_trial_and_unknown_gains_calm_nothing():
         for window in range(3):
             if begins_anew and window == 2:
                 drives.begin()
-            drives.record([CURRENT], WATCH * 0.001)
+            drives.record([cia402.TORQUE_ACTUAL], WATCH * 0.001)
         assert own.written == {}
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drive_env import EmulatedDrives, motion
-from drive_env.firmware.fsa import State
+from drive_env import EmulatedDrives, cia402, motion
+from drive_env.cia402 import State
 from drive_env.firmware.record import get_lanes, set_lanes
 
 PP, PV, CST = 1, 3, 10
@@ -455,7 +455,7 @@ def test_605dh_halt_stops_and_resumes(drives, mode):
     else:
         np.testing.assert_allclose(drives.read(0x606C), SPEED, rtol=0.05)
     if mode == "pp":
-        motion.wait_for(drives, motion.TARGET_REACHED, 30.0, "target reached")
+        motion.wait_for(drives, cia402.TARGET_REACHED, 30.0, "target reached")
         assert drives.read(0x6062).tolist() == [10_000_000, 10_000_000], "the move of before the halt"
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_parity import served
 
-from drive_env import EmulatedDrives, Limits, motion
+from drive_env import EmulatedDrives, Limits, cia402
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.gains import GAIN_OBJECTS, Gains, rule_gains, small_time_constants
 from drive_env.trials import gain_trial
@@ -444,4 +444,4 @@ def test_given_drives_have_no_machine_to_draw():
 
 def test_the_watch_is_half_of_what_it_promises():
     assert 2 * gain_trial.WATCH <= 50
-    assert motion.OPERATION_ENABLED == (0x6F, 0x27)
+    assert cia402.OPERATION_ENABLED == (0x6F, 0x27)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from test_parity import served
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.gains import GAIN_OBJECTS, write_gains
@@ -403,7 +403,7 @@ def test_wild_gains_never_act_and_come_back():
     found = identify(target)[0]
     assert found.value("inertia") == pytest.approx(truth(target.drives, 0, 0.0)["inertia"], rel=0.05)
     assert [int(target.drives.read(name)[0]) for name in GAIN_OBJECTS] == WILD[0].tolist()
-    assert target.drives.read(0x6041)[0] & motion.OPERATION_ENABLED[0] != motion.OPERATION_ENABLED[1]
+    assert not cia402.matches(target.drives.read(0x6041)[0], cia402.OPERATION_ENABLED)
 
 
 def test_an_error_on_the_way_leaves_the_drive_as_it_was(monkeypatch):
@@ -417,7 +417,7 @@ def test_an_error_on_the_way_leaves_the_drive_as_it_was(monkeypatch):
     with pytest.raises(RuntimeError, match="out of paper"):
         identify(target)
     assert [int(target.drives.read(name)[0]) for name in GAIN_OBJECTS] == WILD[0].tolist()
-    assert target.drives.read(0x6041)[0] & motion.OPERATION_ENABLED[0] != motion.OPERATION_ENABLED[1]
+    assert not cia402.matches(target.drives.read(0x6041)[0], cia402.OPERATION_ENABLED)
 
 
 def test_an_axis_that_is_enabled_is_left_alone():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drive_env import motion
+from drive_env import cia402, motion
 from mechanics.loads import LOADS, find_load
 from mechanics.shaft import one
 from tuning.identify.linked_axes import are_linked
@@ -16,8 +16,7 @@ STATUS, CURRENT, MODE = 0x6041, 0x6077, 0x6060
 
 
 def enabled(drives):
-    mask, value = motion.OPERATION_ENABLED
-    return drives.read(STATUS) & mask == value
+    return cia402.matches(drives.read(STATUS), cia402.OPERATION_ENABLED)
 
 
 def test_of_the_loads_only_the_gantry_has_axes_that_pull_at_one_thing():

@@ -36,13 +36,13 @@ from fault_injection import (
     until,
 )
 
-from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, motion
+from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, cia402, motion
 from drive_env.devices import find_device
 from drive_env.master.errors import BusError
 from drive_env.master.port import open_bus
 
 SLOW, FAST = 2 * TURN, 15 * TURN  # pps
-PP, PV = motion.MODES["pp"], motion.MODES["pv"]
+PP, PV = cia402.MODES["pp"], cia402.MODES["pv"]
 TO_ENABLE = np.repeat([0x06, 0x07, 0x0F], 20)
 linux_only = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="signals and fork")
 
@@ -254,7 +254,7 @@ def test_the_second_of_two_axes_falls_silent(when):
         def script(drives):
             motion.enable(drives, mode="pv")  # the drives' watchdogs are set once, before the silence
             motion.disable(drives)
-            for word, state in ((0x06, motion.READY_TO_SWITCH_ON), (0x07, motion.SWITCHED_ON)):
+            for word, state in ((0x06, cia402.READY_TO_SWITCH_ON), (0x07, cia402.SWITCHED_ON)):
                 drives.write(0x6040, word)
                 motion.wait_for(drives, state, 1.0, "the state before")
             if when == "as it is enabled":
@@ -550,7 +550,7 @@ def test_after_our_stop_another_master_enables(emulated):
         def script(drives):
             turn_at(drives, SLOW)
             motion.quick_stop(drives)
-            motion.wait_for(drives, motion.SWITCH_ON_DISABLED, 1.0, "the end of the ramp")
+            motion.wait_for(drives, cia402.SWITCH_ON_DISABLED, 1.0, "the end of the ramp")
             other.enable(PV)
             other.write(0x60FF, FAST, 4)
             read_on(drives, 1.0)
@@ -575,7 +575,7 @@ def ctrl_c_at_speed(drives):
 
 def too_fast(drives):
     """A limit of the speed, passed."""
-    drives.write(0x6060, motion.MODES["cst"])
+    drives.write(0x6060, cia402.MODES["cst"])
     drives.record([0x606C], 0.3, play={0x6071: np.full(300, 800)})
 
 

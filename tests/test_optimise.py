@@ -10,7 +10,7 @@ import pytest
 from test_parity import served
 from typer.testing import CliRunner
 
-from drive_env import EmulatedDrives, motion
+from drive_env import EmulatedDrives, cia402, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
@@ -134,8 +134,7 @@ def test_what_oscillates_is_stopped_and_has_the_last_good_gains_again(rigid):
     assert tried.aborted.tolist() == [False, True, False, False]
     assert bench.aborts.tolist() == [0, 1, 0, 0]
     np.testing.assert_array_equal(read_gains(rigid)[1], bench.rule[1])
-    enabled = rigid.drives.read(0x6041) & motion.OPERATION_ENABLED[0]
-    assert np.all(enabled == motion.OPERATION_ENABLED[1])
+    assert np.all(cia402.matches(rigid.drives.read(0x6041), cia402.OPERATION_ENABLED))
 
 
 class Chart:
@@ -242,7 +241,7 @@ def test_a_search_leaves_the_drives_as_they_were_but_for_the_gains(rigid):
     before = [rigid.drives.read(name) for name in kept]
     optimise(rigid, replace(FEW, trials=3))
     np.testing.assert_array_equal([rigid.drives.read(name) for name in kept], before)
-    assert not np.any(rigid.drives.read(0x6041) & motion.OPERATION_ENABLED[0] == motion.OPERATION_ENABLED[1])
+    assert not np.any(cia402.matches(rigid.drives.read(0x6041), cia402.OPERATION_ENABLED))
 
 
 def test_a_generation_fills_the_lanes():

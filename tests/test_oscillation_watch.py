@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from drive_env import motion
+from drive_env import cia402
 from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.drives.trace import Trace
 from drive_env.gains import GAIN_OBJECTS, write_gains
@@ -101,7 +101,7 @@ def test_a_motor_that_is_not_the_one_named_oscillates_and_is_said():
     assert "oscillated" in found.estimates["inertia"].reason
     assert "off within 50 ms" in found.estimates["resonance"].reason
     assert [int(target.drives.read(name)[0]) for name in GAIN_OBJECTS] == WILD[0].tolist()
-    assert target.drives.read(0x6041)[0] & motion.OPERATION_ENABLED[0] != motion.OPERATION_ENABLED[1]
+    assert not cia402.matches(target.drives.read(0x6041)[0], cia402.OPERATION_ENABLED)
     assert set(found.estimates) == set(NAMES)
 
 

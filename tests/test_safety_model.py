@@ -21,7 +21,7 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.canopen.nmt import SERVICES, Command
 from drive_env.canopen.nmt import State as Nmt
-from drive_env.firmware.fsa import STATE_CODING, State
+from drive_env.cia402 import STATE_CODING, State
 from drive_env.master.errors import BusError
 from drive_env.master.port import Port, open_bus
 from drive_env.safety.model import drive as drive_model

@@ -14,7 +14,7 @@ import pytest
 from fault_injection import ON, ObservedWorld, WorldBus
 from typer.testing import CliRunner
 
-from drive_env import EmulatedDrives, motion
+from drive_env import EmulatedDrives, cia402, motion
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
@@ -84,8 +84,7 @@ def test_an_error_rolls_everything_back_and_goes_on_its_way(target, tmp_path, er
         change(target.drives)
         raise error
     assert take(target) == before
-    mask, enabled = motion.OPERATION_ENABLED
-    assert not np.any(target.drives.read(0x6041) & mask == enabled)
+    assert not np.any(cia402.matches(target.drives.read(0x6041), cia402.OPERATION_ENABLED))
 
 
 def test_a_drive_in_fault_is_rolled_back_too(target, tmp_path):
@@ -94,8 +93,7 @@ def test_a_drive_in_fault_is_rolled_back_too(target, tmp_path):
         change(target.drives)
         target.drives.machine.supply = 65.0  # V: over-voltage
         target.drives.advance(0.1)
-        mask, fault = motion.FAULT
-        assert np.all(target.drives.read(0x6041) & mask == fault)
+        assert np.all(cia402.matches(target.drives.read(0x6041), cia402.FAULT))
     assert take(target) == before
 
 
@@ -139,8 +137,7 @@ def test_an_axis_that_somebody_else_runs_and_nothing_has_changed_is_left_running
     with pytest.raises(RuntimeError, match="axis 0 is enabled"), Transaction(target, tmp_path / "before.toml"):
         target.drives.write(CURRENT_LIMIT, 1234, where=np.array([False, True, False]))
         raise RuntimeError("axis 0 is enabled: disable it")
-    mask, enabled = motion.OPERATION_ENABLED
-    assert (target.drives.read(0x6041) & mask == enabled).tolist() == [True, False, False]
+    assert cia402.matches(target.drives.read(0x6041), cia402.OPERATION_ENABLED).tolist() == [True, False, False]
     assert target.drives.read(CURRENT_LIMIT).tolist() == [7000, 7000, 7000]
 
 

@@ -18,7 +18,7 @@ from test_serve import environment
 from drive_env import EmulatedDrives, SafetyError
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
-from drive_env.firmware.fsa import State
+from drive_env.cia402 import State
 from drive_env.gains import GAIN_OBJECTS
 from tuning.identify.identification import identify
 from tuning.target import on_bus

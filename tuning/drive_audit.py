@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env import motion
+from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary
-from drive_env.trials.positioning import CURRENT, CYCLE, POSITION, STATUS, VELOCITY, wrapped
+from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.move_counter import MoveCounter
 from tuning.target import POSITION_SCALER, Target
 
@@ -34,7 +34,7 @@ SHAKING = 0.4  # RMS change of the current per ms over the rated current, as gai
 SLACK = 0.02  # rev beyond the travel that are none yet: a few counts of an overshoot at its end
 KINDS = ("left its travel", "too fast", "oscillated", "tripped")
 
-_WATCHED = (POSITION, VELOCITY, CURRENT, STATUS)
+_WATCHED = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD)
 
 
 @cache
@@ -67,7 +67,7 @@ class MeteredDrives:
         self._drives = drives
         self._dictionary = _dictionary(target.device.name)
         scaler = np.asarray(drives.read(POSITION_SCALER), float)
-        self._origin = drives.read(POSITION)
+        self._origin = drives.read(cia402.POSITION_ACTUAL)
         self._low, self._high = (ends * scaler / (2.0 * np.pi) for ends in (target.low, target.high))
         self._slack = SLACK * scaler
         limit = target.speed * scaler / (2.0 * np.pi)
@@ -115,7 +115,7 @@ class MeteredDrives:
         moved = self._counter.passed(round(duration / CYCLE), rows)
         self.seconds[moved] = self.elapsed
         self._watch(trace)
-        current = np.asarray(trace[CURRENT], float) * 1e-3
+        current = np.asarray(trace[cia402.TORQUE_ACTUAL], float) * 1e-3
         if play:  # what is played is to shake the axis
             self._shaken[:] = 0
             self._squares[:], self._in_block, self._last_current = 0.0, 0, current[-1]
@@ -127,14 +127,13 @@ class MeteredDrives:
         return [(self._dictionary.find(name), values) for name, values in (play or {}).items()]
 
     def _watch(self, trace: Any) -> None:
-        position = wrapped(trace[POSITION] - self._origin)
-        mask, fault = motion.FAULT_BIT
+        position = wrapped(trace[cia402.POSITION_ACTUAL] - self._origin)
         rows = np.stack(
             [
                 (position < self._low - self._slack) | (position > self._high + self._slack),
-                np.abs(trace[VELOCITY]) > self._fastest,
+                np.abs(trace[cia402.VELOCITY_ACTUAL]) > self._fastest,
                 np.zeros(position.shape, bool),
-                trace[STATUS] & mask == fault,
+                cia402.matches(trace[cia402.STATUSWORD], cia402.FAULT_BIT),
             ]
         )
         before = np.concatenate([self._outside[:, None], rows[:, :-1]], axis=1)

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env import cia402
 from drive_env.trials.positioning import CYCLE
 
 Floats = NDArray[np.float64]
@@ -21,8 +22,12 @@ Key = tuple[int, int]
 
 REST = 20  # cycles at rest that end a move
 SLOW, WEAK = 0.002, 0.02  # of the speed and the current that axes may be moved with: less holds a place
-CONTROLWORD, SET_POINT = (0x6040, 0), 0x10
-POSITIONS, SPEEDS, TORQUES = ((0x607A, 0), (0x60B0, 0)), ((0x60FF, 0), (0x60B1, 0)), ((0x6071, 0), (0x60B2, 0))
+CONTROLWORD, SET_POINT = (cia402.CONTROLWORD, 0), 0x10
+POSITIONS, SPEEDS, TORQUES = (
+    ((cia402.TARGET_POSITION, 0), (cia402.POSITION_OFFSET, 0)),
+    ((cia402.TARGET_VELOCITY, 0), (cia402.VELOCITY_OFFSET, 0)),
+    ((cia402.TARGET_TORQUE, 0), (cia402.TORQUE_OFFSET, 0)),
+)
 
 
 class MoveCounter:

@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.drives.trace import Trace
 from drive_env.gains import write_gains
 from drive_env.trials.gain_trial import OSCILLATION
-from drive_env.trials.positioning import CURRENT, WATCH
+from drive_env.trials.positioning import WATCH
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 CYCLE = 0.001  # s
-CONTROLWORD, DISABLE_VOLTAGE, TARGET_VELOCITY = 0x6040, 0, 0x60FF
+DISABLE_VOLTAGE = 0
 VELOCITY_P, VELOCITY_I = 2, 3  # of raw gains
 CLEAR = 3.0
 SOFTER = 4  # by what the velocity gains of an axis are divided that oscillates with gains of our own
@@ -68,7 +68,7 @@ class WatchedDrives:
     def advance(self, duration: float) -> None:
         """Let time pass, watched."""
         if duration > 0.0:
-            self.record([CURRENT], duration)
+            self.record([cia402.TORQUE_ACTUAL], duration)
 
     def record(
         self,
@@ -79,13 +79,13 @@ class WatchedDrives:
     ) -> Trace:
         """Let time pass while objects are recorded and played, watched; the period is a cycle."""
         rows = {name: np.asarray(values) for name, values in (play or {}).items()}
-        wanted = list(objects) if CURRENT in objects else [*objects, CURRENT]
+        wanted = list(objects) if cia402.TORQUE_ACTUAL in objects else [*objects, cia402.TORQUE_ACTUAL]
         cycles, done, parts = round(duration / CYCLE), 0, []
         while done < cycles:
             now = min(cycles - done, WATCH - self._looked())
             part = {name: values[done : done + now] for name, values in rows.items()}
             parts.append(self._drives.record(wanted, now * CYCLE, part or None, period))
-            self._look(np.asarray(parts[-1][CURRENT], float) * 1e-3)
+            self._look(np.asarray(parts[-1][cia402.TORQUE_ACTUAL], float) * 1e-3)
             done += now
         return Trace.joined(parts, period) if parts else self._drives.record(objects, 0.0, play, period)
 
@@ -116,7 +116,7 @@ class WatchedDrives:
             softer[where, k] = np.maximum(gains[where, k] // SOFTER, 1)
         write_gains(self._drives, softer, where)
         self.swung &= ~where
-        self._drives.write(TARGET_VELOCITY, 0, where=where)
+        self._drives.write(cia402.TARGET_VELOCITY, 0, where=where)
         motion.enable(self, mode=mode, where=where)
         return softer
 
@@ -135,7 +135,7 @@ class WatchedDrives:
             shaking, allowed = window - window.mean(axis=0), self._shaken
         late = (np.sqrt(np.mean(shaking**2, axis=0)) > np.maximum(allowed, self._least)) & ~self.swung
         if late.any():
-            self._drives.write(CONTROLWORD, DISABLE_VOLTAGE, where=late)
+            self._drives.write(cia402.CONTROLWORD, DISABLE_VOLTAGE, where=late)
             self.swung |= late
             if self.swung[self._where].all():
                 raise OscillationError("all axes oscillate, and were switched off")

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.dictionary.access import ObjectAccessError, check_in_range, check_writable
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.held_signals import held_signals
@@ -319,8 +319,7 @@ class Transaction:
         self._stored = np.zeros(target.num_axes, bool)
 
     def __enter__(self) -> Transaction:
-        mask, enabled = motion.OPERATION_ENABLED
-        self._ran: Mask = self._target.drives.read(0x6041) & mask == enabled
+        self._ran: Mask = cia402.matches(self._target.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
         self.before = take(self._target)
         self.before.save(self.path)
         if load_snapshot(self.path) != self.before:  # the only way back
@@ -393,9 +392,9 @@ class Transaction:
 
 def _switch_off(drives: Any, where: Mask) -> None:
     """Switch the voltage off and wait until no axis may turn; one in fault is off once its reaction has ended."""
-    drives.write(0x6040, 0x00, where=where)
+    drives.write(cia402.CONTROLWORD, 0x00, where=where)
     for _ in range(SWITCH_OFF):
-        if not np.any(where & [motion.is_live(int(word)) for word in drives.read(0x6041)]):
+        if not np.any(where & [cia402.is_live(int(word)) for word in drives.read(cia402.STATUSWORD)]):
             return
         drives.advance(motion.STEP)
     raise TimeoutError(f"an axis stays enabled for {SWITCH_OFF * motion.STEP:g} s after its voltage was switched off")

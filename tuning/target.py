@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env import cia402
+
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.motors import Motor
@@ -336,7 +338,7 @@ def _hold_to_travel(target: Target) -> None:
     from drive_env.safety.limits import Limits
 
     drives = target.drives
-    here, scale = drives.read(0x6064), target.increments()
+    here, scale = drives.read(cia402.POSITION_ACTUAL), target.increments()
     width = np.where(np.isfinite(target.high - target.low), target.high - target.low, 0.0)
     slack = np.clip(SLACK * width, *SLACK_ENDS)
     low, high = here + (target.low - slack) * scale, here + (target.high + slack) * scale

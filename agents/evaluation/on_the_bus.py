@@ -10,6 +10,7 @@ import numpy as np
 
 from agents.policies.guard import GuardLimits
 from agents.training.tasks import environment_name, make_lanes
+from drive_env import cia402
 
 if TYPE_CHECKING:
     from tuning.target import Target
@@ -63,7 +64,7 @@ def target_for(
         amplitude, speed = lanes.config.amplitude, lanes.config.speed  # type: ignore[attr-defined]
         lanes.close()
         with CanDrives(**more) as drives:
-            turn, at = drives.read(POSITION_SCALER), drives.read(0x6064)
+            turn, at = drives.read(POSITION_SCALER), drives.read(cia402.POSITION_ACTUAL)
         reach = POSITION_SLACK * amplitude * turn
         position = ((at - reach).tolist(), (at + reach).tolist())
         velocity = (SPEED_SLACK * speed * turn).tolist()

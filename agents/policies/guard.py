@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agents.policies.deadline import Deadline, DeadlineError
 from agents.policies.policy import PolicyError
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.gains import GAIN_OBJECTS
 
 logger = logging.getLogger(__name__)
@@ -28,7 +28,14 @@ logger = logging.getLogger(__name__)
 AT_LIMIT = 0.999  # of the action's range: it cannot ask for more
 STOP_TIMEOUT, CYCLE = 2.0, 0.001  # s, for the ramp of a quick stop; a communication cycle
 # What an agent may change and what must not stay so: gains, offsets, profile velocity and mode.
-KEPT = (*GAIN_OBJECTS, (0x60B0, 0), (0x60B1, 0), (0x60B2, 0), (0x6081, 0), (0x6060, 0))
+KEPT = (
+    *GAIN_OBJECTS,
+    (cia402.POSITION_OFFSET, 0),
+    (cia402.VELOCITY_OFFSET, 0),
+    (cia402.TORQUE_OFFSET, 0),
+    (cia402.PROFILE_VELOCITY, 0),
+    (cia402.MODE, 0),
+)
 AT_REST = 0.01  # of the speed at the begin of the ramp
 
 
@@ -226,14 +233,14 @@ def stop(drives: Any, reason: str) -> None:
 def come_to_rest(drives: Any) -> None:
     """Quick-stop the drives, wait for the end of the ramp, and switch the voltage off."""
     motion.quick_stop(drives)
-    first = np.abs(drives.read(0x606C))
+    first = np.abs(drives.read(cia402.VELOCITY_ACTUAL))
     for _ in range(round(STOP_TIMEOUT / CYCLE)):
-        status = drives.read(0x6041)
+        status = drives.read(cia402.STATUSWORD)
         running = np.zeros(drives.num_axes, bool)
-        for mask, value in (motion.OPERATION_ENABLED, motion.QUICK_STOP_ACTIVE):
+        for mask, value in (cia402.OPERATION_ENABLED, cia402.QUICK_STOP_ACTIVE):
             running |= status & mask == value
-        moving = np.abs(drives.read(0x606C)) > np.maximum(AT_REST * first, 1)
+        moving = np.abs(drives.read(cia402.VELOCITY_ACTUAL)) > np.maximum(AT_REST * first, 1)
         if not np.any(running & moving):
             break
         drives.advance(CYCLE)
-    drives.write(0x6040, 0)
+    drives.write(cia402.CONTROLWORD, 0)

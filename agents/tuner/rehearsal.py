@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from drive_env import cia402
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.gains import GAIN_NAMES, GAIN_OBJECTS
 
@@ -25,7 +26,10 @@ SLOWEST = 0.01  # s, the median of those; a trial that watches for oscillation a
 AT_REST = 0.02  # of the speed limit
 BY_ENCODER = 3  # 2055h
 # What a trial samples besides the envelope's own, and what it plays (gain_trial.py, frequency_response.py).
-SAMPLED, PLAYED = (0x6064, 0x6062, 0x6077, 0x6041), (0x607A,)
+SAMPLED, PLAYED = (
+    (cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD),
+    (cia402.TARGET_POSITION,),
+)
 
 
 class Check(NamedTuple):
@@ -115,12 +119,11 @@ def _identity(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _state(target: Target, axis: int) -> Iterator[Check]:
-    from drive_env import motion
 
-    status = _read(target, 0x6041, axis)
+    status = _read(target, cia402.STATUSWORD, axis)
     names = ("switch on disabled", "ready to switch on", "switched on", "operation enabled", "quick stop", "fault")
-    patterns = (motion.SWITCH_ON_DISABLED, motion.READY_TO_SWITCH_ON, motion.SWITCHED_ON, motion.OPERATION_ENABLED,
-                motion.QUICK_STOP_ACTIVE, motion.FAULT)  # fmt: skip
+    patterns = (cia402.SWITCH_ON_DISABLED, cia402.READY_TO_SWITCH_ON, cia402.SWITCHED_ON, cia402.OPERATION_ENABLED,
+                cia402.QUICK_STOP_ACTIVE, cia402.FAULT)  # fmt: skip
     found = next(
         (name for name, (mask, value) in zip(names, patterns, strict=True) if status & mask == value), "between two"
     )
@@ -132,7 +135,7 @@ def _state(target: Target, axis: int) -> Iterator[Check]:
                                    "once; remove its cause first")  # fmt: skip
     else:
         yield Check("state", OK, text)
-    speed = abs(_read(target, 0x606C, axis)) / target.increments()[axis]
+    speed = abs(_read(target, cia402.VELOCITY_ACTUAL, axis)) / target.increments()[axis]
     if speed > AT_REST * target.speed:
         yield Check("standstill", NO, f"the axis turns at {speed:.3g} rad/s; bring it to rest")
     else:
@@ -141,7 +144,7 @@ def _state(target: Target, axis: int) -> Iterator[Check]:
 
 def _answers(target: Target, axis: int) -> Iterator[Check]:
     drives, times = target.drives, []
-    entry = drives.description.dictionary.find(0x6041)
+    entry = drives.description.dictionary.find(cia402.STATUSWORD)
     for _ in range(READS):
         start = time.perf_counter()
         drives.read_axis(entry, axis)
@@ -232,14 +235,14 @@ def _supply(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _travel(target: Target, axis: int) -> Iterator[Check]:
-    here, scale = _read(target, 0x6064, axis), target.increments()[axis]
+    here, scale = _read(target, cia402.POSITION_ACTUAL, axis), target.increments()[axis]
     low, high = target.low[axis], target.high[axis]
     if not np.isfinite([low, high]).all():
         yield Check("travel", OK, "free to both sides")
         return
     ends = round(here + low * scale), round(here + high * scale)
     text = f"{low:.3g} to {high:.3g} rad from here: 6064h from {ends[0]} to {ends[1]}, now {here}"
-    own = _read(target, (0x607D, 1), axis), _read(target, (0x607D, 2), axis)
+    own = _read(target, (cia402.POSITION_LIMITS, 1), axis), _read(target, (cia402.POSITION_LIMITS, 2), axis)
     if own[0] < own[1] and (ends[0] < own[0] or ends[1] > own[1]):
         yield Check("travel", NO, f"{text}; the drive's own limits 607Dh are {own[0]} to {own[1]}: give less --travel")
     else:
@@ -265,7 +268,7 @@ def _limits(target: Target, axis: int) -> Iterator[Check]:
         yield Check("limits", NO, f"{text}; the drive's limit 2003h is 0 A: set it to the motor's peak current")
     else:
         yield Check("limits", OK, f"{text}; trials may take the drive's own limit, 2003h, {amperes:.3g} A")
-    window = _read(target, 0x6065, axis)
+    window = _read(target, cia402.FOLLOWING_WINDOW, axis)
     yield Check("following error", OK, f"window 6065h is {window} inc; it is widened while the axis is shaken")
 
 
@@ -290,26 +293,26 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, st
     turn = target.increments()
     speed = round(float(np.max(target.speed * turn)))
     ends = target.low * turn, target.high * turn
-    here = target.drives.read(0x6064)
+    here = target.drives.read(cia402.POSITION_ACTUAL)
     finite = all(np.isfinite(end).all() for end in ends)
     way = f"{round(float(np.min(here + ends[0])))}...{round(float(np.max(here + ends[1])))}" if finite else "any"
     amperes = round(1e3 * target.current)
     for key, name in zip(GAIN_OBJECTS, GAIN_NAMES, strict=True):
         yield key, "1...32767", f"gain on trial, {name}", True
-    yield (0x6040, 0), "0, 2, 6, 7, Fh, 1Fh, 80h", "enable, start moves, stop, clear a fault", False
-    yield (0x6060, 0), "0, 1, 8, 9, 10", "pp for moves, csp, csv and cst for what identifies", False
-    yield (0x607A, 0), way, "moves", False
-    yield (0x60FF, 0), f"{-speed}...{speed}", "speed while it is shaken, in csv", False
-    yield (0x6071, 0), f"{-amperes}...{amperes}", "current pulses and the shaking, in cst", False
-    yield (0x6081, 0), f"1...{speed}", "speed of the moves", False
-    for index in (0x6083, 0x6084, 0x6085):
+    yield (cia402.CONTROLWORD, 0), "0, 2, 6, 7, Fh, 1Fh, 80h", "enable, start moves, stop, clear a fault", False
+    yield (cia402.MODE, 0), "0, 1, 8, 9, 10", "pp for moves, csp, csv and cst for what identifies", False
+    yield (cia402.TARGET_POSITION, 0), way, "moves", False
+    yield (cia402.TARGET_VELOCITY, 0), f"{-speed}...{speed}", "speed while it is shaken, in csv", False
+    yield (cia402.TARGET_TORQUE, 0), f"{-amperes}...{amperes}", "current pulses and the shaking, in cst", False
+    yield (cia402.PROFILE_VELOCITY, 0), f"1...{speed}", "speed of the moves", False
+    for index in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         yield (index, 0), "above 0", "ramps of the moves and of a stop", False
     yield (0x2003, 0), f"up to {amperes}", "current limit while it is identified", False
     yield (0x2004, 0), f"0...{amperes}", "current of the encoder's check", False
     yield (0x2055, 0), "1, 3", "open loop for the encoder's check, then the encoder again", False
-    yield (0x6065, 0), "up to 100 turns", "following error while it is shaken", False
+    yield (cia402.FOLLOWING_WINDOW, 0), "up to 100 turns", "following error while it is shaken", False
     for sub, value in ((1, "1"), (2, "-3")):
-        yield (0x60C2, sub), value, "interpolation period of csv and cst, 1 ms", False
+        yield (cia402.INTERPOLATION_PERIOD, sub), value, "interpolation period of csv and cst, 1 ms", False
     yield from _communication(target)
     if keep and target.drives.description.has((0x1010, 1)):
         yield (0x1010, 1), "65766173h", '"save": the gains outlive a power cycle', True
@@ -330,10 +333,20 @@ def _communication(target: Target) -> Iterator[tuple[tuple[int, int], str, str, 
         yield (0x1800 + number, 1), "", f"TPDO {number + 1} silent meanwhile, if it goes with SYNC", False
     if np.isfinite(target.low).all() and np.isfinite(target.high).all():
         for sub, end in ((1, "lower"), (2, "upper")):
-            if target.drives.description.has((0x607D, sub)):
-                yield (0x607D, sub), "the travel", f"{end} software limit, which the drive holds meanwhile", False
-    if target.drives.description.has(0x605A):
-        yield (0x605A, 0), "5, 6", "an axis that is stopped is held at first, in case a weight pulls it", False
+            if target.drives.description.has((cia402.POSITION_LIMITS, sub)):
+                yield (
+                    (cia402.POSITION_LIMITS, sub),
+                    "the travel",
+                    f"{end} software limit, which the drive holds meanwhile",
+                    False,
+                )
+    if target.drives.description.has(cia402.QUICK_STOP_OPTION):
+        yield (
+            (cia402.QUICK_STOP_OPTION, 0),
+            "5, 6",
+            "an axis that is stopped is held at first, in case a weight pulls it",
+            False,
+        )
     if target.drives.time_waits and target.drives.description.has(0x1017):
         yield (0x1017, 0), "1", "for a hundredth of a second: proof that time waits for SYNC", False
     in_real_time = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from drive_env import cia402
 from drive_env.canopen.communication import ModuleObjects
 from drive_env.devices import Device
 from drive_env.dictionary.entries import Entry, ObjectDictionary
@@ -53,7 +54,7 @@ class NodeDictionary:
         if 0x1000 <= entry.index <= 0x1FFF:
             return "communication"
         axis, base = self._device.locate(entry.index)
-        return "profile" if base >= 0x6000 else f"motor {axis}"
+        return "profile" if base in cia402.PROFILE_AREAS else f"motor {axis}"
 
     def _make(self, entry: Entry) -> Port:
         if self._module.owns(entry):

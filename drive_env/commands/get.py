@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from drive_env import cia402
 from drive_env.commands.options import (
     REFUSED,
     Bitrate,
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
     from drive_env.master.can_drives import CanDrives
 
-CONTROLWORD, STATUSWORD = 0x6040, 0x6041
 Raw = Annotated[bool, typer.Option("--raw", help="Integers as the wire carries them, without units.")]
 
 
@@ -90,7 +90,7 @@ def set_object(
     enables is refused, since nobody would watch the motor; one that stops (0, 2, 6, 7) always goes through.
     """
     from drive_env.master import quantities
-    from drive_env.master.parameters import command, of_first_axis
+    from drive_env.master.parameters import command
 
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     with errors_as_exit_codes(), ExitStack() as stack:
@@ -98,7 +98,7 @@ def set_object(
             look_first(interface, channel, node or [1], bitrate, device, eds, timeout)
         drives = stack.enter_context(connect(interface, channel, node, device, eds, **options))
         entry = drives.description.dictionary.find(object_name(name))
-        is_controlword = of_first_axis(entry.index) == CONTROLWORD
+        is_controlword = cia402.of_first_axis(entry.index) == cia402.CONTROLWORD
         # A controlword has no unit, and one that stops is not kept waiting for what one would need.
         increments = [None] * drives.num_axes if raw or is_controlword else increments_per_revolution(drives)
         wanted: list[Any] = [value] * drives.num_axes
@@ -158,9 +158,7 @@ def _tell_plan(
 
 def _refuse_to_enable(entry: Any, controlword: int) -> None:
     """Raise ValueError for a controlword that would enable: this command ends, and nothing watches then."""
-    from drive_env import motion
-
-    if motion.is_enabling(controlword):
+    if cia402.may_enable(controlword):
         raise ValueError(
             f"{entry.label} = {controlword} would enable the axis, and this command ends right after: nobody would "
             "watch the motor. Turn it with `drive-env jog`, or from Python with CanDrives; to stop it, set 2 or 0"
@@ -169,10 +167,8 @@ def _refuse_to_enable(entry: Any, controlword: int) -> None:
 
 def _ask_where_live(drives: Any, what: str, yes: bool) -> None:
     """Have the user agree to a write where a drive may turn its motor; `ask` raises otherwise."""
-    from drive_env import motion
-
-    status = [int(word) for word in drives.read(STATUSWORD)]
-    live = [f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if motion.is_live(word)]
+    status = [int(word) for word in drives.read(cia402.STATUSWORD)]
+    live = [f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if cia402.is_live(word)]
     if live:
         who = ", ".join(live)
         ask(f"{who} is live by its statusword, and obeys at once (to stop it, set 6040 to 2). Write {what}?", yes)

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from drive_env import cia402
 from drive_env.commands.options import (
     REFUSED,
     Bitrate,
@@ -30,12 +31,10 @@ from drive_env.commands.options import (
 from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
-TARGET_VELOCITY, PROFILE_VELOCITY, TARGET_POSITION, POSITION = 0x60FF, 0x6081, 0x607A, 0x6064
-ACCELERATION, STATUSWORD, CONTROLWORD = 0x6083, 0x6041, 0x6040
 DEFAULT_KEYS = [(int(name, 16), 0) for name in DEFAULT]
 CYCLE = 0.001  # s between two samples
 FIRST, LAST = 20, 500  # samples at rest before a movement that is recorded, and besides the time that it should take
-RELATIVE, NEW_SET_POINT = 0x4F, 0x10  # controlword: enabled, targets are relative; and bit 4
+RELATIVE = cia402.ENABLE_OPERATION | cia402.RELATIVE
 INTERNAL_LIMIT = 0x0800  # bit 11 of the statusword
 LOOK, STANDS = 0.2, 0.05  # s between two looks, and the share of the speed asked for below which an axis stands
 LEAST, ENOUGH = 0.01, 0.9  # of the way asked for: less is no movement, and less with an emergency was stopped by that
@@ -75,7 +74,7 @@ def jog(
         from drive_env.safety.limits import Limits
 
         known = describe(device, eds).dictionary
-        current = None if max_current is None else quantities.parse(max_current, known.find(0x6077), None)
+        current = None if max_current is None else quantities.parse(max_current, known.find(cia402.TORQUE_ACTUAL), None)
         if current is not None and current <= 0:
             raise ValueError(f"--max-current {max_current} must be above 0 A; leave it out for the drive's own limit")
         if not 0.001 <= duration <= 3600.0:
@@ -86,19 +85,22 @@ def jog(
             look_first(interface, channel, [node], bitrate, device, eds, timeout)
         with connect(interface, channel, [node], device, eds, safety=Limits(current=current), **options) as drives:
             scale = increments_per_revolution(drives)[0]
-            velocity = quantities.parse(speed, known.find(TARGET_VELOCITY), scale)
+            velocity = quantities.parse(speed, known.find(cia402.TARGET_VELOCITY), scale)
             if velocity == 0:
                 raise ValueError("a speed of 0 turns nothing; give one, e.g. '60 rpm'")
-            distance = None if by is None else quantities.parse(by, known.find(TARGET_POSITION), scale)
+            distance = None if by is None else quantities.parse(by, known.find(cia402.TARGET_POSITION), scale)
             # Told before the axis is enabled.
-            check_limits(known.find(TARGET_VELOCITY), velocity)
-            check_limits(known.find(TARGET_POSITION), distance or 0)
-            if drives.description.has(ACCELERATION) and int(drives.read(ACCELERATION)[0]) == 0:
+            check_limits(known.find(cia402.TARGET_VELOCITY), velocity)
+            check_limits(known.find(cia402.TARGET_POSITION), distance or 0)
+            if (
+                drives.description.has(cia402.PROFILE_ACCELERATION)
+                and int(drives.read(cia402.PROFILE_ACCELERATION)[0]) == 0
+            ):
                 raise ValueError(
                     "the drive's profile acceleration 6083h is 0, so nothing would move; set it "
                     "(drive-env set 6083 '500 rev/s^2'), or commission the drive"
                 )
-            start = int(drives.read(POSITION)[0])
+            start = int(drives.read(cia402.POSITION_ACTUAL)[0])
             if dry_run:
                 _tell_plan(motion, drives, speed, by, duration, start, scale, json=json)
                 return
@@ -112,7 +114,7 @@ def jog(
             with _what_stops([]):
                 motion.disable(drives)
             drives.advance(0.1)
-            moved = int(drives.read(POSITION)[0]) - start
+            moved = int(drives.read(cia402.POSITION_ACTUAL)[0]) - start
             emergencies = [message._asdict() for message in drives.emergencies()]
             if files is not None and trace is not None:
                 entries = [known.find(object_name(name)) for name in DEFAULT]
@@ -123,7 +125,7 @@ def jog(
         if json:
             print_json({"moved": moved, "start": start, "emergencies": emergencies, "stopped": stopped})
         else:
-            print(f"node {node} moved by {quantities.show(moved, known.find(POSITION), scale)}")
+            print(f"node {node} moved by {quantities.show(moved, known.find(cia402.POSITION_ACTUAL), scale)}")
             for message in emergencies:
                 print(f"emergency {_told(message)}")
             if files is not None:
@@ -182,15 +184,14 @@ def _tell_plan(
     """Say where the axis is and what would be done; raises for one in fault, which could not be enabled."""
     from drive_env.master import quantities
 
-    status = int(drives.read(STATUSWORD)[0])
-    mask, fault = motion.FAULT_BIT
-    if status & mask == fault:
+    status = int(drives.read(cia402.STATUSWORD)[0])
+    if cia402.matches(status, cia402.FAULT_BIT):
         raise RuntimeError(f"the drive is in fault ({status:04X}h) and would not be enabled; reset it first")
     what = f"turn at {speed} for {duration:g} s" if by is None else f"turn by {by} at {speed}"
     if json:
         print_json({"would": what, "start": start, "statusword": status, "moved": 0})
         return
-    here = quantities.show(start, drives.description.dictionary.find(POSITION), scale)
+    here = quantities.show(start, drives.description.dictionary.find(cia402.POSITION_ACTUAL), scale)
     print(
         f"node {drives.nodes[0]} is at {here} ({status:04X}h) and would be enabled, {what}, and be switched off again; "
         "nothing was done"
@@ -203,13 +204,13 @@ def _turn(motion: Any, drives: Any, velocity: int, duration: float, is_recorded:
     trace = None
     if is_recorded:
         rows = [0] * FIRST + [velocity] * round(duration / CYCLE) + [0] * LAST
-        trace = drives.record(DEFAULT_KEYS, len(rows) * CYCLE, play={TARGET_VELOCITY: rows})
+        trace = drives.record(DEFAULT_KEYS, len(rows) * CYCLE, play={cia402.TARGET_VELOCITY: rows})
     else:
-        drives.write(TARGET_VELOCITY, velocity)
+        drives.write(cia402.TARGET_VELOCITY, velocity)
         drives.advance(duration)
-    drives.write(TARGET_VELOCITY, 0)
+    drives.write(cia402.TARGET_VELOCITY, 0)
     # Bit 10 in pv tells that the ramp has ended.
-    motion.wait_for(drives, motion.TARGET_REACHED, 10.0, "standstill")
+    motion.wait_for(drives, cia402.TARGET_REACHED, 10.0, "standstill")
     drives.advance(0.05)
     return trace
 
@@ -217,20 +218,20 @@ def _turn(motion: Any, drives: Any, velocity: int, duration: float, is_recorded:
 def _go(motion: Any, drives: Any, velocity: int, distance: int, is_recorded: bool) -> Any:
     """Move in pp, and give the drive its profile velocity back; return the samples that were wanted of it."""
     trace = None
-    before = int(drives.read(PROFILE_VELOCITY)[0])
-    drives.write(PROFILE_VELOCITY, velocity)
+    before = int(drives.read(cia402.PROFILE_VELOCITY)[0])
+    drives.write(cia402.PROFILE_VELOCITY, velocity)
     try:
         motion.enable(drives, mode="pp")
         if is_recorded:
             count = FIRST + round(abs(distance) / velocity / CYCLE) + LAST
-            words = [RELATIVE] * FIRST + [RELATIVE | NEW_SET_POINT] * FIRST + [RELATIVE] * (count - 2 * FIRST)
-            play = {TARGET_POSITION: [distance] * count, CONTROLWORD: words}
+            words = [RELATIVE] * FIRST + [RELATIVE | cia402.NEW_SET_POINT] * FIRST + [RELATIVE] * (count - 2 * FIRST)
+            play = {cia402.TARGET_POSITION: [distance] * count, cia402.CONTROLWORD: words}
             trace = drives.record(DEFAULT_KEYS, count * CYCLE, play=play)
         else:
             motion.start_move(drives, distance, relative=True)
         _arrive(motion, drives, velocity, 10.0 + 2.0 * abs(distance) / velocity)
     finally:
-        drives.write(PROFILE_VELOCITY, before)
+        drives.write(cia402.PROFILE_VELOCITY, before)
     return trace
 
 
@@ -238,17 +239,17 @@ def _arrive(motion: Any, drives: Any, velocity: int, timeout: float) -> None:
     """Wait until the target is reached; RuntimeError for an axis that stands at a limit."""
     from drive_env.master.errors import BusError
 
-    waited, before = 0.0, int(drives.read(POSITION)[0])
+    waited, before = 0.0, int(drives.read(cia402.POSITION_ACTUAL)[0])
     while True:
         try:
-            motion.wait_for(drives, motion.TARGET_REACHED, LOOK, "its target")
+            motion.wait_for(drives, cia402.TARGET_REACHED, LOOK, "its target")
         except BusError:
             raise
         except TimeoutError:
             waited += LOOK
-            here = int(drives.read(POSITION)[0])
+            here = int(drives.read(cia402.POSITION_ACTUAL)[0])
             is_still = abs(here - before) < STANDS * velocity * LOOK
-            if is_still and int(drives.read(STATUSWORD)[0]) & INTERNAL_LIMIT:
+            if is_still and int(drives.read(cia402.STATUSWORD)[0]) & INTERNAL_LIMIT:
                 raise RuntimeError("it stands at a limit switch, or at a limit of position") from None
             if waited >= timeout:
                 raise TimeoutError(f"it was not where it should be after {waited:.1f} s") from None

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from drive_env import cia402
 from drive_env.commands.options import (
     Bitrate,
     Channel,
@@ -27,17 +28,6 @@ from drive_env.commands.options import (
 from drive_env.commands.tables import Column, tables
 
 DEFAULT = ("6041", "6061", "6064", "606C", "6077")
-# Statusword: mask, value and state (CiA 402, state coding).
-STATES = (
-    (0x4F, 0x00, "not ready to switch on"),
-    (0x4F, 0x40, "switch on disabled"),
-    (0x6F, 0x21, "ready to switch on"),
-    (0x6F, 0x23, "switched on"),
-    (0x6F, 0x27, "operation enabled"),
-    (0x6F, 0x07, "quick stop active"),
-    (0x4F, 0x0F, "fault reaction active"),
-    (0x4F, 0x08, "fault"),
-)
 
 
 def monitor(
@@ -125,9 +115,10 @@ def _draw(
     for entry in entries:
         cells = []
         for axis, value in enumerate(values[entry]):
-            if entry.index % 0x800 == 0x41 and entry.index >= 0x6000:
-                state = next((name for mask, word, name in STATES if int(value) & mask == word), "?")
-                cells.append(f"{int(value):04X}h {state}")
+            if cia402.of_first_axis(entry.index) == cia402.STATUSWORD:
+                state = cia402.state_of(int(value))
+                name = "?" if state is None else state.name.lower().replace("_", " ")
+                cells.append(f"{int(value):04X}h {name}")
             elif entry.bits is None:
                 cells.append(str(value))
             else:

@@ -12,10 +12,9 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, NamedTuple
 
-from drive_env import motion
+from drive_env import cia402
 from drive_env.canopen.frames import EMCY, ERROR_CONTROL, NMT, RPDO, SDO_REQUEST, SDO_RESPONSE, TPDO
 from drive_env.dictionary.access import ObjectAccessError
-from drive_env.master.description import PROFILE_OFFSET
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.network import MAX_NODE, PRE_OPERATIONAL
 from drive_env.master.port import Port
@@ -23,7 +22,6 @@ from drive_env.master.sdo import SdoClient
 
 ANSWER_TIMEOUT = 0.5  # s
 MAX_AXES = 8  # of a node (CiA 301: eight profile areas)
-QUICK_STOP, OFF = 0x02, 0x00  # controlwords
 RAMP = 10.0  # s, the longest that a quick stop may take, measured or to be expected
 JUDGED_AFTER = 0.5  # s, from which on a ramp is judged by what it has done
 LOOK = 0.05  # s between two looks at a position
@@ -31,7 +29,7 @@ REST = 0.005  # revolutions in that time: 6 rpm
 REST_INC = 32  # increments in that time, where the drive says nothing of a revolution
 AT_REST_LOOKS = 2  # in a row
 OFF_TIME = 2.0  # s that a drive may take to switch off
-_SCALES = ((0x608F, 1), (0x2058, 0))  # increments of a revolution, where there are any
+_SCALES = ((cia402.ENCODER_RESOLUTION, 1), (0x2058, 0))  # increments of a revolution, where there are any
 
 Axis = tuple[int, int]  # node-ID, number of the axis in it
 
@@ -77,7 +75,7 @@ class ReplayedMotors:
         for node in self._nodes:
             for base in (EMCY, *TPDO, SDO_RESPONSE, ERROR_CONTROL):
                 self._port.subscribe(base + node, partial(self._hear, node))
-        live = [f"{name(axis)} ({word:04X}h)" for axis, word in status.items() if motion.is_live(word)]
+        live = [f"{name(axis)} ({word:04X}h)" for axis, word in status.items() if cia402.is_live(word)]
         if live:
             raise BusError(
                 f"{', '.join(live)} is live already: somebody else runs it, and no frame was sent. End that, or stop "
@@ -109,7 +107,7 @@ class ReplayedMotors:
                 for node in nodes
                 if known and (node, 0) not in status and node not in self._no_drives
             ]
-            for outcome in self._stop_axes([axis for axis, word in status.items() if motion.is_live(word)]):
+            for outcome in self._stop_axes([axis for axis, word in status.items() if cia402.is_live(word)]):
                 if isinstance(outcome, Stopped):
                     stopped.append(outcome)
                 else:
@@ -127,7 +125,7 @@ class ReplayedMotors:
         for part in range(MAX_AXES):
             if not asked:
                 break
-            answers = self._ask(asked, 0x6041 + PROFILE_OFFSET * part)
+            answers = self._ask(asked, cia402.STATUSWORD + cia402.AXIS_OFFSET * part)
             self._there |= answers.keys()
             words = {node: word for node, word in answers.items() if word is not None}
             if part == 0:
@@ -172,7 +170,7 @@ class _Stop:
 
     def __init__(self, port: Port, sdo: SdoClient, axis: Axis, timeout: float) -> None:
         self._port, self._sdo, self._axis, self._timeout = port, sdo, axis, timeout
-        self._offset = PROFILE_OFFSET * axis[1]
+        self._offset = cia402.AXIS_OFFSET * axis[1]
         self._rest = REST_INC
         self._start = self._last = time.monotonic()
         self._position: int | None = None
@@ -186,13 +184,13 @@ class _Stop:
 
     def begin(self) -> None:
         """Command the quick stop."""
-        self._write(QUICK_STOP)
+        self._write(cia402.QUICK_STOP)
         self._start = time.monotonic()
 
     def read_scale(self) -> None:
         """Read what of a way counts as rest."""
         for index, sub in _SCALES:
-            scale = self._read(index + (self._offset if index >= 0x6000 else 0), sub)
+            scale = self._read(index + (self._offset if index in cia402.PROFILE_AREAS else 0), sub)
             if scale:
                 self._rest = max(REST_INC, round(REST * scale))
                 break
@@ -200,8 +198,8 @@ class _Stop:
     def look(self) -> None:
         """Look at statusword and position, and do what is next."""
         now = time.monotonic()
-        word = self._read(0x6041 + self._offset)
-        if word is not None and not motion.is_live(word):
+        word = self._read(cia402.STATUSWORD + self._offset)
+        if word is not None and not cia402.is_live(word):
             self.outcome = Stopped(*self._axis, word, self._cut)
             return
         if self._off_since is not None:
@@ -212,16 +210,16 @@ class _Stop:
                     + "; its motor may run: use the emergency stop"
                 )
                 return
-            self._write(OFF)
+            self._write(cia402.DISABLE_VOLTAGE)
             return
-        if word is not None and word & motion.OPERATION_ENABLED[0] == motion.OPERATION_ENABLED[1]:
-            self._write(QUICK_STOP)  # the first may have been lost
+        if word is not None and cia402.matches(word, cia402.OPERATION_ENABLED):
+            self._write(cia402.QUICK_STOP)  # the first may have been lost
         if self._is_at_rest(now) or self._is_to_be_cut(now):
             self._off_since = now
-            self._write(OFF)
+            self._write(cia402.DISABLE_VOLTAGE)
 
     def _is_at_rest(self, now: float) -> bool:
-        position = self._read(0x6064 + self._offset)
+        position = self._read(cia402.POSITION_ACTUAL + self._offset)
         if position is None:
             return False
         if self._position is not None:
@@ -250,7 +248,7 @@ class _Stop:
         return None
 
     def _write(self, controlword: int) -> None:
-        index = 0x6040 + self._offset
+        index = cia402.CONTROLWORD + self._offset
         data = controlword.to_bytes(2, "little")
         with self._tried():
             self._sdo.write(index, 0, data, f"{controlword} to {index:04X}h:00", self._timeout)

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from drive_env import cia402
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import ObjectDictionary
 from mechanics.near_names import did_you_mean
@@ -95,7 +96,7 @@ class MasterHints(NamedTuple):
     timeout: float
     timeouts: dict[int, float]
     position_scale: tuple[int, int] | None = None
-    turns_positions_round: tuple[tuple[int, int], ...] = ((0x607E, 0),)
+    turns_positions_round: tuple[tuple[int, int], ...] = ((cia402.POLARITY, 0),)
     commands: Mapping[int, str] = MappingProxyType({})
     addresses: Mapping[int, str] = MappingProxyType({})
 

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
+
 Floats = NDArray[np.float64]
 TWO_PI = 2.0 * np.pi
 
@@ -62,7 +64,7 @@ UNITS: dict[str, Unit] = {
 # Units whose factor follows 2058h: what is stored in them is kept in raw integers when the scaler changes.
 SCALED_BY_POSITION = frozenset({"inc", "pps", "pps^2", "position window", "position limit"})
 # Position counters go on past the end of their type, as a counter in a drive does; everything else saturates.
-WRAPPING = frozenset({(0x6062, 0), (0x6063, 0), (0x6064, 0)})
+WRAPPING = frozenset({(cia402.POSITION_DEMAND, 0), (cia402.POSITION_INTERNAL, 0), (cia402.POSITION_ACTUAL, 0)})
 
 NO_WINDOW = 0xFFFFFFFF  # 6067h: window control switched off
 

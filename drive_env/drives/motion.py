@@ -7,28 +7,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env import cia402
+
 Mask = NDArray[np.bool_]
-
-# Numbers of 6060h (CiA 402).
-MODES = {"pp": 1, "pv": 3, "hm": 6, "csp": 8, "csv": 9, "cst": 10}
-
-# Statusword patterns: mask, value (CiA 402, state coding).
-SWITCH_ON_DISABLED = (0x4F, 0x40)
-READY_TO_SWITCH_ON = (0x6F, 0x21)
-SWITCHED_ON = (0x6F, 0x23)
-OPERATION_ENABLED = (0x6F, 0x27)
-QUICK_STOP_ACTIVE = (0x6F, 0x07)
-FAULT = (0x4F, 0x08)
-FAULT_BIT = (0x08, 0x08)  # fault or fault reaction active
-FAULT_REACTION_ACTIVE = (0x4F, 0x0F)
-# States in which a drive may turn its motor.
-LIVE = (OPERATION_ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE)
-TARGET_REACHED = (0x0400, 0x0400)
-SET_POINT_ACKNOWLEDGED = (0x1000, 0x1000)
-SET_POINT_TAKEN_BACK = (0x1000, 0x0000)
-# Homing: bits 13 (error), 12 (attained) and 10 (at rest); 13 stays 0 on drives that do not support it.
-HOMING_BITS = 0x3400
-HOMED, HOMING_UNDER_WAY = 0x1400, (0x0000, 0x1000)
 
 STEP = 0.001  # time between two looks at the statusword [s]
 
@@ -48,16 +29,6 @@ class Drives(Protocol):
         """Let time pass [s]."""
 
 
-def is_enabling(controlword: int) -> bool:
-    """Return whether a controlword may enable an axis, or go on with one that is: bits 0 to 3 (CiA 402)."""
-    return controlword & 0x0F == 0x0F
-
-
-def is_live(statusword: int) -> bool:
-    """Return whether a drive in the state that 6041h shows may turn its motor."""
-    return any(statusword & mask == value for mask, value in LIVE)
-
-
 def wait_for(drives: Drives, pattern: tuple[int, int], timeout: float, what: str, where: Mask | None = None) -> None:
     """Let time pass until the statusword of every axis matches.
 
@@ -75,12 +46,12 @@ def wait_for(drives: Drives, pattern: tuple[int, int], timeout: float, what: str
     axes = np.ones(drives.num_axes, bool) if where is None else where
     waited = 0.0
     while True:
-        status = drives.read(0x6041)
+        status = drives.read(cia402.STATUSWORD)
         late = axes & (status & mask != value)
         if not late.any():
             return
-        fault = axes & (status & FAULT[0] == FAULT[1])
-        if fault.any() and pattern != FAULT:
+        fault = axes & cia402.matches(status, cia402.FAULT)
+        if fault.any() and pattern != cia402.FAULT:
             axis = int(np.flatnonzero(fault)[0])
             raise RuntimeError(
                 f"axis {axis} is in fault while waiting for {what}; see emergencies(), then reset_fault()"
@@ -94,12 +65,12 @@ def wait_for(drives: Drives, pattern: tuple[int, int], timeout: float, what: str
 
 def select_mode(drives: Drives, mode: str, where: Mask | None = None) -> None:
     """Select a mode of operation by abbreviation on the axes that are not in it yet."""
-    if mode not in MODES:
-        raise ValueError(f"no mode is named {mode!r}; there are {', '.join(MODES)}")
+    if mode not in cia402.MODES:
+        raise ValueError(f"no mode is named {mode!r}; there are {', '.join(cia402.MODES)}")
     axes = np.ones(drives.num_axes, bool) if where is None else where
-    other = axes & (drives.read(0x6060) != MODES[mode])
+    other = axes & (drives.read(cia402.MODE) != cia402.MODES[mode])
     if other.any():
-        drives.write(0x6060, MODES[mode], where=other)
+        drives.write(cia402.MODE, cia402.MODES[mode], where=other)
 
 
 def enable(drives: Drives, mode: str | None = None, where: Mask | None = None, timeout: float = 1.0) -> None:
@@ -108,38 +79,38 @@ def enable(drives: Drives, mode: str | None = None, where: Mask | None = None, t
     Raises:
         TimeoutError: If a state is not reached within `timeout` [s].
     """
-    status = drives.read(0x6041)
+    status = drives.read(cia402.STATUSWORD)
     axes = np.ones(drives.num_axes, bool) if where is None else where
-    in_fault = axes & (status & FAULT[0] == FAULT[1])
+    in_fault = axes & cia402.matches(status, cia402.FAULT)
     if in_fault.any():
         reset_fault(drives, where=in_fault, timeout=timeout)
     if mode is not None:
         select_mode(drives, mode, where)
-    stopped = axes & (drives.read(0x6041) & QUICK_STOP_ACTIVE[0] == QUICK_STOP_ACTIVE[1])
+    stopped = axes & cia402.matches(drives.read(cia402.STATUSWORD), cia402.QUICK_STOP_ACTIVE)
     if stopped.any():
-        drives.write(0x6040, 0x0F, where=stopped)
-        wait_for(drives, OPERATION_ENABLED, timeout, "operation enabled after the quick stop", stopped)
-    not_enabled = axes & (drives.read(0x6041) & OPERATION_ENABLED[0] != OPERATION_ENABLED[1])
+        drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=stopped)
+        wait_for(drives, cia402.OPERATION_ENABLED, timeout, "operation enabled after the quick stop", stopped)
+    not_enabled = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     if not not_enabled.any():
         return
     for word, state, name in (
-        (0x06, READY_TO_SWITCH_ON, "ready to switch on"),
-        (0x07, SWITCHED_ON, "switched on"),
-        (0x0F, OPERATION_ENABLED, "operation enabled"),
+        (cia402.SHUTDOWN, cia402.READY_TO_SWITCH_ON, "ready to switch on"),
+        (cia402.SWITCH_ON, cia402.SWITCHED_ON, "switched on"),
+        (cia402.ENABLE_OPERATION, cia402.OPERATION_ENABLED, "operation enabled"),
     ):
-        drives.write(0x6040, word, where=not_enabled)
+        drives.write(cia402.CONTROLWORD, word, where=not_enabled)
         wait_for(drives, state, timeout, name, not_enabled)
 
 
 def disable(drives: Drives, where: Mask | None = None, timeout: float = 1.0) -> None:
     """Switch the voltage off; the axis coasts."""
-    drives.write(0x6040, 0x00, where=where)
-    wait_for(drives, SWITCH_ON_DISABLED, timeout, "switch on disabled", where)
+    drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
+    wait_for(drives, cia402.SWITCH_ON_DISABLED, timeout, "switch on disabled", where)
 
 
 def quick_stop(drives: Drives, where: Mask | None = None) -> None:
     """Command a quick stop; what follows the ramp is 605Ah's."""
-    drives.write(0x6040, 0x02, where=where)
+    drives.write(cia402.CONTROLWORD, cia402.QUICK_STOP, where=where)
 
 
 def reset_fault(drives: Drives, where: Mask | None = None, timeout: float = 1.0) -> None:
@@ -148,12 +119,12 @@ def reset_fault(drives: Drives, where: Mask | None = None, timeout: float = 1.0)
     Raises:
         TimeoutError: If the cause is still there.
     """
-    drives.write(0x6040, 0x00, where=where)
-    drives.write(0x6040, 0x80, where=where)
+    drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
+    drives.write(cia402.CONTROLWORD, cia402.FAULT_RESET, where=where)
     axes = np.ones(drives.num_axes, bool) if where is None else where
     waited = 0.0
     while True:
-        late = axes & (drives.read(0x6041) & FAULT[0] == FAULT[1])
+        late = axes & cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT)
         if not late.any():
             break
         if waited >= timeout:
@@ -161,7 +132,7 @@ def reset_fault(drives: Drives, where: Mask | None = None, timeout: float = 1.0)
             raise TimeoutError(f"axis {axis} stays in fault: the cause is still there; see 2101h and emergencies()")
         drives.advance(STEP)
         waited += STEP
-    drives.write(0x6040, 0x00, where=where)
+    drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
 
 
 def start_move(
@@ -174,12 +145,12 @@ def start_move(
         TimeoutError: If the drive does not take the set-point within `timeout` [s].
     """
     _check_can_move(drives, where)
-    word = 0x4F if relative else 0x0F
-    drives.write(0x607A, position, where=where)
-    drives.write(0x6040, word | 0x10, where=where)
-    wait_for(drives, SET_POINT_ACKNOWLEDGED, timeout, "set-point acknowledge", where)
-    drives.write(0x6040, word, where=where)
-    wait_for(drives, SET_POINT_TAKEN_BACK, timeout, "end of set-point acknowledge", where)
+    word = cia402.ENABLE_OPERATION | (cia402.RELATIVE if relative else 0)
+    drives.write(cia402.TARGET_POSITION, position, where=where)
+    drives.write(cia402.CONTROLWORD, word | cia402.NEW_SET_POINT, where=where)
+    wait_for(drives, cia402.SET_POINT_ACKNOWLEDGED, timeout, "set-point acknowledge", where)
+    drives.write(cia402.CONTROLWORD, word, where=where)
+    wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "end of set-point acknowledge", where)
 
 
 def move_to(
@@ -192,14 +163,14 @@ def move_to(
         TimeoutError: If the target is not reached within `timeout` [s].
     """
     start_move(drives, position, relative=relative, where=where)
-    wait_for(drives, TARGET_REACHED, timeout, "target reached", where)
+    wait_for(drives, cia402.TARGET_REACHED, timeout, "target reached", where)
 
 
 def _check_can_move(drives: Drives, where: Mask | None) -> None:
     axes = np.ones(drives.num_axes, bool) if where is None else where
-    status, mode = drives.read(0x6041), drives.read(0x6061)
-    off = axes & (status & OPERATION_ENABLED[0] != OPERATION_ENABLED[1])
-    other = axes & (mode != MODES["pp"])
+    status, mode = drives.read(cia402.STATUSWORD), drives.read(cia402.MODE_DISPLAY)
+    off = axes & ~cia402.matches(status, cia402.OPERATION_ENABLED)
+    other = axes & (mode != cia402.MODES["pp"])
     for wrong, what in ((off, "is not enabled"), (other, "is not in pp")):
         if wrong.any():
             axis = int(np.flatnonzero(wrong)[0])
@@ -218,25 +189,25 @@ def home(drives: Drives, where: Mask | None = None, timeout: float = 60.0) -> No
     """
     axes = np.ones(drives.num_axes, bool) if where is None else where
     enable(drives, mode="hm", where=where)
-    drives.write(0x6040, 0x0F, where=where)  # bit 4 must rise
-    drives.write(0x6040, 0x1F, where=where)
+    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)  # bit 4 must rise
+    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.NEW_SET_POINT, where=where)
     waited = 0.0
     while True:
         drives.advance(2 * STEP)  # the first look comes after the drive has begun
         waited += 2 * STEP
-        status = drives.read(0x6041)
-        fault = axes & (status & FAULT_BIT[0] == FAULT_BIT[1])
-        bits = status & HOMING_BITS
-        failed = axes & ~fault & (bits != HOMED) & ~np.isin(bits, HOMING_UNDER_WAY)
+        status = drives.read(cia402.STATUSWORD)
+        fault = axes & cia402.matches(status, cia402.FAULT_BIT)
+        bits = status & cia402.HOMING_BITS
+        failed = axes & ~fault & (bits != cia402.HOMED) & ~np.isin(bits, cia402.HOMING_UNDER_WAY)
         if fault.any() or failed.any():
             axis = int(np.flatnonzero(fault | failed)[0])
             what = "is in fault while homing; see emergencies()" if fault[axis] else "gave up homing"
             raise RuntimeError(
                 f"axis {axis} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
             )
-        if not np.any(axes & (bits != HOMED)):
+        if not np.any(axes & (bits != cia402.HOMED)):
             break
         if waited >= timeout:
-            axis = int(np.flatnonzero(axes & (bits != HOMED))[0])
+            axis = int(np.flatnonzero(axes & (bits != cia402.HOMED))[0])
             raise TimeoutError(f"axis {axis} did not attain home in {timeout:g} s: statusword {status[axis]:04X}h")
-    drives.write(0x6040, 0x0F, where=where)
+    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)

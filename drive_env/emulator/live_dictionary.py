@@ -11,6 +11,8 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env import cia402
+from drive_env.cia402 import State
 from drive_env.devices import Device
 from drive_env.dictionary import units
 from drive_env.dictionary.access import (
@@ -29,7 +31,6 @@ from drive_env.emulator.group import Channels, channels
 from drive_env.emulator.prepared_record import SCALES, SPECIAL_UNITS, ProcessImage, Row
 from drive_env.emulator.record_snapshot import LaneImage
 from drive_env.firmware import cycle
-from drive_env.firmware.fsa import State
 from drive_env.firmware.modes import MODES
 from drive_env.firmware.record import get_lanes, set_lanes
 
@@ -40,7 +41,7 @@ Mask = NDArray[np.bool_]
 _EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
 POSITION_SCALER = (0x2058, 0)
-MODE_OF_OPERATION = (0x6060, 0)
+MODE_OF_OPERATION = (cia402.MODE, 0)
 
 
 class LiveDictionary:
@@ -203,7 +204,7 @@ class LiveDictionary:
             else:
                 stored[entry.index, entry.sub] = np.full(self.num_axes, entry.default, np.int64)
         modes = sum(1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None)
-        stored[0x6502, 0] = np.full(self.num_axes, modes, np.int64)
+        stored[cia402.SUPPORTED_MODES, 0] = np.full(self.num_axes, modes, np.int64)
         for name, value in preset.items():
             entry = self.entries.find(name)
             raw = checked_values(entry, value, self.num_axes)

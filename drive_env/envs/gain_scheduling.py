@@ -13,7 +13,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.changing_payload import PayloadChanges, find_payload
 from drive_env.envs.configuration import configured
@@ -41,8 +41,13 @@ GAINS = {"velocity_p": (0x2042, 1), "velocity_i": (0x2042, 2), "position_p": (0x
 BASES = ("rule", "present")
 ROUGH = 0.03  # increment of current from sample to sample, of rated: DESIGN's score counts it so
 
-POSITION, VELOCITY, CURRENT, STATUSWORD = (0x6064, 0), (0x606C, 0), (0x6077, 0), (0x6041, 0)
-TARGETS = {"csp": (0x607A, 0), "csv": (0x60FF, 0)}
+POSITION, VELOCITY, CURRENT, STATUSWORD = (
+    (cia402.POSITION_ACTUAL, 0),
+    (cia402.VELOCITY_ACTUAL, 0),
+    (cia402.TORQUE_ACTUAL, 0),
+    (cia402.STATUSWORD, 0),
+)
+TARGETS = {"csp": (cia402.TARGET_POSITION, 0), "csv": (cia402.TARGET_VELOCITY, 0)}
 LAG = 0.2  # share of the top speed whose lag is the error scale in csp
 INCREMENTS_PER_TURN = (0x2058, 0)
 
@@ -265,7 +270,7 @@ class GainScheduling(Lanes):
         rows = self._run(targets)
         error, velocity, current = self._measured(targets, rows)
         self._now += 1
-        tripped = (rows[STATUSWORD] & motion.FAULT_BIT[0] != 0).any(axis=0)
+        tripped = cia402.matches(rows[STATUSWORD], cia402.FAULT_BIT).any(axis=0)
         fault = self._faults(tripped)
         terminated = fault != ""
         terms = self._terms(error, current, terminated)

@@ -12,7 +12,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.emulator.cyclic_control import Hooks, exchange
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.bus_delays import BusDelays
@@ -25,8 +25,12 @@ from drive_env.envs.trajectories import TRAJECTORIES, draw
 CYCLE = 0.001  # s, one communication cycle
 
 # Mode -> target object, offset object (CiA 402).
-OBJECTS = {"csp": (0x607A, 0x60B0), "csv": (0x60FF, 0x60B1), "cst": (0x6071, 0x60B2)}
-SAMPLED = (0x6041, 0x6064, 0x606C, 0x6077)
+OBJECTS = {
+    "csp": (cia402.TARGET_POSITION, cia402.POSITION_OFFSET),
+    "csv": (cia402.TARGET_VELOCITY, cia402.VELOCITY_OFFSET),
+    "cst": (cia402.TARGET_TORQUE, cia402.TORQUE_OFFSET),
+}
+SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
 POSITION_SCALER, MAXIMUM_CURRENT = 0x2058, 0x2003
 WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "effort": 0.05, "smoothness": 0.05, "trip": 10.0}
 RATES = (500, 1000)
@@ -263,7 +267,7 @@ class Tracking(Lanes):
         self._per_turn = per_turn.reshape(n, -1)[:, 0]
         target, offset = OBJECTS[str(config.mode)]
         play = (target,) if config.action == "direct" else (target, offset)
-        self._acts_on_position = play[-1] == 0x607A
+        self._acts_on_position = play[-1] == cia402.TARGET_POSITION
         self._exchange = exchange(drives, SAMPLED, play, config.cycles, CYCLE)
         self._bus = BusDelays(n, 2 * cycle.LONGEST_DELAY)
         self._episodes = own = cycle.Episodes(
@@ -395,7 +399,7 @@ class Tracking(Lanes):
         """Begin as one does with a real drive: nothing else moves while these axes go back to where they began."""
         drives, mode = self.drives, str(self.config.mode)
         for name in OBJECTS[mode]:
-            if name != 0x607A:
+            if name != cia402.TARGET_POSITION:
                 drives.write(name, 0)
         for attempt in range(RESTARTS):
             self._clear(axes)
@@ -413,29 +417,33 @@ class Tracking(Lanes):
         if self.config.mode != "csp" or not self._has_begun:
             return
         drives = self.drives
-        drives.write(0x607A, drives.read(0x6064), where=axes)
+        drives.write(cia402.TARGET_POSITION, drives.read(cia402.POSITION_ACTUAL), where=axes)
         for _ in range(round(REST_TIME / CYCLE)):
             drives.advance(CYCLE)
-            moving = np.abs(drives.read(0x606C)) > REST_SPEED * self._episodes.scales[:, 1]
+            moving = np.abs(drives.read(cia402.VELOCITY_ACTUAL)) > REST_SPEED * self._episodes.scales[:, 1]
             if not np.any(axes & moving):
                 return
 
     def _go_back(self, axes: Mask) -> None:
         drives, mode = self.drives, str(self.config.mode)
-        position = drives.read(0x6064)
+        position = drives.read(cia402.POSITION_ACTUAL)
         if not self._has_begun:
             self._start = position.copy()
         away = axes & (np.abs(position - self._start) > self._episodes.scales[:, 0] * 1e-3)
         if away.any():
             motion.enable(drives, mode="pp", where=away)
-            speed = drives.read(0x6081)
-            drives.write(0x6081, np.rint(RETURN_SPEED * self._episodes.scales[:, 1]).astype(np.int64), where=away)
+            speed = drives.read(cia402.PROFILE_VELOCITY)
+            drives.write(
+                cia402.PROFILE_VELOCITY,
+                np.rint(RETURN_SPEED * self._episodes.scales[:, 1]).astype(np.int64),
+                where=away,
+            )
             try:
                 motion.move_to(drives, self._start, where=away)
             finally:
-                drives.write(0x6081, speed, where=away)
+                drives.write(cia402.PROFILE_VELOCITY, speed, where=away)
         if mode == "csp":
-            drives.write(0x607A, drives.read(0x6064), where=axes)
+            drives.write(cia402.TARGET_POSITION, drives.read(cia402.POSITION_ACTUAL), where=axes)
         motion.enable(drives, mode=mode, where=axes)
 
     def _clear(self, axes: Mask) -> None:
@@ -443,7 +451,7 @@ class Tracking(Lanes):
         drives = self.drives
         tries = round(RESET_TIME / RESET_PAUSE)
         for attempt in range(tries):
-            faulty = axes & (drives.read(0x6041) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1])
+            faulty = axes & cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
             if not faulty.any():
                 return
             try:

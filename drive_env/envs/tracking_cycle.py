@@ -9,6 +9,7 @@ import numpy as np
 from numba import from_dtype, types
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.envs.bus_delays import Line, pass_on
 from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, Vector, reader
 from mechanics.compiled import cached, inlined, stage
@@ -30,7 +31,7 @@ TRACKING_MARGIN, SPEED_MARGIN, LOAD_MARGIN, EFFORT_MARGIN, SMOOTHNESS_MARGIN = 0
 DIRECT, DIRECT_POSITION, OFFSET_POSITION, OFFSET_VELOCITY, OFFSET_TORQUE = range(5)
 KINDS = {("csp", True): DIRECT_POSITION, ("csv", True): DIRECT, ("cst", True): DIRECT,
          ("csp", False): OFFSET_POSITION, ("csv", False): OFFSET_VELOCITY, ("cst", False): OFFSET_TORQUE}  # fmt: skip
-OPERATION_ENABLED = (0x6F, 0x27)
+OPERATION_ENABLED = cia402.OPERATION_ENABLED
 
 
 @inlined

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.faults.effects import ENCODER_GAIN, ENCODER_NOISE, MOMENTS, Change, Quantity, changes_of
 from drive_env.faults.schedule import ENABLED, NEVER, NO_CONDITION, Condition, Order, cycles_of
 from drive_env.faults.table import Row, checked_parameters, find_fault
@@ -24,7 +25,6 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 ABSENT, WAITING, DUE, ON, OVER = range(5)  # a machine: not concerned, waits for the condition, for the time, ...
-OPERATION_ENABLED = (0x6F, 0x27)
 TWO_PI = 2.0 * math.pi
 SEED_STEP = 2_654_435_761  # golden ratio of 2^32: neighbouring seeds give noises apart
 
@@ -81,7 +81,7 @@ def axes_that_fulfil(condition: Condition, drives: EmulatedDrives) -> Mask:
         return np.ones(count, bool)
     if condition.quantity == ENABLED:
         words = get_lanes(records, "statusword", count).astype(np.int64)
-        return np.asarray(words & OPERATION_ENABLED[0] == OPERATION_ENABLED[1])
+        return np.asarray(cia402.matches(words, cia402.OPERATION_ENABLED))
     value = get_lanes(records, "theta_m" if condition.quantity == "position" else "omega_m", count).astype(float)
     value = np.abs(value) if condition.quantity == "speed" else value
     return np.asarray(value > condition.limit if condition.above else value < condition.limit)

@@ -13,6 +13,7 @@ import numpy as np
 from numba import from_dtype, types
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.firmware import alignment, fsa, inputs, modes, protection, thermal
 from drive_env.firmware.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.derived import derive
@@ -198,7 +199,7 @@ def write_controlword(drive, lane, word):
     """Process a write of 6040h completely: fault reset edge, state commands, new set-point, statusword."""
     before = drive.controlword[lane]
     drive.controlword[lane] = word
-    if word & fsa.BIT_FAULT_RESET and not before & fsa.BIT_FAULT_RESET:
+    if word & cia402.FAULT_RESET and not before & cia402.FAULT_RESET:
         fsa.reset_fault(drive, lane, protection.causes_gone(drive, lane))
     fsa.command(drive, lane)
     if drive.mode_display[lane] == modes.PP:

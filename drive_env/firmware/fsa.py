@@ -6,56 +6,23 @@ changing the state is in `_enter`.
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
+from drive_env import cia402
+from drive_env.cia402 import STATE_CODING, Pattern, State
 from drive_env.firmware.record import EMERGENCY_QUEUE
 from mechanics.compiled import stage
 
-
-class State(IntEnum):
-    """State of the power drive system, in the order of CiA 402's figure."""
-
-    NOT_READY_TO_SWITCH_ON = 0
-    SWITCH_ON_DISABLED = 1
-    READY_TO_SWITCH_ON = 2
-    SWITCHED_ON = 3
-    OPERATION_ENABLED = 4
-    QUICK_STOP_ACTIVE = 5
-    FAULT_REACTION_ACTIVE = 6
-    FAULT = 7
-
-
-# Statusword pattern of each state: bits that the state fixes, and their value (table 149).
-STATE_CODING = {
-    State.NOT_READY_TO_SWITCH_ON: (0x4F, 0x00),
-    State.SWITCH_ON_DISABLED: (0x4F, 0x40),
-    State.READY_TO_SWITCH_ON: (0x6F, 0x21),
-    State.SWITCHED_ON: (0x6F, 0x23),
-    State.OPERATION_ENABLED: (0x6F, 0x27),
-    State.QUICK_STOP_ACTIVE: (0x6F, 0x07),
-    State.FAULT_REACTION_ACTIVE: (0x4F, 0x0F),
-    State.FAULT: (0x4F, 0x08),
-}
-
-
-class Command(NamedTuple):
-    """A command of table 143: the controlword's bits that make it."""
-
-    mask: int
-    value: int
-
-
-SHUTDOWN = Command(0x87, 0x06)
-SWITCH_ON = Command(0x8F, 0x07)
-ENABLE_OPERATION = Command(0x8F, 0x0F)
-DISABLE_VOLTAGE = Command(0x82, 0x00)
-QUICK_STOP = Command(0x86, 0x02)
-DISABLE_OPERATION = Command(0x8F, 0x07)
-FAULT_RESET = Command(0x80, 0x80)  # on the rising edge only
-AUTOMATIC = Command(0, 0)
+SHUTDOWN = cia402.COMMANDS["shutdown"]
+SWITCH_ON = cia402.COMMANDS["switch on"]
+ENABLE_OPERATION = cia402.COMMANDS["enable operation"]
+DISABLE_VOLTAGE = cia402.COMMANDS["disable voltage"]
+QUICK_STOP = cia402.COMMANDS["quick stop"]
+DISABLE_OPERATION = cia402.COMMANDS["disable operation"]
+FAULT_RESET = cia402.COMMANDS["fault reset"]  # on the rising edge only
+AUTOMATIC = Pattern(0, 0)
 
 
 class Transition(NamedTuple):
@@ -63,7 +30,7 @@ class Transition(NamedTuple):
 
     number: int
     start: State
-    command: Command
+    command: Pattern
     end: State
 
 
@@ -106,14 +73,8 @@ STOPPING = int(State.QUICK_STOP_ACTIVE)
 REACTING = int(State.FAULT_REACTION_ACTIVE)
 FAULTED = int(State.FAULT)
 
-# Controlword bits outside the command coding.
-BIT_NEW_SET_POINT = 0x0010
-BIT_RELATIVE = 0x0040
-BIT_FAULT_RESET = 0x0080
-BIT_HALT = 0x0100
-
 INITIALIZATION_FAILED = 4  # state of alignment.py
-WARNING_BIT = 0x0080
+WARNING_BIT = cia402.WARNING.value
 
 # Rows of every device's emergency table that the automaton itself sends.
 EMERGENCY_RESET = 0

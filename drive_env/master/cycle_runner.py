@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env import cia402
 from drive_env.canopen.frames import SYNC
 from drive_env.dictionary.access import check_in_range, check_readable, check_writable
 from drive_env.dictionary.entries import Entry, ObjectName
@@ -29,7 +30,7 @@ logger = logging.getLogger(__name__)
 Integers = NDArray[np.int64]
 MOST_CALLS = 64  # that are remembered
 NOTHING: Sequence[Entry] = ()
-CONTROLWORD = (0x6040, 0)
+CONTROLWORD = (cia402.CONTROLWORD, 0)
 POLL_TIMEOUT = 0.008  # s for the samples of one SYNC
 _NOW = 0
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from canopen.objectdictionary import ODVariable, datatypes
 
+from drive_env import cia402
 from drive_env.devices import AxisOffset, Device, MasterHints, find_device
 from drive_env.dictionary.access import WRONG_TYPE, ObjectAccessError
 from drive_env.dictionary.entries import INTEGER_TYPES, Entry, ObjectDictionary, ObjectName, read_eds
@@ -20,8 +21,7 @@ Key = tuple[int, int]
 CYCLE = 0.001  # communication cycle where the device says nothing else [s]
 
 # CiA 402-2: the profile objects of the next axis lie 800h above; where a device shifts more, its data say so.
-PROFILE_OFFSET = 0x800
-CIA_402_OFFSETS = (AxisOffset(0x6000, 0x67FF, PROFILE_OFFSET),)
+CIA_402_OFFSETS = (AxisOffset(cia402.PROFILE_AREAS.start, cia402.SINGLE_DEVICE_TYPE, cia402.AXIS_OFFSET),)
 
 # Communication emergencies of CiA 301 (table 26 of version 4.2), named where the device's own table has no row.
 EMERGENCY_NAMES = {
@@ -40,12 +40,17 @@ EMERGENCY_NAMES = {
 # synchronous RPDOs takes. CiA 402: maximum current 6073h, in the thousandths of 6077h. Stores and restores erase flash,
 # for which users of python-canopen report up to seconds.
 # Objects whose integers are taken apart bit by bit, or tell where an axis is and goes: their length [bits] by CiA 402.
-KINDS: dict[Key, int] = {(0x6040, 0): 16, (0x6041, 0): 16, (0x6060, 0): 8, (0x6061, 0): 8, (0x6064, 0): 32,
-                         (0x606C, 0): 32, (0x6077, 0): 16, (0x607A, 0): 32, (0x60FF, 0): 32, (0x6071, 0): 16,
-                         (0x605A, 0): 16}  # fmt: skip
-MODE, MODE_DISPLAY = (0x6060, 0), (0x6061, 0)
+_BITS = {
+    8: (cia402.MODE, cia402.MODE_DISPLAY),
+    16: (cia402.CONTROLWORD, cia402.STATUSWORD, cia402.TORQUE_ACTUAL, cia402.TARGET_TORQUE, cia402.QUICK_STOP_OPTION),
+    32: (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TARGET_POSITION, cia402.TARGET_VELOCITY),
+}
+KINDS: dict[Key, int] = {(index, 0): bits for bits, indices in _BITS.items() for index in indices}
+MODE, MODE_DISPLAY = (cia402.MODE, 0), (cia402.MODE_DISPLAY, 0)
 LONGEST_TIMEOUT = 3600.0  # s: no drive takes so long, and a wait of 1e300 s is none that an operating system knows
-CIA_402 = MasterHints(rpdo_type=1, current_limit=(0x6073, 0), timeout=0.5, timeouts={0x1010: 10.0, 0x1011: 10.0})
+CIA_402 = MasterHints(
+    rpdo_type=1, current_limit=(cia402.MAX_CURRENT, 0), timeout=0.5, timeouts={0x1010: 10.0, 0x1011: 10.0}
+)
 
 
 @dataclass
@@ -182,7 +187,7 @@ def describe(device: str | None, eds: str | Path | None) -> Description:
         dictionary, types = ObjectDictionary(path), _read_types(path)
     except Exception as error:  # the reader raises whatever the broken line leads to
         raise ValueError(f"{path} cannot be read as an EDS: {error}; see whether CiA 306 allows that line") from error
-    axes = sum((0x6041 + PROFILE_OFFSET * axis, 0) in types for axis in range(8))
+    axes = sum((cia402.STATUSWORD + cia402.AXIS_OFFSET * axis, 0) in types for axis in range(8))
     if axes == 0:
         raise ValueError(f"{path} describes no CiA 402 drive: it has no statusword 6041h")
     _check_kinds(path, types, axes)
@@ -193,7 +198,7 @@ def _check_kinds(path: Path, types: dict[Key, ODVariable], axes: int) -> None:
     """Raise ValueError for objects that decide what a drive does and are no integers of CiA 402's length."""
     for axis in range(axes):
         for (index, sub), bits in KINDS.items():
-            variable = types.get((index + PROFILE_OFFSET * axis, sub))
+            variable = types.get((index + cia402.AXIS_OFFSET * axis, sub))
             found = None if variable is None else INTEGER_TYPES.get(variable.data_type or 0)
             if variable is not None and (found is None or found[0] != bits):
                 said = "of no integer type" if found is None else f"an integer of {found[0]} bits"

@@ -9,21 +9,22 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
+from drive_env import cia402
 from drive_env.canopen.frames import SDO_REQUEST
 from drive_env.dictionary.entries import ObjectDictionary
-from drive_env.master.description import PROFILE_OFFSET, Description
+from drive_env.master.description import Description
 from drive_env.master.port import Handler, Port
 
-_CONTROLWORD, _STATUSWORD, _MODE, _MODE_DISPLAY = 0x6040, 0x6041, 0x6060, 0x6061
-# Controlword: mask and value, and the statusword of the state it leads to (CiA 402, state coding).
-_STATES = (
-    ((0x82, 0x00), 0x0240),  # disable voltage: switch on disabled
-    ((0x86, 0x02), 0x0240),  # quick stop, at rest again
-    ((0x87, 0x06), 0x0221),  # ready to switch on
-    ((0x8F, 0x07), 0x0233),  # switched on
-    ((0x8F, 0x0F), 0x0637),  # operation enabled, target reached
-    ((0x80, 0x80), 0x0240),  # fault reset
-)
+# The statusword of the state that a command leads to.
+_OFF, _ENABLED = 0x0240, 0x0637  # enabled, and the target is reached
+_STATES = {
+    "disable voltage": _OFF,
+    "quick stop": _OFF,  # at rest again
+    "shutdown": 0x0221,
+    "switch on": 0x0233,
+    "enable operation": _ENABLED,
+    "fault reset": _OFF,
+}
 
 
 def show_frame(can_id: int, data: bytes, remote: bool = False) -> str:
@@ -78,7 +79,7 @@ class DrySdoClient:
                 description.encode(entry, entry.default) if description.is_number(entry) else b""
             )
         for axis in range(description.num_axes):
-            self._values[_STATUSWORD + PROFILE_OFFSET * axis, 0] = struct.pack("<H", 0x0240)
+            self._values[cia402.STATUSWORD + cia402.AXIS_OFFSET * axis, 0] = struct.pack("<H", 0x0240)
 
     def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
         """Return what was written, or else the dictionary's default."""
@@ -105,14 +106,16 @@ class DrySdoClient:
         else:
             self._request(struct.pack("<BHBL", 0x21, index, sub, len(data)))
         self._values[index, sub] = data
-        base, offset = index % PROFILE_OFFSET, index - index % PROFILE_OFFSET
-        if base == _CONTROLWORD % PROFILE_OFFSET and index >= 0x6000:
+        base, offset = index % cia402.AXIS_OFFSET, index - index % cia402.AXIS_OFFSET
+        if base == cia402.CONTROLWORD % cia402.AXIS_OFFSET and index in cia402.PROFILE_AREAS:
             word = int.from_bytes(data, "little")
-            status = next((status for (mask, value), status in _STATES if word & mask == value), 0x0240)
-            status |= 0x1000 if word & 0x10 and status == 0x0637 else 0  # set-point acknowledge
-            self._values[offset + _STATUSWORD % PROFILE_OFFSET, 0] = struct.pack("<H", status)
-        if base == _MODE % PROFILE_OFFSET and index >= 0x6000:
-            self._values[offset + _MODE_DISPLAY % PROFILE_OFFSET, 0] = data
+            commands = (name for name in _STATES if cia402.matches(word, cia402.COMMANDS[name]))
+            status = _STATES.get(next(commands, ""), _OFF)
+            if word & cia402.NEW_SET_POINT and status == _ENABLED:
+                status |= cia402.SET_POINT_ACKNOWLEDGED.value
+            self._values[offset + cia402.STATUSWORD % cia402.AXIS_OFFSET, 0] = struct.pack("<H", status)
+        if base == cia402.MODE % cia402.AXIS_OFFSET and index in cia402.PROFILE_AREAS:
+            self._values[offset + cia402.MODE_DISPLAY % cia402.AXIS_OFFSET, 0] = data
 
     def _request(self, data: bytes) -> None:
         self._port.send(SDO_REQUEST + self._node, data)

@@ -9,11 +9,10 @@ import contextlib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from drive_env import motion
+from drive_env import cia402
 from drive_env.canopen.frames import INVALID
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.entries import Entry
-from drive_env.master.description import PROFILE_OFFSET
 from drive_env.master.errors import BusError
 
 if TYPE_CHECKING:
@@ -30,21 +29,20 @@ COMMANDS = {
     0x1F50: "program download: a service",
     0x1F51: "program control: a service",
     0x1F52: "program verification: a service",
-    0x6040: "controlword: a command",
-    0x6042: "vl target velocity: a command",
-    0x6060: "modes of operation: a command",
-    0x6071: "target torque: a command",
-    0x607A: "target position: a command",
-    0x60B0: "position offset: a command",
-    0x60B1: "velocity offset: a command",
-    0x60B2: "torque offset: a command",
-    0x60B8: "touch probe function: a command",
-    0x60C1: "interpolation data: a command",
-    0x60FE: "digital outputs: a command",
-    0x60FF: "target velocity: a command",
+    cia402.CONTROLWORD: "controlword: a command",
+    cia402.VL_TARGET_VELOCITY: "vl target velocity: a command",
+    cia402.MODE: "modes of operation: a command",
+    cia402.TARGET_TORQUE: "target torque: a command",
+    cia402.TARGET_POSITION: "target position: a command",
+    cia402.POSITION_OFFSET: "position offset: a command",
+    cia402.VELOCITY_OFFSET: "velocity offset: a command",
+    cia402.TORQUE_OFFSET: "torque offset: a command",
+    cia402.TOUCH_PROBE: "touch probe function: a command",
+    cia402.INTERPOLATION_DATA: "interpolation data: a command",
+    cia402.DIGITAL_OUTPUTS: "digital outputs: a command",
+    cia402.TARGET_VELOCITY: "target velocity: a command",
 }
 _DEVICE_OBJECTS = 0x2000  # from here on; what lies below is how a node talks
-_PROFILE = range(0x6000, 0xA000)  # the profile areas of up to eight axes (CiA 301)
 _COMMUNICATION = (range(0x1400, 0x1600), range(0x1800, 0x1A00))
 _MAPPING_ABOVE = 0x200  # the mapping of a PDO lies so far above its communication parameter
 
@@ -69,16 +67,9 @@ class NotRestoredError(BusError):
     """A write failed; what was written before was taken back."""
 
 
-def of_first_axis(index: int) -> int:
-    """Return the index that an object of the profile area has on a node's first axis."""
-    if index not in _PROFILE:
-        return index
-    return _PROFILE.start + (index - _PROFILE.start) % PROFILE_OFFSET
-
-
 def command(index: int, hints: MasterHints) -> str:
     """Return what command or service an object of a device is, "" for none; those of further axes are the same."""
-    return COMMANDS.get(of_first_axis(index)) or hints.commands.get(index, "")
+    return COMMANDS.get(cia402.of_first_axis(index)) or hints.commands.get(index, "")
 
 
 def check_no_commands(keys: Iterable[Key], where: object, hints: MasterHints) -> None:
@@ -171,7 +162,7 @@ def _affected(drives: CanDrives, wanted: Iterable[Key], axis: int) -> Iterable[i
 
 
 def _is_live(drives: CanDrives, axis: int) -> bool:
-    return motion.is_live(int(drives.read_axis(drives.description.dictionary.find(0x6041), axis)))
+    return cia402.is_live(int(drives.read_axis(drives.description.dictionary.find(cia402.STATUSWORD), axis)))
 
 
 def _roll_back(drives: CanDrives, before: Mapping[Key, int], axis: int, cause: BaseException) -> None:

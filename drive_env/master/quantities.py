@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.dictionary.entries import Entry
 
 
@@ -64,7 +65,7 @@ def increments_per_revolution(drives: Any) -> list[float | None]:
         drives: On a bus.
     """
     known = drives.description
-    for name in ("Position Scaler", (0x608F, 1)):  # of the TMCM-1636; encoder increments of CiA 402
+    for name in ("Position Scaler", (cia402.ENCODER_RESOLUTION, 1)):  # of the TMCM-1636; encoder increments of CiA 402
         if known.has(name):
             return [float(value) or None for value in drives.read(name)]
     return [None] * drives.num_axes

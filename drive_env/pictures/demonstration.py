@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.dictionary.access import ObjectAccessError
 from mechanics.untrusted import read_toml
 
@@ -23,10 +23,15 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 DEFAULT = Path(__file__).parent / "demonstration.toml"
-TARGETS = {"pp": (0x607A, 0), "pv": (0x60FF, 0), "csv": (0x60FF, 0), "cst": (0x6071, 0)}
+TARGETS = {
+    "pp": (cia402.TARGET_POSITION, 0),
+    "pv": (cia402.TARGET_VELOCITY, 0),
+    "csv": (cia402.TARGET_VELOCITY, 0),
+    "cst": (cia402.TARGET_TORQUE, 0),
+}
 TO_SI = {"pp": 2.0 * math.pi, "pv": math.pi / 30.0, "csv": math.pi / 30.0, "cst": 1.0}
 UNITS = {"pp": "turns", "pv": "rpm", "csv": "rpm", "cst": "A"}
-PROFILE_VELOCITY = (0x6081, 0)
+PROFILE_VELOCITY = (cia402.PROFILE_VELOCITY, 0)
 # What is chosen, as shares of what there is: enough to be seen, and no limit is reached.
 TRAVEL_SHARE, SPEED_SHARE, CURRENT_SHARE, LOAD_SHARE = 0.8, 0.5, 0.2, 0.3
 LONGEST_MOVE = 1.0  # s at profile velocity
@@ -151,7 +156,7 @@ def _drive(recorder: Recorder, row: Demonstration, setpoints: list[Floats], torq
             drives.write(target, raw)
         if row.mode in ("pp", "pv"):
             recorder.advance(motion.STEP)  # bit 10 falls in the cycle after the set-point
-            motion.wait_for(recorder, motion.TARGET_REACHED, row.longest, f"set-point {k}")
+            motion.wait_for(recorder, cia402.TARGET_REACHED, row.longest, f"set-point {k}")
         recorder.advance(row.hold)
         tell((1.0 + k) / steps)
     if torque:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env import cia402
 from drive_env.dictionary import units
 from drive_env.dictionary.entries import ObjectName
 
@@ -20,8 +21,13 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-POSITION_DEMAND, POSITION, VELOCITY, CURRENT = (0x6062, 0), (0x6064, 0), (0x606C, 0), (0x6077, 0)
-TARGET_VELOCITY, TARGET_CURRENT, MODE = (0x60FF, 0), (0x6071, 0), (0x6061, 0)
+POSITION_DEMAND, POSITION, VELOCITY, CURRENT = (
+    (cia402.POSITION_DEMAND, 0),
+    (cia402.POSITION_ACTUAL, 0),
+    (cia402.VELOCITY_ACTUAL, 0),
+    (cia402.TORQUE_ACTUAL, 0),
+)
+TARGET_VELOCITY, TARGET_CURRENT, MODE = (cia402.TARGET_VELOCITY, 0), (cia402.TARGET_TORQUE, 0), (cia402.MODE_DISPLAY, 0)
 POSITION_SCALER = (0x2058, 0)
 _RECORDED = (POSITION_DEMAND, POSITION, VELOCITY, CURRENT, TARGET_VELOCITY, TARGET_CURRENT, MODE)
 _PROFILED_MODES = (1, 3, 8)  # pp, pv, csp: 6062h goes on in them, and its slope is the velocity demand

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.master.description import Key
 from drive_env.safety.bounds import COUNTED
 from drive_env.safety.objects import CURRENT, HM, POSITION, STATUSWORD, VELOCITY
 from drive_env.safety.rotor import RotorAngle, wrapped
-from drive_env.safety.states import is_live
 
 if TYPE_CHECKING:
     from drive_env.master.can_drives import CanDrives
@@ -150,7 +150,7 @@ class Axes:
         has_new_zero = False
         if STATUSWORD in rows:
             self.status = np.where(where, rows[STATUSWORD][-1], self.status)
-            shown = is_live(self.status)
+            shown = cia402.is_live(self.status)
             current = where & (epoch >= self.epoch) & ~self.in_flight
             was = self.live
             self.assumed &= ~current

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.master.description import Key
 from drive_env.master.errors import RefusedError
 from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
@@ -22,9 +23,17 @@ Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-POSITION_LOW, POSITION_HIGH, FOLLOWING_WINDOW = (0x607D, 1), (0x607D, 2), (0x6065, 0)
-MAX_PROFILE_VELOCITY, MAX_MOTOR_SPEED = (0x607F, 0), (0x6080, 0)
-ACCELERATION, DECELERATION, QUICK_STOP_DECELERATION = (0x6083, 0), (0x6084, 0), (0x6085, 0)
+POSITION_LOW, POSITION_HIGH, FOLLOWING_WINDOW = (
+    (cia402.POSITION_LIMITS, 1),
+    (cia402.POSITION_LIMITS, 2),
+    (cia402.FOLLOWING_WINDOW, 0),
+)
+MAX_PROFILE_VELOCITY, MAX_MOTOR_SPEED = (cia402.MAX_PROFILE_VELOCITY, 0), (cia402.MAX_MOTOR_SPEED, 0)
+ACCELERATION, DECELERATION, QUICK_STOP_DECELERATION = (
+    (cia402.PROFILE_ACCELERATION, 0),
+    (cia402.PROFILE_DECELERATION, 0),
+    (cia402.QUICK_STOP_DECELERATION, 0),
+)
 COUNTED = "pps"  # speeds in increments per second; other units are not set off against positions
 # A settled axis swings by some counts around its target [inc], though by no more than so much of a turn [rev].
 SETTLED, SETTLED_TURNS = 200.0, 0.02

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.dictionary.entries import Entry
 from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
@@ -23,13 +24,11 @@ from drive_env.safety.objects import (
     HOMING_SPEED_TO_ZERO,
     MODE,
     MOVING_SPEEDS,
-    NEW_SET_POINT,
     POSITION,
     POSITION_OFFSET,
     POSITIONING_OPTIONS,
     PP,
     PROFILE_VELOCITY,
-    RELATIVE,
     RUNNING_SPEEDS,
     TARGET_POSITION,
     TARGET_TORQUE,
@@ -39,7 +38,6 @@ from drive_env.safety.objects import (
     VELOCITY_OFFSET,
 )
 from drive_env.safety.rotor import scale_objects
-from drive_env.safety.states import may_enable
 
 if TYPE_CHECKING:
     from drive_env.master.can_drives import CanDrives
@@ -92,7 +90,7 @@ class Commands:
 
     def check_play(self, played: Mapping[Entry, Integers], words: Integers | None) -> None:
         """Raise SafetyError for rows that would pass a limit; `words` are those of the controlword among them."""
-        relative = words is not None and bool(np.any(words & RELATIVE))
+        relative = words is not None and bool(np.any(words & cia402.RELATIVE))
         for entry, rows in played.items():
             key = (entry.index, entry.sub)
             if rows.shape[0] == 0:
@@ -118,15 +116,15 @@ class Commands:
 
     def note_start(self, words: Integers, where: Mask) -> None:
         """Take note of where moves in pp lead that a controlword has started."""
-        starts = where & may_enable(words) & (words & NEW_SET_POINT != 0) & (self._axes.mode == PP)
+        starts = where & cia402.may_enable(words) & (words & cia402.NEW_SET_POINT != 0) & (self._axes.mode == PP)
         target = self._set_points.get(TARGET_POSITION)
         for axis in np.flatnonzero(starts).tolist() if target is not None else ():
-            base = self._axes.aim.get(axis, int(self._axes.position[axis])) if words[axis] & RELATIVE else 0
+            base = self._axes.aim.get(axis, int(self._axes.position[axis])) if words[axis] & cia402.RELATIVE else 0
             self._axes.aim[axis] = base + int(target[axis])  # type: ignore[index]
 
     def check_start(self, words: Integers, where: Mask) -> None:
         """Check a move when it is started: only then is it known whether it is relative, and how fast it will be."""
-        starts = where & may_enable(words) & (words & NEW_SET_POINT != 0)
+        starts = where & cia402.may_enable(words) & (words & cia402.NEW_SET_POINT != 0)
         bounds = self._limits.bounds()
         if not starts.any():
             return
@@ -139,7 +137,7 @@ class Commands:
         target = self._known.find(TARGET_POSITION)
         distance = self._drives.read_entry(target)
         self._set_points[TARGET_POSITION] = distance
-        relative = words & RELATIVE != 0
+        relative = words & cia402.RELATIVE != 0
         self._check_position(target, distance, starts & ~relative, (PP,))
         if np.any(starts & relative):
             for base in self._bases():
@@ -147,7 +145,7 @@ class Commands:
 
     def check_played_starts(self, words: Integers, played: Mapping[Entry, Integers]) -> None:
         """Raise SafetyError for moves that rows start at a speed, which the drive has already, beyond the limit."""
-        starts = (may_enable(words) & (words & NEW_SET_POINT != 0)).any(axis=0)
+        starts = (cia402.may_enable(words) & (words & cia402.NEW_SET_POINT != 0)).any(axis=0)
         if starts.any():
             self._check_speeds(starts, self._modes(), MOVING_SPEEDS, self._limits.bounds().velocity, played)
 
@@ -170,10 +168,10 @@ class Commands:
         target = self._known.find(TARGET_POSITION)
         now = self._drives.read_entry(target)
         rows = next((r for e, r in played.items() if e is target), np.broadcast_to(now, words.shape))
-        rises = (words & NEW_SET_POINT != 0) & np.vstack(
-            [np.ones((1, words.shape[1]), bool), words[:-1] & NEW_SET_POINT == 0]
+        rises = (words & cia402.NEW_SET_POINT != 0) & np.vstack(
+            [np.ones((1, words.shape[1]), bool), words[:-1] & cia402.NEW_SET_POINT == 0]
         )
-        relative = words & RELATIVE != 0
+        relative = words & cia402.RELATIVE != 0
         absolute = np.where(rises & ~relative, rows, self._axes.position)
         self._check_position(target, absolute, self._axes.everywhere, (PP,))
         steps = np.where(rises & relative, rows, 0)

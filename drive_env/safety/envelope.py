@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.dictionary.entries import Entry
 from drive_env.master.description import Key
 from drive_env.safety import signals
@@ -50,13 +51,6 @@ from drive_env.safety.objects import (
     STORE,
 )
 from drive_env.safety.rotor import HOME_OFFSET, scale_objects
-from drive_env.safety.states import (
-    DISABLE_VOLTAGE,
-    cuts_voltage,
-    is_live,
-    leads_on,
-    may_enable,
-)
 from drive_env.safety.stop_runner import StopRunner
 from drive_env.safety.stopping import Stop
 from drive_env.safety.watch import Watch
@@ -191,10 +185,10 @@ class Envelope:
             return
         words = next((rows for entry, rows in played.items() if (entry.index, entry.sub) == CONTROLWORD), None)
         self._commands.check_play(played, words)
-        enables = self._axes.everywhere if words is None else may_enable(words).any(axis=0)
-        if words is not None and cuts_voltage(words).any():
+        enables = self._axes.everywhere if words is None else cia402.may_enable(words).any(axis=0)
+        if words is not None and cia402.cuts_voltage(words).any():
             self._check_cuts(words)
-            self._brake(cuts_voltage(words).any(axis=0))
+            self._brake(cia402.cuts_voltage(words).any(axis=0))
         if words is not None or any((entry.index, entry.sub) in SET_POINTS for entry in played):
             self._arm()
         if words is not None and enables.any():
@@ -206,8 +200,8 @@ class Envelope:
 
     def _check_cuts(self, words: Integers) -> None:
         """Raise SafetyError for rows that take the voltage from an axis which an earlier row lets turn."""
-        after = np.cumsum(may_enable(words), axis=0) > 0
-        if (wrong := np.flatnonzero((after & cuts_voltage(words)).any(axis=0))).size:
+        after = np.cumsum(cia402.may_enable(words), axis=0) > 0
+        if (wrong := np.flatnonzero((after & cia402.cuts_voltage(words)).any(axis=0))).size:
             raise SafetyError(
                 f"axis {int(wrong[0])}: these rows take the voltage away after they have enabled it, and it may turn "
                 "by then; nothing was sent. Play a quick stop (6040h = 2), and write 0 afterwards"
@@ -225,7 +219,7 @@ class Envelope:
         axes = self._axes.of_nodes(nodes)
         self._brake(axes)
         for axis in np.flatnonzero(axes & self._axes.live):
-            self._drives.write_raw(self._known.find(CONTROLWORD), int(axis), DISABLE_VOLTAGE)
+            self._drives.write_raw(self._known.find(CONTROLWORD), int(axis), cia402.DISABLE_VOLTAGE)
         self._axes.take_for_off(axes)
 
     def after_reset(self, nodes: Sequence[int]) -> None:
@@ -335,14 +329,14 @@ class Envelope:
 
     # --- commands -------------------------------------------------------------------------------------------------
     def _before_controlword(self, words: Integers, where: Mask) -> None:
-        enables = where & may_enable(words)
-        if enables.any() or np.any(where & leads_on(words)):
+        enables = where & cia402.may_enable(words)
+        if enables.any() or np.any(where & cia402.leads_on(words)):
             self._arm()
             self._commands.check_start(words, where)
             self._commands.check_modes(enables)
             self._prove_watchdogs(enables)
             self._axes.assume(enables)
-        if np.any(cuts := where & cuts_voltage(words)):
+        if np.any(cuts := where & cia402.cuts_voltage(words)):
             self._brake(cuts)
         self._checked_stop = self._stops.current
 
@@ -351,9 +345,9 @@ class Envelope:
             self._axes.epoch += 1
             self._axes.in_flight &= ~where
         self._commands.note_start(words, where)
-        if np.any(where & may_enable(words)):
+        if np.any(where & cia402.may_enable(words)):
             self._watch.forget_signal()
-        if np.any(enabled := where & may_enable(words)):
+        if np.any(enabled := where & cia402.may_enable(words)):
             with self._axes.lock:
                 if self._stops.current is not self._checked_stop:
                     # It was stopped between the check and the frame, which may have undone that.
@@ -376,7 +370,7 @@ class Envelope:
     def _finds_live(self, where: Mask) -> bool:
         """Return whether an axis that is about to be changed is live: somebody else has enabled it."""
         status = self._known.find(STATUSWORD)
-        return any(is_live(self._drives.read_raw(status, int(axis))) for axis in np.flatnonzero(where))
+        return any(cia402.is_live(self._drives.read_raw(status, int(axis))) for axis in np.flatnonzero(where))
 
     # --- arming ---------------------------------------------------------------------------------------------------
     def _arm(self) -> None:

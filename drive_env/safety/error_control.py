@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
+from drive_env import cia402
 from drive_env.canopen.frames import ERROR_CONTROL
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.master.description import Description
@@ -28,7 +29,7 @@ FIRST_BEATS = 3  # a drive watches from the first heartbeat that it gets on: one
 STAYS = 1  # 1029h:01: a communication error changes nothing (CiA 301, and the TMCM-1636)
 
 # 6007h, what an axis does when its connection is lost (CiA 402): nothing, or the quick stop.
-_ABORT_CONNECTION, NO_ACTION, QUICK_STOP_THEN = (0x6007, 0), b"\0\0", b"\3\0"
+_ABORT_CONNECTION, NO_ACTION, QUICK_STOP_THEN = (cia402.ABORT_CONNECTION_OPTION, 0), b"\0\0", b"\3\0"
 _CONSUMERS, _GUARD_TIME, _LIFE_FACTOR, _ERROR_BEHAVIOUR = 0x1016, (0x100C, 0), (0x100D, 0), (0x1029, 1)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.master.description import Description, Key
 from drive_env.master.errors import RefusedError
 
@@ -16,8 +17,7 @@ if TYPE_CHECKING:
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
-ENCODER_RESOLUTION, GEAR_RATIO, FEED = 0x608F, 0x6091, 0x6092
-HOME_OFFSET = (0x607C, 0)
+HOME_OFFSET = (cia402.HOME_OFFSET, 0)
 
 
 def wrapped(difference: Integers) -> Integers:
@@ -64,9 +64,11 @@ def scale_objects(description: Description) -> tuple[Key, ...]:
     own = description.hints.position_scale
     if own is not None and description.has(own):
         return (own,)
-    if all(description.has((index, sub)) for index in (GEAR_RATIO, FEED) for sub in (1, 2)):
-        return ((GEAR_RATIO, 1), (GEAR_RATIO, 2), (FEED, 1), (FEED, 2))
-    return tuple(key for key in ((ENCODER_RESOLUTION, 1), (ENCODER_RESOLUTION, 2)) if description.has(key))
+    if all(description.has((index, sub)) for index in (cia402.GEAR_RATIO, cia402.FEED_CONSTANT) for sub in (1, 2)):
+        return ((cia402.GEAR_RATIO, 1), (cia402.GEAR_RATIO, 2), (cia402.FEED_CONSTANT, 1), (cia402.FEED_CONSTANT, 2))
+    return tuple(
+        key for key in ((cia402.ENCODER_RESOLUTION, 1), (cia402.ENCODER_RESOLUTION, 2)) if description.has(key)
+    )
 
 
 def read_scale(drives: CanDrives) -> Floats:

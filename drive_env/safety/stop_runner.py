@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import read_own
 from drive_env.safety.errors import SafetyError, logged
@@ -17,7 +18,6 @@ from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.looks import ASK
 from drive_env.safety.objects import CONTROLWORD, QUICK_STOP_OPTION
-from drive_env.safety.states import OPERATION_ENABLED, matches
 from drive_env.safety.stopping import AxisStop, Phase, Sample, Stop
 
 if TYPE_CHECKING:
@@ -194,6 +194,6 @@ class StopRunner:
         if self.current is not None:
             for axis, stop in self.current.axes.items():
                 # What somebody else has enabled since is no longer ours to hold.
-                is_enabled = stop.is_over and matches(int(self._axes.status[axis]), OPERATION_ENABLED)
+                is_enabled = stop.is_over and cia402.matches(int(self._axes.status[axis]), cia402.OPERATION_ENABLED)
                 judged[axis] &= is_enabled
         return judged

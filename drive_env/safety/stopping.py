@@ -10,7 +10,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import NamedTuple
 
-from drive_env.safety.states import DISABLE_VOLTAGE, QUICK_STOP, QUICK_STOP_ACTIVE, is_live, matches
+from drive_env import cia402
 
 REPEAT = 0.02  # s after which a command that shows no effect is sent again
 ANSWER = 0.1  # s within which a drive must have begun its ramp
@@ -84,7 +84,7 @@ class AxisStop:
         fresh = sample.time > self._seen
         if fresh:
             self._seen = sample.time
-        if fresh and sample.time > self._begun and not is_live(sample.status) and self._sent is not None:
+        if fresh and sample.time > self._begun and not cia402.is_live(sample.status) and self._sent is not None:
             self.phase = Phase.OFF
             return None
         if self.phase is Phase.RAMP:
@@ -121,7 +121,9 @@ class AxisStop:
         self._first = max(self._first, abs(sample.speed)) if sample.time < self._begun + GRACE else self._first
         if self._way == 0.0 and abs(sample.speed) > self._rest:
             self._way = math.copysign(1.0, sample.speed)
-        begun = matches(sample.status, QUICK_STOP_ACTIVE) or not matches(sample.status, (0x6F, 0x27))
+        begun = cia402.matches(sample.status, cia402.QUICK_STOP_ACTIVE) or not cia402.matches(
+            sample.status, cia402.OPERATION_ENABLED
+        )
         if not begun:
             if now - self._begun > ANSWER:
                 self.why = "it does not obey the quick stop"
@@ -169,9 +171,12 @@ class AxisStop:
 
     def _command(self, now: float, sample: Sample) -> int | None:
         if self.phase is Phase.RAMP:
-            word, wanted = QUICK_STOP, matches(sample.status, QUICK_STOP_ACTIVE) and sample.time > self._begun
+            word, wanted = (
+                cia402.QUICK_STOP,
+                cia402.matches(sample.status, cia402.QUICK_STOP_ACTIVE) and sample.time > self._begun,
+            )
         elif self.phase is Phase.CUT:
-            word, wanted = DISABLE_VOLTAGE, False
+            word, wanted = cia402.DISABLE_VOLTAGE, False
         else:
             return None
         if self._sent is not None and (wanted or now - self._sent < REPEAT):

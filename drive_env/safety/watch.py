@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.master.description import Key
 from drive_env.master.errors import BusError
 from drive_env.safety.axes import Axes
@@ -20,7 +21,6 @@ from drive_env.safety.judging import Judging
 from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.looks import Looks
 from drive_env.safety.objects import CONTROLWORD, CURRENT, MODE_DISPLAY, POSITION, STATUSWORD, VELOCITY
-from drive_env.safety.states import DISABLE_VOLTAGE
 from drive_env.safety.stop_runner import StopRunner
 from drive_env.safety.stopping import BLIND as BLIND_TIMEOUT
 from drive_env.safety.stopping import LOST, RAMP_TIMEOUT
@@ -260,7 +260,7 @@ class Watch:
         if ends:
             for axis in sorted(stop.axes.keys() - self._axes.lost):
                 with logged():
-                    self._drives.write_raw(self._known.find(CONTROLWORD), axis, DISABLE_VOLTAGE)
+                    self._drives.write_raw(self._known.find(CONTROLWORD), axis, cia402.DISABLE_VOLTAGE)
                     self._axes.in_flight[axis] = False
             self._axes.epoch += 1
             self._stops.current = None

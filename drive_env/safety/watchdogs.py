@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drive_env import cia402
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.master.errors import BusError
 from drive_env.safety.axes import Axes
@@ -18,7 +19,6 @@ from drive_env.safety.lending import Lending
 from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.objects import CONTROLWORD, STATUSWORD
-from drive_env.safety.states import DISABLE_VOLTAGE, is_disabled, is_live
 
 if TYPE_CHECKING:
     from drive_env.master.can_drives import CanDrives
@@ -215,11 +215,11 @@ class Watchdogs:
         for _ in range(5):
             try:
                 status = int(self._drives.read_raw(entry, axis))
-                if is_live(status):
+                if cia402.is_live(status):
                     return False
-                if not is_disabled(status):
-                    self._drives.write_raw(self._known.find(CONTROLWORD), axis, DISABLE_VOLTAGE)
-                off = off + 1 if is_disabled(status) else 0
+                if not cia402.is_disabled(status):
+                    self._drives.write_raw(self._known.find(CONTROLWORD), axis, cia402.DISABLE_VOLTAGE)
+                off = off + 1 if cia402.is_disabled(status) else 0
             except (BusError, ObjectAccessError):
                 if is_woken:
                     return False

@@ -12,25 +12,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.gains import Gains, scaled, write_gains
 from drive_env.motors import Motor
-from drive_env.trials.positioning import (
-    CURRENT,
-    CYCLE,
-    DEMAND,
-    POSITION,
-    STATUS,
-    TRIAL,
-    VELOCITY,
-    WATCH,
-    Move,
-    move_terms,
-    plan_move,
-    start,
-    wrapped,
-    write_profile,
-)
+from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
 from drive_env.trials.score import Terms, cost
 
 Floats = NDArray[np.float64]
@@ -136,11 +121,11 @@ class Trials:
             where: Axes that move.
         """
         drives = self._drives
-        origin = drives.read(POSITION)
+        origin = drives.read(cia402.POSITION_ACTUAL)
         scaler = drives.read((0x2058, 0))
         move = plan_move(self._motor, np.full(drives.num_axes, 3.0 * self._motor.inertia), scaler, reach)
         write_profile(drives, move, where)
-        objects = [POSITION, VELOCITY, CURRENT]
+        objects = [cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL]
         traces = []
         self._prepare(objects)
         for target in (origin + move.distance, origin):
@@ -207,15 +192,14 @@ class Trials:
 
     def down(self) -> Mask:
         """Return which axes are not enabled."""
-        mask, enabled = motion.OPERATION_ENABLED
-        return np.asarray(self._drives.read(STATUS) & mask != enabled)
+        return np.asarray(~cia402.matches(self._drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED))
 
     def _phase(
         self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask
     ) -> tuple[Floats, Floats, Floats, Mask, Mask]:
         """Move and watch; return position, demand, current, whose lanes have been stopped so far, and by whom now."""
         drives, to = self._drives, _on_the_counter(target)
-        objects = [POSITION, DEMAND, CURRENT, STATUS]
+        objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
         traces = []
         culprit = np.zeros(len(stopped), bool)
         self._prepare(objects)
@@ -225,9 +209,8 @@ class Trials:
                 warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
                 trace = self._record(objects, WATCH)
             traces.append(trace)
-            mask, enabled = motion.OPERATION_ENABLED
-            down = where & (trace[STATUS][-1] & mask != enabled)
-            change = np.diff(trace[CURRENT], axis=0) * 1e-3
+            down = where & ~cia402.matches(trace[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
+            change = np.diff(trace[cia402.TORQUE_ACTUAL], axis=0) * 1e-3
             shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * self._motor.rated_current
             new = self._whole_lanes(down | shaking) & where & ~stopped
             if new.any():
@@ -262,8 +245,8 @@ class Trials:
 
 def clear(drives: motion.Drives, where: Mask) -> None:
     """Reset faults and enable again, without waiting; an axis that has not come to rest yet stays as it is."""
-    for word in (0x00, 0x80, 0x06, 0x07, 0x0F):
-        drives.write(0x6040, word, where=where)
+    for word in (cia402.DISABLE_VOLTAGE, cia402.FAULT_RESET, *cia402.ENABLING):
+        drives.write(cia402.CONTROLWORD, word, where=where)
 
 
 def _on_the_counter(position: Integers) -> Integers:

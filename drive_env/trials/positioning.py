@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.motors import Motor
 
 if TYPE_CHECKING:
@@ -31,9 +31,7 @@ ACCELERATION_SHARE = 0.4  # of the rated torque
 SPEED_SHARE, TRAVEL_SHARE = 0.5, 0.4  # of the rated speed at the profile's peak, of what there is to go
 BAND, BAND_COUNTS = 0.01, 3.0  # of the move, and of the encoder: the larger is what counts as settled
 
-OPERATION_ENABLED = motion.OPERATION_ENABLED
-POSITION, VELOCITY, CURRENT, CURRENT_ERROR = 0x6064, 0x606C, 0x6077, (0x2041, 3)
-DEMAND, STATUS = 0x6062, 0x6041
+CURRENT_ERROR = (0x2041, 3)
 
 
 class Move(NamedTuple):
@@ -80,24 +78,24 @@ def reach(load: str | Path | Load) -> Floats:
 def power_up(drives: motion.Drives, where: Mask | None = None) -> None:
     """Take drives from switch on disabled to pp, enabled, in as many milliseconds whatever becomes of them."""
     motion.select_mode(drives, "pp", where)
-    for word in (0x06, 0x07, 0x0F):
+    for word in cia402.ENABLING:
         drives.advance(CYCLE)
-        drives.write(0x6040, word, where=where)
+        drives.write(cia402.CONTROLWORD, word, where=where)
     drives.advance(2 * CYCLE)
 
 
 def write_profile(drives: motion.Drives, move: Move, where: Mask | None = None) -> None:
     """Write the speed and the ramps of a move."""
-    drives.write(0x6081, move.velocity, where=where)
-    drives.write(0x6083, move.acceleration, where=where)
-    drives.write(0x6084, move.acceleration, where=where)
+    drives.write(cia402.PROFILE_VELOCITY, move.velocity, where=where)
+    drives.write(cia402.PROFILE_ACCELERATION, move.acceleration, where=where)
+    drives.write(cia402.PROFILE_DECELERATION, move.acceleration, where=where)
 
 
 def start(drives: motion.Drives, target: Integers, where: Mask | None = None) -> None:
     """Set off for a position [inc]; an axis that is not enabled stays where it is."""
-    drives.write(0x607A, target, where=where)
-    drives.write(0x6040, 0x0F, where=where)  # bit 4 must rise
-    drives.write(0x6040, 0x1F, where=where)
+    drives.write(cia402.TARGET_POSITION, target, where=where)
+    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)  # bit 4 must rise
+    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.NEW_SET_POINT, where=where)
 
 
 def move_terms(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.envs.randomisation import BESIDE, Distributions, Law
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import MOST_RECORDING, check_size
@@ -32,13 +32,17 @@ CYCLE = 0.001  # s
 # What the drive was told, in the order in which it is looked for: object, mode in which it is played, and played as.
 # A position demand comes first: it is what a profile in the drive (pp) made of its target.
 COMMANDS: tuple[tuple[Key, str, Key], ...] = (
-    ((0x6062, 0), "csp", (0x607A, 0)),
-    ((0x607A, 0), "csp", (0x607A, 0)),
-    ((0x60FF, 0), "csv", (0x60FF, 0)),
-    ((0x6071, 0), "cst", (0x6071, 0)),
+    ((cia402.POSITION_DEMAND, 0), "csp", (cia402.TARGET_POSITION, 0)),
+    ((cia402.TARGET_POSITION, 0), "csp", (cia402.TARGET_POSITION, 0)),
+    ((cia402.TARGET_VELOCITY, 0), "csv", (cia402.TARGET_VELOCITY, 0)),
+    ((cia402.TARGET_TORQUE, 0), "cst", (cia402.TARGET_TORQUE, 0)),
 )
-RESPONSES: tuple[Key, ...] = ((0x6064, 0), (0x606C, 0), (0x6077, 0))  # position, velocity, current
-_POSITIONS: tuple[Key, ...] = ((0x6062, 0), (0x6064, 0), (0x607A, 0))
+RESPONSES: tuple[Key, ...] = (
+    (cia402.POSITION_ACTUAL, 0),
+    (cia402.VELOCITY_ACTUAL, 0),
+    (cia402.TORQUE_ACTUAL, 0),
+)  # position, velocity, current
+_POSITIONS: tuple[Key, ...] = ((cia402.POSITION_DEMAND, 0), (cia402.POSITION_ACTUAL, 0), (cia402.TARGET_POSITION, 0))
 MAX_SHIFT = 0.02  # s, the longest time by which a response is looked for earlier or later
 LATEST = 1e7  # s: a stamp of 1e300 has no milliseconds any more
 AT_REST = 0.1  # of the range of the speed: noise of a quiet axis
@@ -179,12 +183,12 @@ def replay(drives: EmulatedDrives, log: Log, settings: Mapping[Any, int] | None 
     told = np.repeat(log.objects[command], log.every, axis=0)
     if log.every > 1 and mode == "csp":
         told = _between(log.objects[command], log.every)
-    start = told[0] - drives.read((0x6064, 0))[:axes] if mode == "csp" else np.zeros(axes, np.int64)
+    start = told[0] - drives.read((cia402.POSITION_ACTUAL, 0))[:axes] if mode == "csp" else np.zeros(axes, np.int64)
     rows = np.tile(told - start, (1, drives.num_machines))
     if mode == "csp":
         drives.write(played, rows[0])
     motion.enable(drives, mode)
-    if command == (0x6062, 0):
+    if command == (cia402.POSITION_DEMAND, 0):
         # A demand is where the drive had to be in that cycle; a target played in csp is reached a cycle later.
         rows = np.concatenate([rows[1:], rows[-1:]])
     names = [name for name in RESPONSES if name in log.objects]
@@ -199,7 +203,7 @@ def command_of(log: Log) -> tuple[Key, str, Key]:
     Raises:
         ValueError: If there is none, naming those that can be, or if the log begins in the middle of a move.
     """
-    speed = log.objects.get((0x606C, 0))
+    speed = log.objects.get((cia402.VELOCITY_ACTUAL, 0))
     if speed is not None and np.any(np.abs(speed[0]) > AT_REST * np.maximum(np.ptp(speed, axis=0), 1)):
         raise ValueError("the log begins in the middle of a move; record it from rest, with scope --before")
     for key, mode, played in COMMANDS:

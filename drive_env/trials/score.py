@@ -25,15 +25,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.gains import Gains, scaled, small_time_constants, write_gains
 from drive_env.trials.positioning import (
-    CURRENT,
     CURRENT_ERROR,
     CYCLE,
-    OPERATION_ENABLED,
-    POSITION,
     SETTLED,
-    STATUS,
     TRIAL,
     Move,
     move_terms,
@@ -260,14 +257,14 @@ class HiddenScore:
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
             power_up(drives)
             start(drives, move.distance)
-            objects: list[ObjectName] = [POSITION, CURRENT, CURRENT_ERROR, STATUS]
+            objects: list[ObjectName] = [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, CURRENT_ERROR, cia402.STATUSWORD]
             free = drives.record(objects, SETTLED * CYCLE)
             drives.machine.load_torque = self._constant + self._load_torque
             loaded = drives.record(objects, (TRIAL - SETTLED) * CYCLE)
-        current = (free[CURRENT] + free[CURRENT_ERROR]) * 1e-3
+        current = (free[cia402.TORQUE_ACTUAL] + free[CURRENT_ERROR]) * 1e-3
         direction = np.where(move.distance < 0, -1, 1)
         settling, noise, overshoot = move_terms(
-            free[POSITION].astype(float),
+            free[cia402.POSITION_ACTUAL].astype(float),
             np.asarray(current, float),
             move,
             self._t_0,
@@ -275,16 +272,15 @@ class HiddenScore:
             move.distance,
             direction,
         )
-        mask, enabled = OPERATION_ENABLED
-        tripped = np.any(loaded[STATUS][-1:] & mask != enabled, axis=0) | np.repeat(
+        tripped = ~cia402.matches(loaded[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED) | np.repeat(
             drives.machine.diverged, self._axes[2]
         )
-        error = np.abs(wrapped(move.distance - loaded[POSITION])).sum(axis=0) * CYCLE / move.increments
+        error = np.abs(wrapped(move.distance - loaded[cia402.POSITION_ACTUAL])).sum(axis=0) * CYCLE / move.increments
         # Half a count is the least that there is to see.
         least = 0.5 / move.counts * (TRIAL - SETTLED) * CYCLE
         shape = self._axes
         terms = Terms(settling, np.ones_like(settling), noise, overshoot, tripped)
-        swings = swing(free[CURRENT].astype(float) * 1e-3, drives.motor.rated_current)
+        swings = swing(free[cia402.TORQUE_ACTUAL].astype(float) * 1e-3, drives.motor.rated_current)
         return (
             terms.each(lambda value: value.reshape(shape)),
             np.maximum(error, least).reshape(shape),

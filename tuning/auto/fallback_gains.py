@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.gains import write_gains
 from drive_env.trials.gain_trial import OSCILLATION
-from drive_env.trials.positioning import CURRENT, WATCH
+from drive_env.trials.positioning import WATCH
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -54,8 +55,8 @@ class CalmedDrives:
     def record(self, objects: Any, duration: float, *arguments: Any, **options: Any) -> Any:
         """Let time pass while objects are recorded; calm what has shaken too long."""
         trace = self._drives.record(objects, duration, *arguments, **options)
-        if self.calm is not None and CURRENT in objects and len(trace) == WATCH:
-            change = np.diff(trace[CURRENT], axis=0) * 1e-3
+        if self.calm is not None and cia402.TORQUE_ACTUAL in objects and len(trace) == WATCH:
+            change = np.diff(trace[cia402.TORQUE_ACTUAL], axis=0) * 1e-3
             shaking = np.sqrt(np.mean(change**2, axis=0)) > self._threshold
             self._windows = np.where(shaking, self._windows + 1, 0)
             late = self._windows >= self._most

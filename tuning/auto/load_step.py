@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import detrend
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.trials import response
-from drive_env.trials.positioning import CURRENT, CYCLE, POSITION, STATUS, wrapped
+from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.certificate.certificate import StepResponse
 
 if TYPE_CHECKING:
@@ -48,29 +48,31 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     packed = one(drives.load)
     # On the load, where it disturbs: the axis with the longest lever feels the share.
     lever = float(np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max())
-    mask, value = motion.OPERATION_ENABLED
-    off = axes & (drives.read(STATUS) & mask != value)
+    off = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     motion.enable(drives, mode="pp", where=axes)
     drives.advance(REST)
     try:
-        rest = drives.record([POSITION, CURRENT], BEFORE)
+        rest = drives.record([cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL], BEFORE)
         windows = []
         # Both ways, and what it does when the load is gone: loose gears swing one way and stand the other.
         for share in (-SHARE, 0.0, SHARE, 0.0):
             drives.machine.load_torque = np.where(machines, share * target.motor.rated_torque / lever, 0.0)
-            windows.append(drives.record([POSITION, CURRENT], AFTER))
+            windows.append(drives.record([cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL], AFTER))
     finally:
         drives.machine.load_torque = 0.0
         drives.advance(REST)
         if off.any():
             motion.disable(drives, where=off)
     loaded = windows[0]
-    raw = np.concatenate([rest[POSITION], loaded[POSITION]])
+    raw = np.concatenate([rest[cia402.POSITION_ACTUAL], loaded[cia402.POSITION_ACTUAL]])
     angle = wrapped(raw - raw[0]) / target.increments()
-    current = np.concatenate([rest[CURRENT], loaded[CURRENT]]) * 1e-3
+    current = np.concatenate([rest[cia402.TORQUE_ACTUAL], loaded[cia402.TORQUE_ACTUAL]]) * 1e-3
     t = np.arange(len(angle), dtype=np.float64) * CYCLE
     # An integrator that is still on its way is no swing.
-    ends = [detrend(1e-3 * window[CURRENT][-round(LOOKED_AT / CYCLE) :], axis=0).std(axis=0) for window in windows]
+    ends = [
+        detrend(1e-3 * window[cia402.TORQUE_ACTUAL][-round(LOOKED_AT / CYCLE) :], axis=0).std(axis=0)
+        for window in windows
+    ]
     swing = np.max(ends, axis=0) / target.motor.rated_current
     found = response.disturbance_metrics(t, angle, np.zeros(target.num_axes), t_load=BEFORE)
     return {

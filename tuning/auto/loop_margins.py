@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.gains import Gains, scaled, write_gains
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.moves import show
 from tuning.auto.run import MOVE_TIME, TRIAL_TIME
-from tuning.auto.trials import BY_TRIAL, FOLLOWING_WINDOW, watch_following
+from tuning.auto.trials import BY_TRIAL, watch_following
 from tuning.response.margins import Margins, margins
 from tuning.response.measured_loop import merged
 
@@ -62,7 +63,7 @@ def measure(run: Run) -> None:
     low, high = run.room()
     here = replace(run.target, low=low, high=np.maximum(high, LEAST_WAY))
     write_gains(drives, run.gains, going)
-    drives.write(FOLLOWING_WINDOW, FREE_WINDOW * drives.read((0x2058, 0)), where=going)
+    drives.write(cia402.FOLLOWING_WINDOW, FREE_WINDOW * drives.read((0x2058, 0)), where=going)
     try:
         with run.spending(going):
             response = frequency_response.measure(here, "velocity", where=going)

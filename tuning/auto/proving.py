@@ -12,25 +12,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.gain_trial import OSCILLATION, PHASES, Trial, Trials, measured_cost, softness
-from drive_env.trials.positioning import (
-    CURRENT,
-    CYCLE,
-    DEMAND,
-    POSITION,
-    STATUS,
-    TRIAL,
-    WATCH,
-    Move,
-    move_terms,
-    plan_move,
-    start,
-    wrapped,
-    write_profile,
-)
+from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
 from drive_env.trials.score import TRIP, Terms, cost
 
 if TYPE_CHECKING:
@@ -53,7 +39,6 @@ STEP_COUNTS = 1.5  # of the encoder: what is less is no motion, and no step
 RETURN_LOOKS, RETURN_LOOK = 8, 0.05  # looks whether it is back, and the time between them [s]
 OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
 ENABLING = 5.0  # s, the longest wait for an axis that is switched on: some align their encoder first
-TARGET_VELOCITY = 0x60FF
 SHORTEST = 16.0  # counts of the encoder: a move that is shorter proves nothing
 # After a move for the record it is looked whether the axis stands, in so many places of an encoder count: a loop at its
 # edge swings between two counts in one place, and stands in another. Windows of 25 ms in each, how many of them pass
@@ -156,7 +141,7 @@ class ProvingGround:
         self._fastest: Floats = np.maximum(top / np.maximum(self.move.velocity, 1), 1.0)
         self._t_0 = 4.0 * small_time_constants(target.device, np.array(corner))
         self._trials = Trials(drives, motor, target.axes_per_machine, self._t_0)  # type: ignore[arg-type]
-        self._origin = drives.read(POSITION)
+        self._origin = drives.read(cia402.POSITION_ACTUAL)
         self._direction = np.ones(target.num_axes, np.int64)
         self._shaken = np.zeros(target.num_axes, bool)
         self.moves = np.zeros(target.num_axes, np.int64)
@@ -175,7 +160,7 @@ class ProvingGround:
     def begin_here(self, where: Mask) -> None:
         """Take where axes are as where the next move begins, of those that turn freely; the others are brought back."""
         free = where & np.isinf(self.target.low) & np.isinf(self.target.high)
-        self._origin = np.where(free, self.target.drives.read(POSITION), self._origin)
+        self._origin = np.where(free, self.target.drives.read(cia402.POSITION_ACTUAL), self._origin)
 
     def recover(self, where: Mask) -> None:
         """Reset faults of axes, and have them hold with gains that are known to; one that cannot stays as it is."""
@@ -225,7 +210,7 @@ class ProvingGround:
         away = self._origin + self._direction * self.move.distance
         start(drives, wrapped(away).astype(np.int64), where)
         self.moves[where] += 1
-        objects = [POSITION, DEMAND, CURRENT, STATUS]
+        objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
         traces, stopped = [], np.zeros(self.target.num_axes, bool)
         for _ in range(TRIAL // WATCH):
             traces.append(drives.record(objects, WATCH * CYCLE))
@@ -267,11 +252,11 @@ class ProvingGround:
                 start(drives, wrapped(at + back * apart).astype(np.int64), where)
             seen = []
             for _ in range(REST):
-                window = drives.record([CURRENT, STATUS], WATCH * CYCLE)
+                window = drives.record([cia402.TORQUE_ACTUAL, cia402.STATUSWORD], WATCH * CYCLE)
                 stopped = self._stop(where & self._shakes(window))
                 worst[stopped] = OSCILLATION
                 self._shaken |= stopped
-                seen.append(window[CURRENT])
+                seen.append(window[cia402.TORQUE_ACTUAL])
             worst = np.maximum(worst, np.concatenate(seen[SETTLED:]).std(axis=0) * 1e-3 / rated)
         return worst
 
@@ -282,19 +267,20 @@ class ProvingGround:
         """
         windows = np.zeros(self.target.num_axes, np.int64)
         for _ in range(HOLDING // WATCH):
-            seen = self.target.drives.record([POSITION, CURRENT, STATUS], WATCH * CYCLE)
+            seen = self.target.drives.record(
+                [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD], WATCH * CYCLE
+            )
             windows = np.where(self._shakes(seen), windows + 1, 0)
             self._stop(where & (windows == PATIENCE))
-            if not np.any(where & ~self._stands(seen[POSITION])):
+            if not np.any(where & ~self._stands(seen[cia402.POSITION_ACTUAL])):
                 break
         self._begin_without_a_step(where)
 
     def _shakes(self, seen: Mapping[object, Any]) -> Mask:
         """Return which axes oscillated in a recording, or are off at its end."""
-        change = np.diff(seen[CURRENT], axis=0) * 1e-3
-        mask, enabled = motion.OPERATION_ENABLED
+        change = np.diff(seen[cia402.TORQUE_ACTUAL], axis=0) * 1e-3
         shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * self.target.motor.rated_current
-        return np.asarray(shaking | (seen[STATUS][-1] & mask != enabled))
+        return np.asarray(shaking | ~cia402.matches(seen[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED))
 
     def _stop(self, where: Mask) -> Mask:
         """Give axes, and those that pull at the same thing, gains that hold; return which got them."""
@@ -334,9 +320,9 @@ class ProvingGround:
         """
         drives = self.target.drives
         motion.enable(drives, mode="csv", where=where, timeout=ENABLING)
-        drives.write(TARGET_VELOCITY, 0, where=where)
+        drives.write(cia402.TARGET_VELOCITY, 0, where=where)
         for _ in range(STOPPING // STOPPING_LOOK):
-            seen = drives.record([POSITION], STOPPING_LOOK * CYCLE)[POSITION]
+            seen = drives.record([cia402.POSITION_ACTUAL], STOPPING_LOOK * CYCLE)[cia402.POSITION_ACTUAL]
             if not np.any(where & ~self._stands(seen)):
                 break
         self.begin_here(where)
@@ -345,7 +331,7 @@ class ProvingGround:
         """Bring back what is not where it should be: what was stopped went on with slower gains, or fell, or ran."""
         drives = self.target.drives
         near = np.maximum(NEAR * np.abs(self.move.distance), NEAR_COUNTS * self._count)
-        off = np.abs(wrapped(drives.read(POSITION) - self._origin))
+        off = np.abs(wrapped(drives.read(cia402.POSITION_ACTUAL) - self._origin))
         # A long way is not to take long.
         faster = np.clip(off / (RETURN_MOVES * np.maximum(np.abs(self.move.distance), 1)), 1.0, self._fastest)
         back = self.move._replace(
@@ -361,7 +347,7 @@ class ProvingGround:
         self.moves[astray] += 1
         for _ in range(RETURN_LOOKS):
             # All the while: a load that was shaken swings on, and would be taken for the next gains' doing.
-            seen = drives.record([POSITION], RETURN_LOOK)[POSITION]
+            seen = drives.record([cia402.POSITION_ACTUAL], RETURN_LOOK)[cia402.POSITION_ACTUAL]
             if not np.any(astray & (np.abs(wrapped(seen - self._origin)).max(axis=0) > near)):
                 break
         self._shaken &= ~astray
@@ -373,7 +359,7 @@ class ProvingGround:
         and its kick would pass for an oscillation.
         """
         drives = self.target.drives
-        here = drives.read(POSITION)
+        here = drives.read(cia402.POSITION_ACTUAL)
         off = where & (np.abs(wrapped(here - self._origin)) > STEP_COUNTS * self._count)
         if not off.any():
             return
@@ -400,7 +386,7 @@ class ProvingGround:
         self._shaken |= where & stopped
         overshoot = terms.overshoot[:2].max(axis=0)
         # Behind its demand at the end of the move, or from where it should be now: a demand may stand still, too.
-        now = np.abs(wrapped(self.target.drives.read(POSITION) - self._origin)) / np.maximum(
+        now = np.abs(wrapped(self.target.drives.read(cia402.POSITION_ACTUAL) - self._origin)) / np.maximum(
             np.abs(self.move.distance), 1
         )
         left = np.maximum(np.abs(tried.error[TRIAL - 1]), now)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
+from drive_env import cia402
 from drive_env.gains import GAIN_OBJECTS, Gains
-from drive_env.trials.positioning import POSITION, wrapped
+from drive_env.trials.positioning import wrapped
 from tuning.auto.result import AxisRun, Result
 from tuning.auto.trial_order import OTHERS
 from tuning.stop_causes import stop_causes
@@ -30,7 +30,6 @@ Mask = NDArray[np.bool_]
 # Drive time of the parts [s]: a frequency response of an axis; a trial, with what recovery takes; a move for the
 # record; and one from where a response has ended.
 RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, LOOK_BACK_TIME = 2.3, 0.85, 0.8, 1.3
-MODE = 0x6060
 
 
 class Run:
@@ -74,7 +73,7 @@ class Run:
         self.spare: Integers = np.zeros_like(self.gains)
         self.fallbacks = np.ones((3, n, len(Gains._fields)), np.int64)
         self.unsafe = ["not looked at"] * n
-        self.modes: Integers = drives.read(MODE)
+        self.modes: Integers = drives.read(cia402.MODE)
         self.fresh: Mask = np.zeros(n, bool)
         self.ground: ProvingGround | None = None
         self.shown: Shown | None = None
@@ -85,7 +84,7 @@ class Run:
         # Axes of one machine are shaken one after the other.
         self.response_time = RESPONSE_TIME * target.axes_per_machine
         self.spent: Floats = np.zeros(n)
-        self._origin = drives.read(POSITION)
+        self._origin = drives.read(cia402.POSITION_ACTUAL)
         # What one axis has, its machine's others have too: they are shaken one after the other.
         self._clock, self._budget = clock, budget * target.axes_per_machine
 
@@ -118,7 +117,7 @@ class Run:
     def room(self) -> tuple[Floats, Floats]:
         """Return how far the rotors may turn from where they are now [rad], down and up, each (num_axes,)."""
         target = self.target
-        here = wrapped(target.drives.read(POSITION) - self._origin) / target.increments()
+        here = wrapped(target.drives.read(cia402.POSITION_ACTUAL) - self._origin) / target.increments()
         return np.minimum(target.low - here, 0.0), np.maximum(target.high - here, 0.0)
 
     @property
@@ -143,8 +142,7 @@ class Run:
     def faults(self) -> dict[int, str]:
         """Return the axes that went into fault while they took part, and which faults."""
         drives = self.target.drives
-        mask, value = motion.FAULT_BIT
-        faulted = self.going & (drives.read(0x6041) & mask == value)
+        faulted = self.going & cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
         causes = stop_causes(drives)
         return {axis: causes[axis] for axis in map(int, np.flatnonzero(faulted))}
 

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
-from tuning.auto.run import MODE
-from tuning.identify.working_state import BOTH_ENDS, INPUTS, LIMIT_SWITCHES, MOTOR_TYPE
+from tuning.identify.working_state import BOTH_ENDS, LIMIT_SWITCHES, MOTOR_TYPE
 from tuning.snapshot import Transaction, restore
 
 if TYPE_CHECKING:
@@ -34,8 +33,7 @@ def begin(run: Run) -> None:
             f"the travel is too short: {way[axis]:.2g} rad, and {LEAST_WAY:g} are needed ({turns:.2g} and {least:.2g} "
             "turns); allow more with --travel"
         )
-    mask, value = motion.OPERATION_ENABLED
-    on = drives.read(0x6041) & mask == value
+    on = cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     if on.any():
         motion.disable(drives, where=on)
 
@@ -49,7 +47,7 @@ def commission(run: Run) -> None:
     for name, value in _commissioning(target).items():
         target.drives.write(name, value, where=run.fresh)
     # No axis is at both ends: switches that say so are not there.
-    unwired = run.fresh & (target.drives.read(INPUTS) & BOTH_ENDS == BOTH_ENDS)
+    unwired = run.fresh & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
     target.drives.write(LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
     run.note(unwired, "both limit switches were active, which no axis can be at: they are ignored (2005h)")
     run.note(run.fresh, f"fresh from the factory: commissioned for {target.motor.name} first")
@@ -65,9 +63,9 @@ def write(run: Run, transaction: Transaction) -> Mask:
     write_gains(drives, run.gains, going)
     motion.disable(drives, where=going)
     # 0, no mode, is what a drive has before its first; it cannot be written.
-    other = going & (run.modes != 0) & (drives.read(MODE) != run.modes)
+    other = going & (run.modes != 0) & (drives.read(cia402.MODE) != run.modes)
     if other.any():
-        drives.write(MODE, run.modes, where=other)
+        drives.write(cia402.MODE, run.modes, where=other)
     kept = dict(zip(((key[0], key[1]) for key in GAIN_OBJECTS), run.gains.T, strict=True))
     axes = []
     for k, values in enumerate(transaction.before.axes):

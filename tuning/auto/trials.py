@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.gains import Gains, scaled, write_gains
 from tuning.auto.proving import ProvingGround
 from tuning.auto.run import MOVE_TIME, TRIAL_TIME
@@ -22,7 +23,6 @@ Mask = NDArray[np.bool_]
 BY_TRIAL = "by a move, its reversal, and a move with 1.5 times velocity P"  # how gains are verified, at the least
 LOUD = 0.06  # RMS increment of the current over the rated one, from which on an axis hunts at rest
 SCALED = [Gains._fields.index(name) for name in ("velocity_p", "velocity_i", "position_p")]
-FOLLOWING_WINDOW = 0x6065
 WINDOW = 10  # following error that trips a trial, over its move: a slow loop lags by the whole of it
 
 
@@ -102,7 +102,7 @@ def watch_following(run: Run, where: Mask) -> None:
     assert run.ground is not None, "proving makes it"
     drives = run.target.drives
     window = WINDOW * np.abs(run.ground.move.distance) + drives.read((0x2058, 0))
-    drives.write(FOLLOWING_WINDOW, window, where=where)
+    drives.write(cia402.FOLLOWING_WINDOW, window, where=where)
 
 
 def faster(gains: Integers, factor: float) -> Integers:

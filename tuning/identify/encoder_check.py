@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from tuning.identify.identification import Estimate, refused
 from tuning.identify.working_state import (
     BY_FIELD,
@@ -21,10 +22,7 @@ from tuning.identify.working_state import (
     CYCLE,
     OPEN_LOOP_CURRENT,
     POLE_PAIRS,
-    POSITION,
     SHAFT_DIRECTION,
-    STATUS,
-    TARGET_VELOCITY,
     Working,
     enable,
     still_enabled,
@@ -82,7 +80,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
         drives.write(OPEN_LOOP_CURRENT, 0, where=where)
         enable(working, "csv", where)
         away, back, field, reasons = _turn(working, where, configured)
-        alive = still_enabled(working, drives.read(STATUS))
+        alive = still_enabled(working, drives.read(cia402.STATUSWORD))
     finally:
         switch_off(drives, where)
         drives.write(OPEN_LOOP_CURRENT, 0, where=where)
@@ -156,7 +154,9 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
         passed = np.zeros(len(turn))
         before = fields[-1]
         for k in range(0, TURN, TURN // 10):
-            drives.record([POSITION], TURN // 10 * CYCLE, play={TARGET_VELOCITY: raw[k : k + TURN // 10]})
+            drives.record(
+                [cia402.POSITION_ACTUAL], TURN // 10 * CYCLE, play={cia402.TARGET_VELOCITY: raw[k : k + TURN // 10]}
+            )
             now = _field(working)
             passed += (now - before + np.pi) % (2.0 * np.pi) - np.pi
             before = now
@@ -184,8 +184,8 @@ def _field(working: Working) -> Floats:
 
 def _rest(working: Working) -> Floats:
     """Return where the rotors come to rest [rad]."""
-    trace = working.target.drives.record([POSITION], 2 * REST * CYCLE)
-    return np.asarray(working.angle(trace[POSITION])[REST:].mean(axis=0))
+    trace = working.target.drives.record([cia402.POSITION_ACTUAL], 2 * REST * CYCLE)
+    return np.asarray(working.angle(trace[cia402.POSITION_ACTUAL])[REST:].mean(axis=0))
 
 
 def _judge(field: float, away: float, back: float, expected: int) -> EncoderCheck:

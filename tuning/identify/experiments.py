@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.gains import gains_from_bandwidths, write_gains
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.encoder_check import EncoderCheck, check_encoders
@@ -16,10 +17,8 @@ from tuning.identify.inertia import Mechanics, identify_mechanics
 from tuning.identify.standstill import standstill_resistances
 from tuning.identify.winding import Winding, identify_winding, pulse, to_torque_mode
 from tuning.identify.working_state import (
-    CURRENT,
     CYCLE,
     GUESS,
-    STATUS,
     Working,
     cautious_bandwidth,
     cautious_gains,
@@ -168,19 +167,19 @@ class Experiments:
         self.begin("resonance, delay, filter", 0.7, RESPONSE)
         self.respond(working, inertia)
         working = self.calm(working)
-        on = working.where & still_enabled(working, drives.read(STATUS))
+        on = working.where & still_enabled(working, drives.read(cia402.STATUSWORD))
         if on.any():
             go_back(replace(working, where=on), "csv", to=0.0)
 
     def hold(self, working: Working) -> Floats:
         """Return what holds the axes [A], at rest in csp."""
         drives = working.target.drives
-        trace = drives.record([CURRENT], HOLD * CYCLE)
-        alive = still_enabled(working, drives.read(STATUS))
+        trace = drives.record([cia402.TORQUE_ACTUAL], HOLD * CYCLE)
+        alive = still_enabled(working, drives.read(cia402.STATUSWORD))
         causes = [] if alive.all() else stop_causes(drives)
         for k in np.flatnonzero(working.where & ~alive):
             self.refuse(int(k), NAMES[4:], f"the drive switched off while it held the axis: {causes[k]}")
-        return np.asarray(trace[CURRENT][-STEADY:].mean(axis=0) * 1e-3)
+        return np.asarray(trace[cia402.TORQUE_ACTUAL][-STEADY:].mean(axis=0) * 1e-3)
 
     def take_windings(self, working: Working, windings: list[Winding]) -> None:
         """Take resistance and inductance."""
@@ -205,7 +204,7 @@ class Experiments:
         target, drives = working.target, working.target.drives
         # Still enabled: an axis under gravity would fall between the experiments.
         go_back(working, "csv")
-        able = working.where & still_enabled(working, drives.read(STATUS))
+        able = working.where & still_enabled(working, drives.read(cia402.STATUSWORD))
         down, up = working.room()
         causes = [] if able.all() else stop_causes(drives)
         for k in np.flatnonzero(working.where):

@@ -18,23 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.dictionary.units import RPM
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.gains import write_gains
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.identification import Estimate, refused
-from tuning.identify.working_state import (
-    CURRENT,
-    CYCLE,
-    GUESS,
-    POSITION,
-    STATUS,
-    TARGET_VELOCITY,
-    Working,
-    cautious_gains,
-    go_back,
-    still_enabled,
-)
+from tuning.identify.working_state import CYCLE, GUESS, Working, cautious_gains, go_back, still_enabled
 from tuning.oscillation_watch import SOFTER, VELOCITY_I, VELOCITY_P, OscillationError
 from tuning.stop_causes import stop_causes
 from tuning.target import Target
@@ -186,7 +176,7 @@ def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
     """Make the moves in csv; return angles [rad] and currents [A], (rows, num_axes), and which axes went through."""
     drives = working.target.drives
     # The velocity loop alone would drift by what every reversal of friction leaves: the way is looked after, slowly.
-    begin = working.angle(drives.read(POSITION))
+    begin = working.angle(drives.read(cia402.POSITION_ACTUAL))
     way = begin + np.cumsum(plan.speed, axis=0) * CYCLE
     fastest = np.abs(plan.speed).max(axis=0)
     angles, currents, alive = [], [], working.where.copy()
@@ -194,10 +184,14 @@ def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
     for k in range(0, len(plan.speed), CORRECTION):
         part = plan.speed[k : k + CORRECTION] + np.clip(FOLLOW * error, -0.3 * fastest, 0.3 * fastest)
         raw = np.where(working.where, np.rint(part * working.increments), 0).astype(np.int64)
-        trace = drives.record([POSITION, CURRENT, STATUS], len(raw) * CYCLE, play={TARGET_VELOCITY: raw})
-        angles.append(working.angle(trace[POSITION]))
-        currents.append(trace[CURRENT] * 1e-3)
-        alive &= still_enabled(working, trace[STATUS][-1])
+        trace = drives.record(
+            [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD],
+            len(raw) * CYCLE,
+            play={cia402.TARGET_VELOCITY: raw},
+        )
+        angles.append(working.angle(trace[cia402.POSITION_ACTUAL]))
+        currents.append(trace[cia402.TORQUE_ACTUAL] * 1e-3)
+        alive &= still_enabled(working, trace[cia402.STATUSWORD][-1])
         error = way[k + len(raw) - 1] - angles[-1][-1]
     return np.concatenate(angles), np.concatenate(currents), alive
 
@@ -234,9 +228,11 @@ def are_linked(working: Working) -> bool:
     pulled = np.zeros(target.num_axes, bool)
     for sign in (1.0, -1.0):
         raw = np.where(first, np.rint(sign * np.outer(shape, way) * working.increments), 0).astype(np.int64)
-        trace = drives.record([CURRENT, POSITION], len(raw) * CYCLE, play={TARGET_VELOCITY: raw})
+        trace = drives.record(
+            [cia402.TORQUE_ACTUAL, cia402.POSITION_ACTUAL], len(raw) * CYCLE, play={cia402.TARGET_VELOCITY: raw}
+        )
         if sign > 0.0:
-            current, angle = trace[CURRENT] * 1e-3, working.angle(trace[POSITION])
+            current, angle = trace[cia402.TORQUE_ACTUAL] * 1e-3, working.angle(trace[cia402.POSITION_ACTUAL])
             rise = current[-STILL // 2 :].mean(axis=0) - current[: STILL // 2].mean(axis=0)
             pulled = np.abs(rise) > LINKED_CURRENT * working.current
             pulled |= np.abs(angle[-1] - angle[0]) > LINKED_WAY * np.abs(way)

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.gains import write_gains
 from drive_env.trials.gain_trial import Identified, Trials
 from tuning.identify.experiments import MECHANICS, PULSED, RESPONSE, UNITS, WORST_MISFIT, Experiments
 from tuning.identify.identification import NAMES, Estimate, Identification, Progress, refused
 from tuning.identify.winding import BRIEFLY, identify_winding, pulse, to_torque_mode
-from tuning.identify.working_state import GUESS, STATUS, Working, cautious_gains, enable, switch_off
+from tuning.identify.working_state import GUESS, Working, cautious_gains, enable, switch_off
 from tuning.oscillation_watch import shaken
 from tuning.response.frequency_response import measure
 from tuning.stop_causes import stop_causes
@@ -121,7 +121,7 @@ class _Brief(Experiments):
 
     def respond(self, working: Working, inertia: NDArray[np.float64]) -> None:
         target, drives = working.target, working.target.drives
-        fault = drives.read(STATUS) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1]
+        fault = cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
         able = working.where & ~fault
         causes = stop_causes(drives) if fault.any() else []
         for k in map(int, np.flatnonzero(working.where & fault)):

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.dead_time import dead_time
 from tuning.identify.encoder_check import FIELD_ANGLE, able, stay_inside
@@ -23,8 +24,6 @@ from tuning.identify.working_state import (
     COMMUTATION,
     CYCLE,
     OPEN_LOOP_CURRENT,
-    POSITION,
-    STATUS,
     Working,
     enable,
     still_enabled,
@@ -72,9 +71,9 @@ def standstill_resistances(working: Working) -> list[Estimate]:
                 duties[row] += drives.read(FLUX_SUM) / (READINGS * 32768.0 * 256.0)
                 errors[row] += drives.read(FLUX_ERROR) * (1e-3 / READINGS)
             currents[row] = raw * 1e-3
-            angles[row] = working.angle(drives.read(POSITION))
+            angles[row] = working.angle(drives.read(cia402.POSITION_ACTUAL))
         field = drives.read(FIELD_ANGLE) * (2.0 * np.pi / 65536.0)
-        alive = still_enabled(working, drives.read(STATUS))
+        alive = still_enabled(working, drives.read(cia402.STATUSWORD))
     finally:
         switch_off(drives, where)
         drives.write(OPEN_LOOP_CURRENT, 0, where=where)

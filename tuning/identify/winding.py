@@ -20,22 +20,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.dead_time import dead_time
 from tuning.identify.identification import Estimate, refused
-from tuning.identify.working_state import (
-    CURRENT,
-    CYCLE,
-    POSITION,
-    STATUS,
-    TARGET_TORQUE,
-    TORQUE_I,
-    TORQUE_P,
-    TORQUE_SUM,
-    Working,
-    still_enabled,
-)
+from tuning.identify.working_state import CYCLE, TORQUE_I, TORQUE_P, TORQUE_SUM, Working, still_enabled
 from tuning.stop_causes import stop_causes
 
 Floats = NDArray[np.float64]
@@ -115,7 +104,7 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
         demand = np.zeros((rows, count))
         current, angle, duty_sum = (np.zeros((rows + 1, count)) for _ in range(3))
         duty_sum[0] = drives.read(TORQUE_SUM)
-        angle[0] = working.angle(drives.read(POSITION))
+        angle[0] = working.angle(drives.read(cia402.POSITION_ACTUAL))
         times = np.zeros(rows + 1)
         times[0] = time.perf_counter()
         for k in range(rows):
@@ -124,16 +113,18 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
             asked = np.clip(holding + played[k] * room + steer, -working.current, working.current)
             raw = np.where(working.where, np.rint(1e3 * asked), 0).astype(np.int64)
             demand[k] = raw * 1e-3
-            trace = drives.record([POSITION, CURRENT], CYCLE, play={TARGET_TORQUE: raw[None, :]})
-            current[k] = trace[CURRENT][0] * 1e-3
+            trace = drives.record(
+                [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL], CYCLE, play={cia402.TARGET_TORQUE: raw[None, :]}
+            )
+            current[k] = trace[cia402.TORQUE_ACTUAL][0] * 1e-3
             duty_sum[k + 1] = drives.read(TORQUE_SUM)
-            angle[k + 1] = working.angle(drives.read(POSITION))
+            angle[k + 1] = working.angle(drives.read(cia402.POSITION_ACTUAL))
             times[k + 1] = time.perf_counter()
         late = float(np.mean(np.diff(times) > LATE * CYCLE)) if in_real_time else 0.0
         if late > MOST_LATE:
             break
-    current[rows] = drives.read(CURRENT) * 1e-3
-    alive = still_enabled(working, drives.read(STATUS))
+    current[rows] = drives.read(cia402.TORQUE_ACTUAL) * 1e-3
+    alive = still_enabled(working, drives.read(cia402.STATUSWORD))
     step = (times[-1] - times[0]) / rows if late > MOST_LATE else CYCLE
     return Pulses(demand, current, angle, duty_sum / (32768.0 * 256.0), blocks[:rows], alive, step)
 
@@ -407,5 +398,5 @@ def _none(reason: str) -> Winding:
 def to_torque_mode(working: Working, holding: Floats) -> None:
     """Go from a velocity mode to cst, with the currents that hold the axes [A]."""
     drives = working.target.drives
-    drives.write(TARGET_TORQUE, np.rint(1e3 * holding).astype(np.int64), where=working.where)
+    drives.write(cia402.TARGET_TORQUE, np.rint(1e3 * holding).astype(np.int64), where=working.where)
     motion.select_mode(drives, "cst", working.where)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.gains import GAIN_OBJECTS, gains_from_bandwidths, write_gains
 from drive_env.motors import Motor
 from tuning.target import Target
@@ -25,18 +25,18 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 CYCLE = 0.001  # s
-POSITION, VELOCITY, CURRENT, DEMANDED = 0x6064, 0x606C, 0x6077, 0x6062
-TARGET_TORQUE, TARGET_VELOCITY, TARGET_POSITION, STATUS = 0x6071, 0x60FF, 0x607A, 0x6041
 TORQUE_P, TORQUE_I, TORQUE_SUM = (0x2041, 1), (0x2041, 2), (0x2041, 4)
 MOTOR_TYPE, COMMUTATION, POLE_PAIRS, OPEN_LOOP_CURRENT = 0x2050, 0x2055, 0x2056, 0x2004
 MAX_CURRENT, ENCODER_DIRECTION, ENCODER_STEPS, SHAFT_DIRECTION = 0x2003, (0x2080, 1), (0x2080, 2), 0x2057
-FOLLOWING_WINDOW, LIMIT_SWITCHES, INPUTS, MOTOR_FLAGS, INIT_MODE = 0x6065, 0x2005, 0x60FD, 0x2101, (0x2080, 3)
+LIMIT_SWITCHES, MOTOR_FLAGS, INIT_MODE = 0x2005, 0x2101, (0x2080, 3)
 BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
 STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is aligned
 # What experiments change, in the order in which it is given back.
 CHANGED = (
-    MAX_CURRENT, OPEN_LOOP_CURRENT, *GAIN_OBJECTS, MOTOR_TYPE, COMMUTATION, POLE_PAIRS, ENCODER_STEPS, 0x6083, 0x6084,
-    0x6085, FOLLOWING_WINDOW, LIMIT_SWITCHES, TARGET_VELOCITY, TARGET_POSITION, TARGET_TORQUE, (0x60C2, 1), (0x60C2, 2),
+    MAX_CURRENT, OPEN_LOOP_CURRENT, *GAIN_OBJECTS, MOTOR_TYPE, COMMUTATION, POLE_PAIRS, ENCODER_STEPS,
+    cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION, cia402.FOLLOWING_WINDOW,
+    LIMIT_SWITCHES, cia402.TARGET_VELOCITY, cia402.TARGET_POSITION, cia402.TARGET_TORQUE,
+    (cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2),
 )  # fmt: skip
 BRUSHED, BRUSHLESS = 1, 3  # 2050h
 BY_FIELD, BY_ENCODER = 1, 3  # 2055h
@@ -83,7 +83,7 @@ class Working:
 
     def room(self) -> tuple[Floats, Floats]:
         """Return how far the rotors may turn from where they are now [rad], down and up."""
-        here = self.angle(self.target.drives.read(POSITION))
+        here = self.angle(self.target.drives.read(cia402.POSITION_ACTUAL))
         return self.target.low - here, self.target.high - here
 
 
@@ -114,14 +114,14 @@ def working_state(target: Target, where: Mask | None = None) -> Iterator[Working
     """
     drives = target.drives
     axes = np.ones(target.num_axes, bool) if where is None else where
-    status = drives.read(STATUS)
-    enabled = axes & (status & motion.OPERATION_ENABLED[0] == motion.OPERATION_ENABLED[1])
+    status = drives.read(cia402.STATUSWORD)
+    enabled = axes & cia402.matches(status, cia402.OPERATION_ENABLED)
     if enabled.any():
         raise RuntimeError(
             f"axis {int(np.flatnonzero(enabled)[0])} is enabled: disable it, identification begins with a drive at rest"
         )
     before = {key: drives.read(key) for key in CHANGED}
-    mode = drives.read(0x6060)
+    mode = drives.read(cia402.MODE)
     try:
         yield _prepare(target, axes, before)
     finally:
@@ -140,19 +140,19 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
         drives.write(ENCODER_STEPS, motor.encoder_counts, where=fresh)
         drives.write(COMMUTATION, BY_ENCODER, where=fresh)
         # No axis is at both ends: switches that say so are not there.
-        unwired = fresh & (drives.read(INPUTS) & BOTH_ENDS == BOTH_ENDS)
+        unwired = fresh & (drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
         drives.write(LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
     own = before[MAX_CURRENT] * 1e-3
     current = np.where(own > 0.0, np.minimum(own, target.current), target.current)
     drives.write(MAX_CURRENT, np.rint(current * 1e3).astype(np.int64), where=axes)
     scale = increments
-    for ramp in (0x6083, 0x6084, 0x6085):
+    for ramp in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         drives.write(ramp, _raw(10.0 * target.speed * scale), where=axes)
     # Slow loops lag by turns: what the experiments allow is watched by them, not by this window.
-    drives.write(FOLLOWING_WINDOW, _raw(200.0 * math.pi * scale), where=axes)
-    drives.write((0x60C2, 1), 1, where=axes)
-    drives.write((0x60C2, 2), -3, where=axes)
-    return Working(target, axes, drives.read(POSITION), increments, current)
+    drives.write(cia402.FOLLOWING_WINDOW, _raw(200.0 * math.pi * scale), where=axes)
+    drives.write((cia402.INTERPOLATION_PERIOD, 1), 1, where=axes)
+    drives.write((cia402.INTERPOLATION_PERIOD, 2), -3, where=axes)
+    return Working(target, axes, drives.read(cia402.POSITION_ACTUAL), increments, current)
 
 
 def _give_back(target: Target, axes: Mask, before: Mapping[Any, Integers], mode: Integers) -> None:
@@ -162,9 +162,9 @@ def _give_back(target: Target, axes: Mask, before: Mapping[Any, Integers], mode:
         changed = axes & (drives.read(key) != before[key])
         if changed.any():
             drives.write(key, before[key], where=changed)
-    other = axes & (drives.read(0x6060) != mode)
+    other = axes & (drives.read(cia402.MODE) != mode)
     if other.any():
-        drives.write(0x6060, mode, where=other)
+        drives.write(cia402.MODE, mode, where=other)
 
 
 def enable(working: Working, mode: str, where: Mask | None = None) -> None:
@@ -175,8 +175,8 @@ def enable(working: Working, mode: str, where: Mask | None = None) -> None:
     """
     drives = working.target.drives
     axes = working.where if where is None else where
-    drives.write(TARGET_VELOCITY, 0, where=axes)
-    drives.write(TARGET_TORQUE, 0, where=axes)
+    drives.write(cia402.TARGET_VELOCITY, 0, where=axes)
+    drives.write(cia402.TARGET_TORQUE, 0, where=axes)
     try:
         motion.enable(drives, mode=mode, where=axes, timeout=ENABLE_TIME)
         waited = 0.0
@@ -197,7 +197,7 @@ def go_back(working: Working, mode: str, to: ArrayLike | None = None) -> None:
     target, drives = working.target, working.target.drives
     motion.select_mode(drives, "csp", working.where)
     goal = working.base if to is None else np.asarray(to, float)
-    here = working.angle(drives.read(POSITION)) - goal
+    here = working.angle(drives.read(cia402.POSITION_ACTUAL)) - goal
     # As slow as the axis farthest away needs it: the path's peak is twice its mean.
     cycles = int(
         np.clip(np.ceil(2.0 * np.abs(here[working.where]).max() / (RETURN_SPEED * target.speed) / CYCLE), 60, 2000)
@@ -205,21 +205,20 @@ def go_back(working: Working, mode: str, to: ArrayLike | None = None) -> None:
     left = 0.5 + 0.5 * np.cos(np.pi * (np.arange(cycles) + 1.0) / cycles)
     path = working.origin + (goal + here * np.concatenate([left, np.zeros(REST)])[:, None]) * working.increments
     raw = ((np.rint(path) + 2.0**31) % 2.0**32 - 2.0**31).astype(np.int64)
-    drives.record([POSITION], len(raw) * CYCLE, play={TARGET_POSITION: raw})
-    drives.write(TARGET_VELOCITY, 0, where=working.where)
+    drives.record([cia402.POSITION_ACTUAL], len(raw) * CYCLE, play={cia402.TARGET_POSITION: raw})
+    drives.write(cia402.TARGET_VELOCITY, 0, where=working.where)
     motion.select_mode(drives, mode, working.where)
 
 
 def switch_off(drives: motion.Drives, where: Mask) -> None:
     """Switch axes off; one in fault is off already, and its fault stays, to be read and reset by who wants."""
-    fault = drives.read(STATUS) & motion.FAULT_BIT[0] == motion.FAULT_BIT[1]
+    fault = cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
     motion.disable(drives, where & ~fault)
 
 
 def still_enabled(working: Working, status: Integers) -> Mask:
     """Return which axes are in operation enabled by their statuswords."""
-    mask, value = motion.OPERATION_ENABLED
-    return np.asarray((status & mask) == value)
+    return np.asarray(cia402.matches(status, cia402.OPERATION_ENABLED))
 
 
 def _raw(values: Floats) -> Integers:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env import motion
+from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
 from drive_env.trials.positioning import wrapped
 from tuning.response.excitation import Lines, periodic
@@ -25,12 +25,14 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-POSITION, VELOCITY, CURRENT, STATUS = 0x6064, 0x606C, 0x6077, 0x6041
-SET_POINT = {"velocity": (0x60FF, 0), "position": (0x607A, 0)}
-OFFSET = {"velocity": (0x60B1, 0), "position": (0x60B0, 0)}  # what the drive adds to the set-point
-SEEN = {"velocity": VELOCITY, "position": POSITION}
+SET_POINT = {"velocity": (cia402.TARGET_VELOCITY, 0), "position": (cia402.TARGET_POSITION, 0)}
+OFFSET = {
+    "velocity": (cia402.VELOCITY_OFFSET, 0),
+    "position": (cia402.POSITION_OFFSET, 0),
+}  # what the drive adds to the set-point
+SEEN = {"velocity": cia402.VELOCITY_ACTUAL, "position": cia402.POSITION_ACTUAL}
 MODE = {"velocity": "csv", "position": "csp"}
-INTERPOLATION = ((0x60C2, 1), (0x60C2, 2))
+INTERPOLATION = ((cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2))
 CYCLE = 0.001  # s
 RAMP, SETTLING = 30, 70  # cycles: of a change of speed, and until what it left has died away
 FADE = 20  # cycles
@@ -81,33 +83,31 @@ class Shaker:
 
     def __enter__(self) -> Shaker:
         drives, where = self._drives, self._where
-        mask, value = motion.OPERATION_ENABLED
-        self._were_on = drives.read(STATUS) & mask == value
-        self._modes = drives.read(0x6060)
+        self._were_on = _enabled(drives)
+        self._modes = drives.read(cia402.MODE)
         self._interpolation = [drives.read(name) for name in INTERPOLATION]
         # A set-point is reached within a millisecond, which is when the next comes.
         for name, value in zip(INTERPOLATION, (1, -3), strict=True):
             drives.write(name, value, where=where)
         self._offset = np.asarray(drives.read(OFFSET[self._loop]), float)
         motion.enable(drives, mode=MODE[self._loop], where=where)
-        self._origin = drives.read(POSITION)
+        self._origin = drives.read(cia402.POSITION_ACTUAL)
         return self
 
     def __exit__(self, *error: Any) -> None:
         drives, where = self._drives, self._where
-        mask, value = motion.OPERATION_ENABLED
-        running = where & (drives.read(STATUS) & mask == value)
+        running = where & _enabled(drives)
         if running.any() and error[0] is None:
             self._go_back(running)
         off = where & ~self._were_on
         if off.any():
-            motion.disable(drives, where=off & (drives.read(STATUS) & mask == value))
+            motion.disable(drives, where=off & _enabled(drives))
         for name, values in zip(INTERPOLATION, self._interpolation, strict=True):
             drives.write(name, values, where=where)
         for mode in np.unique(self._modes[where]):
-            changed = where & (self._modes == mode) & (drives.read(0x6060) != mode)
+            changed = where & (self._modes == mode) & (drives.read(cia402.MODE) != mode)
             if mode and changed.any():
-                drives.write(0x6060, mode, where=changed)
+                drives.write(cia402.MODE, mode, where=changed)
 
     def run(self, amplitude: Floats, speed: Floats, passes: int, periods: int, *, traced: bool = False) -> Pass:
         """Run there and back; the axes end at rest.
@@ -149,10 +149,10 @@ class Shaker:
         return Pass(
             played[chosen],
             (answer * self.radians - path)[chosen],
-            np.asarray(seen[CURRENT][chosen] * 1e-3),
+            np.asarray(seen[cia402.TORQUE_ACTUAL][chosen] * 1e-3),
             quick[0],
             quick[1],
-            np.abs(seen[CURRENT]).max(axis=0) * 1e-3,
+            np.abs(seen[cia402.TORQUE_ACTUAL]).max(axis=0) * 1e-3,
             enabled,
         )
 
@@ -174,7 +174,7 @@ class Shaker:
         return np.concatenate(rows), np.concatenate(inside)
 
     def _position(self, velocity: Floats) -> Floats:
-        start = self._drives.read(POSITION) * self.radians
+        start = self._drives.read(cia402.POSITION_ACTUAL) * self.radians
         return np.asarray(start + np.cumsum(velocity, axis=0) * CYCLE)
 
     def _play(self, raw: Integers, traced: bool) -> tuple[dict[int, Integers], tuple[Floats, Floats] | None, Mask]:
@@ -183,10 +183,13 @@ class Shaker:
         rest = self._drives.read(name)
         play: dict[ObjectName, ArrayLike] = {name: np.where(self._where, raw, rest)}
         if not traced:
-            objects = [SEEN[self._loop], CURRENT, STATUS]
+            objects = [SEEN[self._loop], cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
             trace = self._drives.record(objects, duration, play)
-            mask, value = motion.OPERATION_ENABLED
-            return {key: trace[key] for key in objects[:2]}, None, (trace[STATUS] & mask == value).all(axis=0)
+            return (
+                {key: trace[key] for key in objects[:2]},
+                None,
+                cia402.matches(trace[cia402.STATUSWORD], cia402.OPERATION_ENABLED).all(axis=0),
+            )
         from drive_env.emulator.loop_trace import trace_loops
 
         self.traced_time += duration
@@ -195,16 +198,14 @@ class Shaker:
         fast = trace_loops(self._drives, [*names, "torque_meas"], duration, play).signals
         windows = len(fast[names[0]]) // len(raw)
         seen = {SEEN[self._loop]: np.rint(fast[names[1]][::windows] / self.radians).astype(np.int64)}
-        seen[CURRENT] = np.rint(fast["torque_meas"][::windows] * 1e3).astype(np.int64)
-        mask, value = motion.OPERATION_ENABLED
-        enabled = self._drives.read(STATUS) & mask == value
-        return seen, (fast[names[0]], fast[names[1]]), enabled
+        seen[cia402.TORQUE_ACTUAL] = np.rint(fast["torque_meas"][::windows] * 1e3).astype(np.int64)
+        return seen, (fast[names[0]], fast[names[1]]), _enabled(self._drives)
 
     def _go_back(self, where: Mask) -> None:
         """Bring the axes near to where they began."""
         drives = self._drives
         drives.advance(REST * CYCLE)
-        off = wrapped(drives.read(POSITION) - self._origin) * self.radians * where * BACK
+        off = wrapped(drives.read(cia402.POSITION_ACTUAL) - self._origin) * self.radians * where * BACK
         if np.abs(off).max() < NEAR:
             return
         cycles = max(RETURN, math.ceil(float((np.abs(off) / self.fastest).max()) * 2.0 / CYCLE))
@@ -217,14 +218,14 @@ class Shaker:
         path = velocity if self._loop == "velocity" else self._position(velocity)
         name = SET_POINT[self._loop]
         raw = np.rint(path / self.radians - self._offset).astype(np.int64)
-        drives.record([POSITION], len(raw) * CYCLE, {name: np.where(where, raw, drives.read(name))})
+        drives.record([cia402.POSITION_ACTUAL], len(raw) * CYCLE, {name: np.where(where, raw, drives.read(name))})
 
 
 @contextmanager
 def at_rest(target: Target, loop: str, where: Mask) -> Iterator[None]:
     """Have axes enabled meanwhile, in the mode of a loop, so that each holds its place while another one is shaken."""
     drives = target.drives
-    modes, off = drives.read(0x6060), where & ~_enabled(drives)
+    modes, off = drives.read(cia402.MODE), where & ~_enabled(drives)
     if loop == "velocity" and off.any():
         drives.write(SET_POINT[loop], 0, where=off)
     motion.enable(drives, mode=MODE[loop], where=where)
@@ -234,9 +235,9 @@ def at_rest(target: Target, loop: str, where: Mask) -> Iterator[None]:
         if (now := off & _enabled(drives)).any():
             motion.disable(drives, where=now)
         for mode in np.unique(modes[where]):
-            changed = where & (modes == mode) & (drives.read(0x6060) != mode)
+            changed = where & (modes == mode) & (drives.read(cia402.MODE) != mode)
             if mode and changed.any():
-                drives.write(0x6060, mode, where=changed)
+                drives.write(cia402.MODE, mode, where=changed)
 
 
 @contextmanager
@@ -259,5 +260,4 @@ def let_go(target: Target, where: Mask, shaken: Mask) -> Iterator[None]:
 
 
 def _enabled(drives: motion.Drives) -> Mask:
-    mask, value = motion.OPERATION_ENABLED
-    return np.asarray(drives.read(STATUS) & mask == value)
+    return np.asarray(cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED))

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
-from drive_env.trials.positioning import CURRENT, CYCLE, POSITION, VELOCITY, wrapped
+from drive_env import cia402, motion
+from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.rules.lags import slow_enough, velocity_lag
 from tuning.rules.optima import take_current
 from tuning.rules.proposal import Proposal, Workbench
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-TARGET_TORQUE, CURRENT_LIMIT, STATUS = 0x6071, 0x2003, 0x6041
+CURRENT_LIMIT = 0x2003
 TIME, TRANSIENT = 0.3, 0.1  # of the experiment, and of it what is left out at its beginning [s]
 SHARE = 0.4  # of the rated current, at least: the relay's height
 # Of the drive's current limit, at most: an envelope takes half of it, swung through, for a shaking loop.
@@ -139,9 +139,9 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
     height = np.minimum(
         np.maximum(SHARE * target.motor.rated_current, OVER_FRICTION * dry), np.minimum(limit, target.current)
     )
-    scale, origin = target.increments(), drives.read(POSITION)
+    scale, origin = target.increments(), drives.read(cia402.POSITION_ACTUAL)
     low, high = TRAVEL_SHARE * target.low * scale, TRAVEL_SHARE * target.high * scale
-    drives.write(TARGET_TORQUE, 0, where=axes)
+    drives.write(cia402.TARGET_TORQUE, 0, where=axes)
     motion.enable(drives, mode="cst", where=axes)
     cycles = round(TIME / CYCLE)
     speed, current = np.zeros((cycles, n)), np.zeros((cycles, n))
@@ -150,17 +150,19 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
     torque = np.where(inside, height, 0.0)
     try:
         for k in range(cycles):
-            played = {TARGET_TORQUE: np.rint(1e3 * torque)[None].astype(np.int64)}
-            trace = drives.record([VELOCITY, CURRENT, POSITION], CYCLE, play=played)
-            speed[k] = trace[VELOCITY][0] / scale
-            current[k] = trace[CURRENT][0] * 1e-3
-            way = wrapped(trace[POSITION][0] - origin)
+            played = {cia402.TARGET_TORQUE: np.rint(1e3 * torque)[None].astype(np.int64)}
+            trace = drives.record(
+                [cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL, cia402.POSITION_ACTUAL], CYCLE, play=played
+            )
+            speed[k] = trace[cia402.VELOCITY_ACTUAL][0] / scale
+            current[k] = trace[cia402.TORQUE_ACTUAL][0] * 1e-3
+            way = wrapped(trace[cia402.POSITION_ACTUAL][0] - origin)
             inside &= (way > low) & (way < high)
             # A constant load shifts the swing; what holds it is the mean current that keeps the mean speed at 0.
             bias += np.where(inside, -0.02 * height * np.tanh(way / (0.05 * 2.0 * math.pi * scale)), 0.0)
             bias = np.clip(bias, -0.5 * height, 0.5 * height)
             torque = np.where(inside, bias - height * np.sign(speed[k] + (speed[k] == 0.0)), 0.0)
-        drives.record([VELOCITY], 5 * CYCLE, play={TARGET_TORQUE: np.zeros((5, n), np.int64)})
+        drives.record([cia402.VELOCITY_ACTUAL], 5 * CYCLE, play={cia402.TARGET_TORQUE: np.zeros((5, n), np.int64)})
     finally:
         motion.disable(drives, where=axes)
     count = 2.0 * math.pi / target.motor.encoder_counts

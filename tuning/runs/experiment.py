@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
@@ -29,7 +30,11 @@ MAX_POINTS = 262_144
 MAX_DURATION = 60.0  # s
 MIN_SAMPLES = 20  # in each of the two windows; fewer say nothing about ringing
 GAIN_UNITS = frozenset({"current P", "velocity P", "position P", "I"})  # of dictionary/units.py
-POSITION_SCALER, TARGET_VELOCITY, ACCELERATION = (0x2058, 0), (0x60FF, 0), (0x6083, 0)
+POSITION_SCALER, TARGET_VELOCITY, ACCELERATION = (
+    (0x2058, 0),
+    (cia402.TARGET_VELOCITY, 0),
+    (cia402.PROFILE_ACCELERATION, 0),
+)
 _INDEX = re.compile(r"(?:0x)?([0-9a-f]{4})h?:(?:0x)?([0-9a-f]{1,2})h?", re.IGNORECASE)
 _SPACINGS = ("lin", "log")
 _PAIRS = (("velocity_rpm", "velocity_pps"), ("acceleration_rpm_per_s", "acceleration_pps2"))

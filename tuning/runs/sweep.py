@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import EmulatedDrives, motion
+from drive_env import EmulatedDrives, cia402, motion
 from drive_env.drives.trace import Trace
 from mechanics.loads import find_load
 from mechanics.model import COPIES_PER_MODEL
@@ -28,7 +28,7 @@ from tuning.runs.metrics import Recording
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
 
-VELOCITY, CURRENT, CURRENT_LIMIT = 0x606C, 0x6077, 0x2003
+CURRENT_LIMIT = 0x2003
 FLAGS = ("diverged", "oscillates", "fault")
 PIECE = 0.02  # s of simulation between two reports of progress
 MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
@@ -271,7 +271,7 @@ def _compile(experiment: Experiment) -> None:
     """Compile the kernels, or load them, here and now: from a thread, Ctrl-C would have to wait for the compiler."""
     with _machines(experiment, 1, 1) as drives:
         motion.enable(drives, mode="pv")
-        drives.record([VELOCITY, CURRENT], 0.001)
+        drives.record([cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL], 0.001)
 
 
 def _machines(experiment: Experiment, count: int, num_threads: int | None) -> EmulatedDrives:
@@ -297,18 +297,22 @@ def _record(
     excitation = experiment.excitation
     # Enabled with the preset's gains, which are stable, so that the point's gains meet every axis in the same state.
     motion.enable(drives, mode="pv")
-    drives.write((0x6083, 0), resolved.acceleration)
+    drives.write((cia402.PROFILE_ACCELERATION, 0), resolved.acceleration)
     for column, entry in enumerate(resolved.entries):
         drives.write((entry.index, entry.sub), np.repeat(points[:, column], drives.num_axes // len(points)))
     traces: list[Trace] = []
     for start, end in _pieces(excitation.velocity_time, excitation.load_time, excitation.duration, PIECE,
                               excitation.sampling_period):  # fmt: skip
         if start == excitation.velocity_time:
-            drives.write(0x60FF, resolved.velocity)
+            drives.write(cia402.TARGET_VELOCITY, resolved.velocity)
         if start == excitation.load_time:
             drives.machine.load_torque = excitation.load_torque
         period = excitation.sampling_period
-        traces.append(drives.record([VELOCITY, CURRENT], round((end - start) / period) * period, period=period))
+        traces.append(
+            drives.record(
+                [cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL], round((end - start) / period) * period, period=period
+            )
+        )
         report(end / excitation.duration)
     t = np.arange(sum(map(len, traces)), dtype=np.float64) * excitation.sampling_period
     rpm = 60.0 / resolved.position_scaler
@@ -316,14 +320,13 @@ def _record(
     recording = Recording(
         t=t,
         reference_rpm=np.sign(resolved.velocity) * ramp * rpm,
-        speed_rpm=np.concatenate([trace[VELOCITY] for trace in traces]) * rpm,
-        current=np.concatenate([trace[CURRENT] for trace in traces]) * 1e-3,
+        speed_rpm=np.concatenate([trace[cia402.VELOCITY_ACTUAL] for trace in traces]) * rpm,
+        current=np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * 1e-3,
         current_limit=drives.read(CURRENT_LIMIT).astype(np.float64) * 1e-3,
         t_step=excitation.velocity_time,
         t_load=excitation.load_time,
     )
-    mask, value = motion.FAULT_BIT  # fault, or the reaction that leads to it
-    tripped = drives.read(0x6041) & mask == value
+    tripped = cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
     for message in drives.emergencies():
         tripped[message.axis] = True  # a limit of travel too: what follows it says nothing of the gains
     return recording, tripped

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import cia402
 from drive_env.gains import (
     FITTED_RULE,
     GAIN_OBJECTS,
@@ -24,17 +25,7 @@ from drive_env.gains import (
 )
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.gain_trial import Identified, Trial, Trials, measured_cost, softness
-from drive_env.trials.positioning import (
-    CYCLE,
-    POSITION,
-    PROFILE,
-    SETTLED,
-    TRIAL,
-    plan_move,
-    start,
-    wrapped,
-    write_profile,
-)
+from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, plan_move, start, wrapped, write_profile
 from drive_env.trials.score import TRIP, cost
 from tuning.auto.fallback_gains import CalmedDrives
 from tuning.oscillation_watch import SOFTER, VELOCITY_P, OscillationError, WatchedDrives
@@ -107,7 +98,10 @@ class TrialBench:
         self._where = np.ones(target.num_axes, bool)
         self._direction = np.ones(target.num_axes, np.int64)
         self._was_enabled = ~self._trials.down()
-        self._profile = {name: target.drives.read(name) for name in (0x6081, 0x6083, 0x6084)}
+        self._profile = {
+            name: target.drives.read(name)
+            for name in (cia402.PROFILE_VELOCITY, cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION)
+        }
         self._stops = 0
 
     def identify(self) -> None:
@@ -138,7 +132,7 @@ class TrialBench:
         noise = target.device.stage["adc_noise"].high
         scaler = drives.read((0x2058, 0))
         for _ in range(SOFTENINGS):
-            began = drives.read(POSITION)
+            began = drives.read(cia402.POSITION_ACTUAL)
             watched = WatchedDrives(self._drives, self._where, np.full(target.num_axes, target.current), noise)
             trials = Trials(watched, target.motor, target.axes_per_machine, self.t_0)
             self.moves += MOVES_OF_IDENTIFICATION
@@ -150,7 +144,7 @@ class TrialBench:
             write_gains(drives, gains, watched.swung)
             self._trials.recover(self._where)
             drives.advance(CALM)
-            self._reach = self._reach - wrapped(drives.read(POSITION) - began) / scaler * 2.0 * np.pi
+            self._reach = self._reach - wrapped(drives.read(cia402.POSITION_ACTUAL) - began) / scaler * 2.0 * np.pi
         axis = int(np.flatnonzero(watched.swung)[0])
         raise RuntimeError(
             f"axis {axis} oscillates in the moves of identification, even with 1/{SOFTER ** (SOFTENINGS - 1)} of the "
@@ -239,7 +233,9 @@ class TrialBench:
         for name, values in self._profile.items():
             drives.write(name, values)
         if (off := ~self._was_enabled).any():
-            drives.write(0x6040, 0x06, where=off)  # shutdown: a set-point is not taken up again when enabled anew
+            drives.write(
+                cia402.CONTROLWORD, cia402.SHUTDOWN, where=off
+            )  # shutdown: a set-point is not taken up again when enabled anew
 
     def _start_trial(self) -> None:
         if self._anew:
@@ -249,7 +245,7 @@ class TrialBench:
     def _return(self, axes: Mask) -> None:
         """Bring axes back with the incumbent that are not where the next trial starts: one tripped, and fell or ran."""
         drives = self.target.drives
-        way = np.abs(wrapped(drives.read(POSITION) - self._origin))
+        way = np.abs(wrapped(drives.read(cia402.POSITION_ACTUAL) - self._origin))
         astray = axes & (way > ASTRAY * np.maximum(np.abs(self.move.distance), 1))
         if not astray.any():
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from drive_env import cia402
 from drive_env.firmware import alignment, fsa, profiles, protection
 from drive_env.firmware.modes import csp, cst, csv, cyclic, hm, idle, pp, pv
 from mechanics.compiled import stage
@@ -21,14 +22,14 @@ class Mode(NamedTuple):
 
 MODES = (
     Mode(0, "no", "No mode", None, 1),
-    Mode(1, "pp", "Profile position mode", 0, 2),
-    Mode(3, "pv", "Profile velocity mode", 2, 1),
-    Mode(6, "hm", "Homing mode", 5, 2),
-    Mode(8, "csp", "Cyclic synchronous position mode", 7, 2),
-    Mode(9, "csv", "Cyclic synchronous velocity mode", 8, 1),
-    Mode(10, "cst", "Cyclic synchronous torque mode", 9, 0),
+    Mode(cia402.PP, "pp", "Profile position mode", 0, 2),
+    Mode(cia402.PV, "pv", "Profile velocity mode", 2, 1),
+    Mode(cia402.HM, "hm", "Homing mode", 5, 2),
+    Mode(cia402.CSP, "csp", "Cyclic synchronous position mode", 7, 2),
+    Mode(cia402.CSV, "csv", "Cyclic synchronous velocity mode", 8, 1),
+    Mode(cia402.CST, "cst", "Cyclic synchronous torque mode", 9, 0),
 )
-PP, PV, HM, CSP, CSV, CST = 1, 3, 6, 8, 9, 10
+PP, PV, HM, CSP, CSV, CST = cia402.PP, cia402.PV, cia402.HM, cia402.CSP, cia402.CSV, cia402.CST
 
 
 @stage
@@ -176,7 +177,7 @@ def generate_demand(drive, lane, dt):
         return
     if mode != PP and mode != CSP:
         drive.internal_limit[lane] = 0
-    halted = (drive.controlword[lane] & fsa.BIT_HALT) != 0
+    halted = (drive.controlword[lane] & cia402.HALT) != 0
     if drive.stopping[lane] == 1:
         brake(drive, lane, stop_ramp(drive, lane), dt)
         drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
@@ -216,7 +217,7 @@ def mode_bits(drive, lane):
         if (
             drive.fsa[lane] == fsa.ENABLED
             and drive.stopping[lane] == 0
-            and (drive.controlword[lane] & fsa.BIT_HALT) == 0
+            and (drive.controlword[lane] & cia402.HALT) == 0
             and not is_blocked(drive, lane)
         ):
             bits |= 0x1000

@@ -13,6 +13,7 @@ edge as the methods have them:
 
 from __future__ import annotations
 
+from drive_env import cia402
 from drive_env.firmware import fsa, inputs, profiles, sensors
 from drive_env.firmware.arithmetic import TWO_PI
 from mechanics.compiled import stage
@@ -43,7 +44,7 @@ def _search_sign(method):
 def start_or_stop(drive, lane, word_before):
     """Start homing on the rising edge of controlword bit 4, stop it on the falling one."""
     word = drive.controlword[lane]
-    if word & fsa.BIT_NEW_SET_POINT and not word_before & fsa.BIT_NEW_SET_POINT:
+    if word & cia402.NEW_SET_POINT and not word_before & cia402.NEW_SET_POINT:
         drive.homing_attained[lane] = 0
         drive.target_reached[lane] = 0
         method = drive.homing_method[lane]
@@ -63,7 +64,7 @@ def start_or_stop(drive, lane, word_before):
             )
             drive.homing_state[lane] = FAILED if method == 0 or unable else SEARCH
             drive.target_reached[lane] = 1 if drive.homing_state[lane] == FAILED else 0
-    elif not word & fsa.BIT_NEW_SET_POINT and SEARCH <= drive.homing_state[lane] <= RETURN:
+    elif not word & cia402.NEW_SET_POINT and SEARCH <= drive.homing_state[lane] <= RETURN:
         drive.homing_state[lane] = STOPPED
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from drive_env import cia402
 from drive_env.firmware import fsa, profiles
 from drive_env.firmware.protection import ROUNDING, corrected_maximum, corrected_minimum
 from mechanics.compiled import stage
@@ -14,13 +15,13 @@ def new_set_point(drive, lane, word_before):
     There is no "change immediately" on this drive: a new edge plans anew from where the axis is.
     """
     word = drive.controlword[lane]
-    if not word & fsa.BIT_NEW_SET_POINT:
+    if not word & cia402.NEW_SET_POINT:
         drive.set_point_acknowledged[lane] = 0
         return
-    if word_before & fsa.BIT_NEW_SET_POINT or drive.fsa[lane] != fsa.ENABLED or drive.stopping[lane] == 1:
+    if word_before & cia402.NEW_SET_POINT or drive.fsa[lane] != fsa.ENABLED or drive.stopping[lane] == 1:
         return
     target = drive.target_position[lane]
-    if word & fsa.BIT_RELATIVE:
+    if word & cia402.RELATIVE:
         option = drive.positioning_option[lane] & 3
         if option == 0:
             target += drive.profile_target[lane] if drive.set_point_valid[lane] else drive.position_demand[lane]

@@ -11,9 +11,11 @@ from __future__ import annotations
 from functools import cache
 from typing import NamedTuple
 
+from drive_env import cia402
 from drive_env.canopen.nmt import SERVICES, Command
 from drive_env.canopen.nmt import State as Nmt
-from drive_env.firmware.fsa import AUTOMATIC_TRANSITIONS, BIT_FAULT_RESET, TRANSITIONS, State
+from drive_env.cia402 import State
+from drive_env.firmware.fsa import AUTOMATIC_TRANSITIONS, TRANSITIONS
 
 NOBODY = 0  # node-ID in 1016h: no node is watched
 LIVE = frozenset({State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE})
@@ -58,7 +60,7 @@ class Drive(NamedTuple):
 @cache  # a drive has some hundred states, and each is asked for again and again
 def write_controlword(drive: Drive, word: int) -> Drive:
     """Return the drive after a write of 6040h, which is processed completely at once."""
-    rises = word & BIT_FAULT_RESET and not drive.word & BIT_FAULT_RESET
+    rises = word & cia402.FAULT_RESET and not drive.word & cia402.FAULT_RESET
     drive = drive._replace(word=word)
     if rises and drive.fsa is State.FAULT:
         drive = drive._replace(fsa=State.SWITCH_ON_DISABLED)
@@ -67,7 +69,7 @@ def write_controlword(drive: Drive, word: int) -> Drive:
 
 def _remembering_less(drive: Drive) -> Drive:
     """Return the drive without what of its controlword no longer matters, so that equal futures are equal states."""
-    return drive if drive.ramps else drive._replace(word=drive.word & BIT_FAULT_RESET)
+    return drive if drive.ramps else drive._replace(word=drive.word & cia402.FAULT_RESET)
 
 
 def _command(drive: Drive) -> Drive:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 from drive_env.canopen.nmt import State as Nmt
-from drive_env.firmware.fsa import State as Fsa
+from drive_env.cia402 import State as Fsa
 from drive_env.safety.model.drive import NOBODY, tick
 from drive_env.safety.model.rules import Assumptions, Rules
 from drive_env.safety.model.situation import DRIVE, GONE, LIBRARY, At, Hand, Situation, Step, Stop, beating, beginnings

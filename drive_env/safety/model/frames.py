@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from drive_env.firmware.fsa import State
+from drive_env import cia402
+from drive_env.cia402 import State
 from drive_env.safety.model.drive import latch, write_consumer, write_controlword
 from drive_env.safety.model.rules import Assumptions
 from drive_env.safety.model.situation import ACKNOWLEDGED, GONE, LIBRARY, Hand, Held, Situation, has_sdo, moved
@@ -45,7 +46,7 @@ def transfers(s: Situation, index: int, value: int | None, assumptions: Assumpti
             yield Transfer(LIBRARY, "the node answers no SDO in its NMT state", after, answer)
         return
     done, content = s, object()
-    if index == 0x6040:
+    if index == cia402.CONTROLWORD:
         assert value is not None
         done, content = moved(s, write_controlword(s.drive, value), Hand.OURS), ACKNOWLEDGED
     elif index == 0x1016:
@@ -59,7 +60,7 @@ def transfers(s: Situation, index: int, value: int | None, assumptions: Assumpti
             ("request lost", "the request is lost", s, None, ()),
             ("answer lost", "it acts, and its answer is lost", done, None, ()),
         ]
-        if index == 0x6040:
+        if index == cia402.CONTROLWORD:
             late = (Held("request", value),)
             outcomes += [
                 ("request held", "the request is held back", s, None, late),
@@ -87,7 +88,7 @@ def _answered(s: Situation, index: int, own: object, assumptions: Assumptions) -
     left = s.held if own is None or not assumptions.keeps_order else others
     yield own, s._replace(held=left)
     for k, frame in enumerate(answers):
-        if index != 0x1016 and (frame.content is ACKNOWLEDGED) == (index == 0x6040):
+        if index != 0x1016 and (frame.content is ACKNOWLEDGED) == (index == cia402.CONTROLWORD):
             rest = (*others, *answers[k + 1 :]) + (() if own is None else (Held("answer", own),))
             yield frame.content, s._replace(held=rest)
             return

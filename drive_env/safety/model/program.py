@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from drive_env import cia402
 from drive_env.canopen.nmt import SERVICES, Command
 from drive_env.canopen.nmt import State as Nmt
 from drive_env.firmware.fsa import ENABLE_OPERATION
@@ -70,7 +71,7 @@ def _calls(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
         words = ", ".join(f"{word:02X}h" for word in rows)
         yield from _check(s, rules, "play", f"the program plays 6040h = {words}", rows)
     if s.troubles and not s.held:
-        for kind, text, after, _ in transfers(s, 0x6041, None, assumptions):
+        for kind, text, after, _ in transfers(s, cia402.STATUSWORD, None, assumptions):
             if after.held:
                 yield Step(kind, joined("the program reads 6041h", text), after)
     if s.drive.live:
@@ -154,7 +155,7 @@ def _send(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
     elif s.by_pdo:
         yield from _play_row(s, rules, assumptions)
     else:
-        for kind, text, after, answer in transfers(s, 0x6040, word, assumptions):
+        for kind, text, after, answer in transfers(s, cia402.CONTROLWORD, word, assumptions):
             done = refused(after)
             if answer and rules.live_from == "writes":
                 done = done._replace(believed=_enables((word,)))

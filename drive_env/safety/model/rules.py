@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from drive_env.firmware.fsa import State
+from drive_env.cia402 import State
 
 FIXED_ID, OWN_ID = 127, 126  # under which a master beats: the one of every process, or one that is its own
 

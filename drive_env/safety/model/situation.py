@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 from drive_env.canopen.nmt import SERVICES
 from drive_env.canopen.nmt import State as Nmt
-from drive_env.firmware.fsa import State as Fsa
+from drive_env.cia402 import State as Fsa
 from drive_env.safety.model.drive import NOBODY, Drive
 from drive_env.safety.model.rules import ENABLE, FIXED_ID, OWN_ID, Assumptions, Rules
 

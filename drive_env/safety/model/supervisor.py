@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from drive_env import cia402
 from drive_env.canopen.nmt import State as Nmt
-from drive_env.firmware.fsa import State as Fsa
+from drive_env.cia402 import State as Fsa
 from drive_env.safety.model.frames import named, transfers
 from drive_env.safety.model.rules import DISABLE_VOLTAGE, QUICK_STOP, Assumptions, Rules
 from drive_env.safety.model.situation import (
@@ -33,7 +34,7 @@ def supervisor_steps(s: Situation, rules: Rules, assumptions: Assumptions) -> St
             yield from _look(s, rules)
         elif s.at is At.STALLED and s.believed and not s.lockstep and s.stop is Stop.NONE:
             what = "the lifeline sends a quick stop, and waits for no answer"
-            for kind, text, after, _ in transfers(s, 0x6040, QUICK_STOP, assumptions):
+            for kind, text, after, _ in transfers(s, cia402.CONTROLWORD, QUICK_STOP, assumptions):
                 yield Step(kind, joined(what, text), after._replace(stop=Stop.PROVEN))
 
 
@@ -66,7 +67,7 @@ def _look(s: Situation, rules: Rules) -> Steps:
 
 def _stop(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
     if s.stop is Stop.QUICK:
-        for kind, text, after, answer in transfers(s, 0x6040, QUICK_STOP, assumptions):
+        for kind, text, after, answer in transfers(s, cia402.CONTROLWORD, QUICK_STOP, assumptions):
             # Once in quick stop active it needs nobody any more: a controlword that comes late changes nothing.
             stops = answer is not None and after.drive.fsa is not Fsa.OPERATION_ENABLED
             sent = after._replace(stop=Stop.RAMP, ramped=True, acknowledged=answer is not None)
@@ -81,13 +82,13 @@ def _stop(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
             how = "is not on its ramp" if s.drive.live and s.drive.turns else "stands, or is off"
             yield Step(LIBRARY, f"the stop sees that the axis {how}", s._replace(stop=Stop.CUT))
     elif s.stop is Stop.CUT:
-        for kind, text, after, answer in transfers(s, 0x6040, DISABLE_VOLTAGE, assumptions):
+        for kind, text, after, answer in transfers(s, cia402.CONTROLWORD, DISABLE_VOLTAGE, assumptions):
             then = Stop.PROVEN if rules.gives_up == "always" else Stop.PROVE
             unanswered = answer is None
             done = after._replace(stop=then, acknowledged=not unanswered, interfered=s.interfered and unanswered)
             yield Step(kind, joined("the stop sends 6040h = 00h", text), done)
     elif s.stop is Stop.PROVE:
-        for kind, text, after, answer in transfers(s, 0x6041, None, assumptions):
+        for kind, text, after, answer in transfers(s, cia402.STATUSWORD, None, assumptions):
             what = "the stop reads 6041h" if answer is None else f"the stop reads 6041h: {named(answer)}"
             enough = rules.proof == "read" or s.acknowledged
             if answer in rules.off and enough:
