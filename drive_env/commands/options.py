@@ -72,7 +72,7 @@ def names_a_bus(context: typer.Context) -> bool:
 
 
 def object_name(text: str) -> ObjectName:
-    """Return how the dictionary is asked for an object written as 6041 or 607D:1 (hexadecimal, with 0x or not) or name."""
+    """Return how the dictionary is asked for an object written as 6041, 607D:1 (hexadecimal) or name."""
     found = _INDEX.match(text.strip())
     if found is None:
         return text
