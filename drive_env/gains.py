@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env import motion
 from drive_env.devices import Device
 from drive_env.dictionary.units import RPM
+from drive_env.drives.interface import Drives
 from drive_env.motors import Motor
 
 RAW_MAX = 32767  # the chip's registers are signed
@@ -210,7 +210,7 @@ def scaled(raw: NDArray[Any], factor: ArrayLike) -> NDArray[np.int64]:
     return np.asarray(np.clip(np.rint(raw * np.asarray(factor, float)), 1, RAW_MAX), np.int64)
 
 
-def write_gains(drives: motion.Drives, gains: NDArray[np.int64], where: NDArray[np.bool_] | None = None) -> None:
+def write_gains(drives: Drives, gains: NDArray[np.int64], where: NDArray[np.bool_] | None = None) -> None:
     """Write raw gains of shape (num_axes, 5), in the order of `Gains`."""
     for name, column in zip(GAIN_OBJECTS, gains.T, strict=True):
         drives.write(name, column, where=where)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from agents.shipped import find_agent
 from agents.training.tasks import make_lanes
 from agents.training.train import with_figures
 from tuning.bootstrap import bootstrap_interval
+
+if TYPE_CHECKING:
+    from drive_env.emulator.emulated_drives import EmulatedDrives
 
 Floats = NDArray[np.float64]
 
@@ -164,7 +167,7 @@ def identified_lags(error: Floats, speed: Floats, acceleration: Floats) -> Float
     return np.moveaxis(found, -1, 0)
 
 
-def tune(drives: Any, commissioned: NDArray[np.int64]) -> None:
+def tune(drives: EmulatedDrives, commissioned: NDArray[np.int64]) -> None:
     """Make velocity P of emulated drives for the inertia of each machine, as a perfect identification finds it.
 
     Args:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from agents.commands.cli import app
 from agents.evaluation import episode_log, evaluation_plots, gap
-from agents.evaluation.evaluation import AsOnABus, Evaluation, evaluate
+from agents.evaluation.evaluation import Evaluation, as_on_a_bus, evaluate
 from agents.evaluation.on_the_bus import target_for
 from agents.evaluation.scores import interval
 from agents.evaluation.served import draw_machines, emulated
@@ -236,7 +236,7 @@ def test_over_can_in_lockstep_actions_and_figures_are_the_same():
     found = {}
     with EmulatedDrives(load="two_mass", num_threads=1) as emulated:
         found["emulator"] = evaluate(
-            Gentle(), "tracking", SHORT, drives=AsOnABus(emulated), episodes=2, side="one", guard=PATIENT
+            Gentle(), "tracking", SHORT, drives=as_on_a_bus(emulated), episodes=2, side="one", guard=PATIENT
         )
     world = World(lockstep=True)
     world.add(EmulatedDrives(load="two_mass", num_threads=1), [1])

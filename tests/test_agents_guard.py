@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from test_parity import WorldBus
 
-from agents.evaluation.evaluation import AsOnABus, evaluate
+from agents.evaluation.evaluation import as_on_a_bus, evaluate
 from agents.policies.deadline import Deadline, DeadlineError
 from agents.policies.guard import KEPT, GuardedPolicy, GuardLimits, PolicyStoppedError, stop
 from agents.policies.policy import PolicyError
@@ -110,7 +110,7 @@ def test_over_can_the_drive_is_stopped_and_left_disabled(wrong, guard, message):
 def test_drives_in_this_process_are_stopped_too(wrong, guard, message):
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
         with pytest.raises(PolicyStoppedError, match=message):
-            evaluate(Scripted(wrong), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=1, guard=guard)
+            evaluate(Scripted(wrong), "tracking", OPTIONS, drives=as_on_a_bus(emulated), episodes=1, guard=guard)
         assert is_disabled(emulated) and abs(int(emulated.read(0x606C)[0])) < TURN // 4
 
 
@@ -131,7 +131,7 @@ def test_a_policy_that_fails_at_once_enables_nothing():
 
         emulated.write = watch
         with pytest.raises(PolicyStoppedError, match="IndexError"):
-            evaluate(Scripted(fail, after=0), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=1)
+            evaluate(Scripted(fail, after=0), "tracking", OPTIONS, drives=as_on_a_bus(emulated), episodes=1)
         assert {value for name, value in words if name == 0x6040} <= {0x00, 0x02}  # disable voltage, quick stop
 
 
@@ -147,7 +147,7 @@ def test_a_first_answer_may_take_its_time():
     policy.then = load_first
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
         limits = GuardLimits(stall=0.4)
-        found = evaluate(policy, "tracking", OPTIONS | {"duration": 0.01}, drives=AsOnABus(emulated), episodes=1,
+        found = evaluate(policy, "tracking", OPTIONS | {"duration": 0.01}, drives=as_on_a_bus(emulated), episodes=1,
                          guard=limits)  # fmt: skip
     assert len(found.seeds) == 1
 
@@ -196,7 +196,7 @@ def test_the_stop_is_a_ramp_and_not_a_coasting():
 def test_after_the_evaluation_the_drive_is_at_rest_and_disabled():
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
         found = evaluate(
-            Scripted(None, after=10**6), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=2, guard=PATIENT
+            Scripted(None, after=10**6), "tracking", OPTIONS, drives=as_on_a_bus(emulated), episodes=2, guard=PATIENT
         )
         assert is_disabled(emulated) and len(found.seeds) == 2 and not found.violations
 
@@ -217,7 +217,7 @@ def test_gains_offsets_and_mode_are_as_before(environment, options, then):
         policy = Acting(then, after=10**6 if then is None else 5)
         options = {"load": "inertia", "duration": 0.1, **options}
         with contextlib.nullcontext() if then is None else pytest.raises(PolicyStoppedError):
-            evaluate(policy, environment, options, drives=AsOnABus(emulated), episodes=1, guard=PATIENT)
+            evaluate(policy, environment, options, drives=as_on_a_bus(emulated), episodes=1, guard=PATIENT)
         assert [int(emulated.read(name)[0]) for name in KEPT] == before and is_disabled(emulated)
 
 
@@ -227,7 +227,7 @@ def test_an_interrupt_stops_the_drive_too():
 
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
         with pytest.raises(KeyboardInterrupt):
-            evaluate(Scripted(interrupt), "tracking", OPTIONS, drives=AsOnABus(emulated), episodes=1, guard=PATIENT)
+            evaluate(Scripted(interrupt), "tracking", OPTIONS, drives=as_on_a_bus(emulated), episodes=1, guard=PATIENT)
         assert is_disabled(emulated)
 
 

@@ -19,10 +19,11 @@ from agents.shipped import shipped
 from agents.tuner.tune_target import surrogate, tune_target
 from agents.tuner.tuning_run import run as run_agent
 from drive_env.drives.motion import OPERATION_ENABLED
+from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.trials.gain_trial import Trials
 from tuning.certificate.certificate import load_certificate
-from tuning.drive_audit import KINDS, MeteredDrives
+from tuning.drive_audit import KINDS, DriveAudit
 from tuning.snapshot import load_snapshot
 from tuning.target import emulated
 
@@ -232,10 +233,10 @@ def test_what_shakes_on_with_the_incumbent_is_calmed(monkeypatch):
         Trials, "run", lambda self, gains, incumbent, *rest: run(self, gains, wild + 0 * incumbent, *rest)
     )
     with emulated("tmcm1636", "inertia", "qbl4208") as target:
-        meter = MeteredDrives(target)
-        done = tune_target(replace(target, drives=meter), Reckless(), trials=2)
+        audit = DriveAudit(target)
+        done = tune_target(replace(target, drives=ObservedDrives(target.drives, audit)), Reckless(), trials=2)
     assert [bool(trial.aborted) for trial in done.trials] == [False, True, True]
-    assert meter.violations[KINDS.index("oscillated")].tolist() == [0]  # never for 100 ms
+    assert audit.violations[KINDS.index("oscillated")].tolist() == [0]  # never for 100 ms
 
 
 def test_a_wrong_wiring_ends_the_run_before_any_trial_with_code_1_and_the_reason(tmp_path, monkeypatch):

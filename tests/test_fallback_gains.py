@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from drive_env import cia402
+from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.trials.gain_trial import OSCILLATION
 from drive_env.trials.positioning import WATCH
-from tuning.auto.fallback_gains import CalmedDrives
+from tuning.auto.fallback_gains import FallbackGains
 
 RATED = 4.0  # A
 CALM = np.array([[1, 2, 3, 4, 5], [6, 7, 8, 9, 10]])
@@ -25,7 +26,7 @@ class TwoAxes:
     def __init__(self, shaking, strength):
         self.shaking, self.strength, self.window, self.written = shaking, strength, -1, {}
 
-    def record(self, objects, duration):
+    def record(self, objects, duration, play=None, period=0.001):
         self.window += 1
         step = 1e3 * OSCILLATION * RATED * self.strength * (self.shaking[self.window] == "S")  # mA from cycle to cycle
         second = np.where(np.arange(WATCH) % 2, step, 0.0)
@@ -52,37 +53,40 @@ class _Trace(dict):
 )
 def test_an_axis_is_calmed_after_three_windows_in_a_row(windows, calmed_in):
     own = TwoAxes(windows, 1.1)
-    drives = CalmedDrives(own, RATED)
-    drives.calm = CALM
+    fallback = FallbackGains(2, RATED)
+    fallback.calm = CALM
+    drives = ObservedDrives(own, fallback)
     for _ in windows:
         drives.record([cia402.TORQUE_ACTUAL], WATCH * 0.001)
     if calmed_in is None:
         assert own.written == {}
-        assert not drives.calmed.any()
+        assert not fallback.calmed.any()
     else:
         assert set(own.written) == set(GAIN_OBJECTS)
         assert {window for window, _, _ in own.written.values()} == {calmed_in}
         assert all(where == [False, True] for _, _, where in own.written.values())
-        assert drives.calmed.tolist() == [False, True]
+        assert fallback.calmed.tolist() == [False, True]
 
 
 def test_less_than_shaking_a_new_trial_and_unknown_gains_calm_nothing():
     for strength, begins_anew, calm in ((0.9, False, CALM), (1.1, True, CALM), (1.1, False, None)):
         own = TwoAxes("SSS", strength)
-        drives = CalmedDrives(own, RATED)
-        drives.calm = calm
+        fallback = FallbackGains(2, RATED)
+        fallback.calm = calm
+        drives = ObservedDrives(own, fallback)
         for window in range(3):
             if begins_anew and window == 2:
-                drives.begin()
+                fallback.begin()
             drives.record([cia402.TORQUE_ACTUAL], WATCH * 0.001)
         assert own.written == {}
 
 
 def test_another_look_than_a_window_s_does_not_count():
     own = TwoAxes("SSSS", 1.1)
-    drives = CalmedDrives(own, RATED)
-    drives.calm = CALM
-    own.record = lambda objects, duration: SimpleNamespace(__len__=lambda: 7)
+    fallback = FallbackGains(2, RATED)
+    fallback.calm = CALM
+    drives = ObservedDrives(own, fallback)
+    own.record = lambda objects, duration, play, period: SimpleNamespace(__len__=lambda: 7)
     for _ in range(4):
         drives.record([0x606C], 0.007)
     assert own.written == {}

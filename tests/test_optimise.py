@@ -14,12 +14,13 @@ from drive_env import EmulatedDrives, cia402, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
+from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
 from drive_env.motors import find_motor
 from drive_env.trials.gain_trial import Trials, measured_cost, softness
 from tuning.commands.cli import app
 from tuning.compare.suite import load_suite, open_group
-from tuning.drive_audit import KINDS, MeteredDrives
+from tuning.drive_audit import KINDS, DriveAudit
 from tuning.search import optimise as optimise_module
 from tuning.search import trial_bench
 from tuning.search.optimise import SAFE_STEP, Settings, objective_values, optimise, pareto
@@ -350,12 +351,15 @@ def logs(row, rule):
 
 @pytest.fixture(scope="module")
 def safely():
-    """A safe search on elastic machines, which the rule itself makes oscillate, and what a meter saw of it."""
+    """A safe search on elastic machines, which the rule itself makes oscillate, and what an audit saw of it."""
     machines = [m for m in load_suite() if m.load == "two_mass" and m.motor == "qbl4208"]
     with open_group(machines) as target:
-        meter = MeteredDrives(target)
-        found = optimise(replace(target, drives=meter), Settings(sampler="tpe", trials=20, safe=True, seed=3))
-    return found, meter
+        audit = DriveAudit(target)
+        found = optimise(
+            replace(target, drives=ObservedDrives(target.drives, audit)),
+            Settings(sampler="tpe", trials=20, safe=True, seed=3),
+        )
+    return found, audit
 
 
 def test_a_safe_search_begins_with_gains_that_are_proved(safely):
@@ -399,20 +403,20 @@ def test_a_safe_search_ends_with_gains_that_were_never_stopped_and_are_better(sa
 
 
 def test_a_safe_search_shakes_the_axes_less_than_a_bold_one(safely):
-    found, meter = safely
+    found, audit = safely
     machines = [m for m in load_suite() if m.load == "two_mass" and m.motor == "qbl4208"]
     with open_group(machines) as target:
         bold = optimise(target, Settings(sampler="tpe", trials=20, seed=3))
     assert found.aborts.sum() < 0.7 * bold.aborts.sum()
-    assert meter.violations[KINDS.index("tripped")].sum() == 0
+    assert audit.violations[KINDS.index("tripped")].sum() == 0
 
 
 def test_a_short_travel_is_kept():
     machines = [m for m in load_suite() if m.load == "belt" and m.travel < 1.0]
     with open_group(machines) as target:
-        meter = MeteredDrives(target)
-        optimise(replace(target, drives=meter), Settings(trials=8, safe=True))
-    assert meter.violations[KINDS.index("left its travel")].sum() == 0
+        audit = DriveAudit(target)
+        optimise(replace(target, drives=ObservedDrives(target.drives, audit)), Settings(trials=8, safe=True))
+    assert audit.violations[KINDS.index("left its travel")].sum() == 0
 
 
 # --- on a bus -----------------------------------------------------------------------------------------------------

@@ -7,10 +7,11 @@ import pytest
 
 from drive_env import cia402
 from drive_env.dictionary.entries import ObjectDictionary
+from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.trace import Trace
 from drive_env.gains import GAIN_OBJECTS, write_gains
 from tuning.identify.identification import NAMES, identify
-from tuning.oscillation_watch import OscillationError, WatchedDrives, shaken
+from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken
 from tuning.target import emulated
 
 CURRENT = 0x6077
@@ -22,6 +23,8 @@ class TwoAxes:
     """Two axes whose currents are a square wave of 100 Hz: small, and large on the second from some cycle on."""
 
     num_axes = 2
+
+    observers = ()
 
     def __init__(self, begins):
         self.begins, self.now, self.off = begins, 0, []
@@ -41,30 +44,31 @@ class TwoAxes:
 
 def watched(begins, where=(True, True)):
     own = TwoAxes(begins)
-    return own, WatchedDrives(own, np.array(where), LIMIT)
+    watch = OscillationWatch(np.array(where), LIMIT)
+    return own, ObservedDrives(own, watch), watch
 
 
 @pytest.mark.parametrize("begins", [0, 1, 24, 25, 26, 40, 310])
 @pytest.mark.parametrize("cycles", [1, 7, 400])  # of one call
 def test_an_axis_that_oscillates_has_no_voltage_within_50_ms(begins, cycles):
-    own, drives = watched(begins)
+    own, drives, watch = watched(begins)
     for _ in range(400 // cycles):
         drives.record([CURRENT], cycles * 0.001)
     [(at, name, value, where)] = own.off
     assert (name, value, where) == (0x6040, 0, [False, True])
     assert begins < at <= begins + 50
-    assert drives.swung.tolist() == [False, True]
+    assert watch.swung.tolist() == [False, True]
 
 
 def test_once_all_axes_that_matter_have_oscillated_nothing_goes_on():
-    own, drives = watched(30, where=(False, True))
+    own, drives, _watch = watched(30, where=(False, True))
     with pytest.raises(OscillationError):
         drives.advance(1.0)
     assert own.now <= 80
 
 
 def test_what_is_quiet_is_recorded_as_without_a_watch():
-    own, drives = watched(10**6)
+    own, drives, _watch = watched(10**6)
     trace = drives.record([CURRENT], 0.09)
     other = TwoAxes(10**6).record([CURRENT], 0.09)
     assert trace.t == pytest.approx(other.t)
@@ -73,7 +77,7 @@ def test_what_is_quiet_is_recorded_as_without_a_watch():
 
 
 def test_a_current_that_is_asked_for_is_no_oscillation_until_it_is_exceeded():
-    own, drives = watched(0)
+    own, drives, _watch = watched(0)
     with shaken(drives, np.array([3.1, 3.1])):
         drives.record([CURRENT], 0.5)
     assert own.off == []

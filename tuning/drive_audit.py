@@ -1,6 +1,6 @@
-"""Drives that count what is done to them: the time it took, moves, and what a drive must not be put through.
+"""An audit of what is done to drives: the time it took, moves, and what a drive must not be put through.
 
-A tuner is compared by what it did, not by what it says: the meter stands between it and the drives, and it hides the
+A tuner is compared by what it did, not by what it says: the audit stands between it and the drives, and it hides the
 emulated machine behind them.
 """
 
@@ -8,14 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
 from drive_env.devices import find_device
-from drive_env.dictionary.entries import ObjectDictionary
+from drive_env.dictionary.entries import ObjectDictionary, ObjectName
+from drive_env.drives.interface import Drives
+from drive_env.drives.observed import Observer
+from drive_env.drives.trace import Trace
 from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.move_counter import MoveCounter
 from tuning.target import POSITION_SCALER, Target
@@ -34,8 +37,6 @@ SHAKING = 0.4  # RMS change of the current per ms over the rated current, as gai
 SLACK = 0.02  # rev beyond the travel that are none yet: a few counts of an overshoot at its end
 KINDS = ("left its travel", "too fast", "oscillated", "tripped")
 
-_WATCHED = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD)
-
 
 @cache
 def _dictionary(device: str) -> ObjectDictionary:
@@ -43,8 +44,8 @@ def _dictionary(device: str) -> ObjectDictionary:
     return find_device(device).new_dictionary()
 
 
-class MeteredDrives:
-    """Drives behind a meter; what is not counted is theirs.
+class DriveAudit(Observer):
+    """Counts what is done to drives, and hides their machine.
 
     Args:
         target: What is tuned.
@@ -56,7 +57,8 @@ class MeteredDrives:
         violations: By kind of `KINDS`, (4, num_axes).
     """
 
-    machine = None  # true parameters are nobody's business who tunes
+    objects = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD)
+    hides_machine = True  # true parameters are nobody's business who tunes
 
     def __init__(self, target: Target) -> None:
         drives = target.drives
@@ -64,7 +66,6 @@ class MeteredDrives:
         self.elapsed = 0.0
         self.seconds = np.zeros(count)
         self.violations = np.zeros((len(KINDS), count), np.int64)
-        self._drives = drives
         self._dictionary = _dictionary(target.device.name)
         scaler = np.asarray(drives.read(POSITION_SCALER), float)
         self._origin = drives.read(cia402.POSITION_ACTUAL)
@@ -79,37 +80,27 @@ class MeteredDrives:
         self._squares, self._in_block = np.zeros(count), 0
         self._shaken = np.zeros(count, np.int64)  # blocks in a row
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._drives, name)
-
     @property
     def moves(self) -> Integers:
         """Commanded motions from standstill to standstill so far, as moves.py counts them, (num_axes,)."""
         return self._counter.moves
 
-    def write(self, name: Any, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object, and count what it starts."""
-        self._drives.write(name, value, where=where)
+    def written(self, below: Drives, name: ObjectName, value: ArrayLike, where: Mask | None) -> None:
+        """Count what a write starts."""
         axes = np.ones(len(self.seconds), bool) if where is None else where
         self.seconds[axes] = self.elapsed
         entry = self._dictionary.find(name)
         self._counter.written((entry.index, entry.sub), value, axes)
 
-    def advance(self, duration: float) -> None:
-        """Let time pass, watched."""
-        if duration > 0.0:
-            self.record([], duration)
-
-    def record(
+    def passed(
         self,
-        objects: Sequence[Any],
+        below: Drives,
         duration: float,
-        play: Mapping[Any, ArrayLike] | None = None,
-        period: float = CYCLE,
-    ) -> Any:
-        """Let time pass while objects are recorded and played, watched."""
-        watched = [name for name in _WATCHED if name not in objects]
-        trace = self._drives.record([*objects, *watched], duration, play, period)
+        trace: Trace,
+        asked: Sequence[ObjectName],
+        play: Mapping[ObjectName, ArrayLike] | None,
+    ) -> None:
+        """Count time, moves and violations."""
         self.elapsed += duration
         rows = {(entry.index, entry.sub): values for entry, values in self._entries(play)}
         moved = self._counter.passed(round(duration / CYCLE), rows)
@@ -121,12 +112,11 @@ class MeteredDrives:
             self._squares[:], self._in_block, self._last_current = 0.0, 0, current[-1]
         else:
             self._watch_current(current)
-        return trace
 
-    def _entries(self, play: Mapping[Any, ArrayLike] | None) -> list[tuple[Entry, ArrayLike]]:
+    def _entries(self, play: Mapping[ObjectName, ArrayLike] | None) -> list[tuple[Entry, ArrayLike]]:
         return [(self._dictionary.find(name), values) for name, values in (play or {}).items()]
 
-    def _watch(self, trace: Any) -> None:
+    def _watch(self, trace: Trace) -> None:
         position = wrapped(trace[cia402.POSITION_ACTUAL] - self._origin)
         rows = np.stack(
             [

@@ -1,4 +1,4 @@
-"""Drives that are watched while they are experimented on: what oscillates is switched off within 50 ms.
+"""A watch over drives that are experimented on: what oscillates is switched off within 50 ms.
 
 Time passes in windows of 25 ms, and the currents of each are looked at before the next begins. An axis that moves
 quietly has a current that hardly changes from one millisecond to the next; one that is shaken on purpose has a current
@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
+from drive_env.dictionary.entries import ObjectName
+from drive_env.drives.interface import Drives
+from drive_env.drives.observed import Observer
 from drive_env.drives.trace import Trace
 from drive_env.gains import write_gains
 from drive_env.trials.gain_trial import OSCILLATION
@@ -24,8 +26,6 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-CYCLE = 0.001  # s
-DISABLE_VOLTAGE = 0
 VELOCITY_P, VELOCITY_I = 2, 3  # of raw gains
 CLEAR = 3.0
 SOFTER = 4  # by what the velocity gains of an axis are divided that oscillates with gains of our own
@@ -35,59 +35,45 @@ class OscillationError(RuntimeError):
     """All axes that were experimented on have oscillated, and are off."""
 
 
-class WatchedDrives:
-    """Drives of which an axis that oscillates is switched off, to coast, as after a fault; everything else is theirs.
+class OscillationWatch(Observer):
+    """Switches an axis off that oscillates, to coast, as after a fault.
 
     Args:
-        drives: The drives.
         where: Axes that are experimented on, shape (num_axes,).
         limit: Most current that is asked of each axis [A], shape (num_axes,).
         noise: RMS of the current's samples at rest [A]: what is not clear of it is no oscillation.
 
     Attributes:
-        watch: This object, also where other drives are wrapped around it.
         limit: As given; it may be lowered.
         swung: Axes that oscillated and were switched off, shape (num_axes,).
 
-    `record` and `advance` raise OscillationError once all of them have.
+    What lets time pass raises OscillationError once all of them have.
     """
 
-    def __init__(self, drives: Any, where: Mask, limit: Floats, noise: float = 0.0) -> None:
-        self._drives = drives
+    objects = (cia402.TORQUE_ACTUAL,)
+
+    def __init__(self, where: Mask, limit: Floats, noise: float = 0.0) -> None:
         self._where = where
         self.limit = limit
         self._least = CLEAR * noise
         self._shaken: Floats | None = None  # most current meanwhile [A RMS]
         self._window: list[Floats] = []  # currents since the last look, the one before it among them
-        self.watch = self
-        self.swung: Mask = np.zeros(drives.num_axes, bool)
+        self.swung: Mask = np.zeros(len(where), bool)
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._drives, name)
+    def patience(self) -> int:
+        """Return the cycles until the window is full."""
+        return WATCH - self._looked()
 
-    def advance(self, duration: float) -> None:
-        """Let time pass, watched."""
-        if duration > 0.0:
-            self.record([cia402.TORQUE_ACTUAL], duration)
-
-    def record(
+    def passed(
         self,
-        objects: Sequence[Any],
+        below: Drives,
         duration: float,
-        play: Mapping[Any, ArrayLike] | None = None,
-        period: float = CYCLE,
-    ) -> Trace:
-        """Let time pass while objects are recorded and played, watched; the period is a cycle."""
-        rows = {name: np.asarray(values) for name, values in (play or {}).items()}
-        wanted = list(objects) if cia402.TORQUE_ACTUAL in objects else [*objects, cia402.TORQUE_ACTUAL]
-        cycles, done, parts = round(duration / CYCLE), 0, []
-        while done < cycles:
-            now = min(cycles - done, WATCH - self._looked())
-            part = {name: values[done : done + now] for name, values in rows.items()}
-            parts.append(self._drives.record(wanted, now * CYCLE, part or None, period))
-            self._look(np.asarray(parts[-1][cia402.TORQUE_ACTUAL], float) * 1e-3)
-            done += now
-        return Trace.joined(parts, period) if parts else self._drives.record(objects, 0.0, play, period)
+        trace: Trace,
+        asked: Sequence[ObjectName],
+        play: Mapping[ObjectName, ArrayLike] | None,
+    ) -> None:
+        """Look at the currents, and switch off what oscillates."""
+        self._look(below, np.asarray(trace[cia402.TORQUE_ACTUAL], float) * 1e-3)
 
     @contextmanager
     def shaken(self, current: Floats) -> Iterator[None]:
@@ -100,10 +86,11 @@ class WatchedDrives:
             self._shaken = before
             self._window.clear()
 
-    def soften(self, where: Mask, gains: Integers, mode: str) -> Integers:
+    def soften(self, drives: Drives, where: Mask, gains: Integers, mode: str) -> Integers:
         """Enable axes again that were switched off, with softer velocity gains, and watch them anew.
 
         Args:
+            drives: The drives, as they are watched.
             where: Which, shape (num_axes,).
             gains: Raw gains of all axes, shape (num_axes, 5).
             mode: "csv" or "csp".
@@ -114,16 +101,16 @@ class WatchedDrives:
         softer = gains.copy()
         for k in (VELOCITY_P, VELOCITY_I):
             softer[where, k] = np.maximum(gains[where, k] // SOFTER, 1)
-        write_gains(self._drives, softer, where)
+        write_gains(drives, softer, where)
         self.swung &= ~where
-        self._drives.write(cia402.TARGET_VELOCITY, 0, where=where)
-        motion.enable(self, mode=mode, where=where)
+        drives.write(cia402.TARGET_VELOCITY, 0, where=where)
+        motion.enable(drives, mode=mode, where=where)
         return softer
 
     def _looked(self) -> int:
         return sum(len(part) for part in self._window)
 
-    def _look(self, current: Floats) -> None:
+    def _look(self, below: Drives, current: Floats) -> None:
         self._window.append(current)
         if self._looked() < WATCH:
             return
@@ -135,16 +122,21 @@ class WatchedDrives:
             shaking, allowed = window - window.mean(axis=0), self._shaken
         late = (np.sqrt(np.mean(shaking**2, axis=0)) > np.maximum(allowed, self._least)) & ~self.swung
         if late.any():
-            self._drives.write(cia402.CONTROLWORD, DISABLE_VOLTAGE, where=late)
+            below.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=late)
             self.swung |= late
             if self.swung[self._where].all():
                 raise OscillationError("all axes oscillate, and were switched off")
 
 
+def watch_of(drives: Drives) -> OscillationWatch | None:
+    """Return who watches drives for oscillation, None for nobody."""
+    return next((each for each in drives.observers if isinstance(each, OscillationWatch)), None)
+
+
 @contextmanager
-def shaken(drives: Any, current: Floats) -> Iterator[None]:
+def shaken(drives: Drives, current: Floats) -> Iterator[None]:
     """Have drives, if they are watched, allow so much current meanwhile [A RMS], shape (num_axes,)."""
-    watch = getattr(drives, "watch", None)
+    watch = watch_of(drives)
     if watch is None:
         yield
         return

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.access import ObjectAccessError, check_in_range, check_writable
+from drive_env.drives.interface import Drives, device_of
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.held_signals import held_signals
 from drive_env.master.description import Description, Key, describe
@@ -118,7 +119,7 @@ def take(target: Target) -> Snapshot:
     Take it before the drives record anything: that maps PDOs on a bus, which are parameters, too.
     """
     drives = target.drives
-    identities = [read_identity(drives, node) for node in range(len(drives.nodes))] if _is_on_bus(drives) else []
+    identities = [read_identity(drives.bus, node) for node in range(len(drives.bus.nodes))] if drives.bus else []
     return Snapshot(target.device.name, _read_axes(target), target.bus, identities=tuple(identities))
 
 
@@ -201,11 +202,11 @@ def check_same_drives(file: object, snapshot: Snapshot, drives: CanDrives, *, ot
     """
     # A file that does not say of which drives it is (`load_snapshot` wants its reader's word for that) fits any.
     for node, written in zip(range(len(drives.nodes)), snapshot.identities, strict=False):
-        check_same_drive(file, written, read_identity(drives, node), other_drive=other_drive)
+        check_same_drive(file, written, read_identity(drives.bus, node), other_drive=other_drive)
 
 
 def restore(
-    drives: Any, snapshot: Snapshot, where: Mask | None = None, *, whole: bool = True
+    drives: Drives, snapshot: Snapshot, where: Mask | None = None, *, whole: bool = True
 ) -> list[list[Difference]]:
     """Bring drives back to a snapshot, axis by axis, each all or none; return what was changed on each.
 
@@ -220,10 +221,10 @@ def restore(
     Raises:
         SnapshotError: If the drives are others; NotRestoredError or RollbackError if a drive refuses.
     """
-    if len(snapshot.axes) != drives.num_axes or snapshot.device != drives.device.name:
+    if len(snapshot.axes) != drives.num_axes or snapshot.device != device_of(drives).name:
         raise SnapshotError(
             f"the snapshot is of {len(snapshot.axes)} axes of {snapshot.device}, and here are {drives.num_axes} of "
-            f"{drives.device.name}; open the drives that it was taken from"
+            f"{device_of(drives).name}; open the drives that it was taken from"
         )
     axes = np.ones(drives.num_axes, bool) if where is None else where
     single = _per_axis(drives)
@@ -332,7 +333,7 @@ class Transaction:
             return
         try:
             with undisturbed():
-                if error is not None and getattr(self._target.drives, "safety", None):
+                if error is not None and self._target.drives.safety:
                     # What still turns is braked as their own exit would: without voltage it would run on.
                     self._target.drives.safety.stop(str(error) or type(error).__name__)
                 try:
@@ -390,7 +391,7 @@ class Transaction:
         return True
 
 
-def _switch_off(drives: Any, where: Mask) -> None:
+def _switch_off(drives: Drives, where: Mask) -> None:
     """Switch the voltage off and wait until no axis may turn; one in fault is off once its reaction has ended."""
     drives.write(cia402.CONTROLWORD, 0x00, where=where)
     for _ in range(SWITCH_OFF):
@@ -400,7 +401,7 @@ def _switch_off(drives: Any, where: Mask) -> None:
     raise TimeoutError(f"an axis stays enabled for {SWITCH_OFF * motion.STEP:g} s after its voltage was switched off")
 
 
-def store(drives: Any, where: Mask | None = None) -> None:
+def store(drives: Drives, where: Mask | None = None) -> None:
     """Have drives keep their parameters over a power cycle (1010h)."""
     drives.write(STORE, SAVE, where=where)
 
@@ -409,21 +410,17 @@ def _settings(values: Mapping[Key, int]) -> dict[Key, int]:
     return {key: value for key, value in values.items() if key[0] >= DEVICE_OBJECTS}
 
 
-def _per_axis(drives: Any) -> Any:
+def _per_axis(drives: Drives) -> Any:
     """Return drives whose objects are reached axis by axis, as those of a bus are."""
-    return drives if _is_on_bus(drives) else _EmulatedPerAxis(drives)
-
-
-def _is_on_bus(drives: Any) -> bool:
-    return hasattr(drives, "read_axis")
+    return drives.bus or _EmulatedPerAxis(drives)
 
 
 class _EmulatedPerAxis:
     """Emulated drives as far as `drive_env.master.parameters` needs those of a bus."""
 
-    def __init__(self, drives: Any) -> None:
+    def __init__(self, drives: Drives) -> None:
         self._drives = drives
-        self.description: Description = describe(drives.device.name, None)
+        self.description: Description = describe(device_of(drives).name, None)
 
     def read_axis(self, entry: Entry, axis: int) -> int:
         return int(self._drives.read((entry.index, entry.sub))[axis])

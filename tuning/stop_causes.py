@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from drive_env.drives.interface import Drives
 
 
-def stop_causes(drives: Any) -> list[str]:
+def stop_causes(drives: Drives) -> list[str]:
     """Return what each axis of the drives has told since its emergencies were read last, most important for a message.
 
     Returns:

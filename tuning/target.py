@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.drives.interface import Drives
+from drive_env.drives.observed import ObservedDrives, Observer
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -57,7 +59,7 @@ class Target:
         bus: How the drives of a bus are opened again: what `CanDrives` takes; empty for emulated ones.
     """
 
-    drives: Any
+    drives: Drives
     device: Device
     motor: Motor
     supply: Floats
@@ -261,33 +263,22 @@ def on_bus(
 def timed(target: Target) -> Iterator[tuple[Target, DriveTime]]:
     """Give the target with drives whose passing time is counted, and the clock that counts it."""
     clock = DriveTime()
-    yield replace(target, drives=_TimedDrives(target.drives, clock)), clock
+    yield replace(target, drives=ObservedDrives(target.drives, clock)), clock
 
 
-@dataclass
-class DriveTime:
-    """Time that passed on drives [s]: what a tuner costs on hardware."""
+class DriveTime(Observer):
+    """Counts the time that passes on drives: what a tuner costs on hardware.
 
-    seconds: float = 0.0
+    Attributes:
+        seconds: Time that passed so far [s].
+    """
 
+    def __init__(self) -> None:
+        self.seconds = 0.0
 
-class _TimedDrives:
-    """Drives that count the time which passes on them; everything else is theirs."""
-
-    def __init__(self, drives: Any, clock: DriveTime) -> None:
-        self._drives = drives
-        self._clock = clock
-
-    def advance(self, duration: float) -> None:
-        self._clock.seconds += duration
-        self._drives.advance(duration)
-
-    def record(self, objects: Any, duration: float, *arguments: Any, **options: Any) -> Any:
-        self._clock.seconds += duration
-        return self._drives.record(objects, duration, *arguments, **options)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._drives, name)
+    def passes(self, duration: float) -> None:
+        """Count it."""
+        self.seconds += duration
 
 
 def _ways(travel: Travel | Iterable[Travel], num_axes: int) -> tuple[Floats, Floats]:
@@ -343,4 +334,5 @@ def _hold_to_travel(target: Target) -> None:
     slack = np.clip(SLACK * width, *SLACK_ENDS)
     low, high = here + (target.low - slack) * scale, here + (target.high + slack) * scale
     speed = np.ceil(SPEED_SLACK * target.motor.rated_speed * scale)
+    assert drives.safety is not None, "drives of a bus are opened with an envelope"
     drives.safety.change(Limits(position=(low.tolist(), high.tolist()), velocity=speed.tolist()))

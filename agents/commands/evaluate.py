@@ -264,13 +264,14 @@ def _both_sides(
 
 
 def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, Any], as_on_a_bus: bool = False) -> Any:
-    from agents.evaluation.evaluation import AsOnABus
-    from agents.evaluation.evaluation import evaluate as run
+    from agents.evaluation import evaluation
 
     title = f"{loaded.name} on the emulator"
     if not as_on_a_bus:
         with progress_bar(title) as show:
-            return run(loaded.policy, loaded.environment, configuration, **{**options, "guard": None}, told=show)
+            return evaluation.evaluate(
+                loaded.policy, loaded.environment, configuration, **{**options, "guard": None}, told=show
+            )
     from agents.training.tasks import make_lanes
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
@@ -283,11 +284,11 @@ def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, 
     ):
         joint = getattr(getattr(config, "task", None), "joint", None)
         sensor = None if joint is None else lambda: drives.machine.joint_positions[:, joint]
-        return run(
+        return evaluation.evaluate(
             loaded.policy,
             loaded.environment,
             configuration,
-            drives=AsOnABus(drives),
+            drives=evaluation.as_on_a_bus(drives),
             sensor=sensor,
             side="emulator as on a bus",
             told=show,
@@ -298,7 +299,7 @@ def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, 
 def _on_bus(
     loaded: Any, configuration: dict[str, Any], options: dict[str, Any], sensor: str | None, before: Path, **where: Any
 ) -> Any:
-    from agents.evaluation.evaluation import evaluate as run
+    from agents.evaluation import evaluation
     from agents.evaluation.on_the_bus import target_for
     from agents.policies.open_policy import find_object
     from tuning.snapshot import put_back
@@ -309,7 +310,7 @@ def _on_bus(
         put_back(target, before, "drive-agent"),
         progress_bar(f"{loaded.name} on the bus") as show,
     ):
-        return run(
+        return evaluation.evaluate(
             loaded.policy, loaded.environment, configuration, drives=target.drives, sensor=function, told=show,
             **options,
         )  # fmt: skip

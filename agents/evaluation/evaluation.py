@@ -21,6 +21,8 @@ from agents.policies.agent_file import plain
 from agents.policies.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
 from agents.training.tasks import ENVIRONMENTS, configuration_of, environment_name, make_lanes
 from agents.tuner.tune_target import TRIAL_SECONDS
+from drive_env.drives.interface import Drives
+from drive_env.drives.observed import ObservedDrives, Observer
 from drive_env.master.realtime_section import undisturbed
 from mechanics.untrusted import read_json
 
@@ -99,16 +101,15 @@ class Evaluation:
             raise ValueError(f"{path} is no report of `drive-agent evaluate`; give its report.json") from None
 
 
-class AsOnABus:
-    """Emulated drives without their machine: whatever acts on them does as it would on a bus."""
+class _NoMachine(Observer):
+    """Hides the emulated machine."""
 
-    machine = None
+    hides_machine = True
 
-    def __init__(self, drives: Any) -> None:
-        self._drives = drives
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._drives, name)
+def as_on_a_bus(drives: Drives) -> Drives:
+    """Return emulated drives without their machine: whatever acts on them does as it would on a bus."""
+    return ObservedDrives(drives, _NoMachine())
 
 
 def evaluate(
@@ -119,7 +120,7 @@ def evaluate(
     name: str = "policy",
     episodes: int = 64,
     seed: int = FIRST_SEED,
-    drives: Any = None,
+    drives: Drives | None = None,
     sensor: Any = None,
     guard: GuardLimits | None = None,
     side: str | None = None,
@@ -152,18 +153,18 @@ def evaluate(
     if given:  # machines are drawn on emulators alone
         options = {key: value for key, value in options.items() if key not in ("distributions", "privileged", "stage")}
     lanes: Any
-    count = min(episodes, LANES) if not given else _lanes_of(environment, drives, options)
+    count = min(episodes, LANES) if drives is None else _lanes_of(environment, drives, options)
     more = {"drives": drives, "autoreset_mode": "Disabled"} if given else {"autoreset_mode": "NextStep"}
     if sensor is not None:
         more["sensor"] = sensor
     recorded: list[Episode] = []
     spent, due = 0.0, 0.0
     with ExitStack() as care:
-        if given:
+        if drives is not None:
             care.enter_context(unchanged(drives))
             care.enter_context(stopping(drives))
         lanes = make_lanes(environment, count, options, **more)
-        if not getattr(drives, "time_waits", True):
+        if drives is not None and not drives.time_waits:
             care.enter_context(undisturbed())
         try:
             space: Any = lanes.single_action_space
@@ -185,15 +186,15 @@ def evaluate(
                 recorded += found_now[:wanted]
                 spent += seconds
                 due += step * max(len(episode.rewards) for episode in found_now)
-            if given:
+            if drives is not None:
                 come_to_rest(drives)
             config = lanes.config
             found = configuration_of(lanes)
         finally:
             lanes.close()
     evaluation = summary(recorded, config, found, environment, name, side or ("bus" if given else "emulator"))
-    if not getattr(drives, "time_waits", True):
-        timing = drives.total_timing
+    if drives is not None and not drives.time_waits and drives.bus is not None:
+        timing = drives.bus.total_timing
         evaluation.late = timing.late / max(timing.cycles, 1)
         evaluation.pace = spent / due if environment in FIXED_STEPS else 1.0
     return evaluation
@@ -340,7 +341,7 @@ def _of_lane(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
     return found
 
 
-def _lanes_of(environment: str, drives: Any, options: Mapping[str, Any]) -> int:
+def _lanes_of(environment: str, drives: Drives, options: Mapping[str, Any]) -> int:
     """Return how many lanes given drives are: a lane has the axes of the load."""
     from mechanics.loads import find_load
 

@@ -20,6 +20,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from drive_env.bus.config import Machine
+from drive_env.drives.interface import Drives
 
 STARTING = 180.0  # s until a served bus is up: kernels that are not in the cache are compiled first
 ENDING = 20.0  # s
@@ -35,7 +36,7 @@ class Served(NamedTuple):
 
     channel: str
     nodes: tuple[int, ...]
-    drives: Any = None
+    drives: Drives | None = None
 
 
 def draw_machines(config: Any, count: int, seed: int) -> list[Machine]:

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from agents.evaluation.evaluation import AsOnABus, Evaluation, evaluate, joined
+from agents.evaluation.evaluation import Evaluation, as_on_a_bus, evaluate, joined
 from agents.evaluation.on_the_bus import drives_for
 from agents.evaluation.served import Served, draw_machines, emulated, in_lockstep, in_real_time
 from agents.policies.guard import LIMITS, GuardLimits, PolicyStoppedError
 from agents.training.tasks import environment_name, make_lanes
 from drive_env.bus.config import Machine
+from drive_env.drives.interface import Drives, machine_of
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 
@@ -94,7 +95,7 @@ def on_both_sides(
             with emulated(machine, seed + noise) as drives:
                 sides.append(
                     evaluate(
-                        policy, environment, configuration, drives=AsOnABus(drives), sensor=_sensor(drives, joint),
+                        policy, environment, configuration, drives=as_on_a_bus(drives), sensor=_sensor(drives, joint),
                         seed=seed + k, side="emulator as on a bus", **options,
                     )
                 )  # fmt: skip
@@ -136,8 +137,11 @@ def _over_the_bus(
         )  # fmt: skip
 
 
-def _sensor(drives: Any, joint: int | None) -> Callable[[], Any] | None:
-    return None if joint is None else lambda: drives.machine.joint_positions[:, joint]
+def _sensor(drives: Drives | None, joint: int | None) -> Callable[[], Any] | None:
+    if joint is None or drives is None:
+        return None
+    machine = machine_of(drives)
+    return lambda: machine.joint_positions[:, joint]
 
 
 def _add_hidden(machines: Sequence[Machine], sides: Sequence[Evaluation]) -> None:

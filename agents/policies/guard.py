@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from agents.policies.deadline import Deadline, DeadlineError
 from agents.policies.policy import PolicyError
 from drive_env import cia402, motion
+from drive_env.drives.interface import Drives
 from drive_env.gains import GAIN_OBJECTS
 
 logger = logging.getLogger(__name__)
@@ -188,7 +189,7 @@ class GuardedPolicy:
 
 
 @contextmanager
-def unchanged(drives: Any) -> Iterator[None]:
+def unchanged(drives: Drives) -> Iterator[None]:
     """Put gains, offsets, profile velocity and mode back as they were when what is inside ends; log what fails."""
     before = {name: drives.read(name) for name in KEPT}
     try:
@@ -207,7 +208,7 @@ def unchanged(drives: Any) -> Iterator[None]:
 
 
 @contextmanager
-def stopping(drives: Any) -> Iterator[None]:
+def stopping(drives: Drives) -> Iterator[None]:
     """Leave the drives at rest and disabled if what is inside ends with any exception, Ctrl-C too."""
     try:
         yield
@@ -216,21 +217,21 @@ def stopping(drives: Any) -> Iterator[None]:
         raise
 
 
-def stop(drives: Any, reason: str) -> None:
+def stop(drives: Drives, reason: str) -> None:
     """Bring drives to rest in a hurry and leave them disabled.
 
     Args:
         drives: Emulated ones, or on a bus; there the envelope does it, which goes on where one of them does not answer.
         reason: For the log.
     """
-    envelope = getattr(drives, "safety", None)
+    envelope = drives.safety
     if envelope:
         envelope.stop(reason)
     else:
         come_to_rest(drives)
 
 
-def come_to_rest(drives: Any) -> None:
+def come_to_rest(drives: Drives) -> None:
     """Quick-stop the drives, wait for the end of the ramp, and switch the voltage off."""
     motion.quick_stop(drives)
     first = np.abs(drives.read(cia402.VELOCITY_ACTUAL))

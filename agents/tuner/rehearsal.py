@@ -14,6 +14,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.dictionary.access import ObjectAccessError
+from drive_env.drives.interface import bus_of
 from drive_env.gains import GAIN_NAMES, GAIN_OBJECTS
 
 if TYPE_CHECKING:
@@ -83,11 +84,11 @@ def rehearse(target: Target, *, keep: bool = True) -> Rehearsal:
     """
     checks: list[Check] = []
     for axis in range(target.num_axes):
-        prefix = f"node {target.drives.nodes[axis]}: " if target.num_axes > 1 else ""
+        prefix = f"node {bus_of(target.drives).nodes[axis]}: " if target.num_axes > 1 else ""
         checks += [check._replace(what=prefix + check.what) for check in _checks(target, axis)]
     writes = []
     for key, values, why, stays in _plan(target, keep):
-        entry = target.drives.description.dictionary.find(key)
+        entry = bus_of(target.drives).description.dictionary.find(key)
         try:
             present = tuple(map(int, target.drives.read(key)))
         except ObjectAccessError as error:
@@ -108,7 +109,7 @@ def _read(target: Target, name: Any, axis: int) -> int:
 
 # --- what is looked at ------------------------------------------------------------------------------------------------
 def _identity(target: Target, axis: int) -> Iterator[Check]:
-    drives, facts = target.drives, []
+    drives, facts = bus_of(target.drives), []
     for name, word in ((0x1008, ""), (0x1009, "hardware "), (0x100A, "software "), ((0x1018, 1), "vendor "),
                        ((0x1018, 2), "product "), ((0x1018, 3), "revision "), ((0x1018, 4), "serial ")):  # fmt: skip
         if not drives.description.has(name):
@@ -143,7 +144,7 @@ def _state(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _answers(target: Target, axis: int) -> Iterator[Check]:
-    drives, times = target.drives, []
+    drives, times = bus_of(target.drives), []
     entry = drives.description.dictionary.find(cia402.STATUSWORD)
     for _ in range(READS):
         start = time.perf_counter()
@@ -162,7 +163,7 @@ def _samples(target: Target, axis: int) -> Iterator[Check]:
     from drive_env.canopen.frames import IDENTIFIER, RPDO, TPDO
     from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, plan
 
-    drives = target.drives
+    drives = bus_of(target.drives)
     description, watched = drives.description, []
     if drives.safety is not None:
         watched = drives.safety.watched()
@@ -189,7 +190,7 @@ def _samples(target: Target, axis: int) -> Iterator[Check]:
 
 def _error_control(target: Target, axis: int) -> Iterator[Check]:
     """Look who would stop the drive if this process died."""
-    drives, description = target.drives, target.drives.description
+    drives, description = bus_of(target.drives), bus_of(target.drives).description
     silence = None if drives.safety is None else drives.safety.limits.silence
     if silence is None:
         yield Check("heartbeat", NOTE, "no silence of this process would stop the drive")
@@ -314,7 +315,7 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, st
     for sub, value in ((1, "1"), (2, "-3")):
         yield (cia402.INTERPOLATION_PERIOD, sub), value, "interpolation period of csv and cst, 1 ms", False
     yield from _communication(target)
-    if keep and target.drives.description.has((0x1010, 1)):
+    if keep and bus_of(target.drives).description.has((0x1010, 1)):
         yield (0x1010, 1), "65766173h", '"save": the gains outlive a power cycle', True
 
 
@@ -322,37 +323,37 @@ def _communication(target: Target) -> Iterator[tuple[tuple[int, int], str, str, 
     """Yield what is written so that samples come in PDOs and the drive watches over its master."""
     from drive_env.master.pdo import OUT_OF_DRIVE, slots
 
-    known = target.drives.description.dictionary
+    known = bus_of(target.drives).description.dictionary
     for name, communication, mapping, pdos in (("RPDO", 0x1400, 0x1600, 1), ("TPDO", 0x1800, 0x1A00, 2)):
         for number in range(pdos):
             for entry in known:
                 if entry.index == mapping + number or (entry.index == communication + number and entry.sub in (1, 2)):
                     why = f"{name} {number + 1} off, mapped as above, on again, with SYNC"
                     yield (entry.index, entry.sub), "", why, False
-    for number in slots(target.drives.description, OUT_OF_DRIVE, 0).numbers[2:]:
+    for number in slots(bus_of(target.drives).description, OUT_OF_DRIVE, 0).numbers[2:]:
         yield (0x1800 + number, 1), "", f"TPDO {number + 1} silent meanwhile, if it goes with SYNC", False
     if np.isfinite(target.low).all() and np.isfinite(target.high).all():
         for sub, end in ((1, "lower"), (2, "upper")):
-            if target.drives.description.has((cia402.POSITION_LIMITS, sub)):
+            if bus_of(target.drives).description.has((cia402.POSITION_LIMITS, sub)):
                 yield (
                     (cia402.POSITION_LIMITS, sub),
                     "the travel",
                     f"{end} software limit, which the drive holds meanwhile",
                     False,
                 )
-    if target.drives.description.has(cia402.QUICK_STOP_OPTION):
+    if bus_of(target.drives).description.has(cia402.QUICK_STOP_OPTION):
         yield (
             (cia402.QUICK_STOP_OPTION, 0),
             "5, 6",
             "an axis that is stopped is held at first, in case a weight pulls it",
             False,
         )
-    if target.drives.time_waits and target.drives.description.has(0x1017):
+    if target.drives.time_waits and bus_of(target.drives).description.has(0x1017):
         yield (0x1017, 0), "1", "for a hundredth of a second: proof that time waits for SYNC", False
     in_real_time = (
         ((0x1016, 1), "this process, 500 ms", "whom the drive watches, in real time"),
         ((0x1029, 1), "0", "what it does when that one falls silent, where it was 1"),
     )
     for key, values, why in in_real_time:
-        if target.drives.description.has(key):
+        if bus_of(target.drives).description.has(key):
             yield key, values, why, False

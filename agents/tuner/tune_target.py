@@ -13,6 +13,7 @@ from agents.shipped import TUNER, shipped
 
 if TYPE_CHECKING:
     from agents.policies.guard import GuardLimits
+    from drive_env.drives.interface import Drives
     from tuning.compare.tuners import Outcome
     from tuning.target import Target
 
@@ -88,14 +89,16 @@ def tune_target(
     """
     from agents.policies.guard import GuardedPolicy, stopping
     from drive_env import motion
+    from drive_env.drives.observed import ObservedDrives
     from drive_env.envs.gain_tuning import GainTuning
     from drive_env.gains import write_gains
-    from tuning.auto.fallback_gains import CalmedDrives
+    from tuning.auto.fallback_gains import FallbackGains
     from tuning.search.trial_bench import first_gains
 
     axes = target.axes_per_machine
-    drives = CalmedDrives(target.drives, target.motor.rated_current, windows=PATIENCE)
-    drives.calm = first_gains(target) if calm is None else calm
+    fallback = FallbackGains(target.num_axes, target.motor.rated_current, windows=PATIENCE)
+    fallback.calm = first_gains(target) if calm is None else calm
+    drives = ObservedDrives(target.drives, fallback)
     configuration = dict(policy.bundle.configuration) | ({} if trials is None else {"trials": trials})
     write_gains(drives, first_gains(target))  # before anything is enabled: the drives may have any
     reach = np.where(target.high >= -target.low, target.high, target.low)
@@ -193,11 +196,11 @@ def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
     )
 
 
-def _limits_of(drives: Any) -> GuardLimits:
+def _limits_of(drives: Drives) -> GuardLimits:
     """Return what a policy may do: it may stay at an end of its range, and think while an axis holds its position."""
     from agents.policies.guard import PATIENT, GuardLimits
 
-    envelope = getattr(drives, "safety", None)
+    envelope = drives.safety
     return PATIENT if envelope is None else GuardLimits(saturation=None, stall=envelope.limits.stall)
 
 

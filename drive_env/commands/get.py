@@ -165,7 +165,7 @@ def _refuse_to_enable(entry: Any, controlword: int) -> None:
         )
 
 
-def _ask_where_live(drives: Any, what: str, yes: bool) -> None:
+def _ask_where_live(drives: CanDrives, what: str, yes: bool) -> None:
     """Have the user agree to a write where a drive may turn its motor; `ask` raises otherwise."""
     status = [int(word) for word in drives.read(cia402.STATUSWORD)]
     live = [f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if cia402.is_live(word)]

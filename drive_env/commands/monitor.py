@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -26,6 +26,9 @@ from drive_env.commands.options import (
     print_json,
 )
 from drive_env.commands.tables import Column, tables
+
+if TYPE_CHECKING:
+    from drive_env.master.can_drives import CanDrives
 
 DEFAULT = ("6041", "6061", "6064", "606C", "6077")
 
@@ -66,11 +69,11 @@ def monitor(
                 pass  # the usual end
 
 
-def _look(drives: Any, entries: list[Any]) -> dict[Any, Any]:
+def _look(drives: CanDrives, entries: list[Any]) -> dict[Any, Any]:
     return {entry: drives.read((entry.index, entry.sub)) for entry in entries}
 
 
-def _lines(drives: Any, entries: list[Any], period: float, end: float) -> None:
+def _lines(drives: CanDrives, entries: list[Any], period: float, end: float) -> None:
     start = time.monotonic()
     while True:
         values = _look(drives, entries)
@@ -83,7 +86,7 @@ def _lines(drives: Any, entries: list[Any], period: float, end: float) -> None:
         time.sleep(period)
 
 
-def _table(drives: Any, entries: list[Any], period: float, end: float) -> None:
+def _table(drives: CanDrives, entries: list[Any], period: float, end: float) -> None:
     from rich.live import Live
 
     increments = increments_per_revolution(drives)
@@ -103,7 +106,12 @@ def _table(drives: Any, entries: list[Any], period: float, end: float) -> None:
 
 
 def _draw(
-    drives: Any, entries: list[Any], values: Any, increments: list[float | None], emergencies: list[str], width: int
+    drives: CanDrives,
+    entries: list[Any],
+    values: Any,
+    increments: list[float | None],
+    emergencies: list[str],
+    width: int,
 ) -> Any:
     from rich.console import Group
     from rich.text import Text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -30,6 +30,9 @@ from drive_env.commands.options import (
     object_name,
     print_json,
 )
+
+if TYPE_CHECKING:
+    from drive_env.master.can_drives import CanDrives
 
 # Response and commands of the usual modes: what `drive-env check-model` needs.
 DEFAULT = ("6062", "6064", "606C", "60FF", "6077")
@@ -160,7 +163,7 @@ def _fires(trigger: Trigger, values: Any, scales: list[float | None]) -> Any:
 
 
 def _record(
-    drives: Any,
+    drives: CanDrives,
     entries: list[Any],
     trigger: Trigger | None,
     scales: list[float | None],

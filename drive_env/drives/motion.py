@@ -2,34 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.drives.interface import BasicDrives
 
 Mask = NDArray[np.bool_]
 
 STEP = 0.001  # time between two looks at the statusword [s]
 
 
-class Drives(Protocol):
-    """What this module needs of drives."""
-
-    num_axes: int
-
-    def read(self, name: Any) -> NDArray[np.int64]:
-        """Return an object of every axis."""
-
-    def write(self, name: Any, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object."""
-
-    def advance(self, duration: float) -> None:
-        """Let time pass [s]."""
-
-
-def wait_for(drives: Drives, pattern: tuple[int, int], timeout: float, what: str, where: Mask | None = None) -> None:
+def wait_for(
+    drives: BasicDrives, pattern: tuple[int, int], timeout: float, what: str, where: Mask | None = None
+) -> None:
     """Let time pass until the statusword of every axis matches.
 
     Args:
@@ -63,7 +49,7 @@ def wait_for(drives: Drives, pattern: tuple[int, int], timeout: float, what: str
         waited += STEP
 
 
-def select_mode(drives: Drives, mode: str, where: Mask | None = None) -> None:
+def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
     """Select a mode of operation by abbreviation on the axes that are not in it yet."""
     if mode not in cia402.MODES:
         raise ValueError(f"no mode is named {mode!r}; there are {', '.join(cia402.MODES)}")
@@ -73,7 +59,7 @@ def select_mode(drives: Drives, mode: str, where: Mask | None = None) -> None:
         drives.write(cia402.MODE, cia402.MODES[mode], where=other)
 
 
-def enable(drives: Drives, mode: str | None = None, where: Mask | None = None, timeout: float = 1.0) -> None:
+def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = None, timeout: float = 1.0) -> None:
     """Take drives to operation enabled, a fault being reset first; `mode` is selected before.
 
     Raises:
@@ -102,18 +88,18 @@ def enable(drives: Drives, mode: str | None = None, where: Mask | None = None, t
         wait_for(drives, state, timeout, name, not_enabled)
 
 
-def disable(drives: Drives, where: Mask | None = None, timeout: float = 1.0) -> None:
+def disable(drives: BasicDrives, where: Mask | None = None, timeout: float = 1.0) -> None:
     """Switch the voltage off; the axis coasts."""
     drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
     wait_for(drives, cia402.SWITCH_ON_DISABLED, timeout, "switch on disabled", where)
 
 
-def quick_stop(drives: Drives, where: Mask | None = None) -> None:
+def quick_stop(drives: BasicDrives, where: Mask | None = None) -> None:
     """Command a quick stop; what follows the ramp is 605Ah's."""
     drives.write(cia402.CONTROLWORD, cia402.QUICK_STOP, where=where)
 
 
-def reset_fault(drives: Drives, where: Mask | None = None, timeout: float = 1.0) -> None:
+def reset_fault(drives: BasicDrives, where: Mask | None = None, timeout: float = 1.0) -> None:
     """Reset a fault by the rising edge of controlword bit 7.
 
     Raises:
@@ -136,7 +122,7 @@ def reset_fault(drives: Drives, where: Mask | None = None, timeout: float = 1.0)
 
 
 def start_move(
-    drives: Drives, position: ArrayLike, *, relative: bool = False, where: Mask | None = None, timeout: float = 1.0
+    drives: BasicDrives, position: ArrayLike, *, relative: bool = False, where: Mask | None = None, timeout: float = 1.0
 ) -> None:
     """Start a move in pp to a position [inc], with the set-point handshake of bits 4 and 12.
 
@@ -154,7 +140,12 @@ def start_move(
 
 
 def move_to(
-    drives: Drives, position: ArrayLike, *, relative: bool = False, where: Mask | None = None, timeout: float = 30.0
+    drives: BasicDrives,
+    position: ArrayLike,
+    *,
+    relative: bool = False,
+    where: Mask | None = None,
+    timeout: float = 30.0,
 ) -> None:
     """Move in pp to a position [inc] and wait until it is reached.
 
@@ -166,7 +157,7 @@ def move_to(
     wait_for(drives, cia402.TARGET_REACHED, timeout, "target reached", where)
 
 
-def _check_can_move(drives: Drives, where: Mask | None) -> None:
+def _check_can_move(drives: BasicDrives, where: Mask | None) -> None:
     axes = np.ones(drives.num_axes, bool) if where is None else where
     status, mode = drives.read(cia402.STATUSWORD), drives.read(cia402.MODE_DISPLAY)
     off = axes & ~cia402.matches(status, cia402.OPERATION_ENABLED)
@@ -180,7 +171,7 @@ def _check_can_move(drives: Drives, where: Mask | None) -> None:
             )
 
 
-def home(drives: Drives, where: Mask | None = None, timeout: float = 60.0) -> None:
+def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) -> None:
     """Run the homing method of 6098h and wait until home is attained; the axes are enabled, in hm, afterwards.
 
     Raises:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import ObjectName
+from drive_env.drives.interface import Drives
 from drive_env.emulator.group import call_of
 from drive_env.emulator.prepared_record import ProcessImage, from_od_rows, to_od_rows
 from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, Numbers, reader
@@ -48,7 +49,7 @@ class Exchange:
     """
 
     def __init__(
-        self, drives: Any, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int, period: float
+        self, drives: Drives, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int, period: float
     ) -> None:
         self.hooks: Hooks | None = None
         self.played: Integers = np.zeros((len(play), cycles, drives.num_axes), np.int64)
@@ -126,23 +127,24 @@ class EmulatedExchange(Exchange):
         self, drives: EmulatedDrives, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int
     ) -> None:
         super().__init__(drives, objects, play, cycles, 1.0 / drives.device.profile_rate)
+        self._emulated = drives
         self._cycles = cycles
         self._scale_changes = -1
 
     def run(self) -> None:
         """Let the cycles pass; of axes whose integers are out of range none of the group is run."""
-        if self._scale_changes != self._drives._objects.scale_changes:
+        if self._scale_changes != self._emulated._objects.scale_changes:
             self._prepare()
         if self._image is None:
             super().run()
             return
         self._refused[0] = 0
-        self._drives._run(self._cycles, self._call)
+        self._emulated._run(self._cycles, self._call)
         if self._refused[0]:
-            self._drives._objects.plan_play(dict(zip(self.play, self.played, strict=True)), self._cycles)
+            self._emulated._objects.plan_play(dict(zip(self.play, self.played, strict=True)), self._cycles)
 
     def _prepare(self) -> None:
-        drives, hooks = self._drives, self.hooks
+        drives, hooks = self._emulated, self.hooks
         # What cannot be recorded or played at all is refused here.
         for name in self._objects:
             drives._objects.recordable(drives._objects.entries.find(name))
@@ -178,7 +180,7 @@ class EmulatedExchange(Exchange):
 
 
 def exchange(
-    drives: Any, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int, period: float
+    drives: Drives, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int, period: float
 ) -> Exchange:
     """Return the exchange of some cycles of `period` [s], in the way that is best for these drives."""
     from drive_env.emulator.emulated_drives import EmulatedDrives

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,6 +85,11 @@ class EmulatedDrives:
     """
 
     DEFAULT_MOTOR = "qbl4208"
+    # Of the Drives interface: what emulated drives do not have, and their time, which passes when it is asked to.
+    bus = None
+    safety = None
+    observers = ()
+    time_waits = True
 
     def __init__(
         self,
@@ -188,7 +194,7 @@ class EmulatedDrives:
         self,
         objects: ObjectName | Sequence[ObjectName],
         duration: float,
-        play: Mapping[ObjectName, ArrayLike] | None = None,
+        play: Mapping[Any, ArrayLike] | None = None,
         period: float = 0.001,
     ) -> Trace:
         """Let `duration` [s] pass while objects are recorded and played.

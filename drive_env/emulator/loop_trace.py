@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.dictionary.entries import ObjectName
+from drive_env.drives.interface import Drives
 from drive_env.emulator.group import call_of, channels
 from drive_env.emulator.live_dictionary import NOTHING
 from drive_env.firmware.record import get_lanes, set_lanes
 
 if TYPE_CHECKING:
-    from drive_env.emulator.emulated_drives import EmulatedDrives
+    pass
 
 Floats = NDArray[np.float64]
 
@@ -44,7 +45,7 @@ class LoopTrace(NamedTuple):
 
 
 def trace_loops(
-    drives: EmulatedDrives,
+    drives: Drives,
     signals: Sequence[str],
     duration: float,
     play: Mapping[ObjectName, ArrayLike] | None = None,
@@ -63,48 +64,48 @@ def trace_loops(
         ValueError: For drives on a bus, an unknown signal, or a time that is no whole number of cycles.
         ObjectAccessError: For an object that cannot be played, or a value out of range.
     """
-    if getattr(drives, "machine", None) is None:
+    if drives.machine is None:
         raise ValueError("drives on a bus show their loops once per communication cycle only; use record()")
-    drives = drives.machine._drives  # whatever is wrapped around them
+    emulated = drives.machine.drives  # whatever looks at them does not see this time pass
     for name in signals:
         if name not in SIGNALS:
             raise ValueError(f"no signal is named {name!r}; there are {', '.join(SIGNALS)}")
-    cycles = drives._cycles(duration)
-    values, played = drives._objects.plan_play(play or {}, cycles)
+    cycles = emulated._cycles(duration)
+    values, played = emulated._objects.plan_play(play or {}, cycles)
     sampled = channels([(name, 0) for name in signals])
-    windows = round(drives.device.velocity_rate / drives.device.profile_rate)
-    samples = np.empty((cycles, windows, len(signals), drives.num_axes))
-    live = get_lanes(drives._records, "live", drives.num_axes).astype(np.int32)
-    rates = {id(group.machinery.rates): group.machinery.rates for group in drives._groups}.values()
-    period = 1.0 / drives.device.profile_rate
-    begin, diverged = drives._now, False
+    windows = round(emulated.device.velocity_rate / emulated.device.profile_rate)
+    samples = np.empty((cycles, windows, len(signals), emulated.num_axes))
+    live = get_lanes(emulated._records, "live", emulated.num_axes).astype(np.int32)
+    rates = {id(group.machinery.rates): group.machinery.rates for group in emulated._groups}.values()
+    period = 1.0 / emulated.device.profile_rate
+    begin, diverged = emulated._now, False
     try:
         # Each window as if it were a cycle.
         for one in rates:
             one.replace(windows=1)
         for k in range(cycles):
-            while drives._schedule and drives._schedule[0][0] <= begin + k:
-                _, name, row, where = drives._schedule.pop(0)
-                drives.machine.set(name, row, where)
+            while emulated._schedule and emulated._schedule[0][0] <= begin + k:
+                _, name, row, where = emulated._schedule.pop(0)
+                emulated.machine.set(name, row, where)
             first = call_of(np.ascontiguousarray(values[k : k + 1]), played, samples[k, :1], sampled, 1)
-            diverged |= drives._run_groups(first, 0, 1, True, True)
+            diverged |= emulated._run_groups(first, 0, 1, True, True)
             # A lane that is not alive is computed as ever, and left out of what happens once a cycle.
-            set_lanes(drives._records, "live", np.zeros(drives.num_axes, np.int32))
+            set_lanes(emulated._records, "live", np.zeros(emulated.num_axes, np.int32))
             for one in rates:
                 one.replace(period=0.0)
-            nothing = np.empty((windows - 1, 0, drives.num_axes))
+            nothing = np.empty((windows - 1, 0, emulated.num_axes))
             others = call_of(nothing, NOTHING, samples[k, 1:], sampled, 1)
-            diverged |= drives._run_groups(others, 0, windows - 1, True, True)
-            set_lanes(drives._records, "live", live)
+            diverged |= emulated._run_groups(others, 0, windows - 1, True, True)
+            set_lanes(emulated._records, "live", live)
             for one in rates:
                 one.replace(period=period)
-            drives._now = begin + k + 1
+            emulated._now = begin + k + 1
     finally:
-        set_lanes(drives._records, "live", live)
+        set_lanes(emulated._records, "live", live)
         for one in rates:
             one.replace(windows=windows, period=period)
     if diverged:
-        drives._report_divergence()
-    rows = samples.reshape(cycles * windows, len(signals), drives.num_axes)
-    t = np.arange(len(rows)) / drives.device.velocity_rate
+        emulated._report_divergence()
+    rows = samples.reshape(cycles * windows, len(signals), emulated.num_axes)
+    t = np.arange(len(rows)) / emulated.device.velocity_rate
     return LoopTrace(t, {name: rows[:, k].copy() for k, name in enumerate(signals)})

@@ -44,6 +44,11 @@ class Machines:
         self._rest: LaneImage | None = None  # state of a machine at rest
 
     @property
+    def drives(self) -> EmulatedDrives:
+        """The drives that turn these machines."""
+        return self._drives
+
+    @property
     def parameters(self) -> dict[str, Floats]:
         """True parameters by name [SI], each of shape (num_machines,)."""
         return {name: values.copy() for name, values in self._drives._parameters.items()}

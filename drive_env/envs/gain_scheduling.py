@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.drives.interface import Drives, device_of
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.changing_payload import PayloadChanges, find_payload
 from drive_env.envs.configuration import configured
@@ -192,7 +193,7 @@ class GainScheduling(Lanes):
         num_envs: int = 1,
         *,
         config: GainSchedulingConfig | Mapping[str, Any] | str | Path | None = None,
-        drives: Any = None,
+        drives: Drives | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         reward: Reward | None = None,
@@ -322,7 +323,7 @@ class GainScheduling(Lanes):
         self.reach = Reach(
             distance=room, speed=np.full(self._axes, 0.4 * motor.rated_speed), acceleration=0.5 * torque / heaviest
         )
-        device = self.drives.device
+        device = device_of(self.drives)
         small = float(small_time_constants(device, device.stage["velocity_filter"].default))
         w_v = FITTED_RULE.speed / small
         lag = LAG * self.reach.speed / (FITTED_RULE.position * w_v)
@@ -342,7 +343,7 @@ class GainScheduling(Lanes):
             return
         if laws is None:
             laws = self.config.load if self.config.load in shipped() else {"parameters": {}}
-        self._machines = RandomMachines(self.drives, Distributions.load(laws))
+        self._machines = RandomMachines(machine.drives, Distributions.load(laws))
         changes = max(1, round(self.config.duration / self.config.payload_every))
         self._payload_changes = PayloadChanges(self._payload, machine, self.num_envs, self._steps, changes)
 
@@ -354,7 +355,7 @@ class GainScheduling(Lanes):
             self.base_gains = np.stack([drives.read(name) for name in objects], axis=-1)
         else:
             motor = find_motor(self.config.motor)
-            self.base_gains = np.tile(rule_gains(drives.device, motor, self._nominal_inertia), (self.num_envs, 1))
+            self.base_gains = np.tile(rule_gains(device_of(drives), motor, self._nominal_inertia), (self.num_envs, 1))
         columns = {"velocity_p": 2, "velocity_i": 3, "position_p": 4}
         self._scheduled = self.base_gains[:, [columns[name] for name in self.config.gains]]
 

@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import find_device
+from drive_env.drives.interface import Drives, machine_of
 from drive_env.envs.configuration import configured
 from drive_env.envs.gain_observation import (
     RATIO_MAX,
@@ -178,7 +179,7 @@ class GainTuning(Lanes):
         num_envs: int = 1,
         *,
         config: GainTuningConfig | Mapping[str, Any] | str | Path | None = None,
-        drives: Any = None,
+        drives: Drives | None = None,
         reach: ArrayLike | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
@@ -227,8 +228,8 @@ class GainTuning(Lanes):
         laws = c.distributions
         if laws is None:
             laws = c.load if c.load in shipped() else {"parameters": {}}
-        self._machines = RandomMachines(self.drives, Distributions.load(laws))
-        self._defaults = self.drives.machine.parameters
+        self._machines = RandomMachines(machine_of(self.drives).drives, Distributions.load(laws))
+        self._defaults = machine_of(self.drives).parameters
         self._hidden = HiddenScore(c.device, c.load, c.motor, num_envs, num_threads=c.num_threads, friction=c.friction)
 
     def _spaces(self) -> tuple[gymnasium.Space[Any], Box]:
@@ -274,7 +275,7 @@ class GainTuning(Lanes):
             for lane in np.flatnonzero(mask):
                 self._noise[lane] = self.rngs[lane].integers(1, 2**31)
             self._trial[mask] = 0.0
-            self._parameters = drives.machine.parameters
+            self._parameters = machine_of(drives).parameters
         self._begin_trial(mask)
         self._safe = np.where(
             axes[:, None], np.stack([drives.read(name) for name in GAIN_OBJECTS], axis=-1), self._safe
@@ -358,7 +359,7 @@ class GainTuning(Lanes):
         """
         drives, axes, pictures = self.drives, np.repeat(mask, self._axes), self._pictures
         if self._machines is not None:
-            machine, values = drives.machine, self._machines.values
+            machine, values = machine_of(drives), self._machines.values
             machine.seed_noise(self._noise + self._trial, mask)
             self._trial[mask] += 1.0
             machine.reset(mask)
@@ -448,7 +449,7 @@ class GainTuning(Lanes):
         return np.asarray(self._trials.down().reshape(self.num_envs, -1).any(axis=1))
 
     def _volts(self) -> Floats:
-        return np.asarray(self.drives.machine.supply.reshape(self.num_envs, -1)[:, 0])
+        return np.asarray(machine_of(self.drives).supply.reshape(self.num_envs, -1)[:, 0])
 
     def _close_lanes(self) -> None:
         if self._pictures is not None:

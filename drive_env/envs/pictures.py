@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from drive_env.drives.interface import Drives
     from drive_env.pictures.recording import Recorder
     from drive_env.pictures.render import Picture
     from drive_env.pictures.window import Window
@@ -33,10 +34,10 @@ class Pictures:
         OpenGLError: With "human", if there is no display.
     """
 
-    def __init__(self, drives: Any, mode: str, period: float = 0.001) -> None:
-        if getattr(drives, "machine", None) is None:
+    def __init__(self, drives: Drives, mode: str, period: float = 0.001) -> None:
+        if drives.machine is None:
             raise ValueError("pictures need emulated machines; leave render_mode out on a bus")
-        self._drives = drives
+        self._drives = drives.machine.drives
         self._period = period
         self._recorders: dict[int, Recorder] = {}
         self._picture: Picture | None = None

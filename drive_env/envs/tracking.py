@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
+from drive_env.drives.interface import Drives
 from drive_env.emulator.cyclic_control import Hooks, exchange
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.bus_delays import BusDelays
@@ -197,7 +198,7 @@ class Tracking(Lanes):
         num_envs: int = 1,
         *,
         config: TrackingConfig | Mapping[str, Any] | str | Path | None = None,
-        drives: Any = None,
+        drives: Drives | None = None,
         sensor: Callable[[], ArrayLike] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
@@ -242,10 +243,12 @@ class Tracking(Lanes):
 
     def _prepare(self, sensor: Callable[[], ArrayLike] | None) -> None:
         config, drives, n = self.config, self.drives, self.num_envs
-        machine = getattr(drives, "machine", None)
+        machine = drives.machine
         self._machines = None
         if machine is not None:
-            self._machines = RandomMachines(drives, Distributions.load(config.distributions or {"parameters": {}}))
+            self._machines = RandomMachines(
+                machine.drives, Distributions.load(config.distributions or {"parameters": {}})
+            )
         elif config.distributions is not None:
             raise ValueError("distributions are of emulated machines; leave them out on a bus")
         self._sensor = sensor
@@ -256,7 +259,7 @@ class Tracking(Lanes):
                     "returns it"
                 )
             joint = config.task.joint
-            self._sensor = lambda: drives.machine.joint_positions[:, joint]
+            self._sensor = lambda: machine.joint_positions[:, joint]
         per_turn = drives.read(POSITION_SCALER).astype(float)
         scales = np.empty((self.drives.num_axes, 4))
         scales[:, 0] = config.amplitude * per_turn
@@ -467,7 +470,7 @@ class Tracking(Lanes):
         for message in self.drives.emergencies():
             if message.code:
                 names[message.axis // self._axes].append(message.name)
-        machine = getattr(self.drives, "machine", None)
+        machine = self.drives.machine
         diverged = machine.diverged if machine is not None else np.zeros(self.num_envs, bool)
         found = np.full(self.num_envs, "", object)
         for lane in np.flatnonzero(lanes):

@@ -12,6 +12,7 @@ import contextlib
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Literal
 
 import can
@@ -76,6 +77,9 @@ class CanDrives:
     """
 
     machine = None  # what no bus shows exists on emulators only
+
+    machine = None  # of the Drives interface: what emulated drives alone have
+    observers = ()
 
     def __init__(
         self,
@@ -197,7 +201,7 @@ class CanDrives:
         self,
         objects: ObjectName | Sequence[ObjectName],
         duration: float,
-        play: Mapping[ObjectName, ArrayLike] | None = None,
+        play: Mapping[Any, ArrayLike] | None = None,
         period: float = 0.001,
     ) -> Trace:
         """Let `duration` [s] pass while objects are recorded and played.
@@ -290,10 +294,17 @@ class CanDrives:
     def __enter__(self) -> CanDrives:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
         if error is not None and self.safety is not None and not self._closed:
             self.safety.stop(f"{kind.__name__ if kind else 'an exception'} in the program")
         self.close()
+
+    @property
+    def bus(self) -> CanDrives:
+        """These drives, where others have to do with a bus."""
+        return self
 
     @property
     def timing(self) -> Timing:

@@ -162,7 +162,7 @@ def _affected(drives: CanDrives, wanted: Iterable[Key], axis: int) -> Iterable[i
 
 
 def _is_live(drives: CanDrives, axis: int) -> bool:
-    return cia402.is_live(int(drives.read_axis(drives.description.dictionary.find(cia402.STATUSWORD), axis)))
+    return bool(cia402.is_live(int(drives.read_axis(drives.description.dictionary.find(cia402.STATUSWORD), axis))))
 
 
 def _roll_back(drives: CanDrives, before: Mapping[Key, int], axis: int, cause: BaseException) -> None:

@@ -8,13 +8,16 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.entries import Entry
+
+if TYPE_CHECKING:
+    from drive_env.master.can_drives import CanDrives
 
 
 class Unit(NamedTuple):
@@ -58,7 +61,7 @@ def find_unit(name: str, increments: float | None) -> Unit | None:
     return UNITS.get(name)
 
 
-def increments_per_revolution(drives: Any) -> list[float | None]:
+def increments_per_revolution(drives: CanDrives) -> list[float | None]:
     """Return the position increments of a revolution of every axis, None where the drive does not say.
 
     Args:

@@ -19,13 +19,14 @@ import contextlib
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.entries import Entry
+from drive_env.drives.interface import Drives
 from drive_env.master.description import Key
 from drive_env.safety import signals
 from drive_env.safety.axes import Axes
@@ -423,9 +424,9 @@ class Envelope:
 
 
 @contextlib.contextmanager
-def swinging_allowed(drives: Any) -> Iterator[None]:
+def swinging_allowed(drives: Drives) -> Iterator[None]:
     """Have the envelope of drives, if they have one, take current that swings for intended; its other limits stay."""
-    envelope = getattr(drives, "safety", None)
+    envelope = drives.safety
     if envelope is None:
         yield
         return

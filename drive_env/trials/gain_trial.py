@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.drives.interface import Drives
 from drive_env.gains import Gains, scaled, write_gains
 from drive_env.motors import Motor
 from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
@@ -32,13 +33,6 @@ VELOCITY_P = ALL.index("velocity_p")
 # a fast loop; a limit cycle, whose current goes from limit to limit, 1 and more.
 OSCILLATION = 0.4
 RECOVERY, RECOVERY_TIME = 5, 0.01  # attempts, and the time between them [s]
-
-
-class Drives(motion.Drives, Protocol):
-    """What trials need of drives."""
-
-    def record(self, objects: Any, duration: float, play: Any = None, period: float = 0.001) -> Any:
-        """Let time pass while objects are recorded."""
 
 
 class Identified(NamedTuple):
@@ -225,7 +219,7 @@ class Trials:
 
     def _prepare(self, objects: list[Any]) -> None:
         """Have a bus map what will be recorded: in real time the samples of a move would miss the 10 ms that takes."""
-        if not getattr(self._drives, "time_waits", True):
+        if not self._drives.time_waits:
             self._drives.record(objects, 0.0)
 
     def _record(self, objects: list[Any], cycles: int) -> Mapping[Any, Integers]:
@@ -243,7 +237,7 @@ class Trials:
         return np.repeat(axes.reshape(-1, self._axes).any(axis=1), self._axes)
 
 
-def clear(drives: motion.Drives, where: Mask) -> None:
+def clear(drives: Drives, where: Mask) -> None:
     """Reset faults and enable again, without waiting; an axis that has not come to rest yet stays as it is."""
     for word in (cia402.DISABLE_VOLTAGE, cia402.FAULT_RESET, *cia402.ENABLING):
         drives.write(cia402.CONTROLWORD, word, where=where)

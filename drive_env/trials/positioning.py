@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
+from drive_env.drives.interface import Drives
 from drive_env.motors import Motor
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def reach(load: str | Path | Load) -> Floats:
     return np.where(found.high >= -found.low, found.high, found.low)
 
 
-def power_up(drives: motion.Drives, where: Mask | None = None) -> None:
+def power_up(drives: Drives, where: Mask | None = None) -> None:
     """Take drives from switch on disabled to pp, enabled, in as many milliseconds whatever becomes of them."""
     motion.select_mode(drives, "pp", where)
     for word in cia402.ENABLING:
@@ -84,14 +85,14 @@ def power_up(drives: motion.Drives, where: Mask | None = None) -> None:
     drives.advance(2 * CYCLE)
 
 
-def write_profile(drives: motion.Drives, move: Move, where: Mask | None = None) -> None:
+def write_profile(drives: Drives, move: Move, where: Mask | None = None) -> None:
     """Write the speed and the ramps of a move."""
     drives.write(cia402.PROFILE_VELOCITY, move.velocity, where=where)
     drives.write(cia402.PROFILE_ACCELERATION, move.acceleration, where=where)
     drives.write(cia402.PROFILE_DECELERATION, move.acceleration, where=where)
 
 
-def start(drives: motion.Drives, target: Integers, where: Mask | None = None) -> None:
+def start(drives: Drives, target: Integers, where: Mask | None = None) -> None:
     """Set off for a position [inc]; an axis that is not enabled stays where it is."""
     drives.write(cia402.TARGET_POSITION, target, where=where)
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)  # bit 4 must rise

@@ -1,4 +1,4 @@
-"""Drives that are calmed: what goes on shaking, even with the last good gains, gets gains that are slow.
+"""Fallback gains: what goes on shaking, even with the last good gains, gets gains that are slow.
 
 A trial stops what oscillates and returns to the last good gains. Good ones may be so near to the edge that an axis
 that has been shaken goes on for ever in a limit cycle with them; that is seen only here.
@@ -6,12 +6,16 @@ that has been shaken goes on for ever in a limit cycle with them; that is seen o
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.entries import ObjectName
+from drive_env.drives.interface import Drives
+from drive_env.drives.observed import Observer
+from drive_env.drives.trace import Trace
 from drive_env.gains import write_gains
 from drive_env.trials.gain_trial import OSCILLATION
 from drive_env.trials.positioning import WATCH
@@ -23,11 +27,11 @@ Mask = NDArray[np.bool_]
 WINDOWS = 3  # of 25 ms in a row: a trial has acted after the first, and good gains have had the second to calm it
 
 
-class CalmedDrives:
-    """Drives whose axes get calm gains when they shake for long; everything else is theirs.
+class FallbackGains(Observer):
+    """Gives axes calm gains when they shake for long.
 
     Args:
-        drives: The drives.
+        num_axes: Axes.
         rated_current: Of their motors [A].
         windows: Of 25 ms in a row in which it shakes; a trial has acted after the first.
 
@@ -36,32 +40,34 @@ class CalmedDrives:
         calmed: Axes that got them since the last `begin`, (num_axes,).
     """
 
-    def __init__(self, drives: Any, rated_current: float, windows: int = WINDOWS) -> None:
+    def __init__(self, num_axes: int, rated_current: float, windows: int = WINDOWS) -> None:
         self.calm: Integers | None = None
-        self.calmed: Mask = np.zeros(drives.num_axes, bool)
-        self._drives = drives
+        self.calmed: Mask = np.zeros(num_axes, bool)
         self._threshold = OSCILLATION * rated_current
         self._most = windows
-        self._windows = np.zeros(drives.num_axes, np.int64)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._drives, name)
+        self._windows = np.zeros(num_axes, np.int64)
 
     def begin(self) -> None:
         """Forget what was before a trial."""
         self.calmed[:] = False
         self._windows[:] = 0
 
-    def record(self, objects: Any, duration: float, *arguments: Any, **options: Any) -> Any:
-        """Let time pass while objects are recorded; calm what has shaken too long."""
-        trace = self._drives.record(objects, duration, *arguments, **options)
-        if self.calm is not None and cia402.TORQUE_ACTUAL in objects and len(trace) == WATCH:
-            change = np.diff(trace[cia402.TORQUE_ACTUAL], axis=0) * 1e-3
-            shaking = np.sqrt(np.mean(change**2, axis=0)) > self._threshold
-            self._windows = np.where(shaking, self._windows + 1, 0)
-            late = self._windows >= self._most
-            if late.any():
-                write_gains(self._drives, self.calm, late)
-                self.calmed |= late
-                self._windows[late] = 0
-        return trace
+    def passed(
+        self,
+        below: Drives,
+        duration: float,
+        trace: Trace,
+        asked: Sequence[ObjectName],
+        play: Mapping[ObjectName, ArrayLike] | None,
+    ) -> None:
+        """Calm what has shaken too long."""
+        if self.calm is None or cia402.TORQUE_ACTUAL not in asked or len(trace) != WATCH:
+            return
+        change = np.diff(trace[cia402.TORQUE_ACTUAL], axis=0) * 1e-3
+        shaking = np.sqrt(np.mean(change**2, axis=0)) > self._threshold
+        self._windows = np.where(shaking, self._windows + 1, 0)
+        late = self._windows >= self._most
+        if late.any():
+            write_gains(below, self.calm, late)
+            self.calmed |= late
+            self._windows[late] = 0

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import detrend
 
 from drive_env import cia402, motion
+from drive_env.drives.interface import machine_of
 from drive_env.trials import response
 from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.certificate.certificate import StepResponse
@@ -45,7 +46,8 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     axes = np.repeat(machines, target.axes_per_machine)
     if not axes.any():
         return {}
-    packed = one(drives.load)
+    machine = machine_of(drives)
+    packed = one(machine.drives.load)
     # On the load, where it disturbs: the axis with the longest lever feels the share.
     lever = float(np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max())
     off = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
@@ -56,10 +58,10 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
         windows = []
         # Both ways, and what it does when the load is gone: loose gears swing one way and stand the other.
         for share in (-SHARE, 0.0, SHARE, 0.0):
-            drives.machine.load_torque = np.where(machines, share * target.motor.rated_torque / lever, 0.0)
+            machine.load_torque = np.where(machines, share * target.motor.rated_torque / lever, 0.0)
             windows.append(drives.record([cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL], AFTER))
     finally:
-        drives.machine.load_torque = 0.0
+        machine.load_torque = 0.0
         drives.advance(REST)
         if off.any():
             motion.disable(drives, where=off)

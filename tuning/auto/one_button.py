@@ -145,9 +145,9 @@ def prove_found(
 def tell_of_lateness(run: Run) -> None:
     """Say of a bus in real time whether its SYNCs were late: moves and responses are distorted by that."""
     drives = run.target.drives
-    if getattr(drives, "time_waits", True):
+    if drives.time_waits or drives.bus is None:
         return
-    timing = drives.total_timing
+    timing = drives.bus.total_timing
     worst = 1e3 * timing.worst
     if timing.late:
         run.reserve(

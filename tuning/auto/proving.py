@@ -6,13 +6,14 @@ envelope may be faster: it quick-stops all drives, so that the trial is repeated
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.drives.trace import Trace
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.gain_trial import OSCILLATION, PHASES, Trial, Trials, measured_cost, softness
@@ -276,7 +277,7 @@ class ProvingGround:
                 break
         self._begin_without_a_step(where)
 
-    def _shakes(self, seen: Mapping[object, Any]) -> Mask:
+    def _shakes(self, seen: Trace) -> Mask:
         """Return which axes oscillated in a recording, or are off at its end."""
         change = np.diff(seen[cia402.TORQUE_ACTUAL], axis=0) * 1e-3
         shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * self.target.motor.rated_current

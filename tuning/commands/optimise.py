@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from drive_env.commands.tables import Column, print_lines, print_table
+from drive_env.drives.interface import Drives
 from tuning.commands.options import (
     INTERRUPTED,
     Cluster,
@@ -235,7 +236,7 @@ def _search_bus(target: Any, settings: Any, before: Path, folder: Path, options:
     return found
 
 
-def leave_oscillations_to_trials(drives: Any) -> None:
+def leave_oscillations_to_trials(drives: Drives) -> None:
     """Have the envelope not end a search for what a trial stops itself, nor for a sampler that thinks."""
     from dataclasses import replace
 

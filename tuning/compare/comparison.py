@@ -1,6 +1,6 @@
 """Tuners compared on the same machines: what their gains are worth by hidden J, and what it took to find them.
 
-Every tuner gets every machine as it comes from the box, behind a meter that counts time, moves and violations. Gains
+Every tuner gets every machine as it comes from the box, under an audit that counts time, moves and violations. Gains
 are scored in the emulator by hidden J (drive_env/trials/score.py), relative to that of the fitted rule which knows the
 true inertia; a tuner never sees the score.
 """
@@ -20,13 +20,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.drives.interface import machine_of
+from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import Gains, rule_gains
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import HiddenScore
 from mechanics.untrusted import parse_json
 from tuning.compare.suite import Machine, groups, open_group
 from tuning.compare.tuners import Outcome, RuleTuner, Tuner, find_tuner, identify_all
-from tuning.drive_audit import KINDS, MeteredDrives
+from tuning.drive_audit import KINDS, DriveAudit
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.runs.shard_log import ShardLog
 from tuning.search.trial_bench import read_gains
@@ -228,7 +230,7 @@ class Yardstick:
             inertia = _true_inertia(target)
             reach = np.where(target.high >= -target.low, target.high, target.low)
             supply = target.supply.reshape(len(group), -1)[:, 0]
-            self._hidden.set_machines(drives.machine.parameters, supply)
+            self._hidden.set_machines(machine_of(drives).parameters, supply)
             self._hidden.set_moves(plan_move(target.motor, inertia, drives.read((0x2058, 0)), reach))
             rule = np.concatenate(
                 [
@@ -252,8 +254,8 @@ def _true_inertia(target: Target) -> Floats:
 
     The axes of a machine move together: an axis pushes its own inertia, and what the others' acceleration puts on it.
     """
-    moved = np.concatenate([moved_inertia(group.load) for group in target.drives._groups])
-    share = target.drives.machine.parameters["motor.psi_m"] / target.motor.psi_m
+    moved = np.concatenate([moved_inertia(group.load) for group in machine_of(target.drives).drives._groups])
+    share = machine_of(target.drives).parameters["motor.psi_m"] / target.motor.psi_m
     return np.asarray(moved.reshape(-1) / np.repeat(share, target.axes_per_machine))
 
 
@@ -263,7 +265,7 @@ class _Tuned(NamedTuple):
     outcome: Outcome | None
     gains: Integers
     failure: str
-    meter: MeteredDrives
+    audit: DriveAudit
 
 
 class _Bench:
@@ -271,44 +273,44 @@ class _Bench:
 
     def __init__(self, group: Sequence[Machine], seed: int, num_threads: int | None) -> None:
         self._group, self._seed, self._num_threads = group, seed, num_threads
-        self._identified: tuple[list[Identification], float, Integers, MeteredDrives] | None = None
+        self._identified: tuple[list[Identification], float, Integers, DriveAudit] | None = None
 
     def tune(self, name: str, tuner: Tuner) -> _Tuned:
         """Return what comes of a tuner."""
         with open_group(self._group, self._num_threads) as target:
-            meter = MeteredDrives(target)
-            watched = replace(target, drives=meter)
+            audit = DriveAudit(target)
+            watched = replace(target, drives=ObservedDrives(target.drives, audit))
             machines = (zlib.crc32(machine.name.encode()) for machine in self._group)
             rng = np.random.default_rng((self._seed, zlib.crc32(name.encode()), *machines))
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
                 try:
                     if isinstance(tuner, RuleTuner):
-                        outcome, meter = self._propose(tuner, watched, meter)
+                        outcome, audit = self._propose(tuner, watched, audit)
                     else:
                         outcome = tuner(watched, rng)
-                    return _Tuned(outcome, _checked_gains(outcome, target), "", meter)
+                    return _Tuned(outcome, _checked_gains(outcome, target), "", audit)
                 except Exception as error:  # a tuner is anybody's code; the others are to be compared all the same
-                    return _Tuned(None, read_gains(target), f"{type(error).__name__}: {error}", meter)
+                    return _Tuned(None, read_gains(target), f"{type(error).__name__}: {error}", audit)
 
-    def _propose(self, tuner: RuleTuner, target: Target, meter: MeteredDrives) -> tuple[Outcome, MeteredDrives]:
-        """Return what a rule proposes, and the meter of the identification, which is the same for all rules."""
+    def _propose(self, tuner: RuleTuner, target: Target, audit: DriveAudit) -> tuple[Outcome, DriveAudit]:
+        """Return what a rule proposes, and the audit of the identification, which is the same for all rules."""
         if self._identified is None:
             before = read_gains(target)
             found, seconds = identify_all(target)
-            self._identified = found, seconds, before, meter
-        found, seconds, before, meter = self._identified
-        return tuner.propose(target, found, before, seconds), meter
+            self._identified = found, seconds, before, audit
+        found, seconds, before, audit = self._identified
+        return tuner.propose(target, found, before, seconds), audit
 
 
 def _rows(name: str, group: Sequence[Machine], tuned: _Tuned, yardstick: Yardstick) -> list[MachineRow]:
     """Return what a tuner made of every machine of a group."""
-    hidden, outcome, meter = yardstick.score(tuned.gains), tuned.outcome, tuned.meter
+    hidden, outcome, audit = yardstick.score(tuned.gains), tuned.outcome, tuned.audit
     per_machine = len(tuned.gains) // len(group)
     rows = []
     for k, machine in enumerate(group):
         axes = slice(k * per_machine, (k + 1) * per_machine)
-        counts = meter.violations[:, axes].sum(axis=1)
+        counts = audit.violations[:, axes].sum(axis=1)
         notes = [tuned.failure] if outcome is None else [note for note in outcome.notes[axes] if note]
         rows.append(
             MachineRow(
@@ -317,8 +319,8 @@ def _rows(name: str, group: Sequence[Machine], tuned: _Tuned, yardstick: Yardsti
                 hidden=float(hidden[k]),
                 relative=float(hidden[k] / yardstick.rule[k]),
                 rule=float(yardstick.rule[k]),
-                drive_seconds=round(float(meter.seconds[axes].max()), 3),
-                moves=int(meter.moves[axes].sum()),
+                drive_seconds=round(float(audit.seconds[axes].max()), 3),
+                moves=int(audit.moves[axes].sum()),
                 aborts=0 if outcome is None else int(outcome.aborts[axes].sum()),
                 violations=int(counts.sum()),
                 kinds=", ".join(f"{kind} {count}" for kind, count in zip(KINDS, counts, strict=True) if count),

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import gains_from_bandwidths, write_gains
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.encoder_check import EncoderCheck, check_encoders
@@ -27,7 +28,7 @@ from tuning.identify.working_state import (
     still_enabled,
     working_state,
 )
-from tuning.oscillation_watch import OscillationError, WatchedDrives, shaken
+from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken, watch_of
 from tuning.response.frequency_response import measure
 from tuning.stop_causes import stop_causes
 from tuning.target import Target, timed
@@ -73,9 +74,10 @@ class Experiments:
         """Do them all."""
         with timed(self.target) as (target, clock):
             noise = target.device.stage["adc_noise"].high
-            watched = WatchedDrives(target.drives, self.where, np.full(target.num_axes, target.current), noise)
+            watch = OscillationWatch(self.where, np.full(target.num_axes, target.current), noise)
+            watched = ObservedDrives(target.drives, watch)
             with working_state(replace(target, drives=watched), self.where) as working:
-                watched.limit = working.current
+                watch.limit = working.current
                 with suppress(OscillationError):
                     good = self.check(working)
                     if good.any():
@@ -92,7 +94,8 @@ class Experiments:
 
     def calm(self, working: Working) -> Working:
         """Return the axes that did not oscillate; what the others have no value of is refused with that reason."""
-        swung = working.where & working.target.drives.watch.swung
+        watch = watch_of(working.target.drives)
+        swung = working.where & (np.zeros_like(working.where) if watch is None else watch.swung)
         what, names = self._under_way
         for k in np.flatnonzero(swung):
             for name in names:
@@ -158,7 +161,9 @@ class Experiments:
         write_gains(drives, gains, working.where)
         go_back(working, "csv")
         sign = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
-        windings = identify_winding(working, pulses, electrical, float(target.motor.n_p) * float(sign[0]))
+        windings = identify_winding(
+            working, pulses, np.asarray(electrical, np.float64), float(target.motor.n_p) * float(sign[0])
+        )
         self.take_windings(working, windings)
         self.begin("inertia and friction", 0.3, MECHANICS)
         mechanics, inertia = identify_mechanics(working, holding)
@@ -267,4 +272,4 @@ class Experiments:
 
 
 def _in_real_time(working: Working) -> bool:
-    return not getattr(working.target.drives, "time_waits", True)
+    return not working.target.drives.time_waits

@@ -25,7 +25,7 @@ from drive_env.gains import write_gains
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.identification import Estimate, refused
 from tuning.identify.working_state import CYCLE, GUESS, Working, cautious_gains, go_back, still_enabled
-from tuning.oscillation_watch import SOFTER, VELOCITY_I, VELOCITY_P, OscillationError
+from tuning.oscillation_watch import SOFTER, VELOCITY_I, VELOCITY_P, OscillationError, watch_of
 from tuning.stop_causes import stop_causes
 from tuning.target import Target
 
@@ -267,7 +267,7 @@ def _moved(
 ) -> tuple[Plan, Floats, Floats, Mask, Integers]:
     """Move, once more with softer gains if an axis oscillates; return plan, what `move` returns, and the gains."""
     drives = working.target.drives
-    watch = getattr(drives, "watch", None)
+    watch = watch_of(drives)
     for column in (VELOCITY_P, VELOCITY_I):
         gains[:, column] = np.maximum(gains[:, column] // softness, 1)
     write_gains(drives, gains, working.where)
@@ -282,7 +282,7 @@ def _moved(
         if watch is None or not (again and (working.where & watch.swung).any()):
             break
         swung = working.where & watch.swung
-        gains = watch.soften(swung, gains, "csv")
+        gains = watch.soften(drives, swung, gains, "csv")
         softness[swung] *= SOFTER
     return moves, angle, current, alive, gains
 

@@ -92,7 +92,9 @@ class _Brief(Experiments):
             pulses = pulse(working, holding, BRIEFLY)
         working = self.calm(working)
         sign = 1.0 - 2.0 * float(drives.read(SHAFT_DIRECTION)[0])
-        self.take_windings(working, identify_winding(working, pulses, electrical, target.motor.n_p * sign))
+        self.take_windings(
+            working, identify_winding(working, pulses, np.asarray(electrical, np.float64), target.motor.n_p * sign)
+        )
         self.begin("inertia and friction", 0.45, MECHANICS)
         write_gains(drives, cautious_gains(target, GUESS * target.motor.inertia), working.where)
         motion.select_mode(drives, "pp", working.where)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 from mechanics.packed import PackedLoad
 from tuning.response.linear_model import Plant
 
+if TYPE_CHECKING:
+    from drive_env.emulator.emulated_drives import EmulatedDrives
+
 Floats = NDArray[np.float64]
 
 RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is none
 
 
-def true_plant(drives: Any, axis: int = 0) -> Plant:
+def true_plant(drives: EmulatedDrives, axis: int = 0) -> Plant:
     """Return the plant of an emulated axis, linearised where its load starts, with its first resonance.
 
     Flanks that transmit count as pressed, dry friction and gravity as none.

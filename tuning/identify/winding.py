@@ -97,7 +97,7 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
     stiffness, damping = J * (2.0 * np.pi * HOLD_HZ) ** 2, 2.0 * HOLD_DAMPING * J * 2.0 * np.pi * HOLD_HZ
     room = np.maximum(working.current - np.abs(holding), 0.0)
     levels, blocks = _levels(repeats)
-    in_real_time = not getattr(drives, "time_waits", True)
+    in_real_time = not drives.time_waits
     # Where time does not wait for the reads, first only: how long do they take?
     for played in (np.zeros(PROBE), levels) if in_real_time else (levels,):
         rows = len(played)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
+from drive_env.drives.interface import Drives
 from drive_env.gains import GAIN_OBJECTS, gains_from_bandwidths, write_gains
 from drive_env.motors import Motor
 from tuning.target import Target
@@ -210,7 +211,7 @@ def go_back(working: Working, mode: str, to: ArrayLike | None = None) -> None:
     motion.select_mode(drives, mode, working.where)
 
 
-def switch_off(drives: motion.Drives, where: Mask) -> None:
+def switch_off(drives: Drives, where: Mask) -> None:
     """Switch axes off; one in fault is off already, and its fault stays, to be read and reset by who wants."""
     fault = cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
     motion.disable(drives, where & ~fault)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
+from drive_env.drives.interface import Drives
 from drive_env.trials.positioning import wrapped
 from tuning.response.excitation import Lines, periodic
 from tuning.target import POSITION_SCALER, Target
@@ -138,7 +139,7 @@ class Shaker:
         seen, fast, enabled = self._play(raw.astype(np.int64), traced)
         played = (raw + self._offset) * self.radians - path
         chosen = np.flatnonzero(inside)
-        answer = seen[SEEN[self._loop]]
+        answer = np.asarray(seen[SEEN[self._loop]], float)
         if self._loop == "position":
             answer = wrapped(answer - self._origin) + self._origin
         windows = 0 if fast is None else len(fast[0]) // cycles
@@ -259,5 +260,5 @@ def let_go(target: Target, where: Mask, shaken: Mask) -> Iterator[None]:
             motion.enable(drives, where=on | alone)
 
 
-def _enabled(drives: motion.Drives) -> Mask:
+def _enabled(drives: Drives) -> Mask:
     return np.asarray(cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.dead_time import dead_time_resistance
-from tuning.oscillation_watch import OscillationError, shaken
+from tuning.oscillation_watch import OscillationError, shaken, watch_of
 from tuning.response.excitation import CREST, Lines, dimension, peak, plan_lines
 from tuning.response.excitation_run import CYCLE, MODE, RAMP, SETTLING, Pass, Shaker, at_rest, let_go
 from tuning.response.held_samples import split, unhold
@@ -210,7 +210,7 @@ class _Measurement:
     def _trial(self, shaker: Shaker, limit: Floats, speed: Floats, sign: Floats) -> Pass:
         """Return what a weak shaking shows; an axis that oscillates gets softer gains first, if it may."""
         drives = self._target.drives
-        watch = getattr(drives, "watch", None)
+        watch = watch_of(drives)
         for left in reversed(range(SOFTER + 1)):
             amplitude = self._trial_amplitude(speed, limit)
             try:
@@ -221,7 +221,7 @@ class _Measurement:
                     raise
             if watch is None or not self._softened or not (self._where & watch.swung).any() or not left:
                 break
-            self._gains = watch.soften(self._where & watch.swung, self._gains, MODE[self._loop])
+            self._gains = watch.soften(drives, self._where & watch.swung, self._gains, MODE[self._loop])
         return trial
 
     def _trial_speed(self, room: Floats) -> Floats:

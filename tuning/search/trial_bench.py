@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.drives.interface import machine_of
+from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import (
     FITTED_RULE,
     GAIN_OBJECTS,
@@ -27,8 +29,8 @@ from drive_env.safety.envelope import SafetyError
 from drive_env.trials.gain_trial import Identified, Trial, Trials, measured_cost, softness
 from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, plan_move, start, wrapped, write_profile
 from drive_env.trials.score import TRIP, cost
-from tuning.auto.fallback_gains import CalmedDrives
-from tuning.oscillation_watch import SOFTER, VELOCITY_P, OscillationError, WatchedDrives
+from tuning.auto.fallback_gains import FallbackGains
+from tuning.oscillation_watch import SOFTER, VELOCITY_P, OscillationError, OscillationWatch
 from tuning.target import Target
 
 Floats = NDArray[np.float64]
@@ -92,7 +94,8 @@ class TrialBench:
         self._anew = anew and target.drives.machine is not None
         device, motor = target.device, target.motor
         self.t_0 = 4.0 * float(small_time_constants(device, device.stage["velocity_filter"].default))
-        self._drives = CalmedDrives(target.drives, motor.rated_current)
+        self._fallback = FallbackGains(target.num_axes, motor.rated_current)
+        self._drives = ObservedDrives(target.drives, self._fallback)
         self._trials = Trials(self._drives, motor, target.axes_per_machine, self.t_0)
         self._reach = np.where(target.high >= -target.low, target.high, target.low)
         self._where = np.ones(target.num_axes, bool)
@@ -108,7 +111,7 @@ class TrialBench:
         """Find inertia and friction with gains from the data sheet alone; plan the moves, the rule's and safe gains."""
         target, drives = self.target, self.target.drives
         if self._anew:
-            drives.machine.reset()
+            machine_of(drives).reset()
         gains = first_gains(target)
         write_gains(drives, gains)  # before anything is enabled: the drives may have any
         self._trials.recover(self._where)
@@ -120,7 +123,7 @@ class TrialBench:
         self.incumbent = self.safe.copy()
         write_gains(drives, self.safe)
         drives.advance(TRIAL * CYCLE)  # the first gains may leave an axis swinging
-        self._drives.calm = self.safe
+        self._fallback.calm = self.safe
 
     def _moved(self, gains: Integers) -> tuple[Identified, Integers]:
         """Move there and back for identification; an axis that oscillates is switched off, and moves with softer gains.
@@ -133,19 +136,20 @@ class TrialBench:
         scaler = drives.read((0x2058, 0))
         for _ in range(SOFTENINGS):
             began = drives.read(cia402.POSITION_ACTUAL)
-            watched = WatchedDrives(self._drives, self._where, np.full(target.num_axes, target.current), noise)
+            watch = OscillationWatch(self._where, np.full(target.num_axes, target.current), noise)
+            watched = ObservedDrives(self._drives, watch)
             trials = Trials(watched, target.motor, target.axes_per_machine, self.t_0)
             self.moves += MOVES_OF_IDENTIFICATION
             with suppress(OscillationError):
                 found = trials.identify(self._reach, self._where)
-            if not watched.swung.any():
+            if not watch.swung.any():
                 return found
-            gains[watched.swung, VELOCITY_P:] = np.maximum(gains[watched.swung, VELOCITY_P:] // SOFTER, 1)
-            write_gains(drives, gains, watched.swung)
+            gains[watch.swung, VELOCITY_P:] = np.maximum(gains[watch.swung, VELOCITY_P:] // SOFTER, 1)
+            write_gains(drives, gains, watch.swung)
             self._trials.recover(self._where)
             drives.advance(CALM)
             self._reach = self._reach - wrapped(drives.read(cia402.POSITION_ACTUAL) - began) / scaler * 2.0 * np.pi
-        axis = int(np.flatnonzero(watched.swung)[0])
+        axis = int(np.flatnonzero(watch.swung)[0])
         raise RuntimeError(
             f"axis {axis} oscillates in the moves of identification, even with 1/{SOFTER ** (SOFTENINGS - 1)} of the "
             "gains that its motor's data sheet gives; check motor and wiring"
@@ -162,14 +166,14 @@ class TrialBench:
         axes = self._where if where is None else np.repeat(where, target.axes_per_machine)
         self._start_trial()
         self._return(axes)
-        self._drives.begin()
+        self._fallback.begin()
         try:
             tried = self._trials.run(gains, self.incumbent, self.move, self._origin, self._direction, axes)
         except SafetyError as error:  # the envelope has stopped all drives
             return self._stopped(axes, error)
         self._stops = 0
         # Until the next trial, and not those of the probe.
-        write_gains(target.drives, np.where(self._drives.calmed[:, None], self.safe, self.incumbent), axes)
+        write_gains(target.drives, np.where(self._fallback.calmed[:, None], self.safe, self.incumbent), axes)
         self._trials.recover(axes)
         if not self._anew:  # a trial ends where its move did, and the next one goes the other way
             self._origin = np.where(axes, self._origin + self._direction * self.move.distance, self._origin)
@@ -179,7 +183,7 @@ class TrialBench:
         self.aborts[axes & stopped] += 1
         objectives = self._objectives(tried)
         shape = (self.num_machines, target.axes_per_machine)
-        fragile = axes & self._drives.calmed
+        fragile = axes & self._fallback.calmed
         return Tried(
             self._cost(gains, tried).reshape(shape).max(axis=1),
             objectives.reshape(*shape, -1).max(axis=1),
@@ -239,7 +243,7 @@ class TrialBench:
 
     def _start_trial(self) -> None:
         if self._anew:
-            self.target.drives.machine.reset()
+            machine_of(self.target.drives).reset()
         self._trials.recover(self._where)
 
     def _return(self, axes: Mask) -> None:
