@@ -10,10 +10,10 @@ from drive_env import EmulatedDrives
 from drive_env.bus.wire import Wire
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
-from drive_env.canopen.store import Store
 from drive_env.faults.bus_faults import DISTURBANCES, OF_ONE_NODE, BusFaults
 from drive_env.faults.schedule import Order, parse_order
 from drive_env.faults.table import FAULTS
+from drive_env.node.store import Store
 
 NODE, MASTER = 5, 0x7F
 HEARTBEAT = Frame(0x700 + MASTER, b"\x05")

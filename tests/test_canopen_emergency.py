@@ -7,12 +7,13 @@ import pytest
 from canopen_wire import Wire
 
 from drive_env import EmulatedDrives
-from drive_env.canopen.emergency import CONDITIONS, QUEUE
+from drive_env.canopen.emergency import QUEUE
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.nmt import State
 from drive_env.devices import find_device
 from drive_env.firmware import fsa
 from drive_env.firmware.protection import CAUSES
+from drive_env.node.error_history import CONDITIONS
 
 
 @pytest.fixture(scope="module")

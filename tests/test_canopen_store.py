@@ -13,9 +13,9 @@ import pytest
 from canopen_wire import Wire
 
 from drive_env import EmulatedDrives
-from drive_env.canopen import store
 from drive_env.canopen.node import Node
 from drive_env.devices import find_device
+from drive_env.node import store
 
 SAVE, LOAD = "73 61 76 65", "6C 6F 61 64"
 STORE_FILE = Path(store.__file__)

@@ -20,11 +20,11 @@ from agents.evaluation import episode_log
 from agents.policies.agent_file import Bundle, BundleError
 from agents.training import hyperparameters
 from drive_env.bus.config import BusConfigError, load_bus
-from drive_env.canopen.store import Store
 from drive_env.commands.cli import app as env_app
 from drive_env.envs.configuration import configured
 from drive_env.envs.randomisation import Distributions
 from drive_env.envs.tracking import TrackingConfig
+from drive_env.node.store import Store
 from drive_env.pictures.demonstration import DemonstrationError, load_demonstration
 from mechanics import untrusted
 from mechanics.untrusted import UntrustedFileError, parse_json, parse_toml, read_arrays, read_bytes, read_toml

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drive_env.canopen import frames, mapping
+from drive_env.canopen import frames
 from drive_env.devices import Device
 from drive_env.dictionary.access import (
     INCOMPATIBLE_PARAMETER,
@@ -23,6 +23,7 @@ from drive_env.dictionary.access import (
     check_limits,
 )
 from drive_env.dictionary.entries import Entry, ObjectDictionary
+from drive_env.node import mapping
 from drive_env.node.axis import Port
 
 Key = tuple[int, int]

@@ -17,14 +17,11 @@ import numpy as np
 
 from drive_env.canopen import communication, frames, nmt
 from drive_env.canopen.communication import ModuleObjects, known_bit_rate, signed_command
-from drive_env.canopen.emergency import CONDITIONS, EPSILON, Condition, EmergencyProducer, ErrorHistory
+from drive_env.canopen.emergency import EPSILON, EmergencyProducer
 from drive_env.canopen.error_control import HeartbeatConsumer, HeartbeatProducer, NodeGuarding, consumers
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.nmt import Command, State
-from drive_env.canopen.node_dictionary import NodeDictionary
 from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
-from drive_env.canopen.sdo import SdoServer
-from drive_env.canopen.store import PowerLostError, Section, Store
 from drive_env.dictionary.access import (
     CANNOT_BE_STORED,
     HARDWARE_ERROR,
@@ -35,6 +32,10 @@ from drive_env.dictionary.access import (
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.firmware.protection import CAUSES, CUT, STOP
 from drive_env.node.axis import Axis, QueuedEmergency
+from drive_env.node.error_history import CONDITIONS, Condition, ErrorHistory
+from drive_env.node.node_dictionary import NodeDictionary
+from drive_env.node.sdo_server import SdoServer
+from drive_env.node.store import PowerLostError, Section, Store
 
 logger = logging.getLogger(__name__)
 

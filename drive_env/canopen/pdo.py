@@ -1,21 +1,17 @@
-"""Process data: receive PDOs that write objects, transmit PDOs that send them (CiA 301, 7.2.2)."""
+"""PDOs: which are received and sent, when, and under which identifier (CiA 301, 7.2.2)."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 
-from drive_env.canopen import frames, mapping
+from drive_env.canopen import frames
 from drive_env.canopen.communication import TO_MAPPING, ModuleObjects
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.node import mapping
 from drive_env.node.axis import Port
+from drive_env.node.process_data import MappedObjects
 
 LAST_SYNCHRONOUS = 240  # transmission types 0...240; 254 and 255 are driven by events
 EPSILON = 1e-6  # s: times are sums of cycles
-
-# An RPDO takes effect as a whole: set-points first, then the mode, then the controlword, whatever their order in it. A
-# controlword that starts a move so finds the target of the same frame.
-_RANK = {"": 0, "set_point": 0, "mode": 1, "controlword": 2}
 
 
 class Pdo:
@@ -42,9 +38,7 @@ class Pdo:
         self.transmission_type = objects.value(index, 2)
         count = objects.value(index + TO_MAPPING, 0)
         mapped = [mapping.parse(objects.value(index + TO_MAPPING, sub)) for sub in range(1, count + 1)]
-        self._ports = [self._port(mapped_index, mapped_sub) for mapped_index, mapped_sub, _ in mapped]
-        letters = [mapping.LAYOUT[port.entry.bits or 0][port.entry.signed] for port in self._ports]
-        self._layout = struct.Struct("<" + "".join(letters))
+        self._mapped = MappedObjects([self._port(mapped_index, mapped_sub) for mapped_index, mapped_sub, _ in mapped])
 
     @property
     def is_synchronous(self) -> bool:
@@ -59,14 +53,11 @@ class ReceivePdo(Pdo):
         """Take over what the objects say; what waits for SYNC is forgotten."""
         super().configure()
         self._waiting: bytes | None = None
-        order = sorted(range(len(self._ports)), key=lambda k: _RANK[self._ports[k].event])
-        self._plan = [(k, self._ports[k]) for k in order]
-        self._modes = [(k, port) for k, port in self._plan if port.event == "mode"]
 
     def receive(self, data: bytes) -> str | None:
         """Take a frame; return the condition that it makes, None if it is good."""
-        if len(data) != self._layout.size:
-            return "pdo_too_short" if len(data) < self._layout.size else "pdo_too_long"
+        if len(data) != self._mapped.size:
+            return "pdo_too_short" if len(data) < self._mapped.size else "pdo_too_long"
         if self.is_synchronous:
             self._waiting = data
             return None
@@ -84,21 +75,7 @@ class ReceivePdo(Pdo):
         self._waiting = None
 
     def _apply(self, data: bytes) -> str | None:
-        values = self._layout.unpack(data)
-        plan = self._plan
-        # Masters repeat the mode in every frame: what it is already is no write, which some drives would refuse.
-        if self._modes:
-            repeated = [k for k, port in self._modes if values[k] == port.read()]
-            if repeated:
-                plan = [(k, port) for k, port in plan if k not in repeated]
-        try:
-            for k, port in plan:
-                port.check(values[k])
-        except ObjectAccessError:
-            return "pdo_not_accepted"
-        for k, port in plan:
-            port.write(values[k])
-        return None
+        return None if self._mapped.write(data) else "pdo_not_accepted"
 
 
 class TransmitPdo(Pdo):
@@ -126,7 +103,6 @@ class TransmitPdo(Pdo):
         """Take over what the objects say."""
         before = self.can_id, self._sent_at
         super().configure()
-        self._readers = [port.read for port in self._ports]
         self._inhibit = self._objects.value(self.index, 3) * self._inhibit_unit
         self._period = self._objects.value(self.index, 5) * self._event_unit
         self.start()
@@ -142,23 +118,23 @@ class TransmitPdo(Pdo):
 
     def on_sync(self) -> bytes | None:
         """Return the data to send at this SYNC, None if there is nothing to send."""
-        if not self.is_synchronous or not self._readers:
+        if not self.is_synchronous or not len(self._mapped):
             return None
         if self.transmission_type == 0:
-            data = self._sample()
+            data = self._mapped.pack()
             changed, self._seen = data != self._seen, data
             return data if changed else None
         self._syncs += 1
         if self._syncs < self.transmission_type:
             return None
         self._syncs = 0
-        return self._sample()
+        return self._mapped.pack()
 
     def on_cycle(self, now: float) -> bytes | None:
         """Return the data to send after a communication cycle that ended at `now` [s]."""
-        if self.is_synchronous or not self._readers:
+        if self.is_synchronous or not len(self._mapped):
             return None
-        data = self._sample()
+        data = self._mapped.pack()
         if data != self._seen:
             self._seen = data
             self._is_due = True
@@ -173,6 +149,3 @@ class TransmitPdo(Pdo):
         self._is_due = False
         self._sent_at = now
         return data
-
-    def _sample(self) -> bytes:
-        return self._layout.pack(*[read() for read in self._readers])
