@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,8 @@ from hypothesis import strategies as st
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
-from drive_env.dictionary import units
+from drive_env.dictionary import codec, units
+from drive_env.emulator import prepared_record
 
 # Abort codes of CiA 301.
 READ_ONLY, NO_OBJECT, WRONG_TYPE, NO_SUB = 0x06010002, 0x06020000, 0x06070010, 0x06090011
@@ -347,24 +350,36 @@ def context(scaler=65536.0, **other):
     return units.Context(**{name: values[name] for name in units.Context._fields})
 
 
+def code(unit, low=-(2**31), high=2**32 - 1):
+    """Return the row of an object in that unit, of that range."""
+    row = units.UNITS[unit]
+    return codec.Code("field", 0, unit, "", low, high, row.period, row.specials, row.follows_scale)
+
+
+RANGES = {"1/65536 turn": (-(2**15), 2**15 - 1), "counter": (-(2**31), 2**31 - 1), "position window": (0, 2**32 - 1),
+          "position limit": (-(2**31), 2**31 - 1)}  # fmt: skip
+
+
 @pytest.mark.parametrize("unit", sorted(units.UNITS))
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_every_unit_makes_the_round_trip(unit, data):
     scaler = data.draw(st.sampled_from([65536.0, 1.0, 4096.0, 1e6, 2147483647.0, -65536.0]))
-    low, high = (-(2**15), 2**15 - 1) if unit == "1/65536 turn" else (-(2**31), 2**32 - 1)
+    low, high = RANGES.get(unit, (-(2**31), 2**32 - 1))
     raw = np.array([data.draw(st.integers(low, high))])
-    where = context(scaler)
-    assert (units.to_od(unit, units.from_od(unit, raw, where), where, low, high) == raw).all()
+    row = code(unit, low, high)
+    factor = row.factor(context(scaler))
+    assert (codec.encode(row, codec.decode(row, raw, factor), factor) == raw).all()
 
 
-@pytest.mark.parametrize("unit", sorted(set(units.UNITS) - {"1/65536 turn"}))
+@pytest.mark.parametrize("unit", sorted(name for name, row in units.UNITS.items() if not row.period))
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(value=st.floats(-1e12, 1e12))
-def test_to_od_rounds_and_saturates(unit, value):
-    where = context()
-    one = float(np.ravel(units.from_od(unit, np.array([1]), where))[0])
-    raw = int(units.to_od(unit, np.array([value]), where, -1000, 2000)[0])
+def test_what_is_encoded_is_rounded_and_saturates(unit, value):
+    row = code(unit, -1000, 2000)
+    factor = row.factor(context())
+    one = float(np.ravel(factor)[0])
+    raw = int(codec.encode(row, np.array([value]), factor)[0])
     assert -1000 <= raw <= 2000
     if abs(value) < 900 * abs(one):
         assert abs(raw * one - value) <= 0.5000001 * abs(one)
@@ -372,6 +387,28 @@ def test_to_od_rounds_and_saturates(unit, value):
         assert raw == 2000
     elif value < -1001 * one:
         assert raw == -1000
+
+
+@pytest.mark.parametrize("unit", sorted(units.UNITS))
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(data=st.data())
+def test_arrays_single_values_and_compiled_code_read_a_row_alike(unit, data):
+    low, high = RANGES.get(unit, (-(2**31), 2**31 - 1))
+    row, factor = code(unit, low, high), code(unit).factor(units.Context(65536.0, 100.0 / 32768.0))
+    raw = data.draw(st.one_of(st.integers(low, high), st.sampled_from([low, high])))
+    si = codec.decode_one(row, raw, factor)
+    assert codec.decode(row, np.array([raw]), factor).tolist() == [si]
+    values = np.zeros((1, 1, 1))
+    decoding = codec.compiled_rows([row], decoded=True)
+    assert prepared_record.from_od(np.array([[raw]]), np.array([factor]), decoding[0], values, 0)
+    assert values[0, 0, 0] == si
+    for value in (si, data.draw(st.sampled_from([math.inf, -math.inf, math.nan]) | st.floats(-1e200, 1e200))):
+        found = codec.encode_one(row, value, factor)
+        assert codec.encode(row, np.array([value]), factor).tolist() == [found]
+        compiled = np.zeros((1, 1, 1), np.int64)
+        rows = codec.compiled_rows([row], decoded=False)
+        prepared_record.to_od(np.array([[[value]]]), np.array([[factor]]), rows, compiled)
+        assert compiled[0, 0, 0] == found or abs(value / factor) > 2**52  # where a double has no units any more
 
 
 @pytest.mark.parametrize(
@@ -389,29 +426,39 @@ def test_to_od_rounds_and_saturates(unit, value):
         ("velocity P", 256, 100.0 / 32768.0 * 30.0 / np.pi),  # one LSB of current per rpm
         ("position P", 4096, 2.0 * np.pi / 60.0 * 65536.0 / (2.0 * np.pi)),  # one rpm per 1/65536 revolution
         ("raw", 7, 7.0),
+        ("position window", 0xFFFFFFFF, np.inf),  # switched off
+        ("position window", 65536, 2.0 * np.pi),
+        ("position limit", 2**31 - 1, np.inf),
+        ("position limit", -(2**31), -np.inf),
+        ("position limit", -65536, -2.0 * np.pi),
     ],
 )
 def test_units_by_hand(unit, raw, si):
-    assert float(np.ravel(units.from_od(unit, np.array([raw]), context()))[0]) == pytest.approx(si, rel=1e-12)
-
-
-@settings(max_examples=100, deadline=None, derandomize=True)
-@given(raw=st.integers(0, 2**32 - 1), scaler=st.sampled_from([65536.0, 1000.0, 1e6]))
-def test_position_window_round_trip(raw, scaler):
-    where = context(scaler)
-    window = units.window_from_od(np.array([raw]), where)
-    assert np.isinf(window[0]) == (raw == 0xFFFFFFFF)
-    assert units.window_to_od(window, where).tolist() == [raw]
+    row = code(unit)
+    assert float(np.ravel(codec.decode(row, np.array([raw]), row.factor(context())))[0]) == pytest.approx(si, rel=1e-12)
 
 
 def test_an_angle_wraps_at_half_a_turn():
-    turn = units.to_od("1/65536 turn", np.array([0.0, np.pi - 1e-6, np.pi + 1e-3, -np.pi / 2, 5 * np.pi]), context(),
-                       -32768, 32767)  # fmt: skip
+    row = code("1/65536 turn", -32768, 32767)
+    turn = codec.encode(row, np.array([0.0, np.pi - 1e-6, np.pi + 1e-3, -np.pi / 2, 5 * np.pi]), row.factor(context()))
     assert turn.tolist() == [0, -32768, -32758, -16384, -32768]
 
 
+def test_a_position_is_counted_on_past_the_end_of_its_type():
+    row = code("counter", -(2**31), 2**31 - 1)
+    turns = np.array([32767.0, 32768.0, -32768.5])
+    assert codec.encode(row, turns * 2.0 * np.pi, row.factor(context())).tolist() == [
+        32767 * 65536, -(2**31), 2**31 - 32768
+    ]  # fmt: skip
+
+
+def test_a_scale_of_0_scales_nothing():
+    assert code("inc").factor(units.Context(0.0, 1.0)) == np.inf
+
+
 def test_what_is_no_number_reads_as_zero():
-    assert units.to_od("mA", np.array([np.nan]), context(), -10, 10).tolist() == [0]
+    row = code("mA", -10, 10)
+    assert codec.encode(row, np.array([np.nan]), row.factor(context())).tolist() == [0]
 
 
 # --- stored values ----------------------------------------------------------------------------------------------------

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.canopen.frames import Frame
 from drive_env.devices import AxisOffset, find_device
-from drive_env.dictionary import units
 from drive_env.firmware.record import FIELDS, set_lanes
 from drive_env.node.axis import Axis
 
@@ -96,24 +95,6 @@ def test_every_write_does_what_the_dictionary_of_all_axes_does(drives, entry):
         if field.name != "random":  # each axis has its own noise
             block = drives._records[field.name].reshape(2, -1, 8)[1]
             assert np.array_equal(block[:, 0], block[:, 1], equal_nan=True), field.name
-
-
-@pytest.mark.parametrize("unit", [*sorted(units.UNITS), "position window", "position limit"])
-@settings(max_examples=100, deadline=None, derandomize=True)
-@given(raw=st.integers(-(2**31), 2**32 - 1), scaler=st.sampled_from([65536.0, 1.0, 1e6, -65536.0]))
-def test_one_value_makes_the_round_trip(unit, raw, scaler):
-    if unit == "1/65536 turn":
-        raw = (raw + 2**15) % 2**16 - 2**15
-    if unit == "position window":
-        raw %= 2**32
-    if unit == "position limit":
-        raw = (raw + 2**31) % 2**32 - 2**31
-    factor = units.factor_of_one(unit, units.Context(scaler, 100.0 / 32768.0))
-    assert units.one_to_od(unit, units.one_from_od(unit, raw, factor), factor, -(2**31), 2**32 - 1) == raw
-
-
-def test_a_scale_of_0_scales_nothing():
-    assert units.factor_of_one("inc", units.Context(0.0, 1.0)) == np.inf
 
 
 def test_emergencies_of_one_axis_leave_the_others_alone(drives):

@@ -29,7 +29,8 @@ logging.basicConfig(format="%(message)s")
 from drive_env.firmware import cycle
 from drive_env.emulator.prepared_record import from_od
 values = np.empty((2, 1, 1))
-assert from_od(np.array([[3], [4]]), np.array([0.5]), -10, 10, values, 0) and values.ravel().tolist() == [1.5, 2.0]
+code = np.array([-10, 10, 0.0, *[np.nan] * 4])
+assert from_od(np.array([[3], [4]]), np.array([0.5]), code, values, 0) and values.ravel().tolist() == [1.5, 2.0]
 print("compiled", sum(from_od.stats.cache_misses.values()), "kept", sum(from_od.stats.cache_hits.values()))
 """
 WHOLE = """
@@ -61,7 +62,7 @@ def run(program: str, cache: Path) -> subprocess.CompletedProcess[str]:
 def cache(tmp_path_factory) -> Path:
     """A copy of the real cache, with all kernels that these programs use."""
     values = np.empty((2, 1, 1))
-    from_od(np.array([[3], [4]]), np.array([0.5]), -10, 10, values, 0)
+    from_od(np.array([[3], [4]]), np.array([0.5]), np.array([-10, 10, 0.0, *[np.nan] * 4]), values, 0)
     with EmulatedDrives() as drives:
         drives.advance(0.001)
     copy = tmp_path_factory.mktemp("cache")

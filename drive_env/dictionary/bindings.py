@@ -10,8 +10,7 @@ class Binding:
     """A row of a device's table of bindings.
 
     `event` names what a write sets off in the firmware: "controlword", "mode", "set_point" or nothing. `part` chooses
-    in a deep field. The units "position window" and "position limit" are increments with a value for
-    "off".
+    in a deep field.
     """
 
     index: int

@@ -79,12 +79,11 @@ class Conversion(Bundle):
 
     played: NumberCube  # (objects, cycles, axes)
     factors: Matrix  # (objects, axes)
-    limits: NumberCube  # (objects, 2, 1)
+    codes: Matrix  # rows of codec.compiled_rows
     values: Cube  # SI, (cycles, objects, axes)
     sampled: NumberCube
     sample_factors: Matrix
-    sample_limits: Matrix  # (objects, 2)
-    wraps: Numbers
+    sample_codes: Matrix
     samples: Cube  # SI
     refused: Numbers  # (1,) not 0: an integer was out of range, and its group stayed as it was
     before: int = 0
@@ -101,10 +100,9 @@ def convert_in(address: Any, first: Any, count: Any) -> Any:
     own = conversion_at(address)
     if own.before != 0:
         call_hook(own.before, own.data, first, count)
-    played, factors, limits, values = own.played, own.factors, own.limits, own.values
+    played, factors, codes, values = own.played, own.factors, own.codes, own.values
     for k in range(played.shape[0]):
-        low, high = limits[k, 0, 0], limits[k, 1, 0]
-        if not from_od_rows(played[k], factors[k], low, high, values, k, first, first + count):
+        if not from_od_rows(played[k], factors[k], codes[k], values, k, first, first + count):
             own.refused[0] = 1
             return 0
     return 1
@@ -114,7 +112,7 @@ def convert_in(address: Any, first: Any, count: Any) -> Any:
 def convert_out(address: Any, first: Any, count: Any) -> Any:
     """Bring samples into drive units, and run the hook after."""
     own = conversion_at(address)
-    to_od_rows(own.samples, own.sample_factors, own.sample_limits, own.wraps, own.sampled, first, first + count)
+    to_od_rows(own.samples, own.sample_factors, own.sample_codes, own.sampled, first, first + count)
     if own.after != 0:
         call_hook(own.after, own.data, first, count)
     return 1
@@ -161,12 +159,11 @@ class EmulatedExchange(Exchange):
         self._conversion = Conversion(
             played=self.played,
             factors=np.array([row.factor for row in rows], float).reshape(len(rows), axes),
-            limits=np.array([(row.low, row.high) for row in rows], np.int64).reshape(len(rows), 2, 1),
+            codes=image.input_codes,
             values=values,
             sampled=self.sampled,
             sample_factors=image.factors,
-            sample_limits=image.limits,
-            wraps=image.wraps.astype(np.int64),
+            sample_codes=image.codes,
             samples=samples,
             refused=self._refused,
             before=0 if hooks is None else address_of_hook(hooks.before),

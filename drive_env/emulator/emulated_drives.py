@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.cores import usable_cores
 from drive_env.devices import Device, find_device
+from drive_env.dictionary.codec import Code
 from drive_env.dictionary.entries import ObjectName
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
@@ -153,6 +154,11 @@ class EmulatedDrives:
         self._objects.restart(np.ones(self.num_axes, bool))
         self._scale: tuple[int, list[float | None]] = (-1, [])
 
+    @property
+    def codes(self) -> Mapping[tuple[int, int], Code]:
+        """How the integers of bound objects are SI values, by index and sub-index."""
+        return self._objects.codes
+
     # --- the interface --------------------------------------------------------------------------------------------
     def read(self, name: ObjectName) -> Integers:
         """Return an object as the wire carries it, int64 of shape (num_axes,); a text as an array of str.
@@ -227,17 +233,17 @@ class EmulatedDrives:
                 return self._trace(image.read(samples), len(samples), every)
         known = self._objects.entries
         entries = [known.find(name) for name in objects]
-        bindings = {(e.index, e.sub): self._objects.recordable(e) for e in entries}
-        live = {key: binding for key, binding in bindings.items() if binding is not None}
+        codes = {(e.index, e.sub): self._objects.recordable(e) for e in entries}
+        live = {key: code for key, code in codes.items() if code is not None}
         sampled = channels([(b.field, b.part) for b in live.values()]) if live else NOTHING
         values, played = self._objects.plan_play(play, cycles)
         rows = -(-cycles // every)
         samples = np.empty((rows, len(live), self.num_axes))
         self._run(cycles, call_of(values, played, samples, sampled, every))
         result: dict[tuple[int, int], Integers] = {}
-        for k, (key, binding) in enumerate(live.items()):
-            result[key] = self._objects.to_od(known.find(key), binding, samples[:, k])
-        for key in bindings:
+        for k, (key, code) in enumerate(live.items()):
+            result[key] = self._objects.to_od(code, samples[:, k])
+        for key in codes:
             if key not in result:
                 result[key] = np.broadcast_to(self._objects.read(key), (rows, self.num_axes))
         prepared = self._objects.process_image(objects, list(play))

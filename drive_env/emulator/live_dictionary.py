@@ -25,10 +25,10 @@ from drive_env.dictionary.access import (
     check_writable,
     checked_values,
 )
-from drive_env.dictionary.bindings import Binding
+from drive_env.dictionary.codec import Code, code_of, decode, encode
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
 from drive_env.emulator.group import Channels, channels
-from drive_env.emulator.prepared_record import SCALES, SPECIAL_UNITS, ProcessImage, Row
+from drive_env.emulator.prepared_record import SCALES, ProcessImage, Row
 from drive_env.emulator.record_snapshot import LaneImage
 from drive_env.firmware import cycle
 from drive_env.firmware.modes import MODES
@@ -57,6 +57,7 @@ class LiveDictionary:
     def __init__(self, device: Device, records: NDArray[np.void], num_axes: int, preset: Mapping[str, int]) -> None:
         self.device = device
         self.entries: ObjectDictionary = device.new_dictionary()
+        self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
         self._records = records
         self.num_axes = num_axes
         self._scale_changes = 0
@@ -137,32 +138,29 @@ class LiveDictionary:
         entries = [self.entries.find(name) for name in sampled]
         inputs = [self.entries.find(name) for name in played]
         for entry in entries + inputs:
-            binding = self.device.bindings.get((entry.index, entry.sub))
-            if binding is None or binding.unit in SPECIAL_UNITS:
+            if not self._is_bound(entry):
                 return None
         if any(allowed_values(self.device, entry) is not None for entry in inputs):
             return None
         outputs = list({(entry.index, entry.sub): entry for entry in entries}.values())
         rows, sources = [self._row(entry) for entry in outputs], [self._row(entry) for entry in inputs]
-        if any(row.binding.field in SCALES for row in sources):
+        if any(row.code.field in SCALES for row in sources):
             return None
         into = channels(
-            [(row.binding.field, row.binding.part) for row in sources], [_EVENTS[row.binding.event] for row in sources]
+            [(row.code.field, row.code.part) for row in sources], [_EVENTS[row.code.event] for row in sources]
         )
-        out_of = channels([(row.binding.field, row.binding.part) for row in rows])
+        out_of = channels([(row.code.field, row.code.part) for row in rows])
         return ProcessImage((into, sources), (out_of, rows), self._scale_changes)
 
     def _row(self, entry: Entry) -> Row:
-        binding = self.device.bindings[entry.index, entry.sub]
-        factor = np.broadcast_to(units.UNITS[binding.unit].factor(self._context()), (self.num_axes,))
-        assert entry.low is not None and entry.high is not None, "only numbers are bound"
-        wraps = (entry.index, entry.sub) in units.WRAPPING
-        return Row(entry, binding, np.array(factor, float), wraps, entry.low, entry.high)
+        key = (entry.index, entry.sub)
+        code = self.codes[key]
+        return Row(key, code, np.array(np.broadcast_to(code.factor(self._context()), (self.num_axes,)), float))
 
-    def recordable(self, entry: Entry) -> Binding | None:
-        """Return the binding of an entry whose value changes by itself, None of one that only a write changes."""
+    def recordable(self, entry: Entry) -> Code | None:
+        """Return where the value of an entry is that changes by itself, None of one that only a write changes."""
         check_readable(entry)
-        return self.device.bindings.get((entry.index, entry.sub))
+        return self.codes.get((entry.index, entry.sub))
 
     def plan_play(self, play: Mapping[ObjectName, ArrayLike], cycles: int) -> tuple[Floats, Channels]:
         """Return SI values, shape (cycles, objects, num_axes), and the fields that they go to.
@@ -187,10 +185,10 @@ class LiveDictionary:
                 )
             check_in_range(entry, raw)
             self._check_value(entry, raw.astype(np.int64).reshape(-1))
-            binding = self.device.bindings[entry.index, entry.sub]
-            values[:, k] = self._from_od(binding, raw if raw.ndim == 2 else raw[:, None])
-            fields.append((binding.field, binding.part))
-            kinds.append(_EVENTS[binding.event])
+            code = self.codes[entry.index, entry.sub]
+            values[:, k] = self._from_od(code, raw if raw.ndim == 2 else raw[:, None])
+            fields.append((code.field, code.part))
+            kinds.append(_EVENTS[code.event])
         return values, channels(fields, kinds) if fields else NOTHING
 
     # --- inside ---------------------------------------------------------------------------------------------------
@@ -226,13 +224,15 @@ class LiveDictionary:
     def _stored_image(self) -> LaneImage:
         """Return the fields that `_restore` would set from what is stored, converted by the scales that are stored."""
         context = self._context()._replace(position_scaler=self._stored[POSITION_SCALER].astype(float))
-        bound = [key for key in self._stored if key in self.device.bindings]
-        rows = [self.device.bindings[key] for key in bound if self.entries.find(key).access not in ("ro", "const")]
-        values = [self._from_od(row, self._stored[row.index, row.sub], context) for row in rows]
-        return LaneImage(self._records, [(row.field, row.part) for row in rows], np.array(values))
+        bound = [
+            key for key in self._stored if key in self.codes and self.entries.find(key).access not in ("ro", "const")
+        ]
+        values = [self._from_od(self.codes[key], self._stored[key], context) for key in bound]
+        fields = [(self.codes[key].field, self.codes[key].part) for key in bound]
+        return LaneImage(self._records, fields, np.array(values))
 
     def _is_bound(self, entry: Entry) -> bool:
-        return (entry.index, entry.sub) in self.device.bindings
+        return (entry.index, entry.sub) in self.codes
 
     def _context(self) -> units.Context:
         device = self.device
@@ -243,32 +243,17 @@ class LiveDictionary:
 
     def _read(self, entry: Entry) -> Integers:
         if self._is_bound(entry):
-            binding = self.device.bindings[entry.index, entry.sub]
-            value = get_lanes(self._records, binding.field, self.num_axes, binding.part)
-            return self.to_od(entry, binding, value.astype(float))
+            code = self.codes[entry.index, entry.sub]
+            return self.to_od(code, get_lanes(self._records, code.field, self.num_axes, code.part).astype(float))
         stored = self._values[entry.index, entry.sub]
         return np.full(self.num_axes, stored) if isinstance(stored, str) else stored.copy()
 
-    def to_od(self, entry: Entry, binding: Binding, value: Floats) -> Integers:
+    def to_od(self, code: Code, value: Floats) -> Integers:
         """Return integers on the wire of SI values; axes are the last dimension."""
-        if binding.unit == "position window":
-            return units.window_to_od(value, self._context())
-        if binding.unit == "position limit":
-            return units.limit_to_od(value, self._context())
-        if (entry.index, entry.sub) in units.WRAPPING:
-            increments = np.rint(value / units.UNITS["inc"].factor(self._context()))
-            return np.nan_to_num(units.wrap(increments)).astype(np.int64)
-        low, high = entry.low, entry.high
-        assert low is not None and high is not None, "only numbers are bound"
-        return units.to_od(binding.unit, value, self._context(), low, high)
+        return encode(code, value, code.factor(self._context()))
 
-    def _from_od(self, binding: Binding, raw: NDArray[Any], context: units.Context | None = None) -> Floats:
-        scales = self._context() if context is None else context
-        if binding.unit == "position window":
-            return units.window_from_od(raw, scales)
-        if binding.unit == "position limit":
-            return units.limit_from_od(raw, scales)
-        return units.from_od(binding.unit, raw, scales)
+    def _from_od(self, code: Code, raw: NDArray[Any], context: units.Context | None = None) -> Floats:
+        return decode(code, raw, code.factor(self._context() if context is None else context))
 
     def _check(self, entry: Entry, raw: Integers, where: Mask) -> None:
         self._check_value(entry, raw[where])
@@ -293,7 +278,7 @@ class LiveDictionary:
         if not self._is_bound(entry):
             self._set_value(entry, raw, where)
             return
-        event = _EVENTS[self.device.bindings[key].event]
+        event = _EVENTS[self.codes[key].event]
         if event == cycle.SET_POINT:
             self._set_field(entry, raw, where)
             set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
@@ -311,17 +296,17 @@ class LiveDictionary:
             for other in self.entries
             if self._is_bound(other)
             and other.access not in ("ro", "const")
-            and self.device.bindings[other.index, other.sub].unit in units.SCALED_BY_POSITION
+            and self.codes[other.index, other.sub].follows_scale
         ]
         self._set_field(entry, raw, where)
         for other, value in kept:
             self._set_field(other, value, where)
 
     def _set_field(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        binding = self.device.bindings[entry.index, entry.sub]
-        if binding.field in SCALES:
+        code = self.codes[entry.index, entry.sub]
+        if code.field in SCALES:
             self._scale_changes += 1
-        set_lanes(self._records, binding.field, self._from_od(binding, raw), where, binding.part)
+        set_lanes(self._records, code.field, self._from_od(code, raw), where, code.part)
 
     def _set_value(self, entry: Entry, raw: Integers, where: Mask) -> None:
         key = (entry.index, entry.sub)

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drive_env.dictionary import units
 from drive_env.dictionary.access import CANNOT_BE_STORED, ObjectAccessError, check_allowed, check_limits
-from drive_env.dictionary.bindings import Binding
+from drive_env.dictionary.codec import Code, decode_one, encode_one
 from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.units import Context
 from drive_env.emulator.live_dictionary import (
     MODE_OF_OPERATION,
     POSITION_SCALER,
@@ -26,9 +26,6 @@ from drive_env.emulator.live_dictionary import (
 )
 from drive_env.firmware import cycle, protection
 from drive_env.firmware.record import EMERGENCY_QUEUE, LANES, RECORD
-
-# Units whose factor an axis can change while it runs.
-_CHANGING = units.SCALED_BY_POSITION
 
 
 class Port(NamedTuple):
@@ -118,11 +115,11 @@ class Axis:
         return memory, start // dtype.base.itemsize + part * LANES + self._lane
 
     def _make_port(self, entry: Entry) -> Port:
-        binding = self._device.bindings.get((entry.index, entry.sub))
+        code = self._objects.codes.get((entry.index, entry.sub))
         check = self._checker(entry)
-        if binding is None:
+        if code is None:
             return Port(entry, self._unbound_reader(entry), check, self._unbound_writer(entry))
-        return Port(entry, self._reader(entry, binding), check, self._writer(entry, binding), binding.event)
+        return Port(entry, self._reader(code), check, self._writer(entry, code), code.event)
 
     def _checker(self, entry: Entry) -> Callable[[int], None]:
         device, key = self._device, (entry.index, entry.sub)
@@ -164,40 +161,34 @@ class Axis:
 
         return write
 
-    def _factor(self, unit: str) -> float:
-        context = units.Context(self._reals[self._scaler], self._device.current_full_scale / 32768.0)
-        return units.factor_of_one(unit, context)
+    def _factor(self, code: Code) -> float:
+        return float(code.factor(Context(self._reals[self._scaler], self._device.current_full_scale / 32768.0)))
 
-    def _reader(self, entry: Entry, binding: Binding) -> Callable[[], int]:
-        memory, place = self._place(binding.field, binding.part)
-        unit, low, high = binding.unit, entry.low, entry.high
-        assert low is not None and high is not None, "only numbers are bound"
-        if memory is self._integers and unit == "raw":
+    def _reader(self, code: Code) -> Callable[[], int]:
+        memory, place = self._place(code.field, code.part)
+        low, high = code.low, code.high
+        if memory is self._integers and code.unit == "raw":
             return lambda: min(max(memory[place], low), high)
-        if (entry.index, entry.sub) in units.WRAPPING:
-            return lambda: units.one_wrapped(memory[place], self._factor(unit))
-        if unit in _CHANGING:
-            return lambda: units.one_to_od(unit, memory[place], self._factor(unit), low, high)
-        factor = self._factor(unit)
-        return lambda: units.one_to_od(unit, memory[place], factor, low, high)
+        if code.follows_scale:
+            return lambda: encode_one(code, memory[place], self._factor(code))
+        factor = self._factor(code)
+        return lambda: encode_one(code, memory[place], factor)
 
-    def _writer(self, entry: Entry, binding: Binding) -> Callable[[int], None]:
-        memory, place = self._place(binding.field, binding.part)
-        unit = binding.unit
+    def _writer(self, entry: Entry, code: Code) -> Callable[[int], None]:
+        memory, place = self._place(code.field, code.part)
         if (entry.index, entry.sub) == POSITION_SCALER:
             return lambda raw: self._objects.write_checked(entry, raw, self.number)
-        if binding.event in ("controlword", "mode"):
-            kind = cycle.CONTROLWORD if binding.event == "controlword" else cycle.MODE
+        if code.event in ("controlword", "mode"):
+            kind = cycle.CONTROLWORD if code.event == "controlword" else cycle.MODE
             return lambda raw: self._write_event(kind, raw)
         if memory is self._integers:
-            assert unit == "raw", "whole numbers of the record are bound as they are"
+            assert code.unit == "raw", "whole numbers of the record are bound as they are"
             return lambda raw: memory.__setitem__(place, raw)
-        changing = unit in _CHANGING
-        fixed = self._factor(unit)
-        fresh = binding.event == "set_point"
+        fixed = self._factor(code)
+        fresh = code.event == "set_point"
 
         def write(raw: int) -> None:
-            memory[place] = units.one_from_od(unit, raw, self._factor(unit) if changing else fixed)
+            memory[place] = decode_one(code, raw, self._factor(code) if code.follows_scale else fixed)
             if fresh:
                 self._integers[self._fresh] = 1
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
 from drive_env.dictionary import units
+from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
 
 if TYPE_CHECKING:
@@ -171,16 +172,15 @@ class Recorder:
 def from_raw(drives: EmulatedDrives, name: tuple[int, int], raw: ArrayLike, axes: slice = slice(None)) -> Floats:
     """Return an object's integers [drive units] as SI, axes last."""
     values = np.asarray(raw, np.float64)
-    return units.from_od(drives.device.bindings[name].unit, values, _context(drives, axes))
+    code = drives.codes[name]
+    return decode(code, values, code.factor(_context(drives, axes)))
 
 
 def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> NDArray[np.int64]:
     """Return an SI value, one or one per axis, as an object's integers [drive units], saturated at its range."""
-    entry = drives.device.new_dictionary().find(name)
-    assert entry.low is not None and entry.high is not None, "a number"
+    code = drives.codes[name]
     values = np.broadcast_to(np.asarray(value, np.float64), (drives.num_axes,))
-    context = _context(drives, slice(None))
-    return units.to_od(drives.device.bindings[name].unit, values, context, entry.low, entry.high)
+    return encode(code, values, code.factor(_context(drives, slice(None))))
 
 
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:

@@ -56,10 +56,10 @@ BINDINGS = (
     Binding(cia402.QUICK_STOP_OPTION, 0, "quick_stop_option"),
     Binding(cia402.MODE, 0, "mode", event="mode"),
     Binding(cia402.MODE_DISPLAY, 0, "mode_display"),
-    Binding(cia402.POSITION_DEMAND, 0, "position_demand", "inc"),
+    Binding(cia402.POSITION_DEMAND, 0, "position_demand", "counter"),
     # The manual calls 6063h once the demanded value and once equal to 6064h; it is taken as the actual value.
-    Binding(cia402.POSITION_INTERNAL, 0, "theta_meas", "inc"),
-    Binding(cia402.POSITION_ACTUAL, 0, "theta_meas", "inc"),
+    Binding(cia402.POSITION_INTERNAL, 0, "theta_meas", "counter"),
+    Binding(cia402.POSITION_ACTUAL, 0, "theta_meas", "counter"),
     Binding(cia402.FOLLOWING_WINDOW, 0, "following_error_window", "inc"),
     Binding(cia402.POSITION_WINDOW, 0, "position_window", "position window"),
     Binding(cia402.POSITION_WINDOW_TIME, 0, "position_window_time", "ms"),
