@@ -403,12 +403,14 @@ def test_arrays_single_values_and_compiled_code_read_a_row_alike(unit, data):
     assert prepared_record.from_od(np.array([[raw]]), np.array([factor]), decoding[0], values, 0)
     assert values[0, 0, 0] == si
     for value in (si, data.draw(st.sampled_from([math.inf, -math.inf, math.nan]) | st.floats(-1e200, 1e200))):
+        if row.period and 2**52 < abs(value / factor) < math.inf:
+            continue  # where a double has no units any more
         found = codec.encode_one(row, value, factor)
         assert codec.encode(row, np.array([value]), factor).tolist() == [found]
         compiled = np.zeros((1, 1, 1), np.int64)
         rows = codec.compiled_rows([row], decoded=False)
         prepared_record.to_od(np.array([[[value]]]), np.array([[factor]]), rows, compiled)
-        assert compiled[0, 0, 0] == found or abs(value / factor) > 2**52  # where a double has no units any more
+        assert compiled[0, 0, 0] == found
 
 
 @pytest.mark.parametrize(
