@@ -83,6 +83,7 @@ def encode(code: Code, value: NDArray[Any], factor: Any) -> Integers:
     si = np.asarray(value, np.float64)
     raw = np.rint(si / factor)
     if code.period:
+        raw = np.where(np.isfinite(raw), raw, 0.0)
         raw = np.mod(raw + 0.5 * code.period, code.period) - 0.5 * code.period
     raw = np.nan_to_num(np.clip(raw, code.least, code.greatest))
     for integer, special in code.specials:
