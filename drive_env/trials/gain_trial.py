@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from drive_env import motion
 from drive_env.gains import Gains, scaled, write_gains
 from drive_env.motors import Motor
+from drive_env.speeds import per_increment
 from drive_env.trials.positioning import (
     CURRENT,
     CYCLE,
@@ -148,7 +149,7 @@ class Trials:
             traces.append(self._record(objects, TRIAL))
         position, velocity, current = (np.concatenate([trace[name] for trace in traces]) for name in objects)
         angle = wrapped(position - origin) / move.increments
-        speed = velocity / scaler * 2.0 * np.pi
+        speed = velocity / (scaler * per_increment(drives, VELOCITY)) * 2.0 * np.pi
         return _momentum_balance(angle, speed, current * 1e-3, self._motor), origin
 
     def run(
