@@ -18,6 +18,7 @@ from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary, ObjectName
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import Observer
+from drive_env.drives.speeds import per_increment
 from drive_env.drives.trace import Trace
 from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.move_counter import MoveCounter
@@ -72,8 +73,9 @@ class DriveAudit(Observer):
         self._low, self._high = (ends * scaler / (2.0 * np.pi) for ends in (target.low, target.high))
         self._slack = SLACK * scaler
         limit = target.speed * scaler / (2.0 * np.pi)
-        self._fastest = OVERSPEED * limit
-        self._counter = MoveCounter(limit, target.current * 1e3)
+        counts = per_increment(drives, cia402.VELOCITY_ACTUAL)
+        self._fastest = OVERSPEED * limit * counts
+        self._counter = MoveCounter(limit, target.current * 1e3, counts)
         self._rated = target.motor.rated_current
         self._outside: Mask = np.zeros((len(KINDS), count), bool)
         self._last_current = np.zeros(count)

@@ -50,6 +50,7 @@ def target_for(
     Raises:
         BusError: If the bus cannot be opened or a node does not answer.
     """
+    from drive_env.drives.speeds import per_increment
     from drive_env.master.can_drives import CanDrives
     from drive_env.safety.limits import Limits
     from tuning.target import FREE, LOCKSTEP_PATIENCE, on_bus
@@ -65,9 +66,10 @@ def target_for(
         lanes.close()
         with CanDrives(**more) as drives:
             turn, at = drives.read(POSITION_SCALER), drives.read(cia402.POSITION_ACTUAL)
+            speed_turn = turn * per_increment(drives, cia402.VELOCITY_ACTUAL)
         reach = POSITION_SLACK * amplitude * turn
         position = ((at - reach).tolist(), (at + reach).tolist())
-        velocity = (SPEED_SLACK * speed * turn).tolist()
+        velocity = (SPEED_SLACK * speed * speed_turn).tolist()
     # A trial of gains may oscillate: it sees that and stops the lane by itself.
     oscillation = environment_name(environment) != "ServoDrive/GainTuning-v0"
     limits = Limits(position=position, velocity=velocity, oscillation=oscillation, stall=guard.stall)

@@ -136,7 +136,7 @@ def _state(target: Target, axis: int) -> Iterator[Check]:
                                    "once; remove its cause first")  # fmt: skip
     else:
         yield Check("state", OK, text)
-    speed = abs(_read(target, cia402.VELOCITY_ACTUAL, axis)) / target.increments()[axis]
+    speed = abs(_read(target, cia402.VELOCITY_ACTUAL, axis)) / target.speed_counts()[axis]
     if speed > AT_REST * target.speed:
         yield Check("standstill", NO, f"the axis turns at {speed:.3g} rad/s; bring it to rest")
     else:
@@ -291,8 +291,10 @@ LOOKS = (_identity, _state, _answers, _samples, _error_control, _motor, _supply,
 # --- what would be written --------------------------------------------------------------------------------------------
 def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, str, bool]]:
     """Yield the objects that a run writes: which, between which limits, what for, and whether that stays."""
+    from tuning.identify.wiring import FINDINGS
+
     turn = target.increments()
-    speed = round(float(np.max(target.speed * turn)))
+    speed = round(float(np.max(target.speed * target.speed_counts())))
     ends = target.low * turn, target.high * turn
     here = target.drives.read(cia402.POSITION_ACTUAL)
     finite = all(np.isfinite(end).all() for end in ends)
@@ -310,6 +312,8 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, st
         yield (index, 0), "above 0", "ramps of the moves and of a stop", False
     yield (0x2003, 0), f"up to {amperes}", "current limit while it is identified", False
     yield (0x2004, 0), f"0...{amperes}", "current of the encoder's check", False
+    for key, wrong in FINDINGS.items():
+        yield key, "0, 1", f"where the check finds it wrong: {wrong}", True
     yield (0x2055, 0), "1, 3", "open loop for the encoder's check, then the encoder again", False
     yield (cia402.FOLLOWING_WINDOW, 0), "up to 100 turns", "following error while it is shaken", False
     for sub, value in ((1, "1"), (2, "-3")):

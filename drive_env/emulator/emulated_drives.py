@@ -37,14 +37,13 @@ from drive_env.faults.machine_faults import MachineFaults
 from drive_env.firmware import cycle
 from drive_env.firmware.cycle import Call
 from drive_env.firmware.protection import CAUSES
-from drive_env.firmware.record import get_lanes, new_records, set_lanes
+from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
 from drive_env.master.quantities import integers, is_quantity
 from drive_env.motors import find_motor
 from mechanics.load import Load
 from mechanics.loads import find_load
 from mechanics.model import copies_per_model
-from mechanics.packed import PackedLoad
-from mechanics.template import Template
+from mechanics.packed import PackedLoad, pack
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -72,7 +71,9 @@ class EmulatedDrives:
         seed: Seed of everything random. Machine k of a seed is the same machine in every set.
         first_machine: Number of the first machine.
         identical: Make every machine the one numbered `first_machine`, its noise included: for comparing gains.
-        randomise: Parameters to draw per machine: True for all, or names or groups ("load", "motor.R_s").
+        randomise: Parameters to draw per machine: True for all, or names or groups ("load", "motor.R_s"). How a motor
+            is wired is drawn with the rest where the drives have factory values; commissioned ones know it, and it is
+            drawn where it is named ("motor.encoder_direction").
         ideal: Take a stage, encoder and bearings without faults.
         parameters: True machine parameters [SI] that replace defaults and draws: one value or one per machine.
         supply: Supply voltage [V]; the motor's by default.
@@ -128,7 +129,7 @@ class EmulatedDrives:
         numbers = (
             [first_machine] * num_machines if identical else list(range(first_machine, first_machine + num_machines))
         )
-        self._draw(seed, numbers, randomise, ideal, parameters or {})
+        self._draw(seed, numbers, randomise, ideal, parameters or {}, wired_as_known=motor is not None)
         self._groups = self._build_groups(physics_steps, integrator, friction)
         self._turn = np.zeros(1, np.int64)
         self._fleet = cycle.Fleet(np.array([group.machinery.address for group in self._groups], np.int64), self._turn)
@@ -148,9 +149,12 @@ class EmulatedDrives:
         self._faults = MachineFaults(self)
         self.machine = Machines(self)
         preset = {} if motor is None else self.device.preset(motor)
-        if motor is not None and not self.load.has_switches:
-            preset = {"Limit switches": 3, **preset}
+        if motor is not None:
+            preset = {"Limit switches": 0 if self.load.has_switches else 3, **preset}
         self._objects = LiveDictionary(self.device, self._records, self.num_axes, preset)
+        serial = self.device.canopen.objects.get("serial_number")
+        if serial is not None:
+            self._objects.engrave(serial, np.repeat(np.array(numbers) + 1, self.load.num_axes))
         self._objects.restart(np.ones(self.num_axes, bool))
         self._scale: tuple[int, list[float | None]] = (-1, [])
 
@@ -293,12 +297,13 @@ class EmulatedDrives:
         randomise: bool | Collection[str],
         ideal: bool,
         given: Mapping[str, ArrayLike],
+        wired_as_known: bool,
     ) -> None:
         axes = (1, self.load.num_axes)
         single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6)
         defaults = {p.name: float(single.get(p.name)[0]) for p in self.load.parameters}
         table = parameter_table(self.device, self.motor, self.load, defaults)
-        self._parameters, noise = draw_parameters(table, seed, numbers, randomise, ideal)
+        self._parameters, noise = draw_parameters(table, seed, numbers, randomise, ideal, wired_as_known=wired_as_known)
         seeds = np.repeat(noise, self.load.num_axes) + np.tile(np.arange(axes[1]), self.num_machines)
         self._noise_seeds = np.mod(seeds, 2.0**32 - 1.0) + 1.0  # xorshift stays at 0 for ever
         for name, value in given.items():
@@ -308,32 +313,25 @@ class EmulatedDrives:
 
     def _build_groups(self, physics_steps: int, integrator: str, friction: str) -> list[Group]:
         rates = rates_of(self.device, physics_steps)
-        templates: dict[int, Template] = {}
-        armature, bearings = self._armature(), self._bearings()
-        groups = []
         per_group = copies_per_model(self.load)
-        axes_per_group = per_group * self.load.num_axes
-        for first in range(0, self.num_machines, per_group):
-            machines = slice(first, min(first + per_group, self.num_machines))
-            count = machines.stop - machines.start
-            if count not in templates:
-                templates[count] = Template(self.load, count)
-            load = PackedLoad(
-                self.load,
-                armature[machines],
-                bearings[machines],
-                {p.name: self._parameters[f"load.{p.name}"][machines] for p in self.load.parameters},
-                rates.window / physics_steps,
-                integrator=integrator,
-                friction=friction,
-                # A joint does not go far in a millisecond, and sliding friction does not depend on inertia.
-                weigh_every=rates.windows * physics_steps,
-                template=templates[count],
-                first_machine=first,
-            )
-            block = first // per_group * (axes_per_group // 8)
-            blocks = -(-count * self.load.num_axes // 8)
+        loads = pack(
+            self.load,
+            self._armature(),
+            self._bearings(),
+            {p.name: self._parameters[f"load.{p.name}"] for p in self.load.parameters},
+            rates.window / physics_steps,
+            copies=per_group,
+            integrator=integrator,
+            friction=friction,
+            # A joint does not go far in a millisecond, and sliding friction does not depend on inertia.
+            weigh_every=rates.windows * physics_steps,
+        )
+        groups, first = [], 0
+        for load in loads:
+            machines = slice(first, first + load.copies)
+            block, blocks = first * self.load.num_axes // LANES, -(-load.copies * self.load.num_axes // LANES)
             groups.append(Group(machines, load, self._records[block : block + blocks], rates))
+            first = machines.stop
         return groups
 
     def _set_constants(self, supply: float) -> None:
@@ -350,8 +348,6 @@ class EmulatedDrives:
         records["is_dc"] = motor.kind == "dc"
         records["phase_factor"] = 1.0 if motor.kind == "dc" else 1.5
         records["flux_temperature"] = motor.flux_temperature
-        records["hall_true_polarity"] = motor.hall_polarity
-        records["hall_true_direction"] = motor.hall_direction
         records["n_p"] = motor.n_p
         for switch in self.load.switches:
             kind = SWITCHES.index(switch.kind)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.drives.interface import Drives
+from drive_env.drives.speeds import per_increment
 from drive_env.gains import Gains, scaled, write_gains
 from drive_env.motors import Motor
 from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
@@ -127,7 +128,7 @@ class Trials:
             traces.append(self._record(objects, TRIAL))
         position, velocity, current = (np.concatenate([trace[name] for trace in traces]) for name in objects)
         angle = wrapped(position - origin) / move.increments
-        speed = velocity / scaler * 2.0 * np.pi
+        speed = velocity / (scaler * per_increment(drives, cia402.VELOCITY_ACTUAL)) * 2.0 * np.pi
         return _momentum_balance(angle, speed, current * 1e-3, self._motor), origin
 
     def run(

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
 from drive_env.drives.interface import Drives
+from drive_env.drives.speeds import per_increment
 from drive_env.motors import Motor
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ CURRENT_ERROR = (0x2041, 3)
 
 
 class Move(NamedTuple):
-    """A positioning move: 607Ah from rest at 0, 6081h and 6083h, and what it is in SI, each of shape (num_axes,)."""
+    """A positioning move: 607Ah from rest at 0, its speed and ramp, and what it is in SI, each of shape (num_axes,)."""
 
     distance: Integers  # inc, with its sign
     velocity: Integers  # pps
@@ -87,9 +88,13 @@ def power_up(drives: Drives, where: Mask | None = None) -> None:
 
 def write_profile(drives: Drives, move: Move, where: Mask | None = None) -> None:
     """Write the speed and the ramps of a move."""
-    drives.write(cia402.PROFILE_VELOCITY, move.velocity, where=where)
-    drives.write(cia402.PROFILE_ACCELERATION, move.acceleration, where=where)
-    drives.write(cia402.PROFILE_DECELERATION, move.acceleration, where=where)
+    for name, value in (
+        (cia402.PROFILE_VELOCITY, move.velocity),
+        (cia402.PROFILE_ACCELERATION, move.acceleration),
+        (cia402.PROFILE_DECELERATION, move.acceleration),
+    ):
+        # Rounded up, where a drive counts in rpm: the profile ends in time.
+        drives.write(name, np.ceil(value * per_increment(drives, name)).astype(np.int64), where=where)
 
 
 def start(drives: Drives, target: Integers, where: Mask | None = None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +15,7 @@ from drive_env.gains import GAIN_OBJECTS, Gains
 from drive_env.trials.positioning import wrapped
 from tuning.auto.result import AxisRun, Result
 from tuning.auto.trial_order import OTHERS
+from tuning.identify.wiring import Key, write_wiring
 from tuning.stop_causes import stop_causes
 
 if TYPE_CHECKING:
@@ -119,6 +120,10 @@ class Run:
         target = self.target
         here = wrapped(target.drives.read(cia402.POSITION_ACTUAL) - self._origin) / target.increments()
         return np.minimum(target.low - here, 0.0), np.maximum(target.high - here, 0.0)
+
+    def wire(self, values: Sequence[Mapping[Key, int]]) -> None:
+        """Write the settings that wirings need, of every axis; travel and origin become those that are counted then."""
+        self.target, self._origin = write_wiring(self.target, self._origin, values)
 
     @property
     def look_back_time(self) -> Floats:

@@ -1,9 +1,12 @@
-"""Pole pairs and direction of the encoder: the field is turned in open loop, and the encoder must follow it.
+"""Pole pairs, and which way encoder and halls are wired: the field is turned in open loop, and they must follow it.
 
 With commutation in open loop (2055h) the current of 2004h points along an angle that the velocity demand turns
 (2102h). The rotor follows: electrical turns of the field over turns that the encoder counts are the pole pairs, and
 the sign says whether it counts in the direction in which the field turns. Commutation by encoder needs both to be
-right before any torque is commanded: a reversed encoder makes a motor run away.
+right before any torque is commanded: a reversed encoder makes a motor run away. So do halls where they commutate.
+
+A brushed motor has no field to turn: a current there and back for some milliseconds, longer and longer until it is
+seen, moves the rotor by some counts and tells the direction before any loop is closed over the encoder.
 """
 
 from __future__ import annotations
@@ -15,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.identification import Estimate, refused
+from tuning.identify.wiring import Halls, judge_halls
 from tuning.identify.working_state import (
     BY_FIELD,
     COMMUTATION,
@@ -28,12 +33,13 @@ from tuning.identify.working_state import (
     still_enabled,
     switch_off,
 )
+from tuning.oscillation_watch import shaken
 from tuning.stop_causes import stop_causes
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FIELD_ANGLE, ENCODER_ANGLE = 0x2102, 0x2103  # 1/65536 electrical turn
+FIELD_ANGLE, HALL_ANGLE = 0x2102, 0x2104  # 1/65536 electrical turn
 RAISE, REST, TURN = 20, 60, 240  # cycles: the current comes (gravity does not wait), the rotor rests, the field turns
 MOST_TURN, LEAST_TURN = 1.0, 0.2  # electrical turns of the field
 SHARE = 0.9  # of what current there is
@@ -41,6 +47,11 @@ TOO_SHORT = "travel too short"  # how the reason begins where nothing was turned
 MARGIN = 0.1  # rad of room that stays free
 TOLERANCE = 0.35  # of a pole pair: from here on a ratio is no whole number
 STUCK = 0.25  # of the field's turn: a rotor that follows less does not follow
+# Of a brushed motor: shares of the current and cycles of a quarter of the push; counts that must be seen, and how well
+# they must be the push's own (correlation), apart from what falls or coasts.
+PUSHES = ((0.5, 4), (0.5, 8), (SHARE, 16), (SHARE, 32), (SHARE, 64))
+LEAST_COUNTS, LIKENESS = 10, 0.7
+PULSED = 1.2  # of the current limit, RMS over 25 ms: beyond, the current loop does not pulse but oscillates
 
 
 class EncoderCheck(NamedTuple):
@@ -49,6 +60,7 @@ class EncoderCheck(NamedTuple):
     pole_pairs: Estimate
     direction: Estimate
     ratio: float = math.nan  # of the field's turns to the encoder's, where the rotor followed
+    halls: Halls = Halls()
 
     @property
     def is_good(self) -> bool:
@@ -68,8 +80,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
     count = target.num_axes
     if target.motor.kind == "dc":
         none = refused("1", "a brushed motor has no pole pairs")
-        later = refused("1", "a brushed motor has no field to turn; see the current pulses")
-        return [EncoderCheck(none, later)] * count
+        return [EncoderCheck(none, direction) for direction in _push(working)]
     configured = drives.read(POLE_PAIRS).astype(float)
     commutation = drives.read(COMMUTATION)
     where, reasons = able(working)
@@ -79,7 +90,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
         drives.write(COMMUTATION, BY_FIELD, where=where)
         drives.write(OPEN_LOOP_CURRENT, 0, where=where)
         enable(working, "csv", where)
-        away, back, field, reasons = _turn(working, where, configured)
+        away, back, field, halls, reasons = _turn(working, where, configured)
         alive = still_enabled(working, drives.read(cia402.STATUSWORD))
     finally:
         switch_off(drives, where)
@@ -99,8 +110,57 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
             )
             found.append(EncoderCheck(refused("1", reason), refused("1", reason)))
         else:
-            found.append(_judge(field[k], shaft[k] * away[k], shaft[k] * back[k], target.motor.n_p))
+            check = _judge(field[k], shaft[k] * away[k], shaft[k] * back[k], target.motor.n_p)
+            found.append(check._replace(halls=halls[k]) if check.direction.is_known else check)
     return found
+
+
+def _push(working: Working) -> list[Estimate]:
+    """Push brushed motors there and back, and return the directions of their encoders; all axes are off then."""
+    drives, count = working.target.drives, working.target.num_axes
+    found: list[Estimate] = [refused("1", "not asked for")] * count
+    waiting = working.where.copy()
+    try:
+        enable(working, "cst", waiting)
+        with swinging_allowed(drives), shaken(drives, PULSED * working.current):
+            for share, quarter in PUSHES:
+                # As much forth as back, so that the rotor ends at rest and where it was.
+                sign = np.concatenate([np.repeat((1.0, -1.0, -1.0, 1.0), quarter), np.zeros(quarter)])
+                raw = np.where(waiting, sign[:, None] * np.rint(1e3 * share * working.current), 0).astype(np.int64)
+                angle = working.angle(
+                    drives.record([cia402.POSITION_ACTUAL], len(raw) * CYCLE, play={cia402.TARGET_TORQUE: raw})[
+                        cia402.POSITION_ACTUAL
+                    ]
+                )
+                stay_inside(working, waiting)
+                alive = still_enabled(working, drives.read(cia402.STATUSWORD))
+                for k in np.flatnonzero(waiting):
+                    towards = _likeness(angle[:, k], sign)
+                    seen = np.ptp(angle[:, k]) >= LEAST_COUNTS * 2.0 * np.pi / working.target.motor.encoder_counts
+                    if seen and abs(towards) >= LIKENESS:
+                        found[k] = Estimate(*[float(np.sign(towards))] * 3, "1")
+                    elif not alive[k]:
+                        found[k] = refused("1", "the axis was switched off while it was pushed: it left its travel")
+                    else:
+                        found[k] = refused("1", "the rotor did not follow the current: is it blocked, a cable open?")
+                        continue
+                    waiting[k] = False
+                switch_off(drives, working.where & ~waiting)
+                if not waiting.any():
+                    break
+    finally:
+        switch_off(drives, working.where)
+    return found
+
+
+def _likeness(angle: Floats, torque: Floats) -> float:
+    """Return the correlation, -1...1, of a motion with that of a free mass under a torque; what falls is left out."""
+    t = np.linspace(-1.0, 1.0, len(angle))
+    trend = np.stack([np.ones_like(t), t, t * t], axis=1)
+    pair = np.stack([angle, np.cumsum(np.cumsum(torque))], axis=1)
+    rest = pair - trend @ np.linalg.lstsq(trend, pair, rcond=None)[0]
+    sizes = np.linalg.norm(rest, axis=0)
+    return float(rest[:, 0] @ rest[:, 1] / max(sizes[0] * sizes[1], 1e-30))
 
 
 def able(working: Working) -> tuple[Mask, list[str]]:
@@ -129,11 +189,12 @@ def _way(working: Working) -> tuple[Floats, Mask]:
     return sign * way * n_p, np.asarray(way >= LEAST_TURN * 2.0 * np.pi / n_p)
 
 
-def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Floats, Floats, list[str]]:
+def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Floats, Floats, list[Halls], list[str]]:
     """Turn the fields there and back.
 
     Returns:
-        How far the rotors went [rad], there and back, and the fields [rad], and why an axis was not turned.
+        How far the rotors went [rad], there and back, and the fields [rad], what the halls said on the way there, and
+        why an axis was not turned.
     """
     drives = working.target.drives
     current = np.rint(1e3 * SHARE * working.current).astype(np.int64)
@@ -146,28 +207,31 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     turn = np.where(able, turn, 0.0)
     # Smooth, so that the rotor does not swing: a raised cosine of speed.
     shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(TURN) + 0.5) / TURN)
-    fields = [_field(working)]
+    seen = [(_angle(working, FIELD_ANGLE), _angle(working, HALL_ANGLE))]
     for sign in (1.0, -1.0):
         speed = sign * turn / configured / (TURN * CYCLE) * shape[:, None]
-        raw = np.where(where, np.rint(speed * working.increments), 0).astype(np.int64)
+        raw = np.where(where, np.rint(speed * working.speed_counts()), 0).astype(np.int64)
         raw[-1] = 0
         passed = np.zeros(len(turn))
-        before = fields[-1]
+        before = _angle(working, FIELD_ANGLE)
         for k in range(0, TURN, TURN // 10):
             drives.record(
                 [cia402.POSITION_ACTUAL], TURN // 10 * CYCLE, play={cia402.TARGET_VELOCITY: raw[k : k + TURN // 10]}
             )
-            now = _field(working)
+            now = _angle(working, FIELD_ANGLE)
+            if sign > 0.0:
+                seen.append((now, _angle(working, HALL_ANGLE)))
             passed += (now - before + np.pi) % (2.0 * np.pi) - np.pi
             before = now
             stay_inside(working, where)
-        fields.append(before)
         stands.append(_rest(working))
         if sign > 0.0:
             turned = passed
     short = f"{TOO_SHORT}: the field pulled the rotor to where less than {LEAST_TURN:g} electrical turns are free"
     reasons = [short if chosen and not can else "" for chosen, can in zip(where, able, strict=True)]
-    return stands[1] - stands[0], stands[2] - stands[1], turned, reasons
+    field, hall = np.array(seen).transpose(1, 2, 0)
+    halls = [judge_halls(*both) for both in zip(field, hall, strict=True)]
+    return stands[1] - stands[0], stands[2] - stands[1], turned, halls, reasons
 
 
 def stay_inside(working: Working, where: Mask) -> None:
@@ -178,8 +242,8 @@ def stay_inside(working: Working, where: Mask) -> None:
         switch_off(working.target.drives, out)
 
 
-def _field(working: Working) -> Floats:
-    return np.asarray(working.target.drives.read(FIELD_ANGLE) * (2.0 * np.pi / 65536.0))
+def _angle(working: Working, name: int) -> Floats:
+    return np.asarray(working.target.drives.read(name) * (2.0 * np.pi / 65536.0))
 
 
 def _rest(working: Working) -> Floats:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from tuning.identify.wiring import Settings
     from tuning.target import Target
 
 Mask = NDArray[np.bool_]
@@ -59,11 +60,14 @@ class Identification:
         drive_time: Time that passed on the drive [s].
         told: What is identified, by the same names, where `estimates` have guesses that only a tuner should work with;
             None where they have none.
+        wiring: What is known of the cable: the settings that encoder and halls need, by object, and what the drive has.
+            With others than it needs, its motor runs away or is locked.
     """
 
     estimates: Mapping[str, Estimate]
     drive_time: float
     told: Mapping[str, Estimate] | None = None
+    wiring: Settings = field(default_factory=dict)
 
     def value(self, name: str) -> float:
         """Return a value, nan where it was refused."""

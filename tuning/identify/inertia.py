@@ -183,7 +183,7 @@ def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
     error = np.zeros(len(begin))
     for k in range(0, len(plan.speed), CORRECTION):
         part = plan.speed[k : k + CORRECTION] + np.clip(FOLLOW * error, -0.3 * fastest, 0.3 * fastest)
-        raw = np.where(working.where, np.rint(part * working.increments), 0).astype(np.int64)
+        raw = np.where(working.where, np.rint(part * working.speed_counts()), 0).astype(np.int64)
         trace = drives.record(
             [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD],
             len(raw) * CYCLE,
@@ -227,7 +227,7 @@ def are_linked(working: Working) -> bool:
     shape = _bump(1.0)
     pulled = np.zeros(target.num_axes, bool)
     for sign in (1.0, -1.0):
-        raw = np.where(first, np.rint(sign * np.outer(shape, way) * working.increments), 0).astype(np.int64)
+        raw = np.where(first, np.rint(sign * np.outer(shape, way) * working.speed_counts()), 0).astype(np.int64)
         trace = drives.record(
             [cia402.TORQUE_ACTUAL, cia402.POSITION_ACTUAL], len(raw) * CYCLE, play={cia402.TARGET_VELOCITY: raw}
         )

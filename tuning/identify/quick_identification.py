@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from drive_env import cia402, motion
 from drive_env.gains import write_gains
 from drive_env.trials.gain_trial import Identified, Trials
-from tuning.identify.experiments import MECHANICS, PULSED, RESPONSE, UNITS, WORST_MISFIT, Experiments
+from tuning.identify.encoder_check import PULSED
+from tuning.identify.experiments import MECHANICS, RESPONSE, UNITS, WORST_MISFIT, Experiments
 from tuning.identify.identification import NAMES, Estimate, Identification, Progress, refused
 from tuning.identify.winding import BRIEFLY, identify_winding, pulse, to_torque_mode
 from tuning.identify.working_state import GUESS, Working, cautious_gains, enable, switch_off
@@ -71,6 +72,7 @@ class _Brief(Experiments):
     """Those experiments, with another middle."""
 
     thorough = False
+    corrects = True  # a tuner is to leave a drive that turns
 
     def __init__(self, target: Target, where: NDArray[np.bool_], progress: Progress) -> None:
         super().__init__(target, where, progress)

@@ -17,8 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
 from drive_env.drives.interface import Drives
+from drive_env.drives.speeds import per_increment
 from drive_env.gains import GAIN_OBJECTS, gains_from_bandwidths, write_gains
 from drive_env.motors import Motor
+from tuning.identify.wiring import FINDINGS
 from tuning.target import Target
 
 Floats = NDArray[np.float64]
@@ -28,19 +30,20 @@ Mask = NDArray[np.bool_]
 CYCLE = 0.001  # s
 TORQUE_P, TORQUE_I, TORQUE_SUM = (0x2041, 1), (0x2041, 2), (0x2041, 4)
 MOTOR_TYPE, COMMUTATION, POLE_PAIRS, OPEN_LOOP_CURRENT = 0x2050, 0x2055, 0x2056, 0x2004
-MAX_CURRENT, ENCODER_DIRECTION, ENCODER_STEPS, SHAFT_DIRECTION = 0x2003, (0x2080, 1), (0x2080, 2), 0x2057
+MAX_CURRENT, ENCODER_STEPS, SHAFT_DIRECTION = 0x2003, (0x2080, 2), 0x2057
 LIMIT_SWITCHES, MOTOR_FLAGS, INIT_MODE = 0x2005, 0x2101, (0x2080, 3)
 BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
 STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is aligned
 # What experiments change, in the order in which it is given back.
 CHANGED = (
-    MAX_CURRENT, OPEN_LOOP_CURRENT, *GAIN_OBJECTS, MOTOR_TYPE, COMMUTATION, POLE_PAIRS, ENCODER_STEPS,
+    MAX_CURRENT, OPEN_LOOP_CURRENT, *GAIN_OBJECTS, MOTOR_TYPE, COMMUTATION, POLE_PAIRS, ENCODER_STEPS, *FINDINGS,
     cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION, cia402.FOLLOWING_WINDOW,
     LIMIT_SWITCHES, cia402.TARGET_VELOCITY, cia402.TARGET_POSITION, cia402.TARGET_TORQUE,
     (cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2),
 )  # fmt: skip
 BRUSHED, BRUSHLESS = 1, 3  # 2050h
-BY_FIELD, BY_ENCODER = 1, 3  # 2055h
+BY_FIELD, BY_HALLS, BY_ENCODER = 1, 2, 3  # 2055h
+ALIGNED_BY_HALLS = 2  # 2080h:03
 
 CURRENT_HZ, VELOCITY_HZ, POSITION_HZ = 300.0, 20.0, 5.0  # cautious bandwidths, of data sheet values
 INTEGRATION = 5.0  # T_i as a multiple of 1/w_v
@@ -62,6 +65,7 @@ class Working:
         origin: Position of every axis when the target was made known [inc].
         increments: Position increments per radian.
         current: Most that may be asked for [A], of every axis: the target's limit, or the drive's own if that is lower.
+        fresh: Axes whose drives knew no motor.
     """
 
     target: Target
@@ -69,6 +73,7 @@ class Working:
     origin: Integers
     increments: Floats
     current: Floats
+    fresh: Mask
 
     @property
     def base(self) -> Floats:
@@ -81,6 +86,10 @@ class Working:
         """Return positions [inc] as angles from the origin [rad]; the counter wraps at 2^31."""
         away = np.asarray(position, float) - self.origin
         return np.asarray(((away + 2.0**31) % 2.0**32 - 2.0**31) / self.increments)
+
+    def speed_counts(self) -> Floats:
+        """Return the counts of 606Ch and 60FFh per rad/s, shape (num_axes,)."""
+        return np.asarray(self.increments * per_increment(self.target.drives, cia402.VELOCITY_ACTUAL))
 
     def room(self) -> tuple[Floats, Floats]:
         """Return how far the rotors may turn from where they are now [rad], down and up."""
@@ -148,12 +157,12 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
     drives.write(MAX_CURRENT, np.rint(current * 1e3).astype(np.int64), where=axes)
     scale = increments
     for ramp in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
-        drives.write(ramp, _raw(10.0 * target.speed * scale), where=axes)
+        drives.write(ramp, _raw(10.0 * target.speed * scale * per_increment(drives, ramp)), where=axes)
     # Slow loops lag by turns: what the experiments allow is watched by them, not by this window.
     drives.write(cia402.FOLLOWING_WINDOW, _raw(200.0 * math.pi * scale), where=axes)
     drives.write((cia402.INTERPOLATION_PERIOD, 1), 1, where=axes)
     drives.write((cia402.INTERPOLATION_PERIOD, 2), -3, where=axes)
-    return Working(target, axes, drives.read(cia402.POSITION_ACTUAL), increments, current)
+    return Working(target, axes, drives.read(cia402.POSITION_ACTUAL), increments, current, fresh)
 
 
 def _give_back(target: Target, axes: Mask, before: Mapping[Any, Integers], mode: Integers) -> None:

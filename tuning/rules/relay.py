@@ -139,7 +139,7 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
     height = np.minimum(
         np.maximum(SHARE * target.motor.rated_current, OVER_FRICTION * dry), np.minimum(limit, target.current)
     )
-    scale, origin = target.increments(), drives.read(cia402.POSITION_ACTUAL)
+    scale, counts, origin = target.increments(), target.speed_counts(), drives.read(cia402.POSITION_ACTUAL)
     low, high = TRAVEL_SHARE * target.low * scale, TRAVEL_SHARE * target.high * scale
     drives.write(cia402.TARGET_TORQUE, 0, where=axes)
     motion.enable(drives, mode="cst", where=axes)
@@ -154,7 +154,7 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
             trace = drives.record(
                 [cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL, cia402.POSITION_ACTUAL], CYCLE, play=played
             )
-            speed[k] = trace[cia402.VELOCITY_ACTUAL][0] / scale
+            speed[k] = trace[cia402.VELOCITY_ACTUAL][0] / counts
             current[k] = trace[cia402.TORQUE_ACTUAL][0] * 1e-3
             way = wrapped(trace[cia402.POSITION_ACTUAL][0] - origin)
             inside &= (way > low) & (way < high)

@@ -16,7 +16,7 @@ from drive_env.whole_file import keep_names
 
 HEADER = "# The whole experiment of this run. It repeats from this file: drive-tune sweep --config settings.toml\n"
 _PACKAGES = ("drive-env", "numpy", "numba", "llvmlite", "mujoco")
-_ROOT = Path(__file__).parents[2]
+_ROOT = Path(__file__).parent.parent
 _OURS = tuple(_ROOT / name for name in ("drive_env", "mechanics", "tuning", "agents"))
 
 
