@@ -29,7 +29,8 @@ VARIABLE, GROUPS = "0x7", {"array": "0x8", "record": "0x9"}
 # Keys of a row, and those of the EDS.
 _KEYS = {"name": "ParameterName", "access": "AccessType", "default": "DefaultValue", "low": "LowLimit",
          "high": "HighLimit", "unit": "Unit"}  # fmt: skip
-_LISTS = (
+_MAKERS = range(0x2000, cia402.PROFILE_AREAS.start)
+_LISTS = (("MandatoryObjects", (0x1000, 0x1001, 0x1018)), ("ManufacturerObjects", _MAKERS))
     ("MandatoryObjects", (0x1000, 0x1001, 0x1018)),
     ("ManufacturerObjects", range(0x2000, cia402.PROFILE_AREAS.start)),
 )

@@ -1,0 +1,42 @@
+"""Roles: the parts that objects play on a drive, whatever their index; a device's `roles.toml` says which object does.
+
+A role is a name for an object wherever an object is named: `drives.read(Role.CURRENT_LIMIT)`. A role that a device does
+not have is an answer: `has_role`, or an error that says so.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Role(Enum):
+    """A part that an object plays; the value is what a message calls it."""
+
+    POSITION_SCALE = "scale of positions (increments of a revolution)"
+    CURRENT_LIMIT = "current limit"
+    OPEN_LOOP_CURRENT = "open-loop current"
+    MOTOR_TYPE = "motor type"
+    COMMUTATION = "commutation mode"
+    POLE_PAIRS = "number of pole pairs"
+    SHAFT_DIRECTION = "direction of the shaft"
+    MOTOR_FLAGS = "status flags of the motor"
+    LIMIT_SWITCHES = "use of the limit switches"
+    ENCODER_DIRECTION = "direction of the encoder"
+    ENCODER_STEPS = "steps of the encoder"
+    ENCODER_INITIALISATION = "initialisation of the encoder"
+    HALL_POLARITY = "polarity of the hall sensors"
+    HALL_DIRECTION = "direction of the hall sensors"
+    FIELD_ANGLE = "angle of the field in open loop"
+    ELECTRICAL_ANGLE = "electrical angle by the encoder"
+    HALL_ANGLE = "electrical angle by the hall sensors"
+    CURRENT_P = "current P"
+    CURRENT_I = "current I"
+    TORQUE_ERROR = "error of the torque current"
+    TORQUE_ERROR_SUM = "error sum of the torque current"
+    FLUX_ERROR = "error of the flux current"
+    FLUX_ERROR_SUM = "error sum of the flux current"
+    BRAKE_CHOPPER = "brake chopper"
+    BRAKE_CHOPPER_VOLTAGE = "voltage of the brake chopper"
+    OUTPUTS = "digital outputs"
+    OUTPUTS_MASK = "mask of the digital outputs"
+    ANALOG_INPUTS = "analog inputs"
