@@ -31,9 +31,6 @@ _KEYS = {"name": "ParameterName", "access": "AccessType", "default": "DefaultVal
          "high": "HighLimit", "unit": "Unit"}  # fmt: skip
 _MAKERS = range(0x2000, cia402.PROFILE_AREAS.start)
 _LISTS = (("MandatoryObjects", (0x1000, 0x1001, 0x1018)), ("ManufacturerObjects", _MAKERS))
-    ("MandatoryObjects", (0x1000, 0x1001, 0x1018)),
-    ("ManufacturerObjects", range(0x2000, cia402.PROFILE_AREAS.start)),
-)
 _FACTORY_SCALE = 65536.0  # increments of a revolution where a preset says nothing else
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
+from drive_env.dictionary.entries import ObjectName
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import GAIN_OBJECTS, gains_from_bandwidths, write_gains
@@ -35,7 +36,7 @@ LIMIT_SWITCHES, MOTOR_FLAGS, INIT_MODE = 0x2005, 0x2101, (0x2080, 3)
 BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
 STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is aligned
 # What experiments change, in the order in which it is given back.
-CHANGED = (
+CHANGED: tuple[ObjectName, ...] = (
     MAX_CURRENT, OPEN_LOOP_CURRENT, *GAIN_OBJECTS, MOTOR_TYPE, COMMUTATION, POLE_PAIRS, ENCODER_STEPS, *FINDINGS,
     cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION, cia402.FOLLOWING_WINDOW,
     LIMIT_SWITCHES, cia402.TARGET_VELOCITY, cia402.TARGET_POSITION, cia402.TARGET_TORQUE,
