@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.dictionary.roles import Role
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.envs.randomisation import Distributions, RandomMachines
 from drive_env.gains import FITTED_RULE, Rule, rule_gains
@@ -50,7 +51,7 @@ class Bench:
             axes = drives.load.num_axes
             self.hidden = HiddenScore("tmcm1636", load, motor, machines, num_threads=num_threads)
             self.hidden.set_machines(drives.machine.parameters, drives.machine.supply.reshape(machines, axes)[:, 0])
-            scaler = drives.read((0x2058, 0))
+            scaler = drives.read(Role.POSITION_SCALE)
             self.hidden.set_moves(plan_move(self.motor, self.inertia, scaler, np.tile(reach(load), machines)))
         self.set_reference(FITTED_RULE)
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from test_parity import served
 
+from drive_env.dictionary.roles import Role
 from tuning.identify.identification import identify
 from tuning.identify.standstill import standstill_resistances
-from tuning.identify.working_state import COMMUTATION, OPEN_LOOP_CURRENT, working_state
+from tuning.identify.working_state import working_state
 from tuning.target import Target, emulated
 
 
@@ -30,9 +31,9 @@ def test_dead_time_of_any_kind_is_in_the_interval():
 
 def test_drives_are_left_as_they_were_and_nothing_has_turned_far():
     target = emulated(load="inertia", num_threads=1)
-    before = [int(target.drives.read(name)[0]) for name in (COMMUTATION, OPEN_LOOP_CURRENT)]
+    before = [int(target.drives.read(name)[0]) for name in (Role.COMMUTATION, Role.OPEN_LOOP_CURRENT)]
     at_rest(target)
-    assert [int(target.drives.read(name)[0]) for name in (COMMUTATION, OPEN_LOOP_CURRENT)] == before
+    assert [int(target.drives.read(name)[0]) for name in (Role.COMMUTATION, Role.OPEN_LOOP_CURRENT)] == before
     # The field pulls the rotor to itself, half an electrical turn at most, and swings.
     assert abs(float(target.drives.machine.rotor_angle[0])) < 1.5 * np.pi / target.motor.n_p
 

@@ -13,6 +13,7 @@ import pytest
 from test_parity import served
 
 from drive_env import EmulatedDrives, motion
+from drive_env.devices import find_device
 from drive_env.emulator.parameters import WIRING
 from drive_env.motors import MOTORS
 from drive_env.safety.envelope import SafetyError
@@ -20,9 +21,6 @@ from tuning.auto.one_button import auto
 from tuning.identify.identification import identify
 from tuning.identify.quick_identification import identify_briefly
 from tuning.identify.wiring import (
-    ENCODER_DIRECTION,
-    HALL_DIRECTION,
-    HALL_POLARITY,
     Setting,
     changes,
     corrected,
@@ -34,6 +32,7 @@ from tuning.target import Target, emulated
 MOTOR = MOTORS["qbl4208"]
 HALL, ENCODER = 2, 3  # 2055h
 SPEED = 20.0  # rad/s
+ENCODER_DIRECTION, HALL_POLARITY, HALL_DIRECTION = (0x2080, 1), (0x2070, 1), (0x2070, 2)
 OBJECTS = (ENCODER_DIRECTION, HALL_POLARITY, HALL_DIRECTION)
 EVERY = np.array(list(itertools.product((0, 1), repeat=3)))  # encoder direction, hall polarity, hall direction
 
@@ -204,8 +203,11 @@ def test_halls_are_judged_by_the_field(field, halls, expected):
 def test_a_finding_is_one_line_with_its_remedy():
     has = {ENCODER_DIRECTION: Setting(0, 1), HALL_POLARITY: Setting(1, 1), HALL_DIRECTION: Setting(1, 0)}
     assert changes(has) == {ENCODER_DIRECTION: 1, HALL_DIRECTION: 0}
-    assert finding(has) == ["encoder reversed: write 2080h:01 = 1", "halls in reverse order: write 2070h:02 = 0"]
-    assert corrected(has)[0] == "encoder reversed: 2080h:01 is 1 now, and was 0"
+    assert finding(find_device("tmcm1636"), has) == [
+        "encoder reversed: write 2080h:01 = 1",
+        "halls in reverse order: write 2070h:02 = 0",
+    ]
+    assert corrected(find_device("tmcm1636"), has)[0] == "encoder reversed: 2080h:01 is 1 now, and was 0"
 
 
 # --- identify ---------------------------------------------------------------------------------------------------------

@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary, ObjectName
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import Observer
 from drive_env.drives.speeds import per_increment
 from drive_env.drives.trace import Trace
 from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.move_counter import MoveCounter
-from tuning.target import POSITION_SCALER, Target
+from tuning.target import Target
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
@@ -68,7 +69,7 @@ class DriveAudit(Observer):
         self.seconds = np.zeros(count)
         self.violations = np.zeros((len(KINDS), count), np.int64)
         self._dictionary = _dictionary(target.device.name)
-        scaler = np.asarray(drives.read(POSITION_SCALER), float)
+        scaler = np.asarray(drives.read(Role.POSITION_SCALE), float)
         self._origin = drives.read(cia402.POSITION_ACTUAL)
         self._low, self._high = (ends * scaler / (2.0 * np.pi) for ends in (target.low, target.high))
         self._slack = SLACK * scaler

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import ObservedDrives, Observer
 from drive_env.drives.speeds import per_increment
@@ -30,7 +31,6 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Travel = tuple[float, float]  # how far a rotor may turn from where it stands [rad], low <= 0 <= high
 
-POSITION_SCALER = (0x2058, 0)
 # How axes of a bus belong together: machines of their own; joints of one; ends of one thing, none of which goes alone.
 AXES = ("apart", "coupled", "linked")
 LOCKSTEP_PATIENCE = 5.0  # s, for an answer where time waits: a late one says that the computer is busy
@@ -109,7 +109,7 @@ class Target:
 
     def increments(self) -> Floats:
         """Return the position increments per radian of every rotor, 2058h over 2 pi, shape (num_axes,)."""
-        return np.asarray(self.drives.read(POSITION_SCALER), float) / (2.0 * math.pi)
+        return np.asarray(self.drives.read(Role.POSITION_SCALE), float) / (2.0 * math.pi)
 
     def speed_counts(self) -> Floats:
         """Return the counts of 606Ch and 60FFh per rad/s of every rotor, shape (num_axes,)."""

@@ -11,11 +11,12 @@ import numpy as np
 from agents.policies.guard import GuardLimits
 from agents.training.tasks import environment_name, make_lanes
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
     from tuning.target import Target
 
-POSITION_SCALER = 0x2058  # increments of a revolution
+# increments of a revolution
 # Of the task's amplitude and speed: what a policy may do beyond them before the envelope stops it.
 POSITION_SLACK, SPEED_SLACK = 1.5, 2.0
 
@@ -65,7 +66,7 @@ def target_for(
         amplitude, speed = lanes.config.amplitude, lanes.config.speed  # type: ignore[attr-defined]
         lanes.close()
         with CanDrives(**more) as drives:
-            turn, at = drives.read(POSITION_SCALER), drives.read(cia402.POSITION_ACTUAL)
+            turn, at = drives.read(Role.POSITION_SCALE), drives.read(cia402.POSITION_ACTUAL)
             speed_turn = turn * per_increment(drives, cia402.VELOCITY_ACTUAL)
         reach = POSITION_SLACK * amplitude * turn
         position = ((at - reach).tolist(), (at + reach).tolist())

@@ -14,6 +14,8 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import bus_of
 from drive_env.gains import GAIN_NAMES, GAIN_OBJECTS
 
@@ -87,8 +89,9 @@ def rehearse(target: Target, *, keep: bool = True) -> Rehearsal:
         prefix = f"node {bus_of(target.drives).nodes[axis]}: " if target.num_axes > 1 else ""
         checks += [check._replace(what=prefix + check.what) for check in _checks(target, axis)]
     writes = []
-    for key, values, why, stays in _plan(target, keep):
-        entry = bus_of(target.drives).description.dictionary.find(key)
+    for name, values, why, stays in _plan(target, keep):
+        entry = bus_of(target.drives).description.dictionary.find(name)
+        key = entry.index, entry.sub
         try:
             present = tuple(map(int, target.drives.read(key)))
         except ObjectAccessError as error:
@@ -206,17 +209,21 @@ def _error_control(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _motor(target: Target, axis: int) -> Iterator[Check]:
-    motor, kind = target.motor, _read(target, 0x2050, axis)
+    motor, kind = target.motor, _read(target, Role.MOTOR_TYPE, axis)
     if kind == 0:
         yield Check("motor", NO, "the drive knows no motor (2050h is 0): commission it for the one that turns first")
         return
-    rows = [("encoder counts", (0x2080, 2), motor.encoder_counts)]
+    rows = [("encoder counts", Role.ENCODER_STEPS, motor.encoder_counts)]
     if motor.kind != "dc":
-        rows += [("pole pairs", (0x2056, 0), motor.n_p), ("commutation by the encoder", (0x2055, 0), BY_ENCODER)]
+        rows += [
+            ("pole pairs", Role.POLE_PAIRS, motor.n_p),
+            ("commutation by the encoder", Role.COMMUTATION, BY_ENCODER),
+        ]
     wrong = []
     for what, key, wanted in rows:
         if (has := _read(target, key, axis)) != wanted:
-            wrong.append(f"{key[0]:04X}h:{key[1]:02X} ({what}) is {has}, and {wanted} is needed for {motor.name}")
+            index, sub = target.device.roles[key]
+            wrong.append(f"{index:04X}h:{sub:02X} ({what}) is {has}, and {wanted} is needed for {motor.name}")
     if wrong:
         yield Check("motor", NO, f"{'; '.join(wrong)}: give the --motor that turns, or set the drive up for it")
     else:
@@ -227,8 +234,8 @@ def _motor(target: Target, axis: int) -> Iterator[Check]:
 def _supply(target: Target, axis: int) -> Iterator[Check]:
     volts = float(target.supply[axis])
     text = f"{volts:g} V entered; the drive does not show it: measure it, the gains scale with it"
-    if _read(target, (0x2006, 1), axis) and _read(target, (0x2006, 2), axis) * 0.1 <= volts:
-        chopper = _read(target, (0x2006, 2), axis) * 0.1
+    if _read(target, Role.BRAKE_CHOPPER, axis) and _read(target, Role.BRAKE_CHOPPER_VOLTAGE, axis) * 0.1 <= volts:
+        chopper = _read(target, Role.BRAKE_CHOPPER_VOLTAGE, axis) * 0.1
         yield Check("supply", NO, f"{volts:g} V entered, and the brake chopper acts from {chopper:g} V (2006h:02) on: "
                                   "it would burn; correct one of them")  # fmt: skip
     else:
@@ -263,7 +270,7 @@ def _envelope(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _limits(target: Target, axis: int) -> Iterator[Check]:
-    amperes = _read(target, 0x2003, axis) * 1e-3
+    amperes = _read(target, Role.CURRENT_LIMIT, axis) * 1e-3
     text = f"at most {target.speed:.4g} rad/s and {target.current:.3g} A are commanded while it is identified"
     if amperes <= 0.0:
         yield Check("limits", NO, f"{text}; the drive's limit 2003h is 0 A: set it to the motor's peak current")
@@ -289,7 +296,7 @@ LOOKS = (_identity, _state, _answers, _samples, _error_control, _motor, _supply,
 
 
 # --- what would be written --------------------------------------------------------------------------------------------
-def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, str, bool]]:
+def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bool]]:
     """Yield the objects that a run writes: which, between which limits, what for, and whether that stays."""
     from tuning.identify.wiring import FINDINGS
 
@@ -310,11 +317,11 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, st
     yield (cia402.PROFILE_VELOCITY, 0), f"1...{speed}", "speed of the moves", False
     for index in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         yield (index, 0), "above 0", "ramps of the moves and of a stop", False
-    yield (0x2003, 0), f"up to {amperes}", "current limit while it is identified", False
-    yield (0x2004, 0), f"0...{amperes}", "current of the encoder's check", False
-    for key, wrong in FINDINGS.items():
-        yield key, "0, 1", f"where the check finds it wrong: {wrong}", True
-    yield (0x2055, 0), "1, 3", "open loop for the encoder's check, then the encoder again", False
+    yield Role.CURRENT_LIMIT, f"up to {amperes}", "current limit while it is identified", False
+    yield Role.OPEN_LOOP_CURRENT, f"0...{amperes}", "current of the encoder's check", False
+    for role, wrong in FINDINGS.items():
+        yield role, "0, 1", f"where the check finds it wrong: {wrong}", True
+    yield Role.COMMUTATION, "1, 3", "open loop for the encoder's check, then the encoder again", False
     yield (cia402.FOLLOWING_WINDOW, 0), "up to 100 turns", "following error while it is shaken", False
     for sub, value in ((1, "1"), (2, "-3")):
         yield (cia402.INTERPOLATION_PERIOD, sub), value, "interpolation period of csv and cst, 1 ms", False
@@ -323,7 +330,7 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, st
         yield (0x1010, 1), "65766173h", '"save": the gains outlive a power cycle', True
 
 
-def _communication(target: Target) -> Iterator[tuple[tuple[int, int], str, str, bool]]:
+def _communication(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
     """Yield what is written so that samples come in PDOs and the drive watches over its master."""
     from drive_env.master.pdo import OUT_OF_DRIVE, slots
 

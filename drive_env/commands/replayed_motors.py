@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 
 from drive_env import cia402
 from drive_env.canopen.frames import EMCY, ERROR_CONTROL, NMT, RPDO, SDO_REQUEST, SDO_RESPONSE, TPDO
+from drive_env.devices import device_names, find_device
 from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.roles import Role
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.network import MAX_NODE, PRE_OPERATIONAL
 from drive_env.master.port import Port
@@ -29,7 +31,6 @@ REST = 0.005  # revolutions in that time: 6 rpm
 REST_INC = 32  # increments in that time, where the drive says nothing of a revolution
 AT_REST_LOOKS = 2  # in a row
 OFF_TIME = 2.0  # s that a drive may take to switch off
-_SCALES = ((cia402.ENCODER_RESOLUTION, 1), (0x2058, 0))  # increments of a revolution, where there are any
 
 Axis = tuple[int, int]  # node-ID, number of the axis in it
 
@@ -189,7 +190,7 @@ class _Stop:
 
     def read_scale(self) -> None:
         """Read what of a way counts as rest."""
-        for index, sub in _SCALES:
+        for index, sub in _scales():
             scale = self._read(index + (self._offset if index in cia402.PROFILE_AREAS else 0), sub)
             if scale:
                 self._rest = max(REST_INC, round(REST * scale))
@@ -287,3 +288,10 @@ def name(axis: Axis) -> str:
 
 def _list(nodes: Iterable[int]) -> str:
     return ", ".join(map(str, nodes))
+
+
+def _scales() -> list[tuple[int, int]]:
+    """Return the objects that may say what a revolution counts: the standard's, and those of the devices there are."""
+    roles = [find_device(name).roles for name in device_names()]
+    own = {each[Role.POSITION_SCALE] for each in roles if Role.POSITION_SCALE in each}
+    return [(cia402.ENCODER_RESOLUTION, 1), *sorted(own)]

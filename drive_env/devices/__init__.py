@@ -14,6 +14,7 @@ from drive_env import cia402
 from drive_env.devices.variants import compose_eds, converted_preset, merged, parse_key, variant_bindings
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
+from drive_env.dictionary.roles import Role
 from mechanics.near_names import did_you_mean
 
 FOLDER = Path(__file__).parent
@@ -82,10 +83,8 @@ class MasterHints(NamedTuple):
 
     Attributes:
         rpdo_type: Transmission type of an RPDO that waits for SYNC.
-        current_limit: Object that limits the current, in the unit of 6077h.
         timeout: Longest wait for an answer.
         timeouts: Index -> longest wait, of objects that take longer.
-        position_scale: Object that holds the increments of a revolution, of a device that has its own.
         turns_positions_round: Objects that change what a position means besides its scale and zero: its direction.
         commands: Index -> what it is, of the device's own objects that can be written but are no parameters.
         addresses: Index -> what it is, of those that a backup keeps and nobody restores: the node would be another one
@@ -93,10 +92,8 @@ class MasterHints(NamedTuple):
     """
 
     rpdo_type: int
-    current_limit: tuple[int, int]
     timeout: float
     timeouts: dict[int, float]
-    position_scale: tuple[int, int] | None = None
     turns_positions_round: tuple[tuple[int, int], ...] = ((cia402.POLARITY, 0),)
     commands: Mapping[int, str] = MappingProxyType({})
     addresses: Mapping[int, str] = MappingProxyType({})
@@ -133,11 +130,12 @@ class Device(NamedTuple):
     axis_offsets: tuple[AxisOffset, ...]
     canopen: CanopenBehaviour
     master: MasterHints
+    roles: dict[Role, tuple[int, int]]
     variant_of: str = ""
 
     def new_dictionary(self, node_id: int = 1) -> ObjectDictionary:
         """Return the object dictionary of a node of this device."""
-        return ObjectDictionary(self.eds, node_id)
+        return ObjectDictionary(self.eds, node_id, self.roles)
 
     def locate(self, index: int) -> tuple[int, int]:
         """Return the axis that an object belongs to, and the index of the same object of axis 0."""
@@ -227,12 +225,18 @@ def find_device(name: str) -> Device:
         axis_offsets=tuple(AxisOffset(**row) for row in data["axis_offsets"]),
         canopen=_canopen(data["canopen"]),
         master=_master(data["master"]),
+        roles=_roles(folder),
         variant_of=data.get("variant_of", ""),
     )
 
 
 def _read(folder: Path) -> dict[str, Any]:
     return tomllib.loads((folder / "device.toml").read_text(encoding="utf-8"))
+
+
+def _roles(folder: Path) -> dict[Role, tuple[int, int]]:
+    rows = tomllib.loads((folder / "roles.toml").read_text(encoding="utf-8"))
+    return {Role[name.upper()]: parse_key(text) for name, text in rows.items()}
 
 
 def allowed_values(data: dict[str, Any]) -> dict[tuple[int, int], tuple[int, ...]]:
@@ -271,10 +275,8 @@ def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
 def _master(data: dict[str, Any]) -> MasterHints:
     return MasterHints(
         rpdo_type=data["rpdo_type"],
-        current_limit=parse_key(data["current_limit"]),
         timeout=data["timeout"],
         timeouts={int(index, 16): time for index, time in data["timeouts"].items()},
-        position_scale=parse_key(data["position_scale"]) if "position_scale" in data else None,
         turns_positions_round=tuple(parse_key(text) for text in data["turns_positions_round"]),
         commands={int(index, 16): what for index, what in data.get("commands", {}).items()},
         addresses={int(index, 16): what for index, what in data.get("addresses", {}).items()},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -18,11 +18,12 @@ from drive_env.dictionary.access import (
     NO_SUCH_SUB_INDEX,
     ObjectAccessError,
 )
+from drive_env.dictionary.roles import Role
 from mechanics.untrusted import read_bytes
 
-# How callers name an object: index (sub-index 0), (index, sub-index), or a name of CiA's; a sub-object's name is
-# "Object.Sub-object". Case does not matter.
-ObjectName: TypeAlias = int | tuple[int, int] | str
+# How callers name an object: index (sub-index 0), (index, sub-index), a role, or a name of CiA's; a sub-object's name
+# is "Object.Sub-object". Case does not matter.
+ObjectName: TypeAlias = int | tuple[int, int] | str | Role
 
 # Width [bits], least and greatest value of each integer type of CiA 301.
 _WIDTHS = (8, 16, 24, 32, 40, 48, 56, 64)
@@ -94,10 +95,14 @@ class ObjectDictionary:
     Args:
         path: The EDS.
         node_id: For defaults that depend on it.
+        roles: Which object plays which part.
     """
 
-    def __init__(self, path: Path | EdsText, node_id: int = 1) -> None:
+    def __init__(
+        self, path: Path | EdsText, node_id: int = 1, roles: Mapping[Role, tuple[int, int]] | None = None
+    ) -> None:
         self.path = path
+        self.roles = dict(roles or {})
         self._entries: dict[tuple[int, int], Entry] = {}
         self._names: dict[str, tuple[int, int]] = {}
         for item in read_eds(path, node_id).values():
@@ -113,12 +118,24 @@ class ObjectDictionary:
     def __len__(self) -> int:
         return len(self._entries)
 
+    def has(self, name: ObjectName) -> bool:
+        """Return whether there is such an object, or one that plays such a part."""
+        try:
+            self.find(name)
+        except ObjectAccessError:
+            return False
+        return True
+
     def find(self, name: ObjectName) -> Entry:
         """Return the entry of that name.
 
         Raises:
             ObjectAccessError: 06020000h if there is no such object, 06090011h if it has no such sub-index.
         """
+        if isinstance(name, Role):
+            if name not in self.roles:
+                raise ObjectAccessError(NO_SUCH_OBJECT, f"this drive has no {name.value}")
+            name = self.roles[name]
         if isinstance(name, str):
             key = self._names.get(name.strip().casefold())
             if key is None:

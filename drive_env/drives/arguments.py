@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.dictionary.roles import Role
+
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
 
@@ -50,4 +52,4 @@ def whole_cycles(duration: float, cycle: float) -> int:
 
 def object_names(objects: ObjectName | Sequence[ObjectName]) -> tuple[ObjectName, ...]:
     """Return the objects that are meant: one by its name or index alone, or several; two integers are two indices."""
-    return (objects,) if isinstance(objects, (str, int, np.integer)) else tuple(objects)
+    return (objects,) if isinstance(objects, str | int | np.integer | Role) else tuple(objects)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives, Integers, Mask
 from drive_env.drives.trace import Trace
 
@@ -138,7 +139,7 @@ class ObservedDrives:
         period: float = CYCLE,
     ) -> Trace:
         """Let time pass while objects are recorded and played, and have observers look at it as it goes on."""
-        asked: list[ObjectName] = [objects] if isinstance(objects, int | str | tuple) else list(objects)
+        asked: list[ObjectName] = [objects] if isinstance(objects, int | str | Role) else list(objects)
         wanted = list(asked)
         for observer in self._observers:
             observer.passes(duration)

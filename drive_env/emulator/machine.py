@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask
 from drive_env.emulator.parameters import check_known, check_parameter
 from drive_env.emulator.record_snapshot import LaneImage
@@ -201,13 +202,13 @@ class Machines:
 
     @property
     def outputs(self) -> NDArray[np.int64]:
-        """Digital outputs, bit 0 is GPO0: those of 2703h:01 that the mask 2703h:02 lets through, shape (num_axes,)."""
+        """Digital outputs, bit 0 is GPO0: those that their mask lets through, shape (num_axes,)."""
         read = self._drives.read
-        return (read((0x2703, 1)) & read((0x2703, 2))) >> 16 & 0xF
+        return (read(Role.OUTPUTS) & read(Role.OUTPUTS_MASK)) >> 16 & 0xF
 
     @property
     def analog_inputs(self) -> NDArray[np.int64]:
-        """Readings of the analog inputs (270Eh), 0...4095, shape (inputs, num_axes); set them likewise."""
+        """Readings of the analog inputs, 0...4095, shape (inputs, num_axes); set them likewise."""
         return np.stack([self._drives.read(key) for key in self._analog_inputs()])
 
     @analog_inputs.setter
@@ -219,7 +220,8 @@ class Machines:
 
     def _analog_inputs(self) -> list[tuple[int, int]]:
         entries = self._drives._objects.entries
-        return [(entry.index, entry.sub) for entry in entries if entry.index == 0x270E and entry.sub > 0]
+        first = entries.find(Role.ANALOG_INPUTS)
+        return [(entry.index, entry.sub) for entry in entries if entry.index == first.index and entry.sub >= first.sub]
 
     @property
     def temperatures(self) -> tuple[Floats, Floats]:

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.envs.bus_delays import BusDelays
@@ -51,7 +52,6 @@ POSITION, VELOCITY, CURRENT, STATUSWORD = (
 )
 TARGETS = {"csp": (cia402.TARGET_POSITION, 0), "csv": (cia402.TARGET_VELOCITY, 0)}
 LAG = 0.2  # share of the top speed whose lag is the error scale in csp
-INCREMENTS_PER_TURN = (0x2058, 0)
 
 # Entries of an axis before its gains: name, unit, low, high.
 ENTRIES = (
@@ -333,7 +333,7 @@ class GainScheduling(Lanes):
         self._speed_scale = np.tile(self.reach.speed, self.num_envs)
         self._acceleration_scale = np.tile(self.reach.acceleration, self.num_envs)
         self._rated_current = motor.rated_current
-        self._per_rad = self.drives.read(INCREMENTS_PER_TURN) / (2.0 * np.pi)
+        self._per_rad = self.drives.read(Role.POSITION_SCALE) / (2.0 * np.pi)
         self._speed_counts = self._per_rad * per_increment(self.drives, VELOCITY)
         self._counts = self._per_rad if self.config.mode == "csp" else self._speed_counts  # of the set-point
 

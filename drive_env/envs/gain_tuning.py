@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import find_device
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives, machine_of
 from drive_env.envs.configuration import configured
 from drive_env.envs.gain_observation import (
@@ -284,7 +285,7 @@ class GainTuning(Lanes):
         self._identified = Identified(*(np.where(axes, a, b) for a, b in zip(found, self._identified, strict=True)))
         self._origin = np.where(axes, origin, self._origin)
         self._direction = np.where(axes, 1, self._direction)
-        scaler = drives.read((0x2058, 0))
+        scaler = drives.read(Role.POSITION_SCALE)
         planned = plan_move(self.motor, self._identified.inertia, scaler, self._reach)
         # Lanes outside the mask keep theirs: nothing of what it follows from has changed.
         self._move = planned

@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.cyclic_control import Hooks, exchange
@@ -33,7 +34,6 @@ OBJECTS = {
     "cst": (cia402.TARGET_TORQUE, cia402.TORQUE_OFFSET),
 }
 SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
-POSITION_SCALER, MAXIMUM_CURRENT = 0x2058, 0x2003
 WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "effort": 0.05, "smoothness": 0.05, "trip": 10.0}
 RATES = (500, 1000)
 ACTIONS = ("direct", "offset")
@@ -261,12 +261,12 @@ class Tracking(Lanes):
                 )
             joint = config.task.joint
             self._sensor = lambda: machine.joint_positions[:, joint]
-        per_turn = drives.read(POSITION_SCALER).astype(float)
+        per_turn = drives.read(Role.POSITION_SCALE).astype(float)
         scales = np.empty((self.drives.num_axes, 4))
         scales[:, 0] = config.amplitude * per_turn
         counts = per_turn * per_increment(drives, cia402.VELOCITY_ACTUAL)
         scales[:, 1] = config.speed * counts
-        scales[:, 2] = drives.read(MAXIMUM_CURRENT)
+        scales[:, 2] = drives.read(Role.CURRENT_LIMIT)
         full = {"csp": 1.25 * scales[:, 0], "csv": 1.25 * scales[:, 1], "cst": scales[:, 2]}
         scales[:, 3] = full[str(config.mode)] * (1.0 if config.action == "direct" else config.offset)
         self._per_turn = per_turn.reshape(n, -1)[:, 0]

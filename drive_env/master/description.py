@@ -15,6 +15,7 @@ from drive_env import cia402
 from drive_env.devices import AxisOffset, Device, MasterHints, find_device
 from drive_env.dictionary.access import WRONG_TYPE, ObjectAccessError
 from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, Entry, ObjectDictionary, ObjectName, read_eds
+from drive_env.dictionary.roles import Role
 
 Key = tuple[int, int]
 
@@ -48,9 +49,8 @@ _BITS = {
 KINDS: dict[Key, int] = {(index, 0): bits for bits, indices in _BITS.items() for index in indices}
 MODE, MODE_DISPLAY = (cia402.MODE, 0), (cia402.MODE_DISPLAY, 0)
 LONGEST_TIMEOUT = 3600.0  # s: no drive takes so long, and a wait of 1e300 s is none that an operating system knows
-CIA_402 = MasterHints(
-    rpdo_type=1, current_limit=(cia402.MAX_CURRENT, 0), timeout=0.5, timeouts={0x1010: 10.0, 0x1011: 10.0}
-)
+CIA_402 = MasterHints(rpdo_type=1, timeout=0.5, timeouts={0x1010: 10.0, 0x1011: 10.0})
+CIA_402_ROLES = {Role.CURRENT_LIMIT: (cia402.MAX_CURRENT, 0)}
 
 
 @dataclass
@@ -152,13 +152,13 @@ class Description:
             return same_code[0]
         return EMERGENCY_NAMES.get(code, f"emergency_{code:04X}h")
 
+    def role(self, role: Role) -> Key | None:
+        """Return the object that plays a part, None where this drive has none that does."""
+        return self.dictionary.roles.get(role)
+
     def has(self, name: ObjectName) -> bool:
         """Return whether the dictionary has an object."""
-        try:
-            self.dictionary.find(name)
-        except ObjectAccessError:
-            return False
-        return True
+        return self.dictionary.has(name)
 
 
 def describe(device: str | None, eds: str | Path | None) -> Description:
@@ -184,7 +184,7 @@ def describe(device: str | None, eds: str | Path | None) -> Description:
     if not path.is_file():
         raise ValueError(f"there is no EDS at {path}; give the path of the drive's .eds file")
     try:
-        dictionary, types = ObjectDictionary(path), _read_types(path)
+        dictionary, types = ObjectDictionary(path, roles=CIA_402_ROLES), _read_types(path)
     except Exception as error:  # the reader raises whatever the broken line leads to
         raise ValueError(f"{path} cannot be read as an EDS: {error}; see whether CiA 306 allows that line") from error
     axes = sum((cia402.STATUSWORD + cia402.AXIS_OFFSET * axis, 0) in types for axis in range(8))

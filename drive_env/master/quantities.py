@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
     from drive_env.master.can_drives import CanDrives
@@ -68,7 +69,7 @@ def increments_per_revolution(drives: CanDrives) -> list[float | None]:
         drives: On a bus.
     """
     known = drives.description
-    for name in ("Position Scaler", (cia402.ENCODER_RESOLUTION, 1)):  # of the TMCM-1636; encoder increments of CiA 402
+    for name in (Role.POSITION_SCALE, (cia402.ENCODER_RESOLUTION, 1)):  # its own, or encoder increments of CiA 402
         if known.has(name):
             return [float(value) or None for value in drives.read(name)]
     return [None] * drives.num_axes

@@ -14,6 +14,7 @@ from drive_env import cia402
 from drive_env.dictionary import units
 from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -29,7 +30,6 @@ POSITION_DEMAND, POSITION, VELOCITY, CURRENT = (
     (cia402.TORQUE_ACTUAL, 0),
 )
 TARGET_VELOCITY, TARGET_CURRENT, MODE = (cia402.TARGET_VELOCITY, 0), (cia402.TARGET_TORQUE, 0), (cia402.MODE_DISPLAY, 0)
-POSITION_SCALER = (0x2058, 0)
 _RECORDED = (POSITION_DEMAND, POSITION, VELOCITY, CURRENT, TARGET_VELOCITY, TARGET_CURRENT, MODE)
 _PROFILED_MODES = (1, 3, 8)  # pp, pv, csp: 6062h goes on in them, and its slope is the velocity demand
 _CSV, _CST = 9, 10
@@ -185,6 +185,6 @@ def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> N
 
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
     return units.Context(
-        position_scaler=drives.read(POSITION_SCALER)[axes].astype(float),
+        position_scaler=drives.read(Role.POSITION_SCALE)[axes].astype(float),
         current_lsb=drives.device.current_full_scale / 32768.0,
     )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.master.description import Key
 from drive_env.master.errors import RefusedError
 from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
@@ -121,7 +122,7 @@ def read_bounds(limits: Limits, drives: CanDrives, rotor: RotorAngle, ends: tupl
         settled + np.where(known_scale, SLACK_TURNS * rotor.scale, 0.0),
         velocity,
         count,
-        _magnitude(drives, given(limits.current, drives.num_axes), drives.description.hints.current_limit),
+        _magnitude(drives, given(limits.current, drives.num_axes), drives.description.role(Role.CURRENT_LIMIT)),
         _magnitude(drives, given(limits.following_error, drives.num_axes), FOLLOWING_WINDOW),
         braking,
         np.maximum.reduce([braking, *(_rate(drives, key, rotor.scale) for key in (ACCELERATION, DECELERATION))]),
@@ -155,9 +156,9 @@ def read_own(drives: CanDrives, key: Key, absent: int) -> Integers:
     return np.full(drives.num_axes, absent, np.int64)
 
 
-def _magnitude(drives: CanDrives, user: Floats, key: Key) -> Integers:
-    """Return the user's limit, or the drive's; 0 and the end of the type switch the drive's off."""
-    if np.isnan(user).any():
+def _magnitude(drives: CanDrives, user: Floats, key: Key | None) -> Integers:
+    """Return the user's limit, or the drive's if it has one; 0 and the end of the type switch the drive's off."""
+    if np.isnan(user).any() and key is not None:
         found = read_own(drives, key, NO_LIMIT)
         own = np.where((found <= 0) | (found >= 2**31 - 1), NO_LIMIT, found)
     else:

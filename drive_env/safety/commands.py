@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.roles import Role
 from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import QUICK_STOP_DECELERATION, SLACK_TURNS, increments_per_count, read_own
@@ -78,7 +79,7 @@ class Commands:
     def __init__(self, drives: CanDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
         self._drives = drives
         self._known = drives.description.dictionary
-        self._current_limit = drives.description.hints.current_limit
+        self._current_limit = drives.description.role(Role.CURRENT_LIMIT)
         self._axes = axes
         self._limits = limits
         self._modes = modes
@@ -374,7 +375,8 @@ class Commands:
             )
 
     def _current_origin(self, key: Key) -> str:
-        own = "the drive's" if key == self._current_limit else f"{self._current_limit[0]:04X}h"
+        is_its_own = self._current_limit is None or key == self._current_limit
+        own = "the drive's" if is_its_own or self._current_limit is None else f"{self._current_limit[0]:04X}h"
         return self._limits.origin(self._limits.user.current, "current", own)
 
     def _velocity_origin(self, axis: int) -> str:

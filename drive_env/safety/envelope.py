@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.master.description import Key
 from drive_env.safety import signals
@@ -158,7 +159,7 @@ class Envelope:
             self._commands.note(key, raw, where)
         elif key in scale_objects(self._drives.description):
             self._limits.place()
-        elif key in _BOUNDS or key == self._drives.description.hints.current_limit:
+        elif key in _BOUNDS or key == self._drives.description.role(Role.CURRENT_LIMIT):
             self._limits.forget()
             if key == HOME_OFFSET and self._axes.is_armed:
                 self._limits.lend()  # it corrects software limits

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.dictionary.roles import Role
 from drive_env.master.description import Key
 from drive_env.master.errors import RefusedError
 from drive_env.safety.axes import Axes
@@ -127,11 +128,11 @@ class LimitsInForce:
                 True,
             )
         for key, limit, highest in (
-            (self._drives.description.hints.current_limit, self.user.current, bounds.current),
+            (self._drives.description.role(Role.CURRENT_LIMIT), self.user.current, bounds.current),
             (FOLLOWING_WINDOW, self.user.following_error, bounds.following),
             (MAX_PROFILE_VELOCITY, self.user.velocity, bounds.velocity),
         ):
-            if limit is not None:
+            if limit is not None and key is not None:
                 wanted[key] = (np.where(highest < NO_LIMIT, highest, math.inf), True)
         if self.user.velocity is not None and self._axes.is_counted and np.all(self._axes.rotor.scale > 1.0):
             wanted[MAX_MOTOR_SPEED] = (np.ceil(60.0 * bounds.velocity / self._axes.rotor.scale), True)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.master.description import Description, Key
 from drive_env.master.errors import RefusedError
 
@@ -61,7 +62,7 @@ class RotorAngle:
 
 def scale_objects(description: Description) -> tuple[Key, ...]:
     """Return the objects that say how many increments a revolution has."""
-    own = description.hints.position_scale
+    own = description.role(Role.POSITION_SCALE)
     if own is not None and description.has(own):
         return (own,)
     if all(description.has((index, sub)) for index in (cia402.GEAR_RATIO, cia402.FEED_CONSTANT) for sub in (1, 2)):

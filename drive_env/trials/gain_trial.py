@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import Gains, scaled, write_gains
@@ -117,7 +118,7 @@ class Trials:
         """
         drives = self._drives
         origin = drives.read(cia402.POSITION_ACTUAL)
-        scaler = drives.read((0x2058, 0))
+        scaler = drives.read(Role.POSITION_SCALE)
         move = plan_move(self._motor, np.full(drives.num_axes, 3.0 * self._motor.inertia), scaler, reach)
         write_profile(drives, move, where)
         objects = [cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL]

@@ -33,8 +33,6 @@ ACCELERATION_SHARE = 0.4  # of the rated torque
 SPEED_SHARE, TRAVEL_SHARE = 0.5, 0.4  # of the rated speed at the profile's peak, of what there is to go
 BAND, BAND_COUNTS = 0.01, 3.0  # of the move, and of the encoder: the larger is what counts as settled
 
-CURRENT_ERROR = (0x2041, 3)
-
 
 class Move(NamedTuple):
     """A positioning move: 607Ah from rest at 0, its speed and ramp, and what it is in SI, each of shape (num_axes,)."""

@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.emulator.parameters import WIRING
 from drive_env.gains import Gains, scaled, small_time_constants, write_gains
 from drive_env.trials.positioning import (
-    CURRENT_ERROR,
     CYCLE,
     SETTLED,
     TRIAL,
@@ -259,11 +259,16 @@ class HiddenScore:
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
             power_up(drives)
             start(drives, move.distance)
-            objects: list[ObjectName] = [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, CURRENT_ERROR, cia402.STATUSWORD]
+            objects: list[ObjectName] = [
+                cia402.POSITION_ACTUAL,
+                cia402.TORQUE_ACTUAL,
+                Role.TORQUE_ERROR,
+                cia402.STATUSWORD,
+            ]
             free = drives.record(objects, SETTLED * CYCLE)
             drives.machine.load_torque = self._constant + self._load_torque
             loaded = drives.record(objects, (TRIAL - SETTLED) * CYCLE)
-        current = (free[cia402.TORQUE_ACTUAL] + free[CURRENT_ERROR]) * 1e-3
+        current = (free[cia402.TORQUE_ACTUAL] + free[Role.TORQUE_ERROR]) * 1e-3
         direction = np.where(move.distance < 0, -1, 1)
         settling, noise, overshoot = move_terms(
             free[cia402.POSITION_ACTUAL].astype(float),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.dictionary.roles import Role
 from tuning.auto.loop_margins import SENSITIVITY, sensitivity
 from tuning.auto.moves import show
 from tuning.auto.run import MOVE_TIME
@@ -52,7 +53,7 @@ def _rule_is_better(run: Run) -> Mask:
         plant, identified = run.axes[k].plant, run.axes[k].identified
         assert plant is not None and identified is not None, "an axis that goes on has both"
         known.append(known_of(plant, identified, float(reach[k])))
-    scaler = np.asarray(target.drives.read((0x2058, 0)), float)[chosen]
+    scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[chosen]
     with Twins(target.device, target.motor, known, scaler, 2) as twins:
         hidden = twins.score(np.stack([run.gains[chosen], run.reference[chosen]], axis=1))
     for k, (own, rule) in zip(axes, hidden, strict=True):

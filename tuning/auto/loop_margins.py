@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.gains import Gains, scaled, write_gains
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
@@ -63,7 +64,7 @@ def measure(run: Run) -> None:
     low, high = run.room()
     here = replace(run.target, low=low, high=np.maximum(high, LEAST_WAY))
     write_gains(drives, run.gains, going)
-    drives.write(cia402.FOLLOWING_WINDOW, FREE_WINDOW * drives.read((0x2058, 0)), where=going)
+    drives.write(cia402.FOLLOWING_WINDOW, FREE_WINDOW * drives.read(Role.POSITION_SCALE), where=going)
     try:
         with run.spending(going):
             response = frequency_response.measure(here, "velocity", where=going)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.dictionary.roles import Role
 from drive_env.drives.trace import Trace
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
@@ -136,7 +137,7 @@ class ProvingGround:
             shortest = np.abs(self.reach).reshape(ends).argmin(axis=1)
             self.reach = np.repeat(self.reach.reshape(ends)[np.arange(len(shortest)), shortest], ends[1])
         corner = [target.device.stage["velocity_filter"].default if p is None else p.velocity_filter for p in plants]
-        self.move: Move = plan_move(motor, inertia, drives.read((0x2058, 0)), self.reach)
+        self.move: Move = plan_move(motor, inertia, drives.read(Role.POSITION_SCALE), self.reach)
         self._count: Floats = self.move.increments / self.move.counts  # increments
         top = RETURN_SPEED * target.speed * self.move.increments
         self._fastest: Floats = np.maximum(top / np.maximum(self.move.velocity, 1), 1.0)

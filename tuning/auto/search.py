@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.dictionary.roles import Role
 from drive_env.gains import Gains, gains_from_bandwidths, rule_gains
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
@@ -95,7 +96,7 @@ def compute(run: Run) -> None:
         known.append(known_of(plant, identified, float(reach[axis])))
         proposals = (propose(name, target.device, target.motor, plant) for name in RULES)
         starts.append(np.array([run.reference[axis], *(proposal.gains for proposal in proposals)], np.int64))
-    scaler = np.asarray(target.drives.read((0x2058, 0)), float)[chosen]
+    scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[chosen]
     found = _search_apart(run, known, np.array(starts), scaler)
     run.gains[chosen] = found.gains[:, 0]
     # What the drive itself then tells apart: what is best on other twins.

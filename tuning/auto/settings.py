@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.dictionary.roles import Role
 from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
-from tuning.identify.wiring import FINDINGS, Key, changes, corrected
-from tuning.identify.working_state import BOTH_ENDS, LIMIT_SWITCHES, MOTOR_TYPE
+from tuning.identify.wiring import Key, changes, corrected, findings
+from tuning.identify.working_state import BOTH_ENDS
 from tuning.snapshot import Transaction, restore
 
 if TYPE_CHECKING:
@@ -45,16 +46,16 @@ def commission(run: Run) -> None:
     Identification did so, too, but left drives as they were.
     """
     target = run.target
-    run.fresh = run.going & (target.drives.read(MOTOR_TYPE) == 0)
+    run.fresh = run.going & (target.drives.read(Role.MOTOR_TYPE) == 0)
     _wire(run)
     if not run.fresh.any():
         return
     for name, value in zip(_keys(target, names := _commissioning(target)), names.values(), strict=True):
-        if name not in FINDINGS:
+        if name not in findings(target.device):
             target.drives.write(name, value, where=run.fresh)
     # No axis is at both ends: switches that say so are not there.
     unwired = run.fresh & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
-    target.drives.write(LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
+    target.drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
     run.note(unwired, "both limit switches were active, which no axis can be at: they are ignored (2005h)")
     run.note(run.fresh, f"fresh from the factory: commissioned for {target.motor.name} first")
 
@@ -63,14 +64,18 @@ def _wire(run: Run) -> None:
     """Write what the wiring needs: as it was seen, and where nothing was, as a fresh drive's motor is known to be."""
     target = run.target
     preset = _commissioning(target)
-    known = {key: value for key, value in zip(_keys(target, preset), preset.values(), strict=True) if key in FINDINGS}
+    known = {
+        key: value
+        for key, value in zip(_keys(target, preset), preset.values(), strict=True)
+        if key in findings(target.device)
+    }
     wanted: list[dict[Key, int]] = []
     for k, axis in enumerate(run.axes):
         seen = {} if axis.identified is None else axis.identified.wiring
         needed = known | {key: one.needs for key, one in seen.items()} if run.fresh[k] else changes(seen)
         wanted.append(needed if run.going[k] else {})
         if run.going[k] and not run.fresh[k]:
-            axis.notes += corrected(seen)
+            axis.notes += corrected(target.device, seen)
     run.wire(wanted)
 
 
@@ -92,9 +97,12 @@ def write(run: Run, transaction: Transaction) -> Mask:
     for k, values in enumerate(transaction.before.axes):
         wanted = dict(values)
         if run.fresh[k]:
-            commissioned = [*_keys(run.target, _commissioning(run.target)), (LIMIT_SWITCHES, 0)]
+            commissioned = [
+                *_keys(run.target, _commissioning(run.target)),
+                run.target.device.roles[Role.LIMIT_SWITCHES],
+            ]
             wanted |= {key: int(drives.read(key)[k]) for key in commissioned if key in values}
-        wanted |= {key: int(drives.read(key)[k]) for key in FINDINGS if key in values}
+        wanted |= {key: int(drives.read(key)[k]) for key in findings(run.target.device) if key in values}
         axes.append(wanted | {key: int(column[k]) for key, column in kept.items()})
     restore(drives, replace(transaction.before, axes=tuple(axes)), going, whole=False)
     for axis in np.flatnonzero(going):

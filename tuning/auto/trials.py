@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.gains import Gains, scaled, write_gains
 from tuning.auto.proving import ProvingGround
 from tuning.auto.run import MOVE_TIME, TRIAL_TIME
@@ -101,7 +102,7 @@ def watch_following(run: Run, where: Mask) -> None:
     """Have a following error trip the drive that trials cannot have."""
     assert run.ground is not None, "proving makes it"
     drives = run.target.drives
-    window = WINDOW * np.abs(run.ground.move.distance) + drives.read((0x2058, 0))
+    window = WINDOW * np.abs(run.ground.move.distance) + drives.read(Role.POSITION_SCALE)
     drives.write(cia402.FOLLOWING_WINDOW, window, where=where)
 
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env.dictionary.roles import Role
 from drive_env.whole_file import content_hash, files_to_be
 from mechanics.untrusted import parse_json, read_text
 
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 FORMAT = 2
 HASH = "sha256"
-MAXIMUM_CURRENT = 0x2003
 
 Floats = NDArray[np.float64]
 
@@ -234,7 +234,7 @@ def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, f
 
 def envelope(target: Target) -> dict[str, float]:
     """Return what a target allows; where it has several axes, each of them."""
-    allowed = target.drives.read(MAXIMUM_CURRENT) * 1e-3
+    allowed = target.drives.read(Role.CURRENT_LIMIT) * 1e-3
     rows = {
         "travel low [rad]": target.low,
         "travel high [rad]": target.high,

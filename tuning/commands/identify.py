@@ -26,6 +26,7 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from drive_env.devices import Device
     from tuning.identify.identification import Identification
 
 TITLES = {
@@ -76,7 +77,7 @@ def identify(
         if json:
             print_json([one | before_as_json(file) for one in rows])
         else:
-            _print(found)
+            _print(found, target.device)
             if out is not None:
                 print(f"written to {out}")
             tell_before(file)
@@ -97,7 +98,7 @@ def row(found: Identification) -> dict[str, Any]:
     return {"drive_time": found.drive_time, "estimates": estimates, "wiring": wiring}
 
 
-def _print(found: list[Identification]) -> None:
+def _print(found: list[Identification], device: Device) -> None:
     from tuning.identify.wiring import finding
 
     columns = (Column("", "text"), Column("value"), Column("95 % interval", "text"), Column("unit", "name"))
@@ -114,5 +115,5 @@ def _print(found: list[Identification]) -> None:
                 rows.append((TITLES[name], "-", "as above" if estimate.reason == said else estimate.reason, ""))
                 said = estimate.reason
         print_table(columns, rows, f"{head}{one.drive_time:.1f} s of drive time")
-        for line in finding(one.wiring):
+        for line in finding(device, one.wiring):
             print(f"{head}{line}")

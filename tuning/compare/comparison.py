@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import Gains, rule_gains
@@ -231,7 +232,7 @@ class Yardstick:
             reach = np.where(target.high >= -target.low, target.high, target.low)
             supply = target.supply.reshape(len(group), -1)[:, 0]
             self._hidden.set_machines(machine_of(drives).parameters, supply)
-            self._hidden.set_moves(plan_move(target.motor, inertia, drives.read((0x2058, 0)), reach))
+            self._hidden.set_moves(plan_move(target.motor, inertia, drives.read(Role.POSITION_SCALE), reach))
             rule = np.concatenate(
                 [
                     rule_gains(target.device, target.motor, J, supply=float(volts))

@@ -18,28 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.identification import Estimate, refused
 from tuning.identify.wiring import Halls, judge_halls
-from tuning.identify.working_state import (
-    BY_FIELD,
-    COMMUTATION,
-    CYCLE,
-    OPEN_LOOP_CURRENT,
-    POLE_PAIRS,
-    SHAFT_DIRECTION,
-    Working,
-    enable,
-    still_enabled,
-    switch_off,
-)
+from tuning.identify.working_state import BY_FIELD, CYCLE, Working, enable, still_enabled, switch_off
 from tuning.oscillation_watch import shaken
 from tuning.stop_causes import stop_causes
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FIELD_ANGLE, HALL_ANGLE = 0x2102, 0x2104  # 1/65536 electrical turn
+# 1/65536 electrical turn
 RAISE, REST, TURN = 20, 60, 240  # cycles: the current comes (gravity does not wait), the rotor rests, the field turns
 MOST_TURN, LEAST_TURN = 1.0, 0.2  # electrical turns of the field
 SHARE = 0.9  # of what current there is
@@ -81,23 +71,23 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
     if target.motor.kind == "dc":
         none = refused("1", "a brushed motor has no pole pairs")
         return [EncoderCheck(none, direction) for direction in _push(working)]
-    configured = drives.read(POLE_PAIRS).astype(float)
-    commutation = drives.read(COMMUTATION)
+    configured = drives.read(Role.POLE_PAIRS).astype(float)
+    commutation = drives.read(Role.COMMUTATION)
     where, reasons = able(working)
     if not where.any():
         return [EncoderCheck(refused("1", reason), refused("1", reason)) for reason in reasons]
     try:
-        drives.write(COMMUTATION, BY_FIELD, where=where)
-        drives.write(OPEN_LOOP_CURRENT, 0, where=where)
+        drives.write(Role.COMMUTATION, BY_FIELD, where=where)
+        drives.write(Role.OPEN_LOOP_CURRENT, 0, where=where)
         enable(working, "csv", where)
         away, back, field, halls, reasons = _turn(working, where, configured)
         alive = still_enabled(working, drives.read(cia402.STATUSWORD))
     finally:
         switch_off(drives, where)
-        drives.write(OPEN_LOOP_CURRENT, 0, where=where)
-        drives.write(COMMUTATION, commutation, where=where)
+        drives.write(Role.OPEN_LOOP_CURRENT, 0, where=where)
+        drives.write(Role.COMMUTATION, commutation, where=where)
     # Counting up is the field's direction unless 2057h turns the sign of positions around.
-    shaft = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
+    shaft = 1.0 - 2.0 * drives.read(Role.SHAFT_DIRECTION)
     found = []
     causes = [] if alive.all() else stop_causes(drives)
     for k in range(count):
@@ -200,7 +190,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     drives = working.target.drives
     current = np.rint(1e3 * SHARE * working.current).astype(np.int64)
     for k in range(1, 5):
-        drives.write(OPEN_LOOP_CURRENT, current * k // 4, where=where)
+        drives.write(Role.OPEN_LOOP_CURRENT, current * k // 4, where=where)
         drives.advance(RAISE // 4 * CYCLE)
         stay_inside(working, where)
     stands = [_rest(working)]
@@ -208,20 +198,20 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     turn = np.where(able, turn, 0.0)
     # Smooth, so that the rotor does not swing: a raised cosine of speed.
     shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(TURN) + 0.5) / TURN)
-    seen = [(_angle(working, FIELD_ANGLE), _angle(working, HALL_ANGLE))]
+    seen = [(_angle(working, Role.FIELD_ANGLE), _angle(working, Role.HALL_ANGLE))]
     for sign in (1.0, -1.0):
         speed = sign * turn / configured / (TURN * CYCLE) * shape[:, None]
         raw = np.where(where, np.rint(speed * working.speed_counts()), 0).astype(np.int64)
         raw[-1] = 0
         passed = np.zeros(len(turn))
-        before = _angle(working, FIELD_ANGLE)
+        before = _angle(working, Role.FIELD_ANGLE)
         for k in range(0, TURN, TURN // 10):
             drives.record(
                 [cia402.POSITION_ACTUAL], TURN // 10 * CYCLE, play={cia402.TARGET_VELOCITY: raw[k : k + TURN // 10]}
             )
-            now = _angle(working, FIELD_ANGLE)
+            now = _angle(working, Role.FIELD_ANGLE)
             if sign > 0.0:
-                seen.append((now, _angle(working, HALL_ANGLE)))
+                seen.append((now, _angle(working, Role.HALL_ANGLE)))
             passed += (now - before + np.pi) % (2.0 * np.pi) - np.pi
             before = now
             stay_inside(working, where)
@@ -243,7 +233,7 @@ def stay_inside(working: Working, where: Mask) -> None:
         switch_off(working.target.drives, out)
 
 
-def _angle(working: Working, name: int) -> Floats:
+def _angle(working: Working, name: Role) -> Floats:
     return np.asarray(working.target.drives.read(name) * (2.0 * np.pi / 65536.0))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import gains_from_bandwidths, write_gains
 from drive_env.safety.envelope import swinging_allowed
@@ -17,15 +18,13 @@ from tuning.identify.identification import NAMES, Estimate, Identification, Prog
 from tuning.identify.inertia import Mechanics, identify_mechanics
 from tuning.identify.standstill import standstill_resistances
 from tuning.identify.winding import Winding, identify_winding, pulse, to_torque_mode
-from tuning.identify.wiring import FINDINGS, Settings, changes, finding, needed, write_wiring
+from tuning.identify.wiring import Settings, changes, finding, findings, needed, write_wiring
 from tuning.identify.working_state import (
     ALIGNED_BY_HALLS,
     BY_ENCODER,
     BY_HALLS,
-    COMMUTATION,
     CYCLE,
     GUESS,
-    INIT_MODE,
     Working,
     cautious_bandwidth,
     cautious_gains,
@@ -47,7 +46,6 @@ FREQUENCY_CURRENT_HZ, FREQUENCY_VELOCITY_HZ = 800.0, 25.0  # of the loops in whi
 LEAST_ROOM = 1.2  # rad
 HIGHEST = 400.0  # Hz, of the response
 WORST_MISFIT = 2.0  # of the linear model, over what noise explains
-ELECTRICAL_ANGLE, SHAFT_DIRECTION, POLE_PAIRS = 0x2103, 0x2057, 0x2056
 UNITS = {
     "resistance": "ohm", "inductance": "H", "pole_pairs": "1", "encoder_direction": "1", "inertia": "kg*m^2",
     "coulomb": "A", "viscous": "A*s/rad", "offset": "A", "anti_resonance": "Hz", "resonance": "Hz",
@@ -132,11 +130,11 @@ class Experiments:
 
     def _corrected(self, working: Working, checks: list[EncoderCheck]) -> list[EncoderCheck]:
         """Set drives up for the wiring that was seen, where they may be, and look again; it is taken back."""
-        has = {key: working.target.drives.read(key) for key in FINDINGS}
+        has = {key: working.target.drives.read(key) for key in findings(working.target.device)}
         again = np.zeros(len(checks), bool)
         for k in map(int, np.flatnonzero(working.where)):
             own = {key: int(values[k]) for key, values in has.items()}
-            self._wiring[k] = needed(own, checks[k].direction.value, checks[k].halls)
+            self._wiring[k] = needed(working.target.device, own, checks[k].direction.value, checks[k].halls)
             again[k] = bool(changes(self._wiring[k])) and (self.corrects or working.fresh[k])
         # What its halls aligned when it was first enabled stays so until it is switched off.
         again &= ~_aligned_by_halls(working)
@@ -154,8 +152,10 @@ class Experiments:
         """Return why no torque may be commanded, if so."""
         target = working.target
         aligned = bool(_aligned_by_halls(working)[k])
-        by_halls = aligned or target.drives.read(COMMUTATION)[k] == BY_HALLS
-        remedy = "; ".join(finding(self._wiring[k])) or "the drive does not heed 2080h:01 and 2070h"
+        by_halls = aligned or target.drives.read(Role.COMMUTATION)[k] == BY_HALLS
+        remedy = (
+            "; ".join(finding(working.target.device, self._wiring[k])) or "the drive does not heed 2080h:01 and 2070h"
+        )
         if aligned:
             remedy += ", then switch the drive off and on, since its halls tell it the encoder's angle (2080h:03)"
         if not check.is_good:
@@ -168,7 +168,7 @@ class Experiments:
                 f"the halls do not tell the angle of the field, and torque would lock the motor: {remedy}, then "
                 "identify again"
             )
-        configured = int(target.drives.read(POLE_PAIRS)[k])
+        configured = int(target.drives.read(Role.POLE_PAIRS)[k])
         if check.pole_pairs.is_known and round(check.pole_pairs.value) != configured:
             return (
                 f"the motor has {check.pole_pairs.value:.0f} pole pairs and 2056h says {configured}: torque would turn "
@@ -189,7 +189,7 @@ class Experiments:
         enable(working, "csp")
         go_back(working, "csp")
         holding = self.hold(working)
-        electrical = drives.read(ELECTRICAL_ANGLE) * (2.0 * np.pi / 65536.0)
+        electrical = drives.read(Role.ELECTRICAL_ANGLE) * (2.0 * np.pi / 65536.0)
         to_torque_mode(working, holding)
         with swinging_allowed(drives), shaken(drives, PULSED * working.current):
             pulses = pulse(working, holding)
@@ -197,7 +197,7 @@ class Experiments:
         gains = cautious_gains(target, GUESS * target.motor.inertia)
         write_gains(drives, gains, working.where)
         go_back(working, "csv")
-        sign = 1.0 - 2.0 * drives.read(SHAFT_DIRECTION)
+        sign = 1.0 - 2.0 * drives.read(Role.SHAFT_DIRECTION)
         windings = identify_winding(
             working, pulses, np.asarray(electrical, np.float64), float(target.motor.n_p) * float(sign[0])
         )
@@ -308,8 +308,8 @@ class Experiments:
 def _aligned_by_halls(working: Working) -> Mask:
     """Return which drives commutate by an encoder that the halls align."""
     drives = working.target.drives
-    by_encoder = drives.read(COMMUTATION) == BY_ENCODER
-    return np.asarray(by_encoder & (drives.read(INIT_MODE) == ALIGNED_BY_HALLS))
+    by_encoder = drives.read(Role.COMMUTATION) == BY_ENCODER
+    return np.asarray(by_encoder & (drives.read(Role.ENCODER_INITIALISATION) == ALIGNED_BY_HALLS))
 
 
 def _in_real_time(working: Working) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.dictionary.roles import Role
 from drive_env.gains import write_gains
 from drive_env.trials.gain_trial import Identified, Trials
 from tuning.identify.encoder_check import PULSED
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 INERTIA_ERROR, FRICTION_ERROR = 0.15, 0.3
 DOUBT = {"inertia": 0.2, "velocity_filter": 0.4, "anti_resonance": 0.1, "resonance": 0.1, "damping": 0.5}
 ANOTHER = 2.5  # times the inertia that two moves tell: a response that says more is that of another axis
-ELECTRICAL_ANGLE, SHAFT_DIRECTION = 0x2103, 0x2057
 # Of 46 axes of the suite one had its viscous friction and 13 their dry friction within FRICTION_ERROR.
 SHORT, LONGER = "two moves of a quarter of a second do not tell it from", "`drive-tune identify` moves for longer"
 NOT_TOLD = {
@@ -88,12 +88,12 @@ class _Brief(Experiments):
         self.begin("current pulses", 0.3, NAMES)
         enable(working, "csv")
         holding = self.hold(working)
-        electrical = drives.read(ELECTRICAL_ANGLE) * (2.0 * math.pi / 65536.0)
+        electrical = drives.read(Role.ELECTRICAL_ANGLE) * (2.0 * math.pi / 65536.0)
         to_torque_mode(working, holding)
         with shaken(drives, PULSED * working.current):
             pulses = pulse(working, holding, BRIEFLY)
         working = self.calm(working)
-        sign = 1.0 - 2.0 * float(drives.read(SHAFT_DIRECTION)[0])
+        sign = 1.0 - 2.0 * float(drives.read(Role.SHAFT_DIRECTION)[0])
         self.take_windings(
             working, identify_winding(working, pulses, np.asarray(electrical, np.float64), target.motor.n_p * sign)
         )

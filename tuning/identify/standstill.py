@@ -14,26 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.dead_time import dead_time
-from tuning.identify.encoder_check import FIELD_ANGLE, able, stay_inside
+from tuning.identify.encoder_check import able, stay_inside
 from tuning.identify.identification import Estimate, refused
 from tuning.identify.winding import SUPPLY_IDLE, WIDEST
-from tuning.identify.working_state import (
-    BY_FIELD,
-    COMMUTATION,
-    CYCLE,
-    OPEN_LOOP_CURRENT,
-    Working,
-    enable,
-    still_enabled,
-    switch_off,
-)
+from tuning.identify.working_state import BY_FIELD, CYCLE, Working, enable, still_enabled, switch_off
 from tuning.stop_causes import stop_causes
 
 Floats = NDArray[np.float64]
 
-FLUX_ERROR, FLUX_SUM = (0x2041, 5), (0x2041, 6)
 LEVELS = (0.9, 0.7, 0.5)  # over what may be asked for
 ROUNDS = 3  # there and back, and there again
 SETTLE, APART, READINGS = 60, 3, 8  # cycles until a current stands, and from reading to reading; how many
@@ -54,30 +45,30 @@ def standstill_resistances(working: Working) -> list[Estimate]:
     where, reasons = able(working)
     if not where.any():
         return [refused("ohm", reason) for reason in reasons]
-    commutation = drives.read(COMMUTATION)
+    commutation = drives.read(Role.COMMUTATION)
     levels = [share for k in range(ROUNDS) for share in LEVELS[:: 1 if k % 2 == 0 else -1]]
     currents, duties, errors, angles = (np.zeros((len(levels), target.num_axes)) for _ in range(4))
     try:
-        drives.write(COMMUTATION, BY_FIELD, where=where)
-        drives.write(OPEN_LOOP_CURRENT, 0, where=where)
+        drives.write(Role.COMMUTATION, BY_FIELD, where=where)
+        drives.write(Role.OPEN_LOOP_CURRENT, 0, where=where)
         enable(working, "csv", where)
         for row, share in enumerate(levels):
             raw = np.rint(1e3 * share * working.current).astype(np.int64)
-            drives.write(OPEN_LOOP_CURRENT, raw, where=where)
+            drives.write(Role.OPEN_LOOP_CURRENT, raw, where=where)
             drives.advance(SETTLE * CYCLE)
             stay_inside(working, where)
             for _ in range(READINGS):
                 drives.advance(APART * CYCLE)
-                duties[row] += drives.read(FLUX_SUM) / (READINGS * 32768.0 * 256.0)
-                errors[row] += drives.read(FLUX_ERROR) * (1e-3 / READINGS)
+                duties[row] += drives.read(Role.FLUX_ERROR_SUM) / (READINGS * 32768.0 * 256.0)
+                errors[row] += drives.read(Role.FLUX_ERROR) * (1e-3 / READINGS)
             currents[row] = raw * 1e-3
             angles[row] = working.angle(drives.read(cia402.POSITION_ACTUAL))
-        field = drives.read(FIELD_ANGLE) * (2.0 * np.pi / 65536.0)
+        field = drives.read(Role.FIELD_ANGLE) * (2.0 * np.pi / 65536.0)
         alive = still_enabled(working, drives.read(cia402.STATUSWORD))
     finally:
         switch_off(drives, where)
-        drives.write(OPEN_LOOP_CURRENT, 0, where=where)
-        drives.write(COMMUTATION, commutation, where=where)
+        drives.write(Role.OPEN_LOOP_CURRENT, 0, where=where)
+        drives.write(Role.COMMUTATION, commutation, where=where)
     found = []
     causes = [] if alive.all() else stop_causes(drives)
     for k in range(target.num_axes):

@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.dictionary.roles import Role
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.dead_time import dead_time
 from tuning.identify.identification import Estimate, refused
-from tuning.identify.working_state import CYCLE, TORQUE_I, TORQUE_P, TORQUE_SUM, Working, still_enabled
+from tuning.identify.working_state import CYCLE, Working, still_enabled
 from tuning.stop_causes import stop_causes
 
 Floats = NDArray[np.float64]
@@ -90,8 +91,8 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
     target, drives = working.target, working.target.drives
     motor, count = target.motor, target.num_axes
     P, integral = loop_gains(working)
-    drives.write(TORQUE_P, P.astype(np.int64), where=working.where)
-    drives.write(TORQUE_I, int(integral), where=working.where)
+    drives.write(Role.CURRENT_P, P.astype(np.int64), where=working.where)
+    drives.write(Role.CURRENT_I, int(integral), where=working.where)
     J = 3.0 * motor.inertia / motor.torque_constant
     stiffness, damping = J * (2.0 * np.pi * HOLD_HZ) ** 2, 2.0 * HOLD_DAMPING * J * 2.0 * np.pi * HOLD_HZ
     room = np.maximum(working.current - np.abs(holding), 0.0)
@@ -102,7 +103,7 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
         rows = len(played)
         demand = np.zeros((rows, count))
         current, angle, duty_sum = (np.zeros((rows + 1, count)) for _ in range(3))
-        duty_sum[0] = drives.read(TORQUE_SUM)
+        duty_sum[0] = drives.read(Role.TORQUE_ERROR_SUM)
         angle[0] = working.angle(drives.read(cia402.POSITION_ACTUAL))
         times = np.zeros(rows + 1)
         times[0] = time.perf_counter()
@@ -116,7 +117,7 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
                 [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL], CYCLE, play={cia402.TARGET_TORQUE: raw[None, :]}
             )
             current[k] = trace[cia402.TORQUE_ACTUAL][0] * 1e-3
-            duty_sum[k + 1] = drives.read(TORQUE_SUM)
+            duty_sum[k + 1] = drives.read(Role.TORQUE_ERROR_SUM)
             angle[k + 1] = working.angle(drives.read(cia402.POSITION_ACTUAL))
             times[k + 1] = time.perf_counter()
         late = float(np.mean(np.diff(times) > LATE * CYCLE)) if in_real_time else 0.0

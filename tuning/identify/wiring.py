@@ -1,7 +1,7 @@
 """How a motor's cable is wired, as the field shows it, and the settings with which a drive makes up for that.
 
 The field turns in open loop and takes the rotor along; what encoder and halls then tell says which way they are wired.
-2080h:01 makes up for a reversed encoder, 2070h:01 for halls of inverted level, 2070h:02 for halls in reverse order.
+One object makes up for a reversed encoder, one for halls of inverted level, one for halls in reverse order.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.safety.rotor import wrapped
 
 if TYPE_CHECKING:
+    from drive_env.devices import Device
     from tuning.target import Target
 
 Floats = NDArray[np.float64]
@@ -24,12 +26,11 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 Key = tuple[int, int]
 
-ENCODER_DIRECTION, HALL_POLARITY, HALL_DIRECTION = (0x2080, 1), (0x2070, 1), (0x2070, 2)
 # What is wrong with a cable where the drive is set otherwise than it is wired.
-FINDINGS: dict[Key, str] = {
-    ENCODER_DIRECTION: "encoder reversed",
-    HALL_POLARITY: "hall levels inverted",
-    HALL_DIRECTION: "halls in reverse order",
+FINDINGS = {
+    Role.ENCODER_DIRECTION: "encoder reversed",
+    Role.HALL_POLARITY: "hall levels inverted",
+    Role.HALL_DIRECTION: "halls in reverse order",
 }
 SETTLED = 0.002  # s after which a position is told in the new direction
 
@@ -56,6 +57,11 @@ class Setting(NamedTuple):
 Settings = Mapping[Key, Setting]
 
 
+def findings(device: Device) -> dict[Key, str]:
+    """Return what a cable can be wrong in, by the object that makes up for it, as far as the device has such ones."""
+    return {device.roles[role]: text for role, text in FINDINGS.items() if role in device.roles}
+
+
 def judge_halls(field: Floats, halls: Floats) -> Halls:
     """Return what angles of the field and of the halls [electrical rad] say, shape (n,), read while the field turns."""
 
@@ -71,24 +77,26 @@ def judge_halls(field: Floats, halls: Floats) -> Halls:
     backwards = ratio < 0.0
     off = float(np.angle(np.exp(1j * (halls - np.sign(ratio) * field)).mean()))
     if CLEAR < abs(off) < np.pi - CLEAR:
-        return Halls(backwards, None, f"the halls are off by {np.degrees(off):.0f} degrees: correct 2070h:04")
+        return Halls(backwards, None, f"the halls are off by {np.degrees(off):.0f} degrees: correct their offset")
     return Halls(backwards, abs(off) > 0.5 * np.pi)
 
 
-def needed(reads: Mapping[Key, int], encoder: float, halls: Halls) -> Settings:
+def needed(device: Device, reads: Mapping[Key, int], encoder: float, halls: Halls) -> Settings:
     """Return the settings that a wiring needs, as far as it is known.
 
     Args:
+        device: The drive.
         reads: The objects as they are.
         encoder: 1 where the encoder counts with the field, -1 against it, nan where it is not known.
         halls: What they say.
     """
     found = {
-        ENCODER_DIRECTION: None if np.isnan(encoder) else encoder < 0.0,
-        HALL_POLARITY: halls.inverted,
-        HALL_DIRECTION: halls.reversed,
+        Role.ENCODER_DIRECTION: None if np.isnan(encoder) else encoder < 0.0,
+        Role.HALL_POLARITY: halls.inverted,
+        Role.HALL_DIRECTION: halls.reversed,
     }
-    return {key: Setting(reads[key], reads[key] ^ wrong) for key, wrong in found.items() if wrong is not None}
+    known = {device.roles[role]: wrong for role, wrong in found.items() if role in device.roles and wrong is not None}
+    return {key: Setting(reads[key], reads[key] ^ wrong) for key, wrong in known.items()}
 
 
 def changes(settings: Settings) -> dict[Key, int]:
@@ -96,15 +104,16 @@ def changes(settings: Settings) -> dict[Key, int]:
     return {key: one.needs for key, one in settings.items() if one.has != one.needs}
 
 
-def finding(settings: Settings) -> list[str]:
+def finding(device: Device, settings: Settings) -> list[str]:
     """Return in words what is wrong, with the remedy: "encoder reversed: write 2080h:01 = 1"."""
-    return [f"{FINDINGS[key]}: write {named(key)} = {value}" for key, value in changes(settings).items()]
+    return [f"{findings(device)[key]}: write {named(key)} = {value}" for key, value in changes(settings).items()]
 
 
-def corrected(settings: Settings) -> list[str]:
+def corrected(device: Device, settings: Settings) -> list[str]:
     """Return in words what was wrong, once it is written: "encoder reversed: 2080h:01 is 1 now, and was 0"."""
     wrong = changes(settings)
-    return [f"{FINDINGS[key]}: {named(key)} is {wrong[key]} now, and was {settings[key].has}" for key in wrong]
+    what = findings(device)
+    return [f"{what[key]}: {named(key)} is {wrong[key]} now, and was {settings[key].has}" for key in wrong]
 
 
 def named(key: Key) -> str:
@@ -126,12 +135,12 @@ def write_wiring(target: Target, origin: Integers, values: Sequence[Mapping[Key,
     if not any(values):
         return target, origin
     drives, increments = target.drives, target.increments()
-    before, counted = drives.read(cia402.POSITION_ACTUAL), drives.read(ENCODER_DIRECTION)
-    for key in FINDINGS:
+    before, counted = drives.read(cia402.POSITION_ACTUAL), drives.read(Role.ENCODER_DIRECTION)
+    for key in findings(target.device):
         where = np.array([key in axis for axis in values])
         if where.any():
             drives.write(key, np.array([axis.get(key, 0) for axis in values], np.int64), where=where)
-    turned = drives.read(ENCODER_DIRECTION) != counted
+    turned = drives.read(Role.ENCODER_DIRECTION) != counted
     if not turned.any():
         return target, origin
     drives.advance(SETTLED)

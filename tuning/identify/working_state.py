@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import GAIN_OBJECTS, gains_from_bandwidths, write_gains
@@ -29,17 +30,14 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 CYCLE = 0.001  # s
-TORQUE_P, TORQUE_I, TORQUE_SUM = (0x2041, 1), (0x2041, 2), (0x2041, 4)
-MOTOR_TYPE, COMMUTATION, POLE_PAIRS, OPEN_LOOP_CURRENT = 0x2050, 0x2055, 0x2056, 0x2004
-MAX_CURRENT, ENCODER_STEPS, SHAFT_DIRECTION = 0x2003, (0x2080, 2), 0x2057
-LIMIT_SWITCHES, MOTOR_FLAGS, INIT_MODE = 0x2005, 0x2101, (0x2080, 3)
 BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
 STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is aligned
 # What experiments change, in the order in which it is given back.
 CHANGED: tuple[ObjectName, ...] = (
-    MAX_CURRENT, OPEN_LOOP_CURRENT, *GAIN_OBJECTS, MOTOR_TYPE, COMMUTATION, POLE_PAIRS, ENCODER_STEPS, *FINDINGS,
+    Role.CURRENT_LIMIT, Role.OPEN_LOOP_CURRENT, *GAIN_OBJECTS, Role.MOTOR_TYPE, Role.COMMUTATION, Role.POLE_PAIRS,
+    Role.ENCODER_STEPS, *FINDINGS,
     cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION, cia402.FOLLOWING_WINDOW,
-    LIMIT_SWITCHES, cia402.TARGET_VELOCITY, cia402.TARGET_POSITION, cia402.TARGET_TORQUE,
+    Role.LIMIT_SWITCHES, cia402.TARGET_VELOCITY, cia402.TARGET_POSITION, cia402.TARGET_TORQUE,
     (cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2),
 )  # fmt: skip
 BRUSHED, BRUSHLESS = 1, 3  # 2050h
@@ -144,18 +142,18 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
     increments = target.increments()
     write_gains(drives, cautious_gains(target, GUESS * motor.inertia), axes)
     # A drive fresh from the factory knows no motor; one that is commissioned is taken at its word and checked.
-    fresh = axes & (before[MOTOR_TYPE] == 0)
+    fresh = axes & (before[Role.MOTOR_TYPE] == 0)
     if fresh.any():
-        drives.write(MOTOR_TYPE, BRUSHED if motor.kind == "dc" else BRUSHLESS, where=fresh)
-        drives.write(POLE_PAIRS, motor.n_p, where=fresh)
-        drives.write(ENCODER_STEPS, motor.encoder_counts, where=fresh)
-        drives.write(COMMUTATION, BY_ENCODER, where=fresh)
+        drives.write(Role.MOTOR_TYPE, BRUSHED if motor.kind == "dc" else BRUSHLESS, where=fresh)
+        drives.write(Role.POLE_PAIRS, motor.n_p, where=fresh)
+        drives.write(Role.ENCODER_STEPS, motor.encoder_counts, where=fresh)
+        drives.write(Role.COMMUTATION, BY_ENCODER, where=fresh)
         # No axis is at both ends: switches that say so are not there.
         unwired = fresh & (drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
-        drives.write(LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
-    own = before[MAX_CURRENT] * 1e-3
+        drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
+    own = before[Role.CURRENT_LIMIT] * 1e-3
     current = np.where(own > 0.0, np.minimum(own, target.current), target.current)
-    drives.write(MAX_CURRENT, np.rint(current * 1e3).astype(np.int64), where=axes)
+    drives.write(Role.CURRENT_LIMIT, np.rint(current * 1e3).astype(np.int64), where=axes)
     scale = increments
     for ramp in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         drives.write(ramp, _raw(10.0 * target.speed * scale * per_increment(drives, ramp)), where=axes)
@@ -191,11 +189,11 @@ def enable(working: Working, mode: str, where: Mask | None = None) -> None:
     try:
         motion.enable(drives, mode=mode, where=axes, timeout=ENABLE_TIME)
         waited = 0.0
-        aligns = axes & (drives.read(COMMUTATION) == BY_ENCODER) & (drives.read(MOTOR_TYPE) == BRUSHLESS)
+        aligns = axes & (drives.read(Role.COMMUTATION) == BY_ENCODER) & (drives.read(Role.MOTOR_TYPE) == BRUSHLESS)
         if aligns.any():  # the flags are those of the millisecond before; and what was switched on comes to rest
             drives.advance(50 * CYCLE)
             waited += 50 * CYCLE
-        while np.any(aligns & (drives.read(MOTOR_FLAGS) & STOP_MODE != 0)) and waited < ALIGNMENT_TIME:
+        while np.any(aligns & (drives.read(Role.MOTOR_FLAGS) & STOP_MODE != 0)) and waited < ALIGNMENT_TIME:
             drives.advance(50 * CYCLE)
             waited += 50 * CYCLE
     except (TimeoutError, RuntimeError) as error:

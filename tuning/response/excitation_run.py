@@ -17,11 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.trials.positioning import wrapped
 from tuning.response.excitation import Lines, periodic
-from tuning.target import POSITION_SCALER, Target
+from tuning.target import Target
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -79,7 +80,7 @@ class Shaker:
     def __init__(self, target: Target, loop: str, where: Mask, lines: Lines, kind: str) -> None:
         self._target, self._drives, self._loop, self._where = target, target.drives, loop, where
         self._lines, self._kind = lines, kind
-        self.radians = 2.0 * math.pi / np.maximum(np.asarray(self._drives.read(POSITION_SCALER), float), 1.0)
+        self.radians = 2.0 * math.pi / np.maximum(np.asarray(self._drives.read(Role.POSITION_SCALE), float), 1.0)
         # Of a count of the loop's set-point.
         self.per_count = self.radians / per_increment(self._drives, SEEN[loop])
         self.traced_time = 0.0  # s that passed in traces, which a target's clock does not see

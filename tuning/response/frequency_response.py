@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.dictionary.roles import Role
 from drive_env.gains import GAIN_OBJECTS
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.dead_time import dead_time_resistance
@@ -204,7 +205,7 @@ class _Measurement:
     # --- how strongly ---------------------------------------------------------------------------------------------
     def _current_limit(self) -> Floats:
         """Return what may flow [A]: the user's limit, or the drive's own."""
-        own = self._target.drives.read(self._device.master.current_limit) * 1e-3
+        own = self._target.drives.read(Role.CURRENT_LIMIT) * 1e-3
         return np.asarray(np.minimum(self._target.current, own))
 
     def _trial(self, shaker: Shaker, limit: Floats, speed: Floats, sign: Floats) -> Pass:
@@ -295,7 +296,7 @@ class _Measurement:
         return velocity_noise(self._device, plant)
 
     def _note_limits(self, peak: Floats, where: Mask) -> None:
-        limit = self._target.drives.read(self._device.master.current_limit) * 1e-3
+        limit = self._target.drives.read(Role.CURRENT_LIMIT) * 1e-3
         for axis in np.flatnonzero(where & (peak > 0.98 * limit)):
             self._notes[axis].append(
                 f"the current reached its limit, {limit[axis]:.2f} A, beyond what was asked for: the loop oscillates, "

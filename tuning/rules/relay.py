@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.dictionary.roles import Role
 from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.rules.lags import slow_enough, velocity_lag
 from tuning.rules.optima import take_current
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-CURRENT_LIMIT = 0x2003
 TIME, TRANSIENT = 0.3, 0.1  # of the experiment, and of it what is left out at its beginning [s]
 SHARE = 0.4  # of the rated current, at least: the relay's height
 # Of the drive's current limit, at most: an envelope takes half of it, swung through, for a shaking loop.
@@ -135,7 +135,7 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
     drives, n = target.drives, target.num_axes
     axes = np.ones(n, bool) if where is None else where
     dry = np.zeros(n) if coulomb is None else np.nan_to_num(np.asarray(coulomb, float))
-    limit = OF_LIMIT * drives.read(CURRENT_LIMIT) * 1e-3
+    limit = OF_LIMIT * drives.read(Role.CURRENT_LIMIT) * 1e-3
     height = np.minimum(
         np.maximum(SHARE * target.motor.rated_current, OVER_FRICTION * dry), np.minimum(limit, target.current)
     )

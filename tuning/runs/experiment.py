@@ -18,6 +18,7 @@ from drive_env import cia402
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
+from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment_of
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
@@ -31,11 +32,7 @@ MAX_POINTS = 262_144
 MAX_DURATION = 60.0  # s
 MIN_SAMPLES = 20  # in each of the two windows; fewer say nothing about ringing
 GAIN_UNITS = frozenset({"current P", "velocity P", "position P", "I"})  # of dictionary/units.py
-POSITION_SCALER, TARGET_VELOCITY, ACCELERATION = (
-    (0x2058, 0),
-    (cia402.TARGET_VELOCITY, 0),
-    (cia402.PROFILE_ACCELERATION, 0),
-)
+TARGET_VELOCITY, ACCELERATION = (cia402.TARGET_VELOCITY, 0), (cia402.PROFILE_ACCELERATION, 0)
 _INDEX = re.compile(r"(?:0x)?([0-9a-f]{4})h?:(?:0x)?([0-9a-f]{1,2})h?", re.IGNORECASE)
 _SPACINGS = ("lin", "log")
 _PAIRS = (("velocity_rpm", "velocity_pps"), ("acceleration_rpm_per_s", "acceleration_pps2"))
@@ -184,9 +181,9 @@ def resolve(experiment: Experiment) -> Resolved:
     _check_grid(experiment, entries)
     _check_metric(experiment.metric)
     _check_times(experiment.excitation, 1.0 / device.profile_rate)
-    scaler = int(dictionary.find(POSITION_SCALER).default)
+    scaler = int(dictionary.find(Role.POSITION_SCALE).default)
     scaler = {dictionary.find(name).label: value for name, value in preset.items()}.get(
-        dictionary.find(POSITION_SCALER).label, scaler
+        dictionary.find(Role.POSITION_SCALE).label, scaler
     )
     velocity = experiment.excitation.raw_velocity(dictionary.find(TARGET_VELOCITY), scaler)
     acceleration = experiment.excitation.raw_acceleration(dictionary.find(ACCELERATION), scaler)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import EmulatedDrives, cia402, motion
+from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment_of
 from drive_env.drives.trace import Trace
 from mechanics.loads import find_load
@@ -29,7 +30,6 @@ from tuning.runs.metrics import Recording
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
 
-CURRENT_LIMIT = 0x2003
 FLAGS = ("diverged", "oscillates", "fault")
 PIECE = 0.02  # s of simulation between two reports of progress
 MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
@@ -324,7 +324,7 @@ def _record(
         reference_rpm=np.sign(resolved.velocity) * ramp * rpm,
         speed_rpm=np.concatenate([trace[cia402.VELOCITY_ACTUAL] for trace in traces]) * rpm,
         current=np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * 1e-3,
-        current_limit=drives.read(CURRENT_LIMIT).astype(np.float64) * 1e-3,
+        current_limit=drives.read(Role.CURRENT_LIMIT).astype(np.float64) * 1e-3,
         t_step=excitation.velocity_time,
         t_load=excitation.load_time,
     )

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import (
@@ -118,7 +119,7 @@ class TrialBench:
         drives.advance(CALM)
         self.identified, self._origin = self._moved(gains)
         self._trials.recover(self._where)
-        self.move = plan_move(target.motor, self.identified.inertia, drives.read((0x2058, 0)), self._reach)
+        self.move = plan_move(target.motor, self.identified.inertia, drives.read(Role.POSITION_SCALE), self._reach)
         self.rule, self.safe = (_rule_gains(target, self.identified.inertia, rule) for rule in (FITTED_RULE, SAFE_RULE))
         self.incumbent = self.safe.copy()
         write_gains(drives, self.safe)
@@ -133,7 +134,7 @@ class TrialBench:
         """
         target, drives = self.target, self.target.drives
         noise = target.device.stage["adc_noise"].high
-        scaler = drives.read((0x2058, 0))
+        scaler = drives.read(Role.POSITION_SCALE)
         for _ in range(SOFTENINGS):
             began = drives.read(cia402.POSITION_ACTUAL)
             watch = OscillationWatch(self._where, np.full(target.num_axes, target.current), noise)
