@@ -13,6 +13,7 @@ from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
 from drive_env.dictionary import codec, units
 from drive_env.emulator import prepared_record
+from drive_env.motors import find_motor
 
 # Abort codes of CiA 301.
 READ_ONLY, NO_OBJECT, WRONG_TYPE, NO_SUB = 0x06010002, 0x06020000, 0x06070010, 0x06090011
@@ -507,7 +508,7 @@ def test_factory_values_are_those_of_the_eds():
 
 
 def test_a_preset_is_what_its_file_says(drives):
-    preset = DEVICE.preset("qbl4208")
+    preset = DEVICE.preset(find_motor("qbl4208"))
     assert preset["Motor Type"] == 3
     for name, value in preset.items():
         assert (drives.read(name) == value).all(), name

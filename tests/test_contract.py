@@ -141,7 +141,7 @@ class Life:
     def commission(self):
         drives = self.drives
         assert self.in_state(DISABLED)
-        preset = drives.device.preset(drives.motor.name)
+        preset = drives.device.preset(drives.motor)
         assert preset
         for name, value in preset.items():
             assert np.all(drives.read(name) == value), name

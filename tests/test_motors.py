@@ -3,13 +3,13 @@
 import itertools
 import math
 import re
-import tomllib
 
 import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.devices.tmcm1636.commissioning import preset as rule
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.gains import gains_from_bandwidths
 from drive_env.motors import MOTORS, find_motor
@@ -55,7 +55,9 @@ def test_there_are_motors_from_20_w_to_1_kw_with_and_without_brushes():
 def test_names_are_plain_and_sources_tell_where_numbers_are_from(motor):
     assert re.fullmatch(r"[a-z0-9_]+", motor.name)
     assert find_motor(motor.name) is motor
-    assert len(motor.source) > 20
+    given = dict(motor.sources)
+    assert {"inertia_kg_m2", "rated_torque_nm", "voltage_v"} <= set(given)
+    assert all(len(text) > 10 for text in given.values())
     assert motor.kind in ("pmsm", "dc")
 
 
@@ -155,20 +157,16 @@ def test_class_rows_are_those_of_the_gain_tables_columns(name, R, L, K_t, J):
 
 
 # --- the presets --------------------------------------------------------------------------------------------------
-def read_preset(motor):
-    return tomllib.loads((DEVICE.presets / f"{motor.name}.toml").read_text(encoding="utf-8"))
-
-
-def test_every_motor_has_a_preset_and_every_preset_a_motor():
-    assert sorted(path.stem for path in DEVICE.presets.glob("*.toml")) == NAMES
+def test_what_is_written_is_for_a_motor_that_the_rule_serves_otherwise():
+    written = sorted(path.stem for path in DEVICE.presets.glob("*.toml"))
+    assert set(written) < set(NAMES)
+    for name in written:
+        assert DEVICE.preset(MOTORS[name]) != rule(DEVICE, MOTORS[name]), f"{name}: the rule says the same"
 
 
 def test_preset_gains_are_those_of_its_bandwidths(motor):
-    preset = read_preset(motor)
-    bandwidths = preset["bandwidths"]
-    assert set(bandwidths) == {"current_hz", "velocity_hz", "position_hz"}
-    gains = gains_from_bandwidths(DEVICE, motor, 3.0 * motor.inertia, **bandwidths)
-    objects = preset["objects"]
+    gains = gains_from_bandwidths(DEVICE, motor, 3.0 * motor.inertia, current_hz=1000, velocity_hz=20, position_hz=5)
+    objects = DEVICE.preset(motor)
     written = (
         objects["Torque Mode Settings.Torque_P"],
         objects["Torque Mode Settings.Torque_I"],
@@ -177,12 +175,10 @@ def test_preset_gains_are_those_of_its_bandwidths(motor):
         objects["Position Mode Settings.P_Parameter"],
     )
     assert np.all(np.abs(np.subtract(written, gains)) <= 1)
-    # Slower than this only where a gain would leave its range, which no motor of the table needs.
-    assert bandwidths == {"current_hz": 1000, "velocity_hz": 20, "position_hz": 5}
 
 
 def test_preset_describes_the_motor(motor):
-    objects = read_preset(motor)["objects"]
+    objects = DEVICE.preset(motor)
     assert objects["Motor Type"] == (1 if dc(motor) else 3)
     assert objects["Commutation Mode"] == 3
     assert objects["Motor Pole Pairs"] == motor.n_p
@@ -191,7 +187,7 @@ def test_preset_describes_the_motor(motor):
 
 
 def test_preset_motions_are_within_the_motors_reach(motor):
-    objects = read_preset(motor)["objects"]
+    objects = DEVICE.preset(motor)
     assert 0.35 <= objects["Profile velocity"] / INC / motor.rated_speed <= 0.6
     torque = objects["Profile acceleration"] / INC * 3.0 * motor.inertia
     assert 0.3 <= torque / motor.rated_torque <= 0.7

@@ -14,6 +14,7 @@ from drive_env.commands.get import get, set_object
 from drive_env.commands.jog import jog
 from drive_env.commands.log import log, replay
 from drive_env.commands.monitor import monitor
+from drive_env.commands.motor import motor_app
 from drive_env.commands.names import list_names
 from drive_env.commands.options import INTERRUPTED
 from drive_env.commands.parameters import backup, commission, diff, restore
@@ -45,6 +46,7 @@ PANELS = {
     "Frames": (("log", log), ("replay", replay)),
     "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("check-model", check_model)),
 }
+app.add_typer(motor_app, name="motor", rich_help_panel="This installation")
 for panel, commands in PANELS.items():
     for name, function in commands:
         app.command(name, rich_help_panel=panel)(function)

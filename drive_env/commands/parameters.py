@@ -188,12 +188,13 @@ def commission(
     """
     with errors_as_exit_codes():
         from drive_env.devices import find_device
+        from drive_env.motors import MOTORS, find_motor
 
         known = find_device(device)
         if motor == "?":
-            print("\n".join(sorted(path.stem for path in known.presets.glob("*.toml"))))
+            print("\n".join(MOTORS))
             return
-        preset = known.preset(motor)
+        preset = known.preset(find_motor(motor))
         dictionary = known.new_dictionary()
         wanted = {(e.index, e.sub): value for e, value in ((dictionary.find(n), v) for n, v in preset.items())}
         bus = _Bus(interface, channel, node, device, None, bitrate, timeout)

@@ -15,6 +15,7 @@ from drive_env.devices.variants import compose_eds, converted_preset, merged, pa
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from drive_env.dictionary.roles import Role
+from drive_env.motors import MOTORS, Motor
 from mechanics.near_names import did_you_mean
 
 FOLDER = Path(__file__).parent
@@ -145,13 +146,21 @@ class Device(NamedTuple):
                 return axis, offset.first + above
         return 0, index
 
-    def preset(self, motor: str) -> dict[str, int]:
-        """Return the commissioning preset of a motor: object name -> raw value, in the order of writing."""
-        path = self.presets / f"{motor}.toml"
-        if not path.exists():
-            names = ", ".join(sorted(p.stem for p in self.presets.glob("*.toml")))
-            raise ValueError(f"device {self.name} has no preset for motor {motor!r}; it has {names}")
-        preset: dict[str, int] = dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
+    def preset(self, motor: Motor) -> dict[str, int]:
+        """Return the commissioning preset of a motor: object name -> raw value, in the order of writing.
+
+        The one that is written for a motor of the catalogue, else what the device's rule makes of the motor's data.
+
+        Raises:
+            ValueError: For a motor that the drive cannot turn.
+        """
+        path = self.presets / f"{motor.name}.toml"
+        preset: dict[str, int]
+        if path.exists() and MOTORS.get(motor.name) == motor:
+            preset = dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
+        else:
+            rule = importlib.import_module(f"drive_env.devices.{self.presets.parent.name}.commissioning")
+            preset = rule.preset(find_device(self.variant_of or self.name), motor)
         if not self.variant_of:
             return preset
         before = find_device(self.variant_of).bindings

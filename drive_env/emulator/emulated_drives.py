@@ -39,7 +39,7 @@ from drive_env.firmware.cycle import Call
 from drive_env.firmware.protection import CAUSES
 from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
 from drive_env.master.quantities import integers, is_quantity
-from drive_env.motors import find_motor
+from drive_env.motors import Motor, find_motor
 from mechanics.load import Load
 from mechanics.loads import find_load
 from mechanics.model import copies_per_model
@@ -66,7 +66,7 @@ class EmulatedDrives:
     Args:
         device: Name of the device.
         load: A load's name, the path of your own MJCF, or a `mechanics.Load`.
-        motor: Name of the motor, or None for factory values.
+        motor: Name of the motor, the path of your own motor's TOML, a `Motor`, or None for factory values.
         num_machines: Machines, each with its drives.
         seed: Seed of everything random. Machine k of a seed is the same machine in every set.
         first_machine: Number of the first machine.
@@ -97,7 +97,7 @@ class EmulatedDrives:
         self,
         device: str = "tmcm1636",
         load: str | Path | Load = "two_mass",
-        motor: str | None = DEFAULT_MOTOR,
+        motor: str | Path | Motor | None = DEFAULT_MOTOR,
         num_machines: int = 1,
         seed: int = 0,
         *,
@@ -148,7 +148,7 @@ class EmulatedDrives:
         warn_of_misfits([group.load for group in self._groups], self.motor)
         self._faults = MachineFaults(self)
         self.machine = Machines(self)
-        preset = {} if motor is None else self.device.preset(motor)
+        preset = {} if motor is None else self.device.preset(self.motor)
         if motor is not None:
             preset = {"Limit switches": 0 if self.load.has_switches else 3, **preset}
         self._objects = LiveDictionary(self.device, self._records, self.num_axes, preset)

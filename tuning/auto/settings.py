@@ -112,7 +112,7 @@ def write(run: Run, transaction: Transaction) -> Mask:
 
 def _commissioning(target: Target) -> dict[str, int]:
     """Return what a drive must be told of its motor; how its encoder finds its angle is left as it is."""
-    preset = target.device.preset(target.motor.name)
+    preset = target.device.preset(target.motor)
     return {name: value for name, value in preset.items() if name != ENCODER_INIT}
 
 

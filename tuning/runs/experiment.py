@@ -171,7 +171,7 @@ def resolve(experiment: Experiment) -> Resolved:
     try:
         device, motor = find_device(experiment.device), find_motor(experiment.motor)
         find_load(experiment.load)
-        preset = device.preset(motor.name)
+        preset = device.preset(motor)
     except ValueError as error:
         raise ExperimentError(str(error)) from None
     if not 0 <= experiment.seed < 2**63:

@@ -1,0 +1,173 @@
+"""`drive-env motor`: a motor of one's own, from the numbers of its data sheet to the file that describes it."""
+
+from __future__ import annotations
+
+import json as json_text
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from drive_env.commands.options import check_free, errors_as_exit_codes
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from drive_env.motors import Motor
+
+motor_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
+
+
+@motor_app.callback()
+def motor() -> None:
+    """Motors that the catalogue does not have; --motor takes the path of such a file wherever it takes a name."""
+
+
+@motor_app.command("new")
+def new_motor(
+    file: Annotated[Path, typer.Argument(help="TOML file to write; there must be none yet.")],
+    kind: Annotated[str | None, typer.Option("--kind", help="pmsm (brushless) or dc (brushed).")] = None,
+    title: Annotated[str, typer.Option("--title", help="What the motor is called.")] = "",
+    numbers: Annotated[
+        list[str] | None,
+        typer.Option("--number", "-n", help="A number of the data sheet, e.g. inertia_kg_m2=4.8e-6; again for others."),
+    ] = None,
+    source: Annotated[str, typer.Option("--source", help="Where the numbers come from.")] = "",
+    list_numbers: Annotated[bool, typer.Option("--list", help="List the numbers that there are, and stop.")] = False,
+) -> None:
+    """Write a motor's file from its data sheet: what is not given is asked for, at a terminal.
+
+    A data sheet gives resistance and inductance of a phase or between two terminals, the torque constant per ampere
+    peak or RMS, or a back-EMF; each has a number of its own, and is converted. What it does not give (friction,
+    cogging) is taken from motors of its class, and can be corrected in the file.
+    """
+    from drive_env.motors import NUMBERS, MotorError, load_motor, motor_of
+
+    with errors_as_exit_codes():
+        if list_numbers:
+            for name, row in NUMBERS.items():
+                print(f"{name}: {row.meaning}" + (f" [{row.unit}]" if row.unit else ""))
+            return
+        check_free(file)
+        if file.suffix != ".toml":
+            raise ValueError(f"{file} must end with .toml: so it is told from a motor's name")
+        given = _given(numbers or [])
+        if kind is None:
+            kind = _asked("kind of motor, pmsm (brushless) or dc (brushed)", "pmsm")
+        missing = _missing(kind, given)
+        if missing and not _is_answered():
+            raise ValueError(f"{' or '.join(missing[0])} is missing; give it with --number (--list says what it is)")
+        for choice in missing:
+            name, value = _ask_for(choice)
+            given[name] = value
+        where = source or _asked("source of the numbers (data sheet, revision)", "data sheet")
+        data = {"title": title or file.stem, "kind": kind, "sources": {"data_sheet": where},
+                "numbers": {name: [value, "data_sheet"] for name, value in given.items()}}  # fmt: skip
+        try:
+            motor_of(file.stem, data)
+        except MotorError as error:
+            raise ValueError(f"{error}; nothing was written") from None
+        _write(file, data)
+        _tell(file, load_motor(file))
+
+
+def _given(texts: list[str]) -> dict[str, float]:
+    """Return the numbers of the command line."""
+    from drive_env.motors import NUMBERS
+    from mechanics.near_names import did_you_mean
+
+    found: dict[str, float] = {}
+    for text in texts:
+        name, _, value = (part.strip() for part in text.partition("="))
+        if name not in NUMBERS:
+            raise ValueError(f"{name!r} is no number of a motor{did_you_mean(name, NUMBERS)}; --list shows them")
+        found[name] = _number(name, value)
+    return found
+
+
+def _number(name: str, text: str) -> float:
+    from drive_env.motors import WHOLE
+
+    try:
+        value = float(text)
+    except ValueError:
+        raise ValueError(f"{name} = {text!r} is no number; write it as 4.8e-6") from None
+    return int(value) if name in WHOLE and value == int(value) else value
+
+
+def _missing(kind: str, given: Mapping[str, float]) -> list[tuple[str, ...]]:
+    """Return what is still to be asked for: of each quantity the forms in which it can be given."""
+    from drive_env import motors
+
+    if kind == "dc":
+        wanted: list[tuple[str, ...]] = [(name,) for name in motors.OF_DC]
+    else:
+        forms = (motors.RESISTANCE, motors.INDUCTANCE, motors.TORQUE_CONSTANT)
+        wanted = [tuple(name for name in form if name not in motors.OF_DC) for form in forms]
+        if any(name in given for name in motors.RATED_CURRENT):
+            wanted.pop()  # the torque constant follows from the rated point
+        wanted.append(("pole_pairs",))
+    wanted += [(name,) for name in motors.NEEDED]
+    return [choice for choice in wanted if not any(name in given for name in choice)]
+
+
+def _ask_for(choice: tuple[str, ...]) -> tuple[str, float]:
+    from drive_env.motors import NUMBERS
+
+    name = choice[0]
+    if len(choice) > 1:
+        for number, each in enumerate(choice, 1):
+            typer.echo(f"  {number}: {NUMBERS[each].meaning} [{NUMBERS[each].unit}]", err=True)
+        which = _asked(f"which of these does the data sheet give (1 to {len(choice)})", "1")
+        if not which.isdigit() or not 1 <= int(which) <= len(choice):
+            raise ValueError(f"{which!r} is none of 1 to {len(choice)}")
+        name = choice[int(which) - 1]
+    row = NUMBERS[name]
+    return name, _number(name, _asked(f"{row.meaning}{f' [{row.unit}]' if row.unit else ''}", ""))
+
+
+def _is_answered() -> bool:
+    """Return whether somebody is there to answer."""
+    return sys.stdin.isatty()
+
+
+def _asked(what: str, default: str) -> str:
+    """Ask at a terminal; without one say which option answers."""
+    if not _is_answered():
+        raise ValueError(f"{what} is missing; give it as an option (--kind, --source)")
+    return str(typer.prompt(what, default=default or None, err=True))
+
+
+def _write(file: Path, data: Mapping[str, object]) -> None:
+    from drive_env.motors import NUMBERS
+    from drive_env.whole_file import write_whole
+
+    sources, numbers = data["sources"], data["numbers"]
+    assert isinstance(sources, dict) and isinstance(numbers, dict)
+    lines = [f"title = {json_text.dumps(data['title'])}", f"kind = {json_text.dumps(data['kind'])}", "", "[sources]"]
+    lines += [f"{name} = {json_text.dumps(text)}" for name, text in sources.items()]
+    lines += ["", "[numbers]  # each with its source"]
+    for name, (value, source) in numbers.items():
+        unit = f"{NUMBERS[name].unit}, " if NUMBERS[name].unit else ""
+        lines.append(f'{name} = [{value!r}, "{source}"]  # {unit}{NUMBERS[name].meaning}')
+    write_whole(file, "\n".join(lines) + "\n")
+
+
+def _tell(file: Path, row: Motor) -> None:
+    """Say what the numbers make of the motor, by which a wrong one is noticed."""
+    from drive_env.devices import device_names, find_device
+
+    no_load = row.voltage / math.sqrt(3.0) / (row.n_p * row.psi_m) if row.kind != "dc" else row.voltage / row.psi_m
+    print(f"{file}: {row.title}")
+    print(f"  a phase: {row.R_s:.4g} ohm, {1e3 * row.L_q:.4g} mH; rated current {row.rated_current:.3g} A peak")
+    print(
+        f"  torque constant {row.torque_constant:.4g} N*m/A of peak i_q; {no_load * 30 / math.pi:.0f} rpm without load"
+    )
+    print(f"  rated power {row.rated_torque * row.rated_speed:.3g} W")
+    for name in device_names():
+        try:
+            find_device(name).preset(row)
+        except ValueError as error:
+            print(f"  {name} cannot turn it: {error}")
