@@ -1,0 +1,39 @@
+"""What the papers name exists: files and folders, in backticks, of README, CONTRIBUTING and docs."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAPERS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+ROOMS = ("drive_env", "mechanics", "tuning", "agents", "research", "benchmarks", "tests", "examples", "docs")
+
+
+def named(text):
+    """Return the paths that a text names: from the root, or of a file that one room holds."""
+    for found in re.findall(r"`([\w./-]+)`", text):
+        if "/" in found and (found.split("/")[0] in ROOMS or found.endswith((".py", ".toml", ".md"))):
+            yield found
+
+
+@pytest.mark.parametrize("paper", PAPERS, ids=[str(path.relative_to(ROOT)) for path in PAPERS])
+def test_every_file_that_a_paper_names_exists(paper):
+    missing = []
+    for name in named(paper.read_text(encoding="utf-8")):
+        places = [ROOT / name, *(ROOT / room / name for room in ROOMS), paper.parent / name]
+        if not any(place.exists() for place in places):
+            missing.append(name)
+    assert missing == []
+
+
+def test_the_map_is_two_pages():
+    assert len((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").splitlines()) <= 110
+
+
+def test_every_decision_is_in_the_index():
+    folder = ROOT / "docs" / "decisions"
+    index = (folder / "README.md").read_text(encoding="utf-8")
+    assert {path.name for path in folder.glob("*.md")} - {"README.md"} == set(re.findall(r"\]\((\S+\.md)\)", index))
