@@ -1,4 +1,4 @@
-"""Raw gains of 2041h, 2042h and 2043h from bandwidths, and back.
+"""Raw gains of a cascade of PI loops from bandwidths, and back.
 
 The scale is the motion chip's: with f the current bandwidth [Hz], V the supply, w_v the velocity bandwidth [rad/s], T_i
 the integration time and k_v the position gain [1/s], the raw integers are
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import Device
 from drive_env.dictionary.units import RPM
-from drive_env.drives.interface import Drives
+from drive_env.drives.interface import Drives, device_of
 from drive_env.motors import Motor
 
 RAW_MAX = 32767  # the chip's registers are signed
@@ -27,18 +27,13 @@ DEFAULT_INTEGRATION = 5.0  # T_i as a multiple of 1/w_v
 
 
 class Gains(NamedTuple):
-    """Raw integers of 2041h:01, 2041h:02, 2042h:01, 2042h:02, 2043h:01."""
+    """Raw integers of a cascade of PI, PI and P loops."""
 
     torque_p: int
     torque_i: int
     velocity_p: int
     velocity_i: int
     position_p: int
-
-
-# In the order of Gains.
-GAIN_OBJECTS = ((0x2041, 1), (0x2041, 2), (0x2042, 1), (0x2042, 2), (0x2043, 1))
-GAIN_NAMES = ("torque P", "torque I", "velocity P", "velocity I", "position P")
 
 
 class Bandwidths(NamedTuple):
@@ -111,7 +106,7 @@ def gains_from_bandwidths(
         65536.0 / device.velocity_rate * w_v / integration,
         _POSITION_P_SCALE * 2.0 * math.pi * position_hz,
     )
-    for name, value in zip(GAIN_NAMES, raw, strict=True):
+    for name, value in zip(device.gains.titles, raw, strict=True):
         if not 0.5 <= value < RAW_MAX + 0.5:
             raise ValueError(f"{name} would be {value:.0f}, outside 1...{RAW_MAX}; choose another bandwidth")
     return Gains(*(round(value) for value in raw))
@@ -211,9 +206,13 @@ def scaled(raw: NDArray[Any], factor: ArrayLike) -> NDArray[np.int64]:
 
 
 def write_gains(drives: Drives, gains: NDArray[np.int64], where: NDArray[np.bool_] | None = None) -> None:
-    """Write raw gains of shape (num_axes, 5), in the order of `Gains`."""
-    for name, column in zip(GAIN_OBJECTS, gains.T, strict=True):
-        drives.write(name, column, where=where)
+    """Write raw gains of shape (num_axes, gains), in the order of the device's gain set."""
+    device_of(drives).gains.write(drives, gains, where)
+
+
+def read_gains(drives: Drives) -> NDArray[np.int64]:
+    """Return the raw gains that drives have, shape (num_axes, gains)."""
+    return device_of(drives).gains.read(drives)
 
 
 _POSITION_P_SCALE = 4096.0 * 2.0 * math.pi / 65536.0 / RPM  # raw per 1/s

@@ -22,9 +22,11 @@ from agents.policies.policy import policy_of
 from agents.shipped import find_agent
 from agents.training.tasks import make_lanes
 from agents.training.train import with_figures
+from drive_env.gains import RAW_MAX
 from tuning.bootstrap import bootstrap_interval
 
 if TYPE_CHECKING:
+    from drive_env.devices import Device
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
 Floats = NDArray[np.float64]
@@ -36,7 +38,6 @@ ERROR, SPEED = 0, 3
 LATENCY = 0.003  # s, from a sample to what follows from it, in the mean of the distributions' buses: leads by so much
 SPAN = 3  # samples to either side, over which acceleration is taken
 COMPARED = (following_error, current, pole)
-VELOCITY_P, RAW_MAX = (0x2042, 1), 32767
 
 
 class Rival(NamedTuple):
@@ -113,7 +114,9 @@ def compare(
         lanes: Any = make_lanes(ENVIRONMENT, min(LANES, episodes), {**bundle.configuration, **changes})
         try:
             found: list[tuple[Episode, ...]] = []
-            commissioned = lanes.drives.read(VELOCITY_P) if rival is not None and rival.tuned else None
+            commissioned = (
+                lanes.drives.read(velocity_p(lanes.drives.device)) if rival is not None and rival.tuned else None
+            )
             for first in range(0, episodes, LANES):
                 seeds = list(range(seed + first, seed + first + lanes.num_envs))
                 law = policy if rival is None else _law(rival, lanes, seeds, commissioned)
@@ -167,6 +170,11 @@ def identified_lags(error: Floats, speed: Floats, acceleration: Floats) -> Float
     return np.moveaxis(found, -1, 0)
 
 
+def velocity_p(device: Device) -> tuple[int, int]:
+    """Return the object of a device's velocity P."""
+    return device.gains.keys[device.gains.names.index("velocity_p")]
+
+
 def tune(drives: EmulatedDrives, commissioned: NDArray[np.int64]) -> None:
     """Make velocity P of emulated drives for the inertia of each machine, as a perfect identification finds it.
 
@@ -182,7 +190,7 @@ def tune(drives: EmulatedDrives, commissioned: NDArray[np.int64]) -> None:
     # What a drive measures is inertia over torque constant.
     share = np.repeat(drives.machine.parameters["motor.psi_m"] / motor.psi_m, drives.load.num_axes)
     wanted = commissioned * inertia / share / (COMMISSIONED_INERTIA * motor.inertia)
-    drives.write(VELOCITY_P, np.clip(np.rint(wanted), 1, RAW_MAX).astype(np.int64))
+    drives.write(velocity_p(drives.device), np.clip(np.rint(wanted), 1, RAW_MAX).astype(np.int64))
 
 
 def _law(rival: Rival, lanes: Any, seeds: Sequence[int], commissioned: NDArray[np.int64] | None) -> Law:

@@ -11,7 +11,7 @@ from test_parity import served
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
-from drive_env.gains import GAIN_OBJECTS, Gains, rule_gains, write_gains
+from drive_env.gains import Gains, rule_gains, write_gains
 from drive_env.motors import find_motor
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import plan_move
@@ -35,6 +35,8 @@ from tuning.rules.rules_by_name import propose
 from tuning.runs import provenance
 from tuning.snapshot import load_snapshot, restore
 from tuning.target import Target, emulated
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 NORMAL, EMPTY, WILD, REVERSED, SHORT = range(5)  # axes of `five`
 ENCODER_DIRECTION = (0x2080, 1)

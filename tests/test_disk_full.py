@@ -20,13 +20,15 @@ from agents.commands.cli import app as drive_agent
 from agents.tuner import tuning_run
 from drive_env import CanDrives
 from drive_env.commands.cli import app as drive_env
-from drive_env.gains import GAIN_OBJECTS
+from drive_env.devices import find_device
 from drive_env.whole_file import files_to_be, write_whole
 from tuning.auto import one_button as auto_module
 from tuning.auto.run import Run
 from tuning.commands.cli import app as drive_tune
 from tuning.search import trials_files
 from tuning.snapshot import load_snapshot
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 SAID = "No space left on device"
 SWITCH_ON_DISABLED = (0x4F, 0x40)

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from drive_env import motion
+from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import GAIN_OBJECTS, write_gains
+from drive_env.gains import write_gains
 from tuning.drive_audit import KINDS, DriveAudit
 from tuning.identify.identification import identify
 from tuning.target import emulated
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 TRAVEL, FAST, SHAKE, TRIP = range(len(KINDS))
 TURN = 65536

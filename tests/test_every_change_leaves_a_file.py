@@ -19,11 +19,13 @@ from drive_env import CanDrives, EmulatedDrives, cia402
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.gains import GAIN_OBJECTS
+from drive_env.devices import find_device
 from drive_env.master.description import Description
 from drive_env.master.parameters import read_parameters
 from tuning.commands.cli import app as drive_tune
 from tuning.snapshot import load_snapshot
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 PATIENCE = 120.0  # s until a run has come so far; it is never this long
 OFF = ((0x4F, 0x40), (0x4F, 0x08))  # masks and values of 6041h: as it comes up, and in fault

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from drive_env import cia402
+from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import GAIN_OBJECTS
 from drive_env.trials.gain_trial import OSCILLATION
 from drive_env.trials.positioning import WATCH
 from tuning.auto.fallback_gains import FallbackGains
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 RATED = 4.0  # A
 CALM = np.array([[1, 2, 3, 4, 5], [6, 7, 8, 9, 10]])
@@ -22,6 +24,7 @@ class TwoAxes:
     """Two axes of which the second shakes in the windows that are told, by so many times what counts as shaking."""
 
     num_axes = 2
+    device = find_device("tmcm1636")
 
     def __init__(self, shaking, strength):
         self.shaking, self.strength, self.window, self.written = shaking, strength, -1, {}

@@ -17,17 +17,20 @@ import pytest
 from test_parity import served
 
 from drive_env import cia402, motion
+from drive_env.devices import find_device
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.inertia_check import MisfitWarning
-from drive_env.gains import GAIN_OBJECTS, write_gains
+from drive_env.gains import write_gains
 from mechanics.shaft import way
 from tuning.compare.suite import load_suite, open_group, open_machines
 from tuning.identify import identification
 from tuning.identify.identification import NAMES, identify
 from tuning.identify.quick_identification import identify_briefly
 from tuning.identify.true_plant import true_plant
-from tuning.identify.working_state import CHANGED
+from tuning.identify.working_state import borrowed
 from tuning.target import Target, emulated
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 TURN = 2.0 * math.pi
 # How far a value may be off, as a share of it.
@@ -385,13 +388,15 @@ def test_a_blocked_rotor_is_said():
 # --- how drives are treated -------------------------------------------------------------------------------------------
 def test_a_factory_fresh_drive_is_identified_and_stays_factory_fresh():
     target = emulated(load="inertia", factory_fresh=True, num_threads=1)
-    before = {key: target.drives.read(key) for key in CHANGED}
+    before = {key: target.drives.read(key) for key in borrowed(target.device)}
     assert all(target.drives.read(name)[0] == 0 for name in GAIN_OBJECTS)
     found = identify(target)[0]
     assert found.value("resistance") == pytest.approx(0.36, rel=0.05)
     true = truth(target.drives, 0, 0.0)
     assert found.value("inertia") == pytest.approx(true["inertia"], rel=0.05)
-    assert {key: list(target.drives.read(key)) for key in CHANGED} == {key: list(v) for key, v in before.items()}
+    assert {key: list(target.drives.read(key)) for key in borrowed(target.device)} == {
+        key: list(v) for key, v in before.items()
+    }
 
 
 WILD = np.array([[30000, 30000, 32000, 20000, 30000]])

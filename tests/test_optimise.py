@@ -14,8 +14,9 @@ from drive_env import EmulatedDrives, cia402, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
+from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
+from drive_env.gains import Gains, write_gains
 from drive_env.motors import find_motor
 from drive_env.trials.gain_trial import Trials, measured_cost, softness
 from tuning.commands.cli import app
@@ -26,6 +27,8 @@ from tuning.search import trial_bench
 from tuning.search.optimise import SAFE_STEP, Settings, objective_values, optimise, pareto
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, first_gains, read_gains
 from tuning.target import Target, emulated
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 WILD = np.array([4021, 1573, 30_000, 3000, 30_000])
 FEW = Settings(sampler="tpe", trials=8)

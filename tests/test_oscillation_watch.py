@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from drive_env import cia402
+from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.trace import Trace
-from drive_env.gains import GAIN_OBJECTS, write_gains
+from drive_env.gains import write_gains
 from tuning.identify.identification import NAMES, identify
 from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken
 from tuning.target import emulated
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 CURRENT = 0x6077
 SMALL, LARGE = 100, 3000  # mA
@@ -23,6 +26,7 @@ class TwoAxes:
     """Two axes whose currents are a square wave of 100 Hz: small, and large on the second from some cycle on."""
 
     num_axes = 2
+    device = find_device("tmcm1636")
 
     observers = ()
 

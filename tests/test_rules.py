@@ -11,7 +11,7 @@ from scipy import signal
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.emulator.parameters import velocity_filter
-from drive_env.gains import GAIN_OBJECTS, RAW_MAX, Gains, gains_in_si, write_gains
+from drive_env.gains import RAW_MAX, Gains, gains_in_si, write_gains
 from drive_env.motors import MOTORS, find_motor
 from tuning.response.linear_model import Plant, current_open_loop, position_open_loop, velocity_open_loop
 from tuning.response.margins import margins
@@ -22,6 +22,8 @@ from tuning.rules.optima import modulus_optimum, symmetrical_optimum
 from tuning.rules.pole_placement import place_first_order
 from tuning.rules.proposal import Workbench
 from tuning.rules.rules_by_name import MEANINGS, RULES, propose
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 F = np.geomspace(0.5, 0.49 * DEVICE.velocity_rate, 2000)

@@ -18,7 +18,8 @@ from drive_env import EmulatedDrives, cia402, motion
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.gains import GAIN_OBJECTS, write_gains
+from drive_env.devices import find_device
+from drive_env.gains import write_gains
 from drive_env.master.errors import BusError
 from drive_env.master.sdo import SdoClient
 from drive_env.safety.envelope import SafetyError
@@ -34,6 +35,8 @@ from tuning.snapshot import (
     take,
 )
 from tuning.target import FREE, emulated, on_bus
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 CURRENT_LIMIT, PROFILE_VELOCITY = (0x2003, 0), (0x6081, 0)
 TRIED = np.array([[1000, 900, 800, 700, 600]])

@@ -13,10 +13,13 @@ from test_parity import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World
+from drive_env.devices import find_device
 from drive_env.envs.tracking import OBJECTS, TASKS, Tracking, TrackingConfig
 from drive_env.envs.trajectories import TRAJECTORIES, draw
-from drive_env.gains import GAIN_OBJECTS, Gains, bandwidths_from_gains
+from drive_env.gains import Gains, bandwidths_from_gains
 from mechanics.loads import LOADS as ALL_LOADS
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 NAME = "ServoDrive/Tracking-v0"
 LOADS = tuple(TASKS)

@@ -19,9 +19,11 @@ from drive_env import EmulatedDrives, SafetyError
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.cia402 import State
-from drive_env.gains import GAIN_OBJECTS
+from drive_env.devices import find_device
 from tuning.identify.identification import identify
 from tuning.target import on_bus
+
+GAIN_OBJECTS = find_device("tmcm1636").gains.keys
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from drive_env import cia402, motion
 from drive_env.dictionary.access import ObjectAccessError, check_in_range, check_writable
 from drive_env.drives.interface import Drives, device_of
-from drive_env.gains import GAIN_OBJECTS
 from drive_env.held_signals import held_signals
 from drive_env.master.description import Description, Key, describe
 from drive_env.master.errors import BusError
@@ -371,7 +370,7 @@ class Transaction:
         """Bring axes back to what they were, all by default: the gains at once, the rest once they are disabled."""
         drives = self._target.drives
         axes = np.ones(drives.num_axes, bool) if where is None else where
-        for key in GAIN_OBJECTS:
+        for key in device_of(drives).gains.keys:
             was = np.array([values.get(key, 0) for values in self.before.axes])
             drives.write(key, was, where=axes)
         _switch_off(drives, axes)

@@ -267,11 +267,12 @@ def _report(done: Run, folder: Path, json: bool, bus: bool) -> None:
 
 
 def _print(done: Run, refused: list[str], rule: float | None) -> None:
-    from drive_env.gains import GAIN_NAMES
+    from drive_env.devices import find_device
 
     result = done.result
     axis, certified = result.axes[0], done.certificate.axes[0]
-    lines = [f"{'':<7}{''.join(f'{name:>12}' for name in GAIN_NAMES)}"]
+    titles = find_device(done.certificate.device).gains.titles
+    lines = [f"{'':<7}{''.join(f'{name:>12}' for name in titles)}"]
     for name, gains in (("before", axis.before), ("after", axis.after)):
         lines.append(f"{name:<7}{''.join(f'{value:>12}' for value in gains)}")
     if axis.accepted and (said := _answer(done)):

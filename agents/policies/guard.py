@@ -21,16 +21,14 @@ from numpy.typing import ArrayLike, NDArray
 from agents.policies.deadline import Deadline, DeadlineError
 from agents.policies.policy import PolicyError
 from drive_env import cia402, motion
-from drive_env.drives.interface import Drives
-from drive_env.gains import GAIN_OBJECTS
+from drive_env.drives.interface import Drives, device_of
 
 logger = logging.getLogger(__name__)
 
 AT_LIMIT = 0.999  # of the action's range: it cannot ask for more
 STOP_TIMEOUT, CYCLE = 2.0, 0.001  # s, for the ramp of a quick stop; a communication cycle
-# What an agent may change and what must not stay so: gains, offsets, profile velocity and mode.
+# What an agent may change and what must not stay so, beside gains: offsets, profile velocity and mode.
 KEPT = (
-    *GAIN_OBJECTS,
     (cia402.POSITION_OFFSET, 0),
     (cia402.VELOCITY_OFFSET, 0),
     (cia402.TORQUE_OFFSET, 0),
@@ -191,7 +189,7 @@ class GuardedPolicy:
 @contextmanager
 def unchanged(drives: Drives) -> Iterator[None]:
     """Put gains, offsets, profile velocity and mode back as they were when what is inside ends; log what fails."""
-    before = {name: drives.read(name) for name in KEPT}
+    before = {name: drives.read(name) for name in (*device_of(drives).gains.keys, *KEPT)}
     try:
         yield
     finally:

@@ -17,7 +17,6 @@ from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import bus_of
-from drive_env.gains import GAIN_NAMES, GAIN_OBJECTS
 
 if TYPE_CHECKING:
     from tuning.target import Target
@@ -283,13 +282,13 @@ def _limits(target: Target, axis: int) -> Iterator[Check]:
 def _gains(target: Target, axis: int) -> Iterator[Check]:
     from tuning.search.trial_bench import first_gains, read_gains
 
-    has, begins = (_named(gains(target)[axis]) for gains in (read_gains, first_gains))
+    has, begins = (_named(target, gains(target)[axis]) for gains in (read_gains, first_gains))
     fresh = " (factory-fresh)" if not read_gains(target)[axis].any() else ""
     yield Check("gains", OK, f"now {has}{fresh}; a run begins with {begins}, from the motor's data sheet")
 
 
-def _named(gains: Any) -> str:
-    return ", ".join(f"{name} {value}" for name, value in zip(GAIN_NAMES, gains, strict=True))
+def _named(target: Target, gains: Any) -> str:
+    return ", ".join(f"{name} {value}" for name, value in zip(target.device.gains.titles, gains, strict=True))
 
 
 LOOKS = (_identity, _state, _answers, _samples, _error_control, _motor, _supply, _travel, _envelope, _limits, _gains)
@@ -307,8 +306,8 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
     finite = all(np.isfinite(end).all() for end in ends)
     way = f"{round(float(np.min(here + ends[0])))}...{round(float(np.max(here + ends[1])))}" if finite else "any"
     amperes = round(1e3 * target.current)
-    for key, name in zip(GAIN_OBJECTS, GAIN_NAMES, strict=True):
-        yield key, "1...32767", f"gain on trial, {name}", True
+    for gain in target.device.gains.rows:
+        yield gain.key, f"1...{gain.highest}", f"gain on trial, {gain.title}", True
     yield (cia402.CONTROLWORD, 0), "0, 2, 6, 7, Fh, 1Fh, 80h", "enable, start moves, stop, clear a fault", False
     yield (cia402.MODE, 0), "0, 1, 8, 9, 10", "pp for moves, csp, csv and cst for what identifies", False
     yield (cia402.TARGET_POSITION, 0), way, "moves", False

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from drive_env import cia402
+from drive_env.devices.gain_set import GainSet, load_gain_set
 from drive_env.devices.variants import compose_eds, converted_preset, merged, parse_key, variant_bindings
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
@@ -132,6 +133,7 @@ class Device(NamedTuple):
     canopen: CanopenBehaviour
     master: MasterHints
     roles: dict[Role, tuple[int, int]]
+    gains: GainSet
     variant_of: str = ""
 
     def new_dictionary(self, node_id: int = 1) -> ObjectDictionary:
@@ -235,6 +237,7 @@ def find_device(name: str) -> Device:
         canopen=_canopen(data["canopen"]),
         master=_master(data["master"]),
         roles=_roles(folder),
+        gains=load_gain_set(folder / "gains.toml"),
         variant_of=data.get("variant_of", ""),
     )
 

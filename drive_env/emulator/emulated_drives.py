@@ -18,12 +18,13 @@ from drive_env.cores import usable_cores
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.codec import Code
 from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.trace import Trace
 from drive_env.emulator.group import Group, call_of, channels, rates_of
 from drive_env.emulator.inertia_check import warn_of_misfits
-from drive_env.emulator.live_dictionary import NOTHING, POSITION_SCALER, LiveDictionary
+from drive_env.emulator.live_dictionary import NOTHING, LiveDictionary
 from drive_env.emulator.machine import Machines, checked_supply
 from drive_env.emulator.parameters import (
     apply_to_records,
@@ -191,7 +192,7 @@ class EmulatedDrives:
     def _increments(self) -> list[float | None]:
         """Return the position increments per revolution of each axis, read again once they were written."""
         if self._scale[0] != self._objects.scale_changes:
-            read = self.read(POSITION_SCALER).tolist()
+            read = self.read(Role.POSITION_SCALE).tolist()
             self._scale = self._objects.scale_changes, [float(scaler) or None for scaler in read]
         return self._scale[1]
 

@@ -27,6 +27,7 @@ from drive_env.dictionary.access import (
 )
 from drive_env.dictionary.codec import Code, code_of, decode, encode
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
+from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
 from drive_env.emulator.prepared_record import SCALES, ProcessImage, Row
 from drive_env.emulator.record_snapshot import LaneImage
@@ -40,7 +41,6 @@ Mask = NDArray[np.bool_]
 
 _EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
-POSITION_SCALER = (0x2058, 0)
 MODE_OF_OPERATION = (cia402.MODE, 0)
 
 
@@ -58,6 +58,7 @@ class LiveDictionary:
     def __init__(self, device: Device, records: NDArray[np.void], num_axes: int, preset: Mapping[str, int]) -> None:
         self.device = device
         self.entries: ObjectDictionary = device.new_dictionary()
+        self.scale_key = device.roles.get(Role.POSITION_SCALE)  # whose write gives positions another scale
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
         self._records = records
         self.num_axes = num_axes
@@ -189,7 +190,7 @@ class LiveDictionary:
         for k, (name, given) in enumerate(play.items()):
             entry = self.entries.find(name)
             check_writable(entry)
-            if not self._is_bound(entry) or (entry.index, entry.sub) == POSITION_SCALER:
+            if not self._is_bound(entry) or (entry.index, entry.sub) == self.scale_key:
                 raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} cannot be played; write it before")
             raw = np.asarray(given)
             if raw.shape not in ((cycles,), (cycles, self.num_axes)):
@@ -232,7 +233,9 @@ class LiveDictionary:
         A read-only field that the firmware computes is none of them.
         """
         length = max(map(len, self._stored.values()))
-        context = self._context()._replace(position_scaler=self._stored[POSITION_SCALER].astype(float))
+        context = self._context()
+        if self.scale_key is not None:
+            context = context._replace(position_scaler=self._stored[self.scale_key].astype(float))
         bound = [
             key for key in self._stored if key in self.codes and self.entries.find(key).access not in ("ro", "const")
         ]
@@ -293,7 +296,7 @@ class LiveDictionary:
             set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
         elif event >= 0:
             cycle.write_events(self._records, event, raw, where)
-        elif key == POSITION_SCALER:
+        elif key == self.scale_key:
             self._rescale(entry, raw, where)
         else:
             self._set_field(entry, raw, where)

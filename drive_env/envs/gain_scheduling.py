@@ -24,7 +24,7 @@ from drive_env.envs.lanes import Info, Lanes, Reward, Stepped, check_choice
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
-from drive_env.gains import FITTED_RULE, RAW_MAX, rule_gains, small_time_constants, write_gains
+from drive_env.gains import FITTED_RULE, RAW_MAX, read_gains, rule_gains, small_time_constants, write_gains
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
@@ -40,7 +40,7 @@ CYCLE = 0.001  # s, communication cycle
 STEPS = (0.005, 0.020)  # s, shortest and longest time between two sets of gains
 MODES = ("csp", "csv")
 # What can be scheduled: the integers of 2041h are computed from R and L, and are no part of it.
-GAINS = {"velocity_p": (0x2042, 1), "velocity_i": (0x2042, 2), "position_p": (0x2043, 1)}
+GAINS = ("velocity_p", "velocity_i", "position_p")  # those of the outer loops, which payloads change
 BASES = ("rule", "present")
 ROUGH = 0.03  # increment of current from sample to sample, of rated: DESIGN's score counts it so
 
@@ -103,7 +103,7 @@ class GainSchedulingConfig:
     excitation: str = "moves"
     step: float = 0.010
     duration: float = 2.0
-    gains: tuple[str, ...] = tuple(GAINS)
+    gains: tuple[str, ...] = GAINS
     base: str = "rule"
     span: float = 1.0
     payload: str = "auto"
@@ -123,7 +123,7 @@ class GainSchedulingConfig:
             raise ValueError(f"gains must be different ones of {', '.join(GAINS)}, not {self.gains!r}")
         object.__setattr__(self, "gains", tuple(self.gains))
         for name in self.gains:
-            check_choice("a gain", name, tuple(GAINS))
+            check_choice("a gain", name, GAINS)
         for name in self.weights:
             check_choice("a weight's name", name, tuple(WEIGHTS))
         object.__setattr__(self, "weights", {**WEIGHTS, **self.weights})
@@ -354,13 +354,14 @@ class GainScheduling(Lanes):
         """Keep the five raw gains of every axis that an action of 0 means, shape (num_axes, 5)."""
         drives = self.drives
         if drives.machine is None or self.config.base == "present":
-            objects = ((0x2041, 1), (0x2041, 2), (0x2042, 1), (0x2042, 2), (0x2043, 1))
-            self.base_gains = np.stack([drives.read(name) for name in objects], axis=-1)
+            self.base_gains = read_gains(drives)
         else:
             motor = find_motor(self.config.motor)
             self.base_gains = np.tile(rule_gains(device_of(drives), motor, self._nominal_inertia), (self.num_envs, 1))
-        columns = {"velocity_p": 2, "velocity_i": 3, "position_p": 4}
-        self._scheduled = self.base_gains[:, [columns[name] for name in self.config.gains]]
+        known = device_of(drives).gains
+        columns = [known.names.index(name) for name in self.config.gains]
+        self._scheduled = self.base_gains[:, columns]
+        self._gain_objects = [known.keys[column] for column in columns]
 
     # --- a step ---------------------------------------------------------------------------------------------------
     def _gains_of(self, action: Floats) -> Integers:

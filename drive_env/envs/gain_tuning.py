@@ -29,7 +29,7 @@ from drive_env.envs.gain_observation import (
 from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Reward, Stepped, check_choice
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
-from drive_env.gains import GAIN_OBJECTS, RAW_MAX, Gains, rule_gains, small_time_constants
+from drive_env.gains import RAW_MAX, Gains, read_gains, rule_gains, small_time_constants
 from drive_env.motors import find_motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
 from drive_env.trials.positioning import TRIAL, plan_move, power_up, reach
@@ -278,9 +278,7 @@ class GainTuning(Lanes):
             self._trial[mask] = 0.0
             self._parameters = machine_of(drives).parameters
         self._begin_trial(mask)
-        self._safe = np.where(
-            axes[:, None], np.stack([drives.read(name) for name in GAIN_OBJECTS], axis=-1), self._safe
-        )
+        self._safe = np.where(axes[:, None], read_gains(drives), self._safe)
         found, origin = self._trials.identify(self._reach, axes)
         self._identified = Identified(*(np.where(axes, a, b) for a, b in zip(found, self._identified, strict=True)))
         self._origin = np.where(axes, origin, self._origin)

@@ -17,7 +17,6 @@ from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.units import Context
 from drive_env.emulator.live_dictionary import (
     MODE_OF_OPERATION,
-    POSITION_SCALER,
     LiveDictionary,
     allowed_values,
     check_state,
@@ -176,7 +175,7 @@ class Axis:
 
     def _writer(self, entry: Entry, code: Code) -> Callable[[int], None]:
         memory, place = self._place(code.field, code.part)
-        if (entry.index, entry.sub) == POSITION_SCALER:
+        if (entry.index, entry.sub) == self._objects.scale_key:
             return lambda raw: self._objects.write_checked(entry, raw, self.number)
         if code.event in ("controlword", "mode"):
             kind = cycle.CONTROLWORD if code.event == "controlword" else cycle.MODE

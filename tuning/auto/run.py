@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.gains import GAIN_OBJECTS, Gains
+from drive_env.gains import Gains, read_gains
 from drive_env.trials.positioning import wrapped
 from tuning.auto.result import AxisRun, Result
 from tuning.auto.trial_order import OTHERS
@@ -67,7 +67,7 @@ class Run:
         drives, n = target.drives, target.num_axes
         self.target = target
         self.rng = np.random.default_rng(seed)
-        self.before: Integers = np.stack([drives.read(name) for name in GAIN_OBJECTS], axis=1)
+        self.before: Integers = read_gains(drives)
         self.axes = [AxisRun(Gains(*map(int, row)), Gains(*map(int, row))) for row in self.before]
         self.gains, self.reference = (np.ones((n, len(Gains._fields)), np.int64) for _ in range(2))
         self.others = np.ones((len(OTHERS), n, len(Gains._fields)), np.int64)

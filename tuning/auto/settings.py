@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
-from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
+from drive_env.gains import Gains, write_gains
 from tuning.identify.wiring import Key, changes, corrected, findings
 from tuning.identify.working_state import BOTH_ENDS
 from tuning.snapshot import Transaction, restore
@@ -92,7 +92,7 @@ def write(run: Run, transaction: Transaction) -> Mask:
     other = going & (run.modes != 0) & (drives.read(cia402.MODE) != run.modes)
     if other.any():
         drives.write(cia402.MODE, run.modes, where=other)
-    kept = dict(zip(((key[0], key[1]) for key in GAIN_OBJECTS), run.gains.T, strict=True))
+    kept = dict(zip(run.target.device.gains.keys, run.gains.T, strict=True))
     axes = []
     for k, values in enumerate(transaction.before.axes):
         wanted = dict(values)

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
 
-from drive_env.gains import GAIN_NAMES, GAIN_OBJECTS
+from drive_env.devices import find_device
 from tuning.certificate.certificate_pictures import bode_picture, step_picture
 
 if TYPE_CHECKING:
+    from drive_env.devices.gain_set import GainSet
     from tuning.certificate.certificate import AxisCertificate, Certificate
 
 SEAL = "<!-- sha256 of all before this line: "
@@ -45,7 +46,7 @@ def to_html(certificate: Certificate) -> str:
     title = f"Tuning of {certificate.device} with {certificate.motor}"
     body = [f"<h1>{escape(title)}</h1>", _summary(certificate)]
     for axis in certificate.axes:
-        body += _axis(axis)
+        body += _axis(axis, find_device(certificate.device).gains)
     body += ["<h2>What it was made with</h2>", _pairs(certificate.versions)]
     text = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -95,14 +96,14 @@ def _summary(certificate: Certificate) -> str:
     return _pairs(rows) + f"<p>Hash of the certificate's content (SHA-256): <code>{certificate.hash()}</code></p>"
 
 
-def _axis(axis: AxisCertificate) -> list[str]:
+def _axis(axis: AxisCertificate, known: GainSet) -> list[str]:
     colour, words = COLOURS[axis.verdict]
     parts = [
         f"<h2>Axis {axis.axis}: <span class='{colour}'>{words}</span></h2>",
         f"<p>{escape(axis.reason)}</p>",
         *([_list("reserved", axis.reservations)] if axis.reservations else []),
         "<h3>Gains</h3>",
-        _gains(axis),
+        _gains(axis, known),
     ]
     if axis.notes:
         parts.append(_list("notes", axis.notes))
@@ -126,10 +127,10 @@ def _list(kind: str, lines: Iterable[str]) -> str:
     return f'<ul class="{kind}">' + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>"
 
 
-def _gains(axis: AxisCertificate) -> str:
+def _gains(axis: AxisCertificate, known: GainSet) -> str:
     rows = []
     si = list(zip(axis.before_si.items(), axis.after_si.values(), strict=True))
-    for k, (name, (index, sub)) in enumerate(zip(GAIN_NAMES, GAIN_OBJECTS, strict=True)):
+    for k, (name, (index, sub)) in enumerate(zip(known.titles, known.keys, strict=True)):
         (meaning, before), after = si[k] if k < len(si) else (("", math.nan), math.nan)
         label = f"{index:04X}h:{sub:02X}"
         cells = [name, label, axis.before[k], axis.after[k], meaning, _figure(before), _figure(after)]

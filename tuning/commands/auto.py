@@ -74,13 +74,14 @@ def _left_behind(target: Target, file: Path) -> str:
     """Say what drives have after Ctrl-C: it may come before anything was changed, or after everything was."""
     import numpy as np
 
-    from drive_env.gains import GAIN_OBJECTS
     from tuning.snapshot import load_snapshot
 
     if not file.exists():
         return "nothing was changed"
     before = load_snapshot(file)
-    if all(np.array_equal(target.drives.read(key), [axis[key] for axis in before.axes]) for key in GAIN_OBJECTS):
+    if all(
+        np.array_equal(target.drives.read(key), [axis[key] for axis in before.axes]) for key in target.device.gains.keys
+    ):
         return (
             "the drives are disabled and have the gains from before; if ever not, "
             f"drive-tune undo {file} brings them back"

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,10 +20,13 @@ from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
-from drive_env.gains import GAIN_OBJECTS, gains_from_bandwidths, write_gains
+from drive_env.gains import gains_from_bandwidths, write_gains
 from drive_env.motors import Motor
 from tuning.identify.wiring import FINDINGS
 from tuning.target import Target
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -32,14 +35,19 @@ Mask = NDArray[np.bool_]
 CYCLE = 0.001  # s
 BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
 STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is aligned
-# What experiments change, in the order in which it is given back.
-CHANGED: tuple[ObjectName, ...] = (
-    Role.CURRENT_LIMIT, Role.OPEN_LOOP_CURRENT, *GAIN_OBJECTS, Role.MOTOR_TYPE, Role.COMMUTATION, Role.POLE_PAIRS,
+
+
+def borrowed(device: Device) -> tuple[ObjectName, ...]:
+    """Return what experiments change, in the order in which it is given back."""
+    return (
+    Role.CURRENT_LIMIT, Role.OPEN_LOOP_CURRENT, *device.gains.keys, Role.MOTOR_TYPE, Role.COMMUTATION, Role.POLE_PAIRS,
     Role.ENCODER_STEPS, *FINDINGS,
     cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION, cia402.FOLLOWING_WINDOW,
     Role.LIMIT_SWITCHES, cia402.TARGET_VELOCITY, cia402.TARGET_POSITION, cia402.TARGET_TORQUE,
     (cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2),
 )  # fmt: skip
+
+
 BRUSHED, BRUSHLESS = 1, 3  # 2050h
 BY_FIELD, BY_HALLS, BY_ENCODER = 1, 2, 3  # 2055h
 ALIGNED_BY_HALLS = 2  # 2080h:03
@@ -129,7 +137,7 @@ def working_state(target: Target, where: Mask | None = None) -> Iterator[Working
         raise RuntimeError(
             f"axis {int(np.flatnonzero(enabled)[0])} is enabled: disable it, identification begins with a drive at rest"
         )
-    before = {key: drives.read(key) for key in CHANGED}
+    before = {key: drives.read(key) for key in borrowed(target.device)}
     mode = drives.read(cia402.MODE)
     try:
         yield _prepare(target, axes, before)
@@ -167,7 +175,7 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
 def _give_back(target: Target, axes: Mask, before: Mapping[Any, Integers], mode: Integers) -> None:
     drives = target.drives
     switch_off(drives, axes)
-    for key in CHANGED:
+    for key in borrowed(target.device):
         changed = axes & (drives.read(key) != before[key])
         if changed.any():
             drives.write(key, before[key], where=changed)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.roles import Role
-from drive_env.gains import GAIN_OBJECTS
+from drive_env.gains import read_gains
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.dead_time import dead_time_resistance
 from tuning.oscillation_watch import OscillationError, shaken, watch_of
@@ -150,8 +150,10 @@ def measure(
 
 def _closed_loops(target: Target, loop: str) -> Mask:
     """Return which axes have the gains that the loop needs."""
-    needed = (0, 2) if loop == "velocity" else (0, 2, 4)
-    return np.asarray(np.all([target.drives.read(GAIN_OBJECTS[k]) > 0 for k in needed], axis=0))
+    loops = ("current", "velocity") if loop == "velocity" else ("current", "velocity", "position")
+    known = target.device.gains
+    needed = [known.rows[k].key for each in loops if (k := known.column(each, "P")) is not None]
+    return np.asarray(np.all([target.drives.read(key) > 0 for key in needed], axis=0))
 
 
 class _Measurement:
@@ -171,7 +173,7 @@ class _Measurement:
 
     def run(self, progress: Callable[[float], object]) -> MeasuredLoop:
         target = self._target
-        self._gains = np.stack([target.drives.read(name) for name in GAIN_OBJECTS], axis=1)
+        self._gains = read_gains(target.drives)
         where = self._where
         with timed(target) as (counted, clock):
             shaker = Shaker(counted, self._loop, where, self._lines, self._kind)

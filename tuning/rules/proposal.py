@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from drive_env.dictionary.units import RPM
-from drive_env.gains import GAIN_NAMES, RAW_MAX, Gains
+from drive_env.gains import RAW_MAX, Gains
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from tuning.response.linear_model import Plant
 
 COARSE = 0.05  # a gain that an integer misses by more than this share is worth a note
-
-_TITLES = dict(zip(Gains._fields, GAIN_NAMES, strict=True))
 
 
 class Proposal(NamedTuple):
@@ -47,6 +45,7 @@ class Workbench:
     """
 
     def __init__(self, device: Device, plant: Plant) -> None:
+        self._titles = dict(zip(device.gains.names, device.gains.titles, strict=True))
         per_ampere = 256.0 * device.current_full_scale / plant.supply  # Q8.8, duty of the supply per full scale
         self._raw_per_si = {
             "torque_p": per_ampere,  # V/A
@@ -91,7 +90,7 @@ class Workbench:
         self._wanted[name] = wanted
         raw = 0 if wanted == 0.0 else min(max(round(wanted), 1), RAW_MAX)
         self._raw[name] = raw
-        title = _TITLES[name]
+        title = self._titles[name]
         if wanted > RAW_MAX + 0.5:
             self.note(
                 f"{title} would have to be {wanted:.0f}, and no integer above {RAW_MAX} exists: "

@@ -19,7 +19,6 @@ from drive_env.drives.interface import machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import (
     FITTED_RULE,
-    GAIN_OBJECTS,
     Rule,
     gains_from_bandwidths,
     rule_gains,
@@ -278,7 +277,7 @@ def first_gains(target: Target) -> Integers:
 
 def read_gains(target: Target) -> Integers:
     """Return the gains that the drives have, shape (num_axes, 5)."""
-    return np.stack([target.drives.read(name) for name in GAIN_OBJECTS], axis=-1)
+    return target.device.gains.read(target.drives)
 
 
 def _rule_gains(target: Target, inertia: Floats, rule: Rule) -> Integers:

@@ -1,0 +1,90 @@
+"""The gains of a device: which objects they are, in which loop and range; any number of them, in the device's order."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from drive_env.drives.interface import BasicDrives
+
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Key = tuple[int, int]
+
+
+class Gain(NamedTuple):
+    """A gain: its name in code, its title for people, its object, the greatest integer, its loop and its part in it."""
+
+    name: str
+    title: str
+    key: Key
+    highest: int
+    loop: str
+    part: str
+
+
+@dataclass(frozen=True)
+class GainSet:
+    """The gains of a device, in its order; raw integers have shape (..., len(set))."""
+
+    rows: tuple[Gain, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in code."""
+        return tuple(row.name for row in self.rows)
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """Titles for people."""
+        return tuple(row.title for row in self.rows)
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """Objects."""
+        return tuple(row.key for row in self.rows)
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.rows)
+
+    def column(self, loop: str, part: str) -> int | None:
+        """Return which gain is the part ("P", "I") of a loop ("current", "velocity", "position"); None for none."""
+        return next((k for k, row in enumerate(self.rows) if (row.loop, row.part) == (loop, part)), None)
+
+    def columns_of(self, *loops: str) -> list[int]:
+        """Return which gains belong to loops."""
+        return [k for k, row in enumerate(self.rows) if row.loop in loops]
+
+    def clipped(self, raw: ArrayLike) -> Integers:
+        """Return gains as integers within what the device takes, 1 at least: 0 opens a loop."""
+        most = np.array([row.highest for row in self.rows], float)
+        return np.asarray(np.clip(np.rint(np.asarray(raw, float)), 1.0, most), np.int64)
+
+    def read(self, drives: BasicDrives) -> Integers:
+        """Return the gains that drives have, shape (num_axes, len(set))."""
+        return np.stack([drives.read(key) for key in self.keys], axis=-1)
+
+    def write(self, drives: BasicDrives, gains: Integers, where: Mask | None = None) -> None:
+        """Write gains of shape (num_axes, len(set))."""
+        for key, column in zip(self.keys, gains.T, strict=True):
+            drives.write(key, column, where=where)
+
+
+def load_gain_set(path: Path) -> GainSet:
+    """Return the gain set of a device's `gains.toml`."""
+    data: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+    rows = []
+    for row in data["gain"]:
+        index, sub = row["object"].split(":")
+        rows.append(
+            Gain(row["name"], row["title"], (int(index, 16), int(sub)), row["highest"], row["loop"], row["part"])
+        )
+    return GainSet(tuple(rows))
