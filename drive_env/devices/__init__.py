@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from drive_env import cia402
 from drive_env.devices.gain_set import GainSet, load_gain_set
-from drive_env.devices.variants import compose_eds, converted_preset, merged, parse_key, variant_bindings
+from drive_env.devices.variants import compose_eds, converted_preset, merged, own_variant, parse_key, variant_bindings
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from drive_env.dictionary.roles import Role
@@ -157,16 +157,24 @@ class Device(NamedTuple):
             ValueError: For a motor that the drive cannot turn.
         """
         path = self.presets / f"{motor.name}.toml"
+        written_for = find_device(self.variant_of or self.name)
         preset: dict[str, int]
-        if path.exists() and MOTORS.get(motor.name) == motor:
+        if path.exists() and MOTORS.get(motor.name) == motor and self._scales_gains_as(written_for):
             preset = dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
         else:
             rule = importlib.import_module(f"drive_env.devices.{self.presets.parent.name}.commissioning")
-            preset = rule.preset(find_device(self.variant_of or self.name), motor)
+            preset = rule.preset(self, motor)
         if not self.variant_of:
             return preset
         before = find_device(self.variant_of).bindings
         return converted_preset(preset, self.new_dictionary(), before, self.bindings)
+
+    def _scales_gains_as(self, other: Device) -> bool:
+        """Return whether an integer of a gain is the same gain on both."""
+        mine, its = (
+            (one.current_full_scale, one.current_rate, one.velocity_rate, one.nominal_current) for one in (self, other)
+        )
+        return mine == its
 
 
 def device_names() -> list[str]:
@@ -192,12 +200,23 @@ def device_of(kind: int, vendor: int | None, product: int | None) -> str | None:
 
 @cache
 def find_device(name: str) -> Device:
-    """Return a device by name; ValueError lists the names there are."""
+    """Return a device by its name, or a variant of one's own by the path of its TOML file.
+
+    Raises:
+        ValueError: For a name that none has, with those there are, or a file that describes no variant.
+    """
     folder = FOLDER / name
-    if name not in device_names():
+    if name.endswith(".toml"):
+        own = own_variant(Path(name), {known: _read(FOLDER / known) for known in device_names()})
+    elif name in device_names():
+        own = _read(folder)
+    else:
         near = did_you_mean(name, device_names())
-        raise ValueError(f"no device is named {name!r}; there are {', '.join(device_names())}{near}")
-    data = own = _read(folder)
+        raise ValueError(
+            f"no device is named {name!r}; there are {', '.join(device_names())}{near}; or give the path of a "
+            "variant's .toml file"
+        )
+    data = own
     if "variant_of" in own:
         base = find_device(own["variant_of"])
         folder = FOLDER / base.name

@@ -13,13 +13,19 @@ from __future__ import annotations
 import configparser
 import dataclasses
 import io
+import itertools
+import math
+import tomllib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from drive_env import cia402
 from drive_env.dictionary import units
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
+from mechanics.near_names import did_you_mean
+from mechanics.untrusted import read_bytes
 
 Key = tuple[int, int]
 
@@ -47,6 +53,70 @@ def merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
         before = base.get(name)
         result[name] = merged(before, value) if isinstance(before, Mapping) and isinstance(value, Mapping) else value
     return result
+
+
+def own_variant(path: Path, devices: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the data of a variant in a file of one's own: a power stage's limits, rates, and objects if need be.
+
+    Args:
+        path: The file; it names the device that it is a variant of.
+        devices: Data of the devices there are, by name.
+
+    Raises:
+        ValueError: If the file cannot be read, or has what a variant cannot have, with the remedy.
+    """
+    try:
+        own = tomllib.loads(read_bytes(path).decode("utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is no TOML file: {error}") from None
+    of = str(own.get("variant_of"))
+    if of not in devices or "variant_of" in devices[of]:
+        bases = [name for name, data in devices.items() if "variant_of" not in data]
+        raise ValueError(f"{path}: variant_of is {of!r}; it names the device that differs a little: {', '.join(bases)}")
+    base = devices[of]
+    for table, value in own.items():
+        if table in ("name", "title", "variant_of", "objects", "groups"):
+            continue
+        _check_like(f"{path}: {table}", value, base.get(table), base)
+    whole = merged(base, own)
+    supply, current = whole["supply"], whole["current"]
+    if not supply["undervoltage"] < supply["overvoltage"]:
+        raise ValueError(
+            f"{path}: supply.undervoltage = {supply['undervoltage']:g} V must lie below supply.overvoltage = "
+            f"{supply['overvoltage']:g} V"
+        )
+    if not current["nominal"] <= current["overcurrent"] <= current["full_scale"]:
+        raise ValueError(
+            f"{path}: current.nominal = {current['nominal']:g} A, overcurrent = {current['overcurrent']:g} A and "
+            f"full_scale = {current['full_scale']:g} A must come in this order: what flows for ever, what trips, what "
+            "can be measured"
+        )
+    rates = [whole["rates"][name] for name in ("current", "velocity", "profile")]
+    if any(fast % slow for fast, slow in itertools.pairwise(rates)):
+        raise ValueError(f"{path}: rates = {rates} Hz; each must be a whole multiple of the next")
+    return {"title": f"{base['title']}, {path.stem}", "objects": {}, "groups": {}} | own | {"name": str(path)}
+
+
+def _check_like(where: str, value: Any, known: Any, base: Mapping[str, Any]) -> None:
+    """Raise ValueError unless a value is of the kind that the device's data have there; numbers are above 0."""
+    if known is None:
+        name = where.rsplit(" ", 1)[-1]
+        raise ValueError(f"{where} is nothing that a device has{did_you_mean(name, base)}")
+    if isinstance(known, Mapping):
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{where} is a table of {', '.join(known)}")
+        for key, inner in value.items():
+            _check_like(f"{where}.{key}", inner, known.get(key), known)
+    elif isinstance(known, bool):
+        if not isinstance(value, bool):
+            raise ValueError(f"{where} = {value!r} must be true or false")
+    elif isinstance(known, int | float):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
+            raise ValueError(f"{where} = {value!r} must be a number above 0")
+    elif not isinstance(value, type(known)):
+        raise ValueError(f"{where} = {value!r} must be as {known!r} is")
 
 
 def compose_eds(name: str, base: str, data: Mapping[str, Any]) -> EdsText:
