@@ -27,6 +27,7 @@ from rich.table import Table
 
 from benchmarks import bus, environments, gain_tuning, sweeps, training
 from drive_env import EmulatedDrives, motion
+from drive_env.drives import MOST_MACHINES
 from drive_env.firmware import cycle
 from mechanics.loads import LOADS
 
@@ -138,6 +139,24 @@ def throughput(sizes: tuple[int, ...], progress: Progress) -> list[dict[str, flo
     return rows
 
 
+def construction(quick: bool = False) -> dict[str, float]:
+    """Return seconds to make a large set of machines, alike and drawn, each in a fresh process whose memory is new."""
+    count = 4096 if quick else MOST_MACHINES
+    made = (
+        "import sys, time; from drive_env import EmulatedDrives; EmulatedDrives(load=sys.argv[1], num_machines=65);"
+        "t = time.perf_counter();"
+        "EmulatedDrives(load=sys.argv[1], num_machines=int(sys.argv[2]), randomise=sys.argv[3] == 'drawn');"
+        "print(time.perf_counter() - t)"
+    )
+    result = {}
+    for load in ("inertia", LOAD):
+        for kind in ("alike", "drawn"):
+            command = [sys.executable, "-W", "ignore", "-c", made, load, str(count), kind]
+            runs = [float(subprocess.run(command, capture_output=True, text=True, check=True).stdout) for _ in range(3)]
+            result[f"{count:,} machines, {load}, {kind} [s]"] = min(runs)
+    return result
+
+
 def start_up() -> dict[str, float]:
     """Return seconds of a fresh process: import, first result with an empty cache, first result with a full one."""
     first = (
@@ -173,7 +192,7 @@ def main() -> None:
     console = Console()
     sizes = SIZES[:-1] if options.quick else SIZES
     with Progress(console=console, transient=True) as progress:
-        parts = "firmware, bound, loads, bus, environments, training, sweeps, start-up"
+        parts = "firmware, bound, loads, bus, environments, training, sweeps, construction, start-up"
         task = progress.add_task(parts, total=parts.count(",") + len(LOADS))
         result: dict[str, Any] = {"ns per drive and tick": ticks()}
         progress.advance(task)
@@ -191,6 +210,8 @@ def main() -> None:
         progress.advance(task)
         result["sweeps"] = sweeps.figures(options.quick)
         progress.advance(task)
+        result["construction"] = construction(options.quick)
+        progress.advance(task)
         if not options.quick:
             result["start-up"] = start_up()
         progress.advance(task)
@@ -202,6 +223,7 @@ def main() -> None:
         "environments",
         "training",
         "sweeps",
+        "construction",
         "start-up",
     ):
         if name in result:

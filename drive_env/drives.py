@@ -22,7 +22,7 @@ from drive_env.faults.machine_faults import MachineFaults
 from drive_env.firmware import cycle
 from drive_env.firmware.cycle import Call
 from drive_env.firmware.protection import CAUSES
-from drive_env.firmware.record import get_lanes, new_records, set_lanes
+from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
 from drive_env.group import Group, call_of, channels, rates_of
 from drive_env.live_dictionary import NOTHING, POSITION_SCALER, LiveDictionary
 from drive_env.machine import Machines, checked_supply
@@ -35,8 +35,7 @@ from drive_env.trace import Trace
 from mechanics.load import Load
 from mechanics.loads import find_load
 from mechanics.model import copies_per_model
-from mechanics.packed import PackedLoad
-from mechanics.template import Template
+from mechanics.packed import PackedLoad, pack
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -290,32 +289,25 @@ class EmulatedDrives:
 
     def _build_groups(self, physics_steps: int, integrator: str, friction: str) -> list[Group]:
         rates = rates_of(self.device, physics_steps)
-        templates: dict[int, Template] = {}
-        armature, bearings = self._armature(), self._bearings()
-        groups = []
         per_group = copies_per_model(self.load)
-        axes_per_group = per_group * self.load.num_axes
-        for first in range(0, self.num_machines, per_group):
-            machines = slice(first, min(first + per_group, self.num_machines))
-            count = machines.stop - machines.start
-            if count not in templates:
-                templates[count] = Template(self.load, count)
-            load = PackedLoad(
-                self.load,
-                armature[machines],
-                bearings[machines],
-                {p.name: self._parameters[f"load.{p.name}"][machines] for p in self.load.parameters},
-                rates.window / physics_steps,
-                integrator=integrator,
-                friction=friction,
-                # A joint does not go far in a millisecond, and sliding friction does not depend on inertia.
-                weigh_every=rates.windows * physics_steps,
-                template=templates[count],
-                first_machine=first,
-            )
-            block = first // per_group * (axes_per_group // 8)
-            blocks = -(-count * self.load.num_axes // 8)
+        loads = pack(
+            self.load,
+            self._armature(),
+            self._bearings(),
+            {p.name: self._parameters[f"load.{p.name}"] for p in self.load.parameters},
+            rates.window / physics_steps,
+            copies=per_group,
+            integrator=integrator,
+            friction=friction,
+            # A joint does not go far in a millisecond, and sliding friction does not depend on inertia.
+            weigh_every=rates.windows * physics_steps,
+        )
+        groups, first = [], 0
+        for load in loads:
+            machines = slice(first, first + load.copies)
+            block, blocks = first * self.load.num_axes // LANES, -(-load.copies * self.load.num_axes // LANES)
             groups.append(Group(machines, load, self._records[block : block + blocks], rates))
+            first = machines.stop
         return groups
 
     def _set_constants(self, supply: float) -> None:

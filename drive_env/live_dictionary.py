@@ -50,7 +50,8 @@ class LiveDictionary:
         device: Whose dictionary it is.
         records: The axes' records.
         num_axes: Number of axes.
-        preset: Object name -> raw value, written after the factory values; both are what a reset restores.
+        preset: Object name -> raw value, written after the factory values; both are what a restart restores. The
+            records have them from the first restart on.
     """
 
     def __init__(self, device: Device, records: NDArray[np.void], num_axes: int, preset: Mapping[str, int]) -> None:
@@ -88,11 +89,10 @@ class LiveDictionary:
         if self._image is None:
             self._image = self._stored_image()
         self._image.restore(axes)
-        chosen = np.flatnonzero(axes)
         for key, raw in self._stored.items():
             values = self._values.get(key)
             if isinstance(values, np.ndarray):
-                values[chosen] = raw[chosen]
+                np.copyto(values, raw, where=axes)
         after = self._context()
         if np.any(before.position_scaler != after.position_scaler):
             self._scale_changes += 1
@@ -109,11 +109,13 @@ class LiveDictionary:
 
     def stored(self, axis: int) -> dict[tuple[int, int], int]:
         """Return what a restart restores on one axis."""
-        return {key: int(raw[axis]) for key, raw in self._stored.items()}
+        return {key: int(raw[axis if len(raw) > 1 else 0]) for key, raw in self._stored.items()}
 
     def store(self, axis: int, values: Mapping[tuple[int, int], int]) -> None:
         """Set what a restart restores on one axis; the values are those of objects that exist, within their range."""
         for key, raw in values.items():
+            if len(self._stored[key]) < self.num_axes:
+                self._stored[key] = np.repeat(self._stored[key], self.num_axes)
             self._stored[key][axis] = raw
         self._image = None
 
@@ -194,41 +196,40 @@ class LiveDictionary:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _commission(self, preset: Mapping[str, int]) -> dict[tuple[int, int], Integers]:
-        """Write factory values, then the preset; return the raw values that a reset restores."""
-        everywhere = np.ones(self.num_axes, bool)
+        """Return the raw values that a restart restores, factory values and then the preset; one of all axes each."""
         stored: dict[tuple[int, int], Integers] = {}
         for entry in self.entries:
             if isinstance(entry.default, str):
                 self._values[entry.index, entry.sub] = entry.default
             else:
-                stored[entry.index, entry.sub] = np.full(self.num_axes, entry.default, np.int64)
+                stored[entry.index, entry.sub] = np.array([entry.default], np.int64)
         modes = sum(1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None)
-        stored[0x6502, 0] = np.full(self.num_axes, modes, np.int64)
+        stored[0x6502, 0] = np.array([modes], np.int64)
         for name, value in preset.items():
             entry = self.entries.find(name)
-            raw = checked_values(entry, value, self.num_axes)
+            raw = checked_values(entry, value, 1)
             self._check_value(entry, raw)
             stored[entry.index, entry.sub] = raw.copy()
-        # The scaler first: the factors of positions follow it.
-        for key in sorted(stored, key=lambda key: key != POSITION_SCALER):
-            self._restore(self.entries.find(key), stored[key], everywhere)
+        for key, raw in stored.items():
+            if not self._is_bound(self.entries.find(key)):
+                self._values[key] = np.repeat(raw, self.num_axes)
         return stored
 
-    def _restore(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Write a value without what a write sets off; a read-only field that the firmware computes stays."""
-        if self._is_bound(entry):
-            if entry.access not in ("ro", "const"):
-                self._set_field(entry, raw, where)
-        else:
-            self._set_value(entry, raw, where)
-
     def _stored_image(self) -> LaneImage:
-        """Return the fields that `_restore` would set from what is stored, converted by the scales that are stored."""
+        """Return the fields that a restart sets from what is stored, converted by the scales that are stored.
+
+        A read-only field that the firmware computes is none of them.
+        """
+        length = max(map(len, self._stored.values()))
         context = self._context()._replace(position_scaler=self._stored[POSITION_SCALER].astype(float))
         bound = [key for key in self._stored if key in self.device.bindings]
         rows = [self.device.bindings[key] for key in bound if self.entries.find(key).access not in ("ro", "const")]
         values = [self._from_od(row, self._stored[row.index, row.sub], context) for row in rows]
-        return LaneImage(self._records, [(row.field, row.part) for row in rows], np.array(values))
+        return LaneImage(
+            self._records,
+            [(row.field, row.part) for row in rows],
+            np.array([np.broadcast_to(value, (length,)) for value in values]),
+        )
 
     def _is_bound(self, entry: Entry) -> bool:
         return (entry.index, entry.sub) in self.device.bindings

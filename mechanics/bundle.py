@@ -49,7 +49,7 @@ class Bundle:
 
     def __post_init__(self) -> None:
         fields = fields_of(self._layout)
-        self._table = np.zeros(sum(_slots(kind) for kind in fields.values()), np.int64)
+        self._table = np.zeros(_size_of(self._layout), np.int64)
         self.address = int(self._table.ctypes.data)
         self._fill(fields)
 
@@ -73,8 +73,7 @@ class Bundle:
                 flags = value.flags
                 assert value.ndim == ndim and flags.c_contiguous and flags.aligned, name
                 assert value.dtype.itemsize == item_size, name
-                self._table[start] = value.ctypes.data
-                self._table[start + 1 : start + 1 + ndim] = value.shape
+                self._table[start : start + 1 + ndim] = (value.ctypes.data, *value.shape)
             elif kind is types.float64:
                 reals[start] = value
             else:
@@ -110,6 +109,12 @@ def slots_of(layout: Any) -> tuple[tuple[str, int, types.Type, int, int], ...]:
         else (name, place_of(layout, name), kind, 0, 0)
         for name, kind in fields_of(layout).items()
     )
+
+
+@cache
+def _size_of(layout: Any) -> int:
+    """Return the number of slots of a bundle's table."""
+    return sum(_slots(kind) for kind in fields_of(layout).values())
 
 
 @cache

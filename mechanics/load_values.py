@@ -91,6 +91,10 @@ class LoadValues:
     def store(self, name: str, values: Floats, where: slice | NDArray[np.bool_]) -> None:
         """Store a parameter of the copies chosen, one value each; ValueError leaves all as it was."""
         self.check(name, values)
+        self.store_checked(name, values, where)
+
+    def store_checked(self, name: str, values: Floats, where: slice | NDArray[np.bool_]) -> None:
+        """Store what `check` has seen."""
         parameter = self._parameter(name)
         if parameter.field in _BODY_FIELDS:
             bodies = self._bodies[parameter.element][where]

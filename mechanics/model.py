@@ -108,6 +108,8 @@ def compile_packed(load: Load, copies: int) -> mujoco.MjModel:
     constrained = is_constrained(single)
     packed.memory = _MEMORY_FIXED + (_MEMORY_PER_CONSTRAINED_COPY if constrained else _MEMORY_PER_COPY) * copies
     packed.option = _spec(load).option
+    # What is only seen would be copied with each model and moved at each step. A fluid, though, acts on shapes.
+    packed.compiler.discardvisual = not (single.opt.density or single.opt.viscosity)
     bits = _bits(single)
     for k in range(copies):
         child = _spec(load)

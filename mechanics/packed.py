@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
+from typing import NoReturn
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from mechanics.friction import BRISTLE_DAMPING, FrictionModel, find_friction
-from mechanics.load import Combination, Friction, Load
+from mechanics.load import Load
 from mechanics.load_values import FRICTION_COLUMNS, LoadValues
-from mechanics.modal import corrections
+from mechanics.modal import Corrections, corrections
 from mechanics.plant import Plant
 from mechanics.template import Template
 
@@ -26,6 +27,8 @@ Floats = NDArray[np.float64]
 MAX_PHASE_PER_STEP = 0.7
 # Damping that couples resonances by more than this per step is off by more than 0.5 % of the peak speed.
 MAX_COUPLING_PER_STEP = 0.1
+# Machines whose numbers are derived together: their matrices stay in the processor's cache.
+COPIES_AT_ONCE = 2048
 _DISABLED = (
     mujoco.mjtDisableBit.mjDSBL_ACTUATION
     | mujoco.mjtDisableBit.mjDSBL_SENSOR
@@ -54,6 +57,8 @@ class PackedLoad:
         template: Of this load and as many copies, instead of one made anew.
         first_machine: Number of copy 0, for messages.
         weigh_every: Steps after which the inertias that friction sees are brought to the present position.
+        ready: False neither checks the parameters nor derives anything from the numbers: `pack` does so of many
+            models at once.
 
     Attributes:
         joints: Names of a copy's joints, in the order of its degrees of freedom.
@@ -76,6 +81,7 @@ class PackedLoad:
         template: Template | None = None,
         first_machine: int = 0,
         weigh_every: int = 1,
+        ready: bool = True,
     ) -> None:
         self.load = load
         self.copies: int = armature.shape[0]
@@ -104,13 +110,8 @@ class PackedLoad:
         if load.rolls:
             # MuJoCo takes the inertia of simple joints from a constant; a roll's grows.
             self.model.dof_simplenum[:] = 0
-        # The bearings' friction acts on the rotors' motions.
-        turning = self.template.turning
-        # Friction on a rotor's own motion is computed in one with its bearing's, unless it has bristles.
-        self._merged = {} if self._model_of_friction.bristles else _proportional(turning, load.frictions)
-        apart = [row.motion for k, row in enumerate(load.frictions) if k not in self._merged]
-        self._motions = turning + apart + [row.motion for row in load.contacts]
-        self.num_frictions = self.num_axes + len(apart)
+        self._rows = self.template.rows(self._model_of_friction)
+        self.num_frictions = self._rows.num_frictions
         self._passive_armature = self._by_copy(self.model.dof_armature).copy()
         self.start = np.array(self.model.qpos0[: self.num_dofs])
         for joint, position in load.start.items():
@@ -118,13 +119,14 @@ class PackedLoad:
         self.values = LoadValues(load, self.model, self.joints, self.template.bodies, armature, motor_friction)
         springs = any(p.field == "jnt_stiffness" for p in load.parameters) or bool(np.any(self.values.stiffness))
         self._elastic = self.staggered and springs
+        store = self.values.store if ready else self.values.store_checked
         for name, values in parameters.items():
-            self.values.store(name, np.asarray(values, float), slice(None))
+            store(name, np.asarray(values, float), slice(None))
         self.data = mujoco.MjData(self.model)
         self.plant = self._new_plant()
-        self._jammed = self._jam_rows()
-        self._apply()
-        self.reset(np.ones(self.copies, bool))
+        if ready:
+            self._apply()
+            self.reset(np.ones(self.copies, bool))
 
     # --- parameters -----------------------------------------------------------------------------------------------
     def get(self, name: str) -> Floats:
@@ -211,7 +213,7 @@ class PackedLoad:
         plant = self.plant
         held = np.zeros_like(plant.brake)
         for axis, values in enumerate(torque.T):
-            row, ratio = self._jammed[axis]
+            row, ratio = self._rows.jammed[axis]
             held[row] = np.maximum(held[row], ratio * values)  # a part that two axes drive is held for both
         plant.jam[:] = held[: self.num_axes]
         plant.brake[self.num_axes :] = held[self.num_axes :]
@@ -275,14 +277,8 @@ class PackedLoad:
 
     def _new_plant(self) -> Plant:
         copies, dofs, axes = self.copies, self.num_dofs, self.num_axes
-        frictions, contacts, elements = self.num_frictions, len(self.load.contacts), len(self._motions)
-        names = [row.name for row in self.load.contacts]
-        carries = np.full(axes + len(self.load.frictions), -1)
-        for k, row in enumerate(self.load.frictions):
-            if row.carries:
-                into = self._merged[k][0] if k in self._merged else axes + k
-                carries[into] = names.index(row.carries)
-        disturbance = self._combinations([self.load.disturbance])[0]
+        rows, frictions, contacts = self._rows, self.num_frictions, len(self.load.contacts)
+        elements = len(rows.motion)
         return Plant(
             model_address=self.model._address,
             data_address=self.data._address,
@@ -313,9 +309,9 @@ class PackedLoad:
             reached=np.zeros((dofs, copies)),
             applied=np.zeros((dofs, copies)),
             total=np.zeros((dofs, copies)),
-            axis_motion=self._combinations(self._motions[:axes]),
-            axis_position=self._combinations(self.template.position),
-            axis_start=self._combinations(self._motions[:axes]) @ self.start,
+            axis_motion=rows.motion[:axes],
+            axis_position=rows.position,
+            axis_start=rows.motion[:axes] @ self.start,
             axis_kick=np.zeros((axes, dofs, copies)),
             stiffness=np.zeros((dofs, dofs, copies)),
             held=np.zeros((dofs, dofs, copies)),
@@ -326,11 +322,11 @@ class PackedLoad:
             spring_zero=np.array(self.model.qpos_spring[:dofs]),
             damping=np.zeros((dofs, copies)),
             bias=np.zeros((dofs, copies)),
-            motion=self._combinations(self._motions),
+            motion=rows.motion,
             share=np.zeros((elements, dofs, copies)),
             mass=np.ones((elements, copies)),
             friction=np.zeros((frictions, 8, copies)),
-            carries=carries[self._apart()].astype(np.int64),
+            carries=rows.carries,
             bristle=np.zeros((copies, frictions)),
             stuck=np.zeros((frictions, copies), np.int64),
             holding=np.zeros((frictions, copies)),
@@ -340,7 +336,7 @@ class PackedLoad:
             roll=np.zeros((copies, len(self.load.rolls), 4)),
             roll_armature=np.zeros((copies, len(self.load.rolls))),
             roll_inertia=np.zeros((copies, len(self.load.rolls))),
-            disturbance=np.repeat(disturbance[:, None], copies, axis=1),
+            disturbance=np.repeat(rows.disturbance[:, None], copies, axis=1),
             load_torque=np.zeros(copies),
             profile_at=np.zeros(0),
             profile=np.zeros((copies, 0)),
@@ -353,57 +349,27 @@ class PackedLoad:
             diverged=np.zeros(copies, np.int64),
         )
 
-    def _combinations(self, motions: Sequence[Combination]) -> Floats:
-        """Return motions as coefficients of the joints, shape (motions, D)."""
-        rows = np.zeros((len(motions), self.num_dofs))
-        for row, motion in zip(rows, motions, strict=True):
-            for joint, coefficient in motion.items():
-                row[self.joints.index(joint)] += coefficient
-        return rows
-
     def _apply(self, changed: NDArray[np.bool_] | None = None) -> None:
-        """Bring parameters into MuJoCo's model and the plant: stiffness corrected, damping halved, inertias derived.
+        """Bring the parameters of the changed copies into MuJoCo's model and the plant; None is all."""
+        if changed is None or np.any(changed):
+            _derive([self], None if changed is None else np.flatnonzero(changed))
 
-        What is derived outside MuJoCo is so for the changed copies alone; None is all.
+    def _weigh(self) -> Floats:
+        """Bring masses and rotors into MuJoCo's model; return each copy's inertia at the start, shape (copies, D, D).
+
+        At the start, so that setting one copy cannot change the rounding of another.
         """
-        plant, copies = self.plant, np.arange(self.copies) if changed is None else np.flatnonzero(changed)
-        if not len(copies):
-            return
         self._place_rotors()
-        moving = (self.data.qpos.copy(), self.data.qvel.copy())
-        mujoco.mj_setConst(self.model, self.data)
-        # At the reference position, so that setting one copy cannot change the rounding of another.
-        self._by_copy(self.data.qpos)[:], self.data.qvel[:] = self.start, 0.0
-        inertia = self.mass_matrix()[copies]
-        plant.bias[:, copies] = self._by_copy(self.data.qfrc_bias)[copies].T
-        self.data.qpos[:], self.data.qvel[:] = moving
-        plant.damping[:] = self.values.damping.T
-        if self.staggered:
-            stiffness, damping = self.values.stiffness[copies], self.values.damping[copies]
-            found = corrections(inertia, stiffness, damping, plant.axis_motion, self.h)
-            self._check_phase(found.phase, found.shapes, copies)
-            self._check_coupling(found.coupling, found.shapes, copies)
-            plant.stiffness[..., copies] = _copies_last(found.stiffness)
-            plant.held[..., copies] = _copies_last(found.held)
-            plant.held_moment[..., copies] = _copies_last(found.held_moment)
-            plant.axis_kick[..., copies] = _copies_last(found.kick)
-            plant.damper[..., copies] = _copies_last(found.damping)
-            plant.ends[..., copies] = _copies_last(found.ends)
-            plant.ends_of_speed[..., copies] = _copies_last(found.ends_of_speed)
-        # The springs' force is the plant's, since the corrected one is no spring of a joint any more.
-        self._by_copy(self.model.jnt_stiffness)[:] = 0.0 if self.staggered else self.values.stiffness
-        self._by_copy(self.model.dof_damping)[:] = self.values.damping * (0.5 if self.staggered else 1.0)
-        inverse = np.linalg.inv(inertia)
-        share = np.einsum("cde,fe->fdc", inverse, plant.motion)
-        mass = 1.0 / np.einsum("fd,fdc->fc", plant.motion, share)
-        plant.mass[:, copies] = mass
-        plant.share[..., copies] = share * mass[:, None]
-        self._apply_frictions(copies)
-        self._apply_contacts(copies)
-        plant.roll[:] = self.values.roll
-        dofs = plant.roll_dof
-        wound = self._by_copy(self.model.dof_armature)[:, dofs] - plant.roll_armature
-        plant.roll_inertia[copies] = inertia[:, dofs, dofs] - wound[copies]
+        data = self.data
+        moving = (data.qpos.copy(), data.qvel.copy())
+        if self.constrained or self.model.opt.enableflags:
+            mujoco.mj_setConst(self.model, data)
+        else:
+            self.template.weigh(self.model, data)
+        self._by_copy(data.qpos)[:], data.qvel[:] = self.start, 0.0
+        inertia = self.mass_matrix()
+        data.qpos[:], data.qvel[:] = moving
+        return inertia
 
     def _place_rotors(self) -> None:
         """Enter the rotors as armature of their joints or tendons, on the load's side of the gear."""
@@ -421,116 +387,198 @@ class PackedLoad:
             start, core, _, density = self.values.roll[:, k].T
             armature[:, dof] += 0.5 * np.pi * density * (np.maximum(start, core) ** 4 - core**4)
 
-    def _jam_rows(self) -> list[tuple[int, float]]:
-        """Return which friction of the plant holds the load of each axis, and its torque or force per rotor torque."""
-        found = []
-        apart = self._apart()
-        for axis in range(self.num_axes):
-            # What moves with the rotor: joints of its own motion, and those that a contact drives from them.
-            per_rotor = {name: 1.0 / c for name, c in self._motions[axis].items()}
-            for contact in self.load.contacts:
-                if len(contact.motion) > 1 and any(name in per_rotor for name in contact.motion):
-                    driver = next(name for name in contact.motion if name in per_rotor)
-                    for name, c in contact.motion.items():
-                        per_rotor.setdefault(name, -contact.motion[driver] * per_rotor[driver] / c)
-            best = (axis, 1.0)
-            for row, k in enumerate(apart):
-                if k < self.num_axes:
-                    continue
-                shared = [name for name in self._motions[row] if name in per_rotor and self._motions[row][name] != 0.0]
-                if shared:
-                    best = (row, abs(1.0 / (self._motions[row][shared[0]] * per_rotor[shared[0]])))
-            found.append(best)
-        return found
-
-    def _apart(self) -> list[int]:
-        """Return which frictions the plant has a row for: the axes' bearings, and those that are not merged in one."""
-        loads = range(len(self.load.frictions))
-        return [*range(self.num_axes), *(self.num_axes + k for k in loads if k not in self._merged)]
-
-    def _apply_frictions(self, copies: NDArray[np.intp]) -> None:
-        chosen, plant = self._model_of_friction, self.plant
-        own = self.values.friction[copies]
-        column = {name: own[:, :, k] for k, name in enumerate(FRICTION_COLUMNS)}
-        # The motors' bearings keep theirs: it is theirs to be without friction.
-        loads = np.arange(own.shape[1]) >= self.num_axes
-        coulomb = np.where(loads & (not chosen.dry), 0.0, column["coulomb"])
-        risen = np.where(loads & (not chosen.stribeck), column["coulomb"], column["breakaway"])
-        breakaway = np.where(loads & (not chosen.dry), 0.0, np.maximum(risen, coulomb))
-        viscous = np.where(loads & (not chosen.viscous), 0.0, column["viscous"])
-        losses = 1.0 / column["efficiency"] - 1.0
-        rows = np.stack([coulomb, breakaway, column["stribeck"], viscous, column["drag"], losses], axis=-1)
-        for k, (axis, scale) in self._merged.items():
-            # A force F(v) on a motion that is `scale` of the rotor's is a torque of scale F(scale v) there.
-            row, turning = rows[:, self.num_axes + k], rows[:, axis]
-            powers = np.array([1.0, 1.0, 0.0, 2.0, 3.0, 1.0])
-            turning += row * scale**powers * np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
-            turning[:, 2] = row[:, 2] / scale
-        rows = rows[:, self._apart()]
-        plant.friction[:, :5, copies] = _copies_last(rows[:, :, :5])
-        plant.friction[:, 7, copies] = rows[:, :, 5].T
-        bristle = column["bristle"][:, self._apart()]
-        bristled = loads[self._apart()] & chosen.bristles & (bristle > 0.0)
-        stiffness = np.where(bristled, rows[:, :, 1] / np.where(bristled, bristle, 1.0), 0.0)
-        plant.friction[:, 5, copies] = stiffness.T
-        mass = plant.mass[: self.num_frictions, copies]
-        plant.friction[:, 6, copies] = 2.0 * BRISTLE_DAMPING * np.sqrt(stiffness.T * mass)
-
-    def _apply_contacts(self, copies: NDArray[np.intp]) -> None:
-        plant, stiffness = self.plant, self.values.contact[copies, :, 2].T
-        plant.contact[:, :4, copies] = _copies_last(self.values.contact[copies])
-        phase = 0.5 * self.h * np.sqrt(stiffness / plant.mass[self.num_frictions :, copies])
-        if self.staggered:
-            # As in modal.py, for the mode that the spring has while it is pressed.
-            plant.contact[:, 2, copies] *= np.sinc(phase / np.pi) ** 2
-            plant.contact[:, 4, copies] = np.sinc(2.0 * phase / np.pi) - 1.0
-            plant.contact[:, 5, copies] = 2.0 * phase / self.h * np.sin(phase)
-            plant.contact[:, 6, copies] = np.sinc(phase / np.pi) / np.cos(phase) - 1.0
-        if phase.size and 2.0 * phase.max() > MAX_PHASE_PER_STEP:
-            k, worst = np.unravel_index(int(phase.argmax()), phase.shape)
-            self._refuse(f"contact {self.load.contacts[int(k)].name!r}", int(copies[worst]), float(phase.max()))
-
-    def _check_phase(self, phase: Floats, shapes: Floats, copies: NDArray[np.intp]) -> None:
-        if 2.0 * phase.max() > MAX_PHASE_PER_STEP:
-            worst, mode = np.unravel_index(int(phase.argmax()), phase.shape)
-            # The joint whose spring takes most of that mode's energy.
-            dof = int(np.argmax(self.values.stiffness[copies[worst]] * shapes[worst, :, mode] ** 2))
-            self._refuse(f"joint {self.joints[dof]!r}", int(copies[worst]), float(phase.max()))
-
-    def _check_coupling(self, coupling: Floats, shapes: Floats, copies: NDArray[np.intp]) -> None:
-        limit = MAX_COUPLING_PER_STEP / self.h
-        if np.abs(coupling).max() > limit:
-            worst, *modes = (int(k) for k in np.unravel_index(int(np.abs(coupling).argmax()), coupling.shape))
-            damping = self.values.damping[copies[worst]]
-            # The joint whose damper couples those two modes most.
-            dof = int(np.argmax(np.abs(damping * shapes[worst][:, modes].prod(axis=1))))
-            raise ValueError(
-                f"joint {self.joints[dof]!r} of machine {self._first_machine + int(copies[worst])} is damped by "
-                f"{damping[dof]:g}, so strongly that its resonances brake each other at {np.abs(coupling).max():.0f} "
-                f"1/s; the limit is {limit:.0f} 1/s at a physics step of {self.h * 1e6:.0f} us; lower its damping or "
-                "take more physics steps per millisecond"
-            )
-
-    def _refuse(self, what: str, copy_: int, phase: float) -> None:
-        raise ValueError(
-            f"{what} of machine {self._first_machine + copy_} resonates at {phase / (np.pi * self.h):.0f} Hz; the "
-            f"limit is {MAX_PHASE_PER_STEP / (2.0 * np.pi * self.h):.0f} Hz at a physics step of {self.h * 1e6:.0f} "
-            "us; lower its stiffness, raise its inertia or take more physics steps per millisecond"
-        )
-
 
 def _copies_last(array: Floats) -> Floats:
     return np.moveaxis(array, 0, -1)
 
 
-def _proportional(turning: Sequence[Combination], frictions: Sequence[Friction]) -> dict[int, tuple[int, float]]:
-    """Return the frictions that act on an axis's own motion, at most one each: index -> axis, motion per rotor's."""
-    found: dict[int, tuple[int, float]] = {}
-    for k, row in enumerate(frictions):
-        for axis, motion in enumerate(turning):
-            if set(motion) != set(row.motion) or any(axis == taken for taken, _ in found.values()):
-                continue
-            scales = [row.motion[joint] / motion[joint] for joint in motion]
-            if max(scales) - min(scales) <= 1e-12 * abs(scales[0]):
-                found[k] = (axis, abs(scales[0]))
+def pack(
+    load: Load,
+    armature: Floats,
+    motor_friction: Floats,
+    parameters: Mapping[str, Floats],
+    h: float,
+    *,
+    copies: int,
+    integrator: str = "leapfrog",
+    friction: str = "stribeck",
+    weigh_every: int = 1,
+) -> list[PackedLoad]:
+    """Return machines in packed models of `copies` each, the last of as many as are left.
+
+    They are what `PackedLoad` would make of them one by one, in a third of the time.
+
+    Args:
+        load: The row, resolved (model.py).
+        armature: Rotor inertia of each machine's axes [kg*m^2], shape (machines, axes).
+        motor_friction: Of each machine's axes, shape (machines, axes, 4), as of `PackedLoad`.
+        parameters: Parameter name -> values, shape (machines,).
+        h: Physics step [s].
+        copies: Machines in a model.
+        integrator: As of `PackedLoad`.
+        friction: As of `PackedLoad`.
+        weigh_every: As of `PackedLoad`.
+
+    Raises:
+        ValueError: As `PackedLoad`.
+    """
+    templates: dict[int, Template] = {}
+    packed: list[PackedLoad] = []
+    for first in range(0, len(armature), copies):
+        machines = slice(first, first + copies)
+        count = len(armature[machines])
+        if count not in templates:
+            templates[count] = Template(load, count)
+        packed.append(
+            PackedLoad(
+                load, armature[machines], motor_friction[machines],
+                {name: values[machines] for name, values in parameters.items()}, h, integrator=integrator,
+                friction=friction, template=templates[count], first_machine=first, weigh_every=weigh_every, ready=False,
+            )
+        )  # fmt: skip
+    for name, values in parameters.items():
+        packed[0].values.check(name, values)
+    at_once = max(1, COPIES_AT_ONCE // copies)
+    for k in range(0, len(packed), at_once):
+        _derive(packed[k : k + at_once])
+    for one in packed:
+        one.reset(np.ones(one.copies, bool))
+    return packed
+
+
+def _derive(loads: Sequence[PackedLoad], changed: NDArray[np.intp] | None = None) -> None:
+    """Bring parameters into MuJoCo's models and the plants: stiffness corrected, damping halved, inertias derived.
+
+    Args:
+        loads: Of the same row and with the same options.
+        changed: Copies of the only load there is for which what is derived outside MuJoCo is so; None is all.
+
+    Raises:
+        ValueError: For a machine that cannot be stepped.
+    """
+    first = loads[0]
+    copies: slice | NDArray[np.intp] = slice(None) if changed is None else changed
+    inertia = np.concatenate([load._weigh()[copies] for load in loads])
+    ends = np.cumsum([len(np.arange(load.copies)[copies]) for load in loads])
+    parts = [slice(end - count, end) for end, count in zip(ends, np.diff(ends, prepend=0), strict=True)]
+    machines = np.concatenate([load._first_machine + np.arange(load.copies)[copies] for load in loads])
+
+    def gathered(name: str) -> Floats:
+        return np.concatenate([getattr(load.values, name)[copies] for load in loads])
+
+    for load in loads:
+        plant, values = load.plant, load.values
+        plant.bias[:, copies] = load._by_copy(load.data.qfrc_bias)[copies].T
+        plant.damping[:] = values.damping.T
+    motion = first.plant.motion
+    stiffness, damping = gathered("stiffness"), gathered("damping")
+    # Of each plant's array, what its copies get, copies last.
+    derived: dict[str, Floats] = {}
+    if first.staggered:
+        found = corrections(inertia, stiffness, damping, first.plant.axis_motion, first.h)
+        _check_phase(first, found, stiffness, machines)
+        _check_coupling(first, found, damping, machines)
+        derived |= {
+            "stiffness": _copies_last(found.stiffness),
+            "held": _copies_last(found.held),
+            "held_moment": _copies_last(found.held_moment),
+            "axis_kick": _copies_last(found.kick),
+            "damper": _copies_last(found.damping),
+            "ends": _copies_last(found.ends),
+            "ends_of_speed": _copies_last(found.ends_of_speed),
+        }
+    inverse = np.linalg.inv(inertia)
+    share = np.einsum("cde,fe->fdc", inverse, motion)
+    mass = 1.0 / np.einsum("fd,fdc->fc", motion, share)
+    derived |= {"mass": mass, "share": share * mass[:, None]}
+    derived["friction"] = _frictions(first, gathered("friction"), mass[: first.num_frictions])
+    derived["contact"] = _contacts(first, gathered("contact"), mass[first.num_frictions :], machines)
+    for load, part in zip(loads, parts, strict=True):
+        plant, values = load.plant, load.values
+        # The springs' force is the plant's, since the corrected one is no spring of a joint any more.
+        load._by_copy(load.model.jnt_stiffness)[:] = 0.0 if load.staggered else values.stiffness
+        load._by_copy(load.model.dof_damping)[:] = values.damping * (0.5 if load.staggered else 1.0)
+        for name, array in derived.items():
+            getattr(plant, name)[..., copies] = array[..., part]
+        plant.roll[:] = values.roll
+        dofs = plant.roll_dof
+        wound = load._by_copy(load.model.dof_armature)[:, dofs] - plant.roll_armature
+        plant.roll_inertia[copies] = inertia[part][:, dofs, dofs] - wound[copies]
+
+
+def _frictions(load: PackedLoad, own: Floats, mass: Floats) -> Floats:
+    """Return the plant's rows of friction, shape (F, 8, n), of copies whose frictions are `own` on inertias `mass`."""
+    chosen, rows_of = load._model_of_friction, load._rows
+    column = {name: own[:, :, k] for k, name in enumerate(FRICTION_COLUMNS)}
+    # The motors' bearings keep theirs: it is theirs to be without friction.
+    loads = np.arange(own.shape[1]) >= load.num_axes
+    coulomb = np.where(loads & (not chosen.dry), 0.0, column["coulomb"])
+    risen = np.where(loads & (not chosen.stribeck), column["coulomb"], column["breakaway"])
+    breakaway = np.where(loads & (not chosen.dry), 0.0, np.maximum(risen, coulomb))
+    viscous = np.where(loads & (not chosen.viscous), 0.0, column["viscous"])
+    losses = 1.0 / column["efficiency"] - 1.0
+    rows = np.stack([coulomb, breakaway, column["stribeck"], viscous, column["drag"], losses], axis=-1)
+    for k, (axis, scale) in rows_of.merged.items():
+        # A force F(v) on a motion that is `scale` of the rotor's is a torque of scale F(scale v) there.
+        row, turning = rows[:, load.num_axes + k], rows[:, axis]
+        powers = np.array([1.0, 1.0, 0.0, 2.0, 3.0, 1.0])
+        turning += row * scale**powers * np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
+        turning[:, 2] = row[:, 2] / scale
+    rows = rows[:, rows_of.apart]
+    bristle = column["bristle"][:, rows_of.apart]
+    bristled = loads[rows_of.apart] & chosen.bristles & (bristle > 0.0)
+    stiffness = np.where(bristled, rows[:, :, 1] / np.where(bristled, bristle, 1.0), 0.0)
+    found = np.empty((rows.shape[1], 8, len(rows)))
+    found[:, :5] = _copies_last(rows[:, :, :5])
+    found[:, 5] = stiffness.T
+    found[:, 6] = 2.0 * BRISTLE_DAMPING * np.sqrt(stiffness.T * mass)
+    found[:, 7] = rows[:, :, 5].T
     return found
+
+
+def _contacts(load: PackedLoad, own: Floats, mass: Floats, machines: NDArray[np.intp]) -> Floats:
+    """Return the plant's rows of contacts, shape (B, 7, n), of copies whose contacts are `own` between `mass`."""
+    stiffness = own[:, :, 2].T
+    found = np.zeros((own.shape[1], 7, len(own)))
+    found[:, :4] = _copies_last(own)
+    phase = 0.5 * load.h * np.sqrt(stiffness / mass)
+    if load.staggered:
+        # As in modal.py, for the mode that the spring has while it is pressed.
+        found[:, 2] *= np.sinc(phase / np.pi) ** 2
+        found[:, 4] = np.sinc(2.0 * phase / np.pi) - 1.0
+        found[:, 5] = 2.0 * phase / load.h * np.sin(phase)
+        found[:, 6] = np.sinc(phase / np.pi) / np.cos(phase) - 1.0
+    if phase.size and 2.0 * phase.max() > MAX_PHASE_PER_STEP:
+        k, worst = np.unravel_index(int(phase.argmax()), phase.shape)
+        _refuse(load, f"contact {load.load.contacts[int(k)].name!r}", int(machines[worst]), float(phase.max()))
+    return found
+
+
+def _check_phase(load: PackedLoad, found: Corrections, stiffness: Floats, machines: NDArray[np.intp]) -> None:
+    if 2.0 * found.phase.max() > MAX_PHASE_PER_STEP:
+        worst, mode = np.unravel_index(int(found.phase.argmax()), found.phase.shape)
+        # The joint whose spring takes most of that mode's energy.
+        dof = int(np.argmax(stiffness[worst] * found.shapes[worst, :, mode] ** 2))
+        _refuse(load, f"joint {load.joints[dof]!r}", int(machines[worst]), float(found.phase.max()))
+
+
+def _check_coupling(load: PackedLoad, found: Corrections, damping: Floats, machines: NDArray[np.intp]) -> None:
+    limit, coupling = MAX_COUPLING_PER_STEP / load.h, found.coupling
+    if np.abs(coupling).max() > limit:
+        worst, *modes = (int(k) for k in np.unravel_index(int(np.abs(coupling).argmax()), coupling.shape))
+        # The joint whose damper couples those two modes most.
+        dof = int(np.argmax(np.abs(damping[worst] * found.shapes[worst][:, modes].prod(axis=1))))
+        raise ValueError(
+            f"joint {load.joints[dof]!r} of machine {int(machines[worst])} is damped by {damping[worst, dof]:g}, so "
+            f"strongly that its resonances brake each other at {np.abs(coupling).max():.0f} 1/s; the limit is "
+            f"{limit:.0f} 1/s at a physics step of {load.h * 1e6:.0f} us; lower its damping or take more physics "
+            "steps per millisecond"
+        )
+
+
+def _refuse(load: PackedLoad, what: str, machine: int, phase: float) -> NoReturn:
+    raise ValueError(
+        f"{what} of machine {machine} resonates at {phase / (np.pi * load.h):.0f} Hz; the limit is "
+        f"{MAX_PHASE_PER_STEP / (2.0 * np.pi * load.h):.0f} Hz at a physics step of {load.h * 1e6:.0f} us; lower its "
+        "stiffness, raise its inertia or take more physics steps per millisecond"
+    )

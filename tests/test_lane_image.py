@@ -40,7 +40,11 @@ def test_a_restart_restores_what_single_writes_would(used):
     used._records[:] = before
     objects._values.update({key: value.copy() for key, value in values.items()})
     for key in sorted(objects._stored, key=lambda key: key != POSITION_SCALER):
-        objects._restore(objects.entries.find(key), objects._stored[key], mask)
+        entry, raw = objects.entries.find(key), np.broadcast_to(objects._stored[key], (11,))
+        if key not in objects.device.bindings:
+            objects._set_value(entry, raw, mask)
+        elif entry.access not in ("ro", "const"):  # what is read only the firmware computes
+            objects._set_field(entry, raw, mask)
     from drive_env.firmware import cycle
 
     cycle.power_on(used._records, mask)

@@ -1,9 +1,11 @@
 """Copies packed into one model: each is what it would be alone, and one that leaves physics leaves alone."""
 
+import copy
 import dataclasses
 import warnings
 from functools import cache
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -11,8 +13,9 @@ from drive_env import EmulatedDrives, motion
 from mechanics.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.model import compile_packed
-from mechanics.packed import PackedLoad
+from mechanics.packed import PackedLoad, pack
 from mechanics.stepping import step
+from mechanics.template import Template
 
 STEPS = 400
 H = 200e-6
@@ -144,6 +147,50 @@ def test_a_template_gives_the_same_model_and_shares_no_memory():
     assert np.array_equal(first.mass_matrix(), second.mass_matrix())
     second.set("inertia", np.full(8, 9e-5), np.ones(8, bool))
     assert np.array_equal(first.get("inertia"), values["inertia"])
+
+
+@pytest.mark.parametrize("friction", ["stribeck", "lugre"])
+@pytest.mark.parametrize("name", list(LOADS))
+def test_machines_packed_at_once_are_those_packed_one_by_one(name, friction, monkeypatch):
+    monkeypatch.setattr("mechanics.packed.COPIES_AT_ONCE", 16)  # two models, then one, then what is left
+    values, armature, bearing = parameters(name, 30)
+    together = pack(LOADS[name], armature, bearing, values, H, copies=8, friction=friction)
+    assert [load.copies for load in together] == [8, 8, 8, 6]
+    for k, load in enumerate(together):
+        some = slice(8 * k, 8 * k + load.copies)
+        own = {key: value[some] for key, value in values.items()}
+        alone = PackedLoad(LOADS[name], armature[some], bearing[some], own, H, friction=friction)
+        for field in dataclasses.fields(load.plant):
+            if not field.name.endswith("_address"):
+                found, expected = getattr(load.plant, field.name), getattr(alone.plant, field.name)
+                np.testing.assert_array_equal(found, expected, err_msg=field.name)
+        assert load.data.qpos.tobytes() == alone.data.qpos.tobytes()
+
+
+def test_a_machine_that_cannot_be_stepped_is_named_among_all():
+    stiffness = np.where(np.arange(30) == 19, 1e9, 20.0)
+    with pytest.raises(ValueError, match=r"joint 'twist' of machine 19 resonates at"):
+        pack(LOADS["two_mass"], np.full((30, 1), J_M), np.zeros((30, 1, 4)), {"stiffness": stiffness}, H, copies=8)
+    with pytest.raises(ValueError, match=r"stiffness of load 'two_mass' must be finite and not negative"):
+        pack(LOADS["two_mass"], np.full((30, 1), J_M), np.zeros((30, 1, 4)), {"stiffness": -stiffness}, H, copies=8)
+
+
+@pytest.mark.parametrize("name", list(LOADS))
+def test_what_follows_from_masses_is_what_mujoco_finds(name):
+    template, seed = Template(LOADS[name], 3), 1
+    changed = []
+    for weigh in (mujoco.mj_setConst, template.weigh):
+        model, rng = copy.copy(template.model), np.random.default_rng(seed)
+        model.body_mass[:] *= rng.uniform(0.5, 2.0, model.nbody)
+        model.body_inertia[:] *= rng.uniform(0.5, 2.0, (model.nbody, 1))
+        model.body_ipos[:] *= rng.uniform(0.5, 2.0, (model.nbody, 1))
+        model.dof_armature[:] = rng.uniform(1e-6, 1e-3, model.nv)
+        weigh(model, mujoco.MjData(model))
+        data = mujoco.MjData(model)
+        data.qpos[:] = rng.uniform(-0.5, 0.5, model.nq)
+        mujoco.mj_forward(model, data)
+        changed.append((model.body_subtreemass.tobytes(), data.M.tobytes(), data.qfrc_bias.tobytes()))
+    assert changed[0] == changed[1]
 
 
 # --- divergence -------------------------------------------------------------------------------------------------------
