@@ -124,6 +124,7 @@ def evaluate(
     guard: GuardLimits | None = None,
     side: str | None = None,
     told: Callable[[float], None] = lambda share: None,
+    at_once: int | None = None,
 ) -> Evaluation:
     """Run episodes and return what they say.
 
@@ -141,6 +142,7 @@ def evaluate(
             machines.
         side: What the report calls the drives.
         told: Is told the share that is done.
+        at_once: Episodes side by side on emulated machines; by default `lanes_for` as many.
 
     Raises:
         PolicyStoppedError: If the policy did what it must not; given drives are at rest and disabled then.
@@ -152,7 +154,7 @@ def evaluate(
     if given:  # machines are drawn on emulators alone
         options = {key: value for key, value in options.items() if key not in ("distributions", "privileged", "stage")}
     lanes: Any
-    count = min(episodes, LANES) if not given else _lanes_of(environment, drives, options)
+    count = (at_once or lanes_for(episodes)) if not given else _lanes_of(environment, drives, options)
     more = {"drives": drives, "autoreset_mode": "Disabled"} if given else {"autoreset_mode": "NextStep"}
     if sensor is not None:
         more["sensor"] = sensor
@@ -197,6 +199,11 @@ def evaluate(
         evaluation.late = timing.late / max(timing.cycles, 1)
         evaluation.pace = spent / due if environment in FIXED_STEPS else 1.0
     return evaluation
+
+
+def lanes_for(episodes: int) -> int:
+    """Return how many of so many episodes run side by side on emulated machines."""
+    return min(episodes, LANES)
 
 
 def joined(parts: Sequence[Evaluation]) -> Evaluation:

@@ -73,6 +73,42 @@ def open_policy(text: str, *, trust: bool = False) -> LoadedPolicy:
     )
 
 
+def opened(
+    text: str, environment: str | None, configuration: Mapping[str, Any], *, trust: bool = False
+) -> LoadedPolicy:
+    """Return the policy that a text names, a baseline in its environment with these options among them.
+
+    Args:
+        text: What names it.
+        environment: Name of the environment; a baseline is of one.
+        configuration: The environment's options.
+        trust: As `open_policy` takes it.
+    """
+    from agents.baselines import baseline
+    from agents.tasks import make_lanes
+
+    if not is_baseline(text):
+        return open_policy(text, trust=trust)
+    if environment is None:
+        raise ValueError(f"{text} does not say its environment; give --environment")
+    lanes: Any = make_lanes(environment, 1, configuration)
+    actions, config = lanes.single_action_space.shape[0], lanes.config
+    lanes.close()
+    return LoadedPolicy(text, baseline(text, environment, config, actions), environment)
+
+
+def names_a_file(text: str) -> bool:
+    """Return whether a text names a policy by the file that holds it."""
+    return text.lower().endswith((*OPENERS, CHECKPOINT))
+
+
+def is_baseline(text: str) -> bool:
+    """Return whether a text names a baseline, which acts in whatever environment is asked for."""
+    from agents.baselines import BASELINES
+
+    return any(text in rows for rows in BASELINES.values())
+
+
 class CallablePolicy:
     """A Python function of an observation; it gets all lanes' at once, shape (lanes, entries).
 

@@ -1,14 +1,18 @@
 """Search for hyper-parameters with Optuna: every trial trains an agent and scores it on machines that it has not seen.
 
-The study is a journal file: it can be gone on with after an interruption, and by several processes at once.
+The study is a journal file: it can be gone on with after an interruption, and by several processes at once. Trials are
+drawn in rounds, each from what the rounds before have found, so that those of a round may run side by side: where they
+run changes none of them.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -16,7 +20,13 @@ import yaml
 from agents.hyperparameters import merge
 from agents.training import ALGORITHMS, DivergedError, Run, train
 
+if TYPE_CHECKING:
+    from tuning.pools import Pool
+
 JOURNAL, BEST = "study.log", "best.yaml"
+ROUND = 5  # trials that are drawn from the same knowledge, and may run at a time
+# Torch's and NumPy's random numbers are a process's: of two trainings at once in it, none would be what it is alone.
+_ALONE = threading.Lock()
 
 
 class Row(NamedTuple):
@@ -61,6 +71,21 @@ class Trial(NamedTuple):
     drawn: Mapping[str, Any]
 
 
+class _Task(NamedTuple):
+    """A training and its score, for whatever process; without a folder its files come back with the score."""
+
+    run: Run
+    folder: Path | None
+    episodes: int
+
+
+class _Scored(NamedTuple):
+    """What came of a task: the score to be minimised, None if the training diverged, and files by their names."""
+
+    score: float | None
+    files: Mapping[str, bytes]
+
+
 def search(
     environment: str,
     algorithm: str,
@@ -71,10 +96,11 @@ def search(
     seed: int = 0,
     episodes: int = 64,
     told: Callable[[Trial, Trial | None], None] | None = None,
+    pool: Pool | None = None,
 ) -> dict[str, Any]:
     """Try hyper-parameters and return the best, RL-Zoo's way; the folder gets the study, and best.yaml, trial by trial.
 
-    A search that is killed loses the trial under way: the next search in the folder goes on behind it.
+    A search that is killed loses the trials under way: the next search in the folder goes on behind them.
 
     Args:
         environment: Name of the environment.
@@ -84,7 +110,8 @@ def search(
         trials: How many more.
         seed: Of trainings and of the search.
         episodes: Of a score.
-        told: Is told of each trial that is over, and of the best one; None before there is one.
+        told: Is told of each trial that is over, in their order, and of the best one; None before there is one.
+        pool: Where else trials run, ROUND at a time, which changes none of them.
 
     Raises:
         DivergedError: If no training at all gave an agent.
@@ -93,46 +120,115 @@ def search(
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend
 
-    from agents.evaluation import FIRST_SEED, evaluate
-    from agents.policy import policy_of
-
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # what failed is told, in a line
     base = Run(environment, algorithm, hyperparameters)
     storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
     study = optuna.create_study(storage=storage, study_name=f"{base.environment} {algorithm}", load_if_exists=True)
+    states = optuna.trial.TrialState
 
-    def objective(trial: Any) -> float:
+    def begun(known: Any) -> tuple[Any, _Task]:
+        """Return a trial, drawn from what was known when its round began, and what is to be done."""
+        study.sampler = optuna.samplers.RandomSampler()  # draws nothing yet
+        trial = study.ask()
         # Seeded by trial: a search that is gone on with, or a second process, would draw the first ones again.
         own = np.random.SeedSequence((seed, trial.number)).generate_state(1)[0]
-        study.sampler = optuna.samplers.TPESampler(seed=int(own))
+        study.sampler = _sampler(known, int(own))
         given = drawn(algorithm, hyperparameters, trial)
+        here = pool is None or pool.shares_disk
         run = Run(environment, algorithm, given, seed=seed, preset="search")
-        bundle = train(run, folder / f"trial-{trial.number:03d}")
-        found = evaluate(
-            policy_of(bundle), bundle.environment, bundle.configuration, episodes=episodes, seed=FIRST_SEED // 2
-        )
-        mean = found.interval(found.score).mean
-        return mean if found.lower_is_better[found.score] else -mean
+        return trial, _Task(run, _folder_of(folder, trial.number) if here else None, episodes)
 
-    done = (optuna.trial.TrialState.COMPLETE,)
-
-    def tell(study: Any, trial: Any) -> None:
-        best = study.best_trial if study.get_trials(deepcopy=False, states=done) else None
+    def over(trial: Any, scored: _Scored) -> None:
+        for name, content in scored.files.items():
+            path = _folder_of(folder, trial.number) / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+        # A training that diverges is a trial that failed: the next ones go elsewhere.
+        found = study.tell(trial, scored.score, state=states.FAIL if scored.score is None else states.COMPLETE)
+        best = study.best_trial if study.get_trials(deepcopy=False, states=(states.COMPLETE,)) else None
         if best is not None:
             _write(folder / BEST, base.environment, drawn(algorithm, hyperparameters, best), study, best)
         if told is not None:
-            over, first = (None if one is None else Trial(one.number, one.value, one.params) for one in (trial, best))
-            assert over is not None
-            told(over, first)
+            last, first = (None if one is None else Trial(one.number, one.value, one.params) for one in (found, best))
+            assert last is not None
+            told(last, first)
 
-    # A training that diverges is a trial that failed: the next ones go elsewhere.
-    study.optimize(objective, n_trials=trials, callbacks=[tell], catch=(DivergedError,))
-    if not study.get_trials(deepcopy=False, states=done):
+    for first in range(0, trials, ROUND):
+        count = min(ROUND, trials - first)
+        known = optuna.create_study()
+        known.add_trials(study.get_trials(states=(states.COMPLETE,)))
+        waiting: list[Any] = []
+        try:
+            if pool is None:
+                for _ in range(count):
+                    trial, task = begun(known)
+                    waiting = [trial]
+                    over(trial, _trained(task))
+            else:
+                tasks = [begun(known) for _ in range(count)]
+                waiting = [trial for trial, _ in tasks]
+                for scored in _in_turn(pool.unordered(_trained, [task for _, task in tasks])):
+                    over(waiting[0], scored)
+                    del waiting[0]
+        except (Exception, KeyboardInterrupt):
+            for trial in waiting:
+                study.tell(trial, state=states.FAIL, skip_if_finished=True)
+            raise
+    if not study.get_trials(deepcopy=False, states=(states.COMPLETE,)):
         raise DivergedError(f"all {len(study.trials)} trainings diverged; give a smaller learning_rate (--config)")
     best: dict[str, Any] = drawn(algorithm, hyperparameters, study.best_trial)
     return best
+
+
+def _sampler(known: Any, seed: int) -> Any:
+    """Return Optuna's own sampler, which draws from what is known in place of what the study has meanwhile."""
+    from optuna.samplers import TPESampler
+
+    class FromTheRoundsBefore(TPESampler):
+        def sample_independent(self, _study: Any, trial: Any, name: str, distribution: Any) -> Any:
+            return super().sample_independent(known, trial, name, distribution)
+
+    return FromTheRoundsBefore(seed=seed, multivariate=False)  # what is drawn jointly is so before the trial's seed
+
+
+def _trained(task: _Task) -> _Scored:
+    """Do a task."""
+    from agents.evaluation import FIRST_SEED, evaluate
+    from agents.policy import policy_of
+
+    with _ALONE, tempfile.TemporaryDirectory() as elsewhere:
+        folder = Path(elsewhere) if task.folder is None else task.folder
+        score: float | None = None
+        try:
+            bundle = train(task.run, folder)
+        except DivergedError:
+            pass
+        else:
+            found = evaluate(
+                policy_of(bundle), bundle.environment, bundle.configuration, episodes=task.episodes,
+                seed=FIRST_SEED // 2,
+            )  # fmt: skip
+            mean = found.interval(found.score).mean
+            score = mean if found.lower_is_better[found.score] else -mean
+        paths = [] if task.folder is not None else [path for path in folder.rglob("*") if path.is_file()]
+        return _Scored(score, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths})
+
+
+def _in_turn(results: Iterator[tuple[int, _Scored]]) -> Iterator[_Scored]:
+    """Give results in the order of their tasks, each as soon as those before it are there."""
+    early: dict[int, _Scored] = {}
+    given = 0
+    for k, scored in results:
+        early[k] = scored
+        while given in early:
+            yield early.pop(given)
+            given += 1
+
+
+def _folder_of(folder: Path, number: int) -> Path:
+    return folder / f"trial-{number:03d}"
 
 
 def _write(path: Path, environment: str, best: Mapping[str, Any], study: Any, trial: Any) -> None:

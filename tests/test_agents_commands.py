@@ -65,6 +65,16 @@ def test_a_search_finds_and_goes_on(tmp_path, shrunk):
         assert list(csv.DictReader(file))[-1]["timesteps"] == "64"  # whole rollouts of 16 steps of 4 lanes
 
 
+@pytest.mark.slow
+def test_a_search_on_processes_is_the_same_search(tmp_path, shrunk):
+    for folder, more in (("here", ()), ("apart", ("--workers", 2))):
+        out = tmp_path / folder
+        found = run("search", "tracking", "--config", shrunk, "--steps", 40, "--trials", 2, "--out", out, *more)
+        assert found.exit_code == 0, found.output
+    for name in ("best.yaml", "trial-000/agent.npz", "trial-001/agent.npz"):
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "apart" / name).read_bytes(), name
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

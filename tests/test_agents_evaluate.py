@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 from types import SimpleNamespace
 
@@ -17,9 +18,10 @@ from agents.both_sides import HIDDEN, on_both_sides
 from agents.bundle import Bundle, BundleError
 from agents.cli import app
 from agents.evaluation import AsOnABus, Evaluation, evaluate
+from agents.evaluation_shards import Written, evaluate_elsewhere
 from agents.guard import GuardLimits
 from agents.on_the_bus import target_for
-from agents.policies import PolicyNotFoundError, open_policy
+from agents.policies import PolicyNotFoundError, open_policy, opened
 from agents.policy import PolicyError, policy_of
 from agents.scores import interval
 from agents.served import draw_machines, emulated
@@ -534,3 +536,65 @@ def test_the_export_command_prints_differences_and_latency(tmp_path, monkeypatch
     assert run("evaluate", tmp_path / "agent.onnx", "--episodes", 1).exit_code == 0
     monkeypatch.chdir(tmp_path)  # one that ships is written here, not beside the package's file
     assert run("export", "tracking_gantry").exit_code == 0 and (tmp_path / "tracking_gantry.onnx").is_file()
+
+
+# --- on processes and clusters ----------------------------------------------------------------------------------------
+DRAWN = SHORT | {"distributions": "two_mass"}
+
+
+class Elsewhere:
+    """A pool as a cluster is: tasks and results are pickled, and come back in another order."""
+
+    width, shares_disk = 2, False
+
+    def unordered(self, function, items, say=None):
+        for k, item in reversed(list(enumerate(items))):
+            task = pickle.loads(pickle.dumps((function, item)))
+            yield k, pickle.loads(pickle.dumps(task[0](task[1])))
+
+
+@pytest.mark.parametrize("policy", ["agent.npz", "feed_forward", "tracking_two_mass", "test_agents_evaluate:gentle"])
+def test_rounds_elsewhere_give_the_same_files(policy, tmp_path, monkeypatch):
+    monkeypatch.setattr("agents.evaluation.LANES", 2)
+    text = agent(tmp_path / "agent.npz") if policy == "agent.npz" else policy
+    here = evaluate(opened(text, "ServoDrive/Tracking-v0", DRAWN).policy, "tracking", DRAWN, name=text, episodes=5)
+    written = Written.of(text, trust=False)
+    if policy == "agent.npz":
+        (tmp_path / "agent.npz").unlink()  # of another computer
+    told = []
+    apart = evaluate_elsewhere(
+        written, "tracking", DRAWN, Elsewhere(), name=text, episodes=5, seed=1_000_000, told=told.append
+    )
+    assert told == pytest.approx([1 / 3, 2 / 3, 1.0])
+    for one, folder in ((here, tmp_path / "here"), (apart, tmp_path / "apart")):
+        folder.mkdir()
+        one.save(folder / "report.json")
+        episode_log.save(folder / "episodes.npz", one.environment, one.configuration, one.episodes)
+    for name in ("report.json", "episodes.npz"):
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "apart" / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_same_bytes_on_processes(tmp_path):
+    own = agent(tmp_path / "agent.npz", distributions="two_mass")
+    for folder, more in (("here", ()), ("apart", ("--workers", 2))):
+        found = run("evaluate", own, "--episodes", 70, "--out", tmp_path / folder, *more)
+        assert found.exit_code == 0, found.output
+    names = sorted(path.name for path in (tmp_path / "here").iterdir())
+    assert names == sorted(path.name for path in (tmp_path / "apart").iterdir())
+    for name in names:
+        assert (tmp_path / "here" / name).read_bytes() == (tmp_path / "apart" / name).read_bytes(), name
+
+
+@pytest.mark.parametrize(("more", "message"), [
+    (("--bitrate", 500_000), "--bitrate is of a bus; give its --channel, or leave --bitrate out"),
+    (("--device", "tmcm6212"), "--device is of a bus; give its --channel, or leave --device out"),
+    (("--sensor", "a:b"), "--sensor is of a bus; give its --channel, or leave --sensor out"),
+    (("--workers", 2, "--bus"), "--workers runs episodes of the emulator; leave it out on a bus, with --gap"),
+    (("--cluster", "tcp://x:1", "--gap", 2), "--cluster runs episodes of the emulator; leave it out on a bus"),
+    (("--workers", 0), "--workers 0 is below 1; give the number of processes"),
+    (("--workers", 1, "--cluster", "tcp://x:1"), "choose --workers or --cluster"),
+])  # fmt: skip
+def test_what_would_be_ignored_is_refused(more, message):
+    found = run("evaluate", "tracking_two_mass", *more)
+    assert (found.exit_code, message in " ".join(found.output.split())) == (2, True), found.output

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from agents.policy import policy_of
 from agents.shipped import TUNER, shipped
 from agents.tasks import ENVIRONMENTS, environment_name, make_lanes
 from agents.training import AGENT, CHECKPOINT, TABLE, DivergedError, Run, train
+from tuning.pools import PoolError
 
 TINY = {"ServoDrive/Tracking-v0": {"duration": 0.01}, "ServoDrive/GainScheduling-v0": {"duration": 0.02},
         "ServoDrive/GainTuning-v0": {"trials": 1}}  # fmt: skip
@@ -422,6 +424,66 @@ def test_a_search_without_any_agent_says_so(tmp_path, monkeypatch):
     monkeypatch.setitem(search.SPACES, "ppo", (search.Row("learning_rate", choices=(1e6,)),))
     with pytest.raises(DivergedError, match="all 1 trainings diverged; give a smaller learning_rate"):
         search.search(run.environment, "ppo", run.hyperparameters, tmp_path, trials=1)
+
+
+class Elsewhere:
+    """A pool as a cluster is: tasks are pickled, files stay where they are, and results come back in another order."""
+
+    width, shares_disk = 3, False
+
+    def unordered(self, function, items, say=None):
+        for k, item in reversed(list(enumerate(items))):
+            task = pickle.loads(pickle.dumps((function, item)))
+            yield k, pickle.loads(pickle.dumps(task[0](task[1])))
+
+
+def test_trials_elsewhere_are_those_of_one_process(tmp_path, monkeypatch):
+    monkeypatch.setattr(search, "ROUND", 2)
+    run, found, told = tiny(timesteps=32), {}, {}
+    for name, pool in (("here", None), ("elsewhere", Elsewhere())):
+        told[name] = []
+        found[name] = search.search(
+            run.environment, "ppo", run.hyperparameters, tmp_path / name, trials=3, seed=4, episodes=2, pool=pool,
+            told=lambda trial, best, own=told[name]: own.append((trial, best)),
+        )  # fmt: skip
+    assert found["here"] == found["elsewhere"]
+    assert told["here"] == told["elsewhere"]
+    assert drawn_in(tmp_path / "here") == drawn_in(tmp_path / "elsewhere")
+    for name in (search.BEST, *(f"trial-{k:03d}/agent.npz" for k in range(3))):
+        one, other = ((tmp_path / folder / name) for folder in ("here", "elsewhere"))
+        assert one.read_bytes() == other.read_bytes(), name
+
+
+def test_what_a_round_draws_follows_from_the_rounds_before_wherever_it_runs(tmp_path, monkeypatch):
+    """Optuna's sampler draws at random until it knows ten trials: the thirteenth and later ones tell."""
+
+    def scored(task):
+        return search._Scored(abs(task.run.hyperparameters["learning_rate"] - 1e-3), {})
+
+    class AtOnce(Elsewhere):
+        def unordered(self, function, items, say=None):
+            return [(k, function(item)) for k, item in reversed(list(enumerate(items)))]
+
+    monkeypatch.setattr(search, "_trained", scored)
+    run = tiny(timesteps=32)
+    for name, pool in (("here", None), ("again", None), ("elsewhere", AtOnce())):
+        search.search(run.environment, "ppo", run.hyperparameters, tmp_path / name, trials=20, seed=4, pool=pool)
+    rows = drawn_in(tmp_path / "here")
+    assert rows == drawn_in(tmp_path / "again") == drawn_in(tmp_path / "elsewhere")
+    assert np.mean([value for *_, value in rows[15:]]) < np.mean([value for *_, value in rows[:10]])  # it learns
+
+
+def test_trials_that_an_error_ends_are_over_for_the_next_search(tmp_path, monkeypatch):
+    run = tiny(timesteps=32)
+
+    class Lost(Elsewhere):
+        def unordered(self, function, items, say=None):
+            yield 0, function(items[0])
+            raise PoolError("the connection was lost")
+
+    with pytest.raises(PoolError):
+        search.search(run.environment, "ppo", run.hyperparameters, tmp_path, trials=3, episodes=2, pool=Lost())
+    assert [state for state, _, _ in drawn_in(tmp_path)] == ["COMPLETE", "FAIL", "FAIL"]
 
 
 def test_there_is_nothing_to_resume(tmp_path):

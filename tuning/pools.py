@@ -30,6 +30,7 @@ Say = Callable[[str], None]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+AGAIN = "go on with --resume"
 CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
 FIRST_RESULT = "waiting for the first result (a worker that never ran before compiles for half a minute)"
 # Files of a tls:// address, and what Dask's security calls them.
@@ -75,12 +76,13 @@ def in_order(pool: Pool, function: Callable[[Item], Result], items: Sequence[Ite
 
 
 @contextmanager
-def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
+def open_pool(workers: int | None = None, cluster: str | None = None, again: str = AGAIN) -> Iterator[Pool]:
     """Give somewhere for work to run.
 
     Args:
         workers: Processes of this machine; None for this process itself.
         cluster: Address of the scheduler of a running Dask cluster, as `parse_cluster` reads it.
+        again: What to do when work is lost, for messages.
 
     Raises:
         ValueError: For both, or fewer than one worker.
@@ -89,7 +91,7 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
     if workers is not None and cluster is not None:
         raise ValueError("workers and a cluster exclude each other; choose --workers or --cluster")
     if cluster is not None:
-        with _cluster(cluster) as pool:
+        with _cluster(cluster, again) as pool:
             yield pool
     elif workers is not None:
         if workers < 1:
@@ -98,7 +100,7 @@ def open_pool(workers: int | None = None, cluster: str | None = None) -> Iterato
         context = multiprocessing.get_context("spawn")
         executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_as_worker)
         try:
-            yield _Processes(executor, workers)
+            yield _Processes(executor, workers, again)
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
     else:
@@ -122,9 +124,10 @@ class _Here:
 class _Processes:
     shares_disk = True
 
-    def __init__(self, executor: ProcessPoolExecutor, width: int) -> None:
+    def __init__(self, executor: ProcessPoolExecutor, width: int, again: str = AGAIN) -> None:
         self._executor = executor
         self.width = width
+        self._again = again
 
     def unordered(
         self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
@@ -138,8 +141,7 @@ class _Processes:
                 yield futures[future], future.result()
         except BrokenProcessPool:
             raise PoolError(
-                "a worker process ended on its own, perhaps for want of memory; take fewer --workers and go on with "
-                "--resume"
+                f"a worker process ended on its own, perhaps for want of memory; take fewer --workers and {self._again}"
             ) from None
 
     def differences(self) -> list[str]:
@@ -149,10 +151,11 @@ class _Processes:
 class _Dask:
     shares_disk = False
 
-    def __init__(self, client: Any, width: int, address: str = "") -> None:
+    def __init__(self, client: Any, width: int, address: str = "", again: str = AGAIN) -> None:
         self._client = client
         self.width = width
         self._address = address
+        self._again = again
 
     def unordered(
         self, function: Callable[[Item], Result], items: Sequence[Item], say: Say = _silent
@@ -178,17 +181,17 @@ class _Dask:
         except ImportError as error:
             raise self._without_package(error) from None
         except KilledWorker as error:
-            raise PoolError(f"workers of the cluster died over and over: {error}; go on with --resume") from None
+            raise PoolError(f"workers of the cluster died over and over: {error}; {self._again}") from None
         except (CancelledError, OSError) as error:
             raise PoolError(
                 f"the connection to the Dask scheduler at {self._address} was lost: start it again, with its workers, "
-                "and go on with --resume"
+                f"and {self._again}"
             ) from error
 
     def _without_package(self, error: Exception, worker: str = "a worker") -> PoolError:
         return PoolError(
             f"{worker} of the cluster at {self._address} cannot run this: {error}; install drive-env where it runs, "
-            "and go on with --resume"
+            f"and {self._again}"
         )
 
     @contextmanager
@@ -268,7 +271,7 @@ def parse_cluster(text: str) -> tuple[str, dict[str, Any]]:
 
 
 @contextmanager
-def _cluster(address: str) -> Iterator[Pool]:
+def _cluster(address: str, again: str) -> Iterator[Pool]:
     try:
         from distributed import Client
     except ImportError:
@@ -289,7 +292,7 @@ def _cluster(address: str) -> Iterator[Pool]:
         threads = client.nthreads()
         if not threads:
             raise PoolError(f"the cluster at {address} has no workers; start some with `dask worker {address}`")
-        yield _Dask(client, sum(threads.values()), address)
+        yield _Dask(client, sum(threads.values()), address, again)
 
 
 @contextmanager

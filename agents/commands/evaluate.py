@@ -13,12 +13,15 @@ from agents.commands.options import (
     REFUSED,
     Bitrate,
     Channel,
+    Cluster,
     Interface,
     Json,
     Load,
     Nodes,
     Seed,
     Trust,
+    Workers,
+    elsewhere,
     errors_as_exit_codes,
     fail,
     new_folder,
@@ -34,7 +37,9 @@ BUS_EPISODES, EPISODES = 8, 64
 # Times the time that steps should take; share of SYNCs (each tears a hole into a move): from here on worth a word.
 SLOW, LATE = 1.05, 0.0005
 BUS_OPTIONS = ("bus", "interface", "channel", "node")
-NOT_OF_A_GAP = (*BUS_OPTIONS, "bitrate", "device", "episodes", "against", "replay", "sensor")
+OF_A_BUS_ALONE = ("bitrate", "device", "sensor")
+NOT_OF_A_GAP = (*BUS_OPTIONS, *OF_A_BUS_ALONE, "episodes", "against", "replay")
+ELSEWHERE = ("workers", "cluster")
 
 
 def evaluate(
@@ -102,6 +107,8 @@ def evaluate(
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for report, episodes and pictures, new or empty.")
     ] = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     trust: Trust = False,
     yes: Yes = False,
     json: Json = False,
@@ -111,7 +118,8 @@ def evaluate(
     On a bus it acts inside the safety envelope; a policy that gives no number, sticks at its limit, stalls or never
     returns is stopped, and the drives are left at rest and disabled. Their parameters are in a file for
     `drive-tune undo` meanwhile, beside --out or in runs/, and back at the end. `--out` keeps report.json,
-    episodes.npz and pictures. In real time other programs disturb: on Linux, `chrt -f 10 drive-agent evaluate ...` goes
+    episodes.npz and pictures. On the emulator, 64 episodes at a time are a task of --workers or --cluster, to the same
+    bytes. In real time other programs disturb: on Linux, `chrt -f 10 drive-agent evaluate ...` goes
     before them.
     """
     with errors_as_exit_codes():
@@ -128,6 +136,14 @@ def evaluate(
         on_bus = any(was_typed(context, one) for one in BUS_OPTIONS)
         if lockstep and not on_bus and gap is None:
             raise ValueError("--lockstep is of a bus; give its --channel, or --gap")
+        for name in OF_A_BUS_ALONE:
+            if not on_bus and gap is None and was_typed(context, name):
+                raise ValueError(f"--{name} is of a bus; give its --channel, or leave --{name} out")
+        away = [name for name in ELSEWHERE if was_typed(context, name)]
+        if away and (on_bus or gap is not None or replay is not None):
+            raise ValueError(
+                f"--{away[0]} runs episodes of the emulator; leave it out on a bus, with --gap and with --replay"
+            )
         if gap is not None and (extra := [one for one in NOT_OF_A_GAP if was_typed(context, one)]):
             raise ValueError(f"--gap serves machines of its own, an episode each; leave --{extra[0]} out")
         recording = None if replay is None or replay.suffix.lower() == ".csv" else _recording(replay)
@@ -152,6 +168,8 @@ def evaluate(
                     **({} if bitrate is None else {"bitrate": bitrate}))
             if before
             else _on_emulator(loaded, configuration, options)
+            if not away
+            else _elsewhere(loaded, configuration, options, trust, workers, cluster)
         )  # fmt: skip
         gaps: list[str] = []
         if against is not None:
@@ -178,14 +196,12 @@ def _open(
     """Return the policy, its environment filled in (`otherwise` if nobody says it), and the environment's options."""
     import tomllib
 
-    from agents.baselines import BASELINES, baseline
-    from agents.policies import LoadedPolicy, open_policy
-    from agents.tasks import environment_name, make_lanes
+    from agents.policies import LoadedPolicy, is_baseline, open_policy, opened
+    from agents.tasks import environment_name
     from drive_env.envs.randomisation import shipped as shipped_distributions
     from mechanics.untrusted import read_toml
 
-    names = {name for rows in BASELINES.values() for name in rows}
-    loaded = LoadedPolicy(text, None) if text in names else open_policy(text, trust=trust)
+    loaded = LoadedPolicy(text, None) if is_baseline(text) else open_policy(text, trust=trust)
     if environment is not None:
         wanted = environment_name(environment)
         if loaded.environment not in (None, wanted):
@@ -205,10 +221,7 @@ def _open(
             configuration["distributions"] = load if load in shipped_distributions() else None
         configuration["load"] = load
     if loaded.policy is None:
-        lanes: Any = make_lanes(loaded.environment, 1, configuration)
-        actions = lanes.single_action_space.shape[0]
-        lanes.close()
-        loaded.policy = baseline(text, loaded.environment, lanes.config, actions)
+        loaded.policy = opened(text, loaded.environment, configuration).policy
     return loaded, configuration
 
 
@@ -293,6 +306,25 @@ def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, 
             told=show,
             **options,
         )
+
+
+def _elsewhere(
+    loaded: Any,
+    configuration: dict[str, Any],
+    options: dict[str, Any],
+    trust: bool,
+    workers: int | None,
+    cluster: str | None,
+) -> Any:
+    from agents.evaluation_shards import Written, evaluate_elsewhere
+
+    given = {key: options[key] for key in ("name", "episodes", "seed")}
+    written = Written.of(options["name"], trust)
+    with (
+        elsewhere(workers, cluster, "give the command again") as pool,
+        progress_bar(f"{loaded.name}, elsewhere") as show,
+    ):
+        return evaluate_elsewhere(written, loaded.environment, configuration, pool, told=show, **given)
 
 
 def _on_bus(

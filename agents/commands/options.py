@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -20,7 +20,12 @@ from drive_env.tools.options import Json as Json
 from drive_env.tools.options import Nodes as Nodes
 from drive_env.tools.options import ending_by
 from drive_env.tools.options import print_json as print_json
+from tuning.commands.options import Cluster as Cluster
+from tuning.commands.options import Workers as Workers
 from tuning.provenance import run_folder
+
+if TYPE_CHECKING:
+    from tuning.pools import Pool
 
 # Whatever takes long to import (torch, the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
 
@@ -60,6 +65,26 @@ def new_folder(path: Path | None, name: str) -> Path:
 
 
 @contextmanager
+def elsewhere(workers: int | None, cluster: str | None, again: str) -> Iterator[Pool | None]:
+    """Give where work runs that --workers or --cluster moves out of this process, None without either.
+
+    Args:
+        workers: As `open_pool` takes it.
+        cluster: As `open_pool` takes it.
+        again: What to do when work is lost.
+    """
+    if workers is None and cluster is None:
+        yield None
+        return
+    from tuning.pools import open_pool
+
+    with open_pool(workers, cluster, again) as pool:
+        for line in pool.differences():
+            print(f"note: {line}", file=sys.stderr)
+        yield pool
+
+
+@contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
     """Show a bar on stderr while something long goes on, if that is a terminal; what is given takes the share done."""
     if not sys.stderr.isatty():
@@ -77,10 +102,12 @@ def errors_as_exit_codes() -> Iterator[None]:
     from agents.policy import PolicyError
     from drive_env.master.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError
+    from tuning.pools import PoolError
 
     with ending_by(
-        fail, refused=(PolicyError, SafetyError, BusError, RefusedError, TimeoutError), mistakes=(ImportError,)
-    ):
+        fail, refused=(PolicyError, SafetyError, BusError, RefusedError, PoolError, TimeoutError),
+        mistakes=(ImportError,),
+    ):  # fmt: skip
         try:
             yield
         except ModuleNotFoundError as error:

@@ -1,0 +1,89 @@
+"""Episodes of a policy on processes and clusters: the lanes of each round are a task, and give what they do here."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from agents.evaluation import Evaluation, evaluate, lanes_for, summary
+from agents.policies import names_a_file, opened
+from agents.scores import Episode
+from agents.tasks import configuration_of, environment_name, make_lanes
+
+if TYPE_CHECKING:
+    from tuning.pools import Pool
+
+
+class Written(NamedTuple):
+    """A policy as its user wrote it, with the content of its file: whoever opens it needs no disk of ours.
+
+    Attributes:
+        text: What names it.
+        content: Of the file that the text is, None if it is none.
+        trust: As `open_policy` takes it.
+    """
+
+    text: str
+    content: bytes | None
+    trust: bool
+
+    @classmethod
+    def of(cls, text: str, trust: bool) -> Written:
+        """Return what a text names."""
+        return cls(text, Path(text).read_bytes() if names_a_file(text) else None, trust)
+
+    def open(self, environment: str, configuration: Mapping[str, Any]) -> Any:
+        """Return the policy, or the baseline, in an environment with these options."""
+        if self.content is None:
+            return opened(self.text, environment, configuration, trust=self.trust).policy
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / Path(self.text).name
+            path.write_bytes(self.content)
+            return opened(str(path), environment, configuration, trust=self.trust).policy
+
+
+class _Round(NamedTuple):
+    policy: Written
+    environment: str
+    configuration: dict[str, Any]
+    seed: int  # of the first episode
+    episodes: int
+    at_once: int
+
+
+def _run(task: _Round) -> list[Episode]:
+    policy = task.policy.open(task.environment, task.configuration)
+    return evaluate(
+        policy, task.environment, task.configuration, episodes=task.episodes, seed=task.seed, at_once=task.at_once
+    ).episodes
+
+
+def evaluate_elsewhere(
+    policy: Written,
+    environment: str,
+    configuration: Mapping[str, Any],
+    pool: Pool,
+    *,
+    name: str,
+    episodes: int,
+    seed: int,
+    told: Callable[[float], None] = lambda share: None,
+) -> Evaluation:
+    """Run episodes on emulated machines and return what they say, as `evaluate` does, wherever the pool runs them."""
+    environment, options = environment_name(environment), dict(configuration)
+    at_once = lanes_for(episodes)
+    rounds = [
+        _Round(policy, environment, options, seed + first, min(at_once, episodes - first), at_once)
+        for first in range(0, episodes, at_once)
+    ]
+    found: dict[int, list[Episode]] = {}
+    for k, recorded in pool.unordered(_run, rounds):
+        found[k] = recorded
+        told(len(found) / len(rounds))
+    lanes: Any = make_lanes(environment, 1, options)
+    config, complete = lanes.config, configuration_of(lanes)
+    lanes.close()
+    every = [episode for k in range(len(rounds)) for episode in found[k]]
+    return summary(every, config, complete, environment, name, "emulator")
