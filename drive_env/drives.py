@@ -63,7 +63,9 @@ class EmulatedDrives:
         seed: Seed of everything random. Machine k of a seed is the same machine in every set.
         first_machine: Number of the first machine.
         identical: Make every machine the one numbered `first_machine`, its noise included: for comparing gains.
-        randomise: Parameters to draw per machine: True for all, or names or groups ("load", "motor.R_s").
+        randomise: Parameters to draw per machine: True for all, or names or groups ("load", "motor.R_s"). How a motor
+            is wired is drawn with the rest where the drives have factory values; commissioned ones know it, and it is
+            drawn where it is named ("motor.encoder_direction").
         ideal: Take a stage, encoder and bearings without faults.
         parameters: True machine parameters [SI] that replace defaults and draws: one value or one per machine.
         supply: Supply voltage [V]; the motor's by default.
@@ -114,7 +116,7 @@ class EmulatedDrives:
         numbers = (
             [first_machine] * num_machines if identical else list(range(first_machine, first_machine + num_machines))
         )
-        self._draw(seed, numbers, randomise, ideal, parameters or {})
+        self._draw(seed, numbers, randomise, ideal, parameters or {}, wired_as_known=motor is not None)
         self._groups = self._build_groups(physics_steps, integrator, friction)
         self._turn = np.zeros(1, np.int64)
         self._fleet = cycle.Fleet(np.array([group.machinery.address for group in self._groups], np.int64), self._turn)
@@ -274,12 +276,13 @@ class EmulatedDrives:
         randomise: bool | Collection[str],
         ideal: bool,
         given: Mapping[str, ArrayLike],
+        wired_as_known: bool,
     ) -> None:
         axes = (1, self.load.num_axes)
         single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6)
         defaults = {p.name: float(single.get(p.name)[0]) for p in self.load.parameters}
         table = parameter_table(self.device, self.motor, self.load, defaults)
-        self._parameters, noise = draw_parameters(table, seed, numbers, randomise, ideal)
+        self._parameters, noise = draw_parameters(table, seed, numbers, randomise, ideal, wired_as_known=wired_as_known)
         seeds = np.repeat(noise, self.load.num_axes) + np.tile(np.arange(axes[1]), self.num_machines)
         self._noise_seeds = np.mod(seeds, 2.0**32 - 1.0) + 1.0  # xorshift stays at 0 for ever
         for name, value in given.items():
@@ -324,8 +327,6 @@ class EmulatedDrives:
         records["is_dc"] = motor.kind == "dc"
         records["phase_factor"] = 1.0 if motor.kind == "dc" else 1.5
         records["flux_temperature"] = motor.flux_temperature
-        records["hall_true_polarity"] = motor.hall_polarity
-        records["hall_true_direction"] = motor.hall_direction
         records["n_p"] = motor.n_p
         for switch in self.load.switches:
             kind = SWITCHES.index(switch.kind)

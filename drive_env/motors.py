@@ -37,6 +37,8 @@ class Motor(NamedTuple):
     kind: str = "pmsm"
     thermal_time: float = 600.0  # s, winding and housing
     flux_temperature: float = -1.1e-3  # 1/K, of neodymium magnets
+    # How its cable is wired: what 2080h:01, 2070h:01 and 2070h:02 of the drive must say.
+    encoder_direction: int = 0
     hall_polarity: int = 0
     hall_direction: int = 0
 
@@ -140,8 +142,11 @@ MOTORS: dict[str, Motor] = {
             viscous=1.5e-6,
             encoder_line_error=2e-4,
             commutation_offset=0.02,
+            encoder_direction=1,
+            hall_polarity=1,
             source="torque, current, speed, pole pairs, encoder: vendor listing; flux from rated torque over rated "
-            "current; R, L, J are values of its class (L from the maker's demonstration gains)",
+            "current; R, L, J are values of its class (L from the maker's demonstration gains); wiring: what the "
+            "maker's demonstration programs set in the drive",
         ),
         Motor(
             name="ec_i_40",

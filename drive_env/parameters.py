@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from drive_env import motors
 from drive_env.devices import Device
 from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.firmware.sensors import encoder_count
 from drive_env.machine_numbers import machine_numbers
 from drive_env.motors import Motor
 from mechanics.load import Load
@@ -21,6 +22,10 @@ Mask = NDArray[np.bool_]
 Records = NDArray[np.void]
 
 VELOCITY_FILTER_DAMPING = 0.7
+
+
+# How a motor's cable is wired, each 0 or 1: what 2080h:01, 2070h:01 and 2070h:02 must say for the motor to turn.
+WIRING = ("motor.encoder_direction", "motor.hall_polarity", "motor.hall_direction")
 
 
 class MachineParameter(NamedTuple):
@@ -43,6 +48,8 @@ _FIELDS = {
     "motor.thermal_resistance": ("thermal_resistance", 0),
     "motor.thermal_time": ("thermal_time", 0),
     "motor.ambient": ("ambient", 0),
+    "motor.hall_polarity": ("hall_true_polarity", 0),
+    "motor.hall_direction": ("hall_true_direction", 0),
     "motor.hall_offset": ("hall_true_offset", 0),
     "motor.hall_broken": ("hall_broken", 0),
     "motor.encoder_broken": ("encoder_broken", 0),
@@ -115,6 +122,10 @@ def parameter_table(
                 f"load.{parameter.name}", parameter.unit, value, parameter.low * value, parameter.high * value, value
             )
         )
+    # Last, so that all others are drawn as they were without them.
+    for name in WIRING:
+        wired = float(getattr(motor, name.removeprefix("motor.")))
+        rows.append(MachineParameter(name, "1", wired, 0.0, 1.0, wired))
     return {row.name: row for row in rows}
 
 
@@ -130,6 +141,8 @@ def draw_parameters(
     machines: Sequence[int],
     randomise: bool | Collection[str],
     ideal: bool,
+    *,
+    wired_as_known: bool = False,
 ) -> tuple[dict[str, Floats], Floats]:
     """Return each machine's parameters, and the seed of its noise, shape (machines,).
 
@@ -142,16 +155,22 @@ def draw_parameters(
         machines: Numbers of the machines.
         randomise: True draws all, False none; or names, a group's ("load") or a parameter's ("load.inertia").
         ideal: Use ideal values in place of defaults.
+        wired_as_known: Draw no wiring unless it is named itself: for drives that were commissioned for the motor's.
 
     Raises:
         ValueError: If a name is none of a group or parameter.
     """
     chosen = _chosen(table, randomise)
+    if wired_as_known:
+        named = () if isinstance(randomise, bool) else (randomise,) if isinstance(randomise, str) else randomise
+        chosen -= {name for name in WIRING if name not in named}
     noise, shares = machine_numbers(seed, machines, len(table))
     values: dict[str, Floats] = {}
     for k, row in enumerate(table.values()):
         if row.name in chosen:
             values[row.name] = row.low + shares[:, k] * (row.high - row.low)
+            if row.name in WIRING:
+                values[row.name] = np.rint(values[row.name])
         else:
             values[row.name] = np.full(len(machines), row.ideal if ideal else row.default)
     return values, noise
@@ -171,6 +190,11 @@ def check_parameter(name: str, values: Floats) -> None:
     if not np.all(np.isfinite(values)):
         raise ValueError(f"{name} must be finite, not {values[~np.isfinite(values)][0]}")
     if any(word in name for word in _SIGNED) or values.size == 0:
+        return
+    if name in WIRING:
+        other = values[(values != 0.0) & (values != 1.0)]
+        if other.size:
+            raise ValueError(f"{name} must be 0 or 1, as the cable is wired, not {other[0]:g}")
         return
     if name == "stage.adc_bits" and values.min() < 1.0:
         raise ValueError(f"{name} must be 1 or more, not {values.min():g}")
@@ -231,6 +255,7 @@ def apply_to_records(records: Records, device: Device, motor: Motor, name: str, 
             set_lanes(records, _AT_TEMPERATURE[name], values, axes)
         return True
     special: dict[str, Callable[[], None]] = {
+        "motor.encoder_direction": lambda: change_encoder(records, "encoder_true_direction", values, axes),
         "motor.encoder_interpolation": lambda: _set_encoder(records, motor, values, axes),
         "stage.dead_time": lambda: set_lanes(records, "dead_time_duty", values * device.current_rate, axes),
         "stage.adc_gain_error_a": lambda: set_lanes(records, "adc_gain", 1.0 + values, axes, 0),
@@ -242,6 +267,24 @@ def apply_to_records(records: Records, device: Device, motor: Motor, name: str, 
         return False
     special[name]()
     return True
+
+
+def change_encoder(records: Records, field: str, values: Floats, axes: Mask) -> None:
+    """Let encoders count otherwise from here on, by a field of the record: what they have counted they keep."""
+
+    def lanes(name: str) -> Floats:
+        return get_lanes(records, name, len(values)).astype(float)
+
+    def count() -> Floats:
+        edges = (lanes("theta_m") + lanes("encoder_error")) * lanes("encoder_counts") / (2.0 * np.pi)
+        shown: Floats = encoder_count.py_func(edges * lanes("encoder_gain"), lanes("encoder_true_direction"))
+        return shown
+
+    before = count()
+    set_lanes(records, field, values, axes)
+    moved = count() - before
+    for name in ("count", "count_zero"):
+        set_lanes(records, name, lanes(name) + moved, axes)
 
 
 def _set_encoder(records: Records, motor: Motor, interpolation: Floats, axes: Mask) -> None:

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import Gains, scaled, small_time_constants, write_gains
+from drive_env.parameters import WIRING
 from drive_env.positioning import (
     CURRENT,
     CURRENT_ERROR,
@@ -194,7 +195,8 @@ class HiddenScore:
         kind = {f"load.{p.name}": p.field for p in self._drives.load.parameters}
         inertia = np.tile([v.inertia for v in self.variants], self.num_machines)
         stiffness = np.tile([v.stiffness for v in self.variants], self.num_machines)
-        values = {name: np.repeat(value, variants) for name, value in parameters.items()}
+        # Its own drives know how their motors are wired; how they were wired elsewhere changes nothing of the gains.
+        values = {name: np.repeat(value, variants) for name, value in parameters.items() if name not in WIRING}
         for name, field in kind.items():
             if field in _INERTIA:
                 values[name] = values[name] * inertia

@@ -68,7 +68,7 @@ def five(tmp_path_factory):
         yield target, result, before, (gains(drives), settings(drives)), file
 
 
-TUNED = [NORMAL, EMPTY, WILD]
+TUNED = [NORMAL, EMPTY, WILD, REVERSED]
 
 
 @pytest.mark.parametrize("axis", TUNED)
@@ -97,7 +97,7 @@ def test_gains_are_all_that_is_changed_and_the_drives_are_off(five):
 
 @pytest.mark.parametrize(
     ("axis", "words"),
-    [(REVERSED, "encoder counts against"), (SHORT, "travel is too short: 0.008 rad, and 0.2 are needed")],
+    [(SHORT, "travel is too short: 0.008 rad, and 0.2 are needed")],
 )
 def test_what_cannot_be_tuned_gets_its_gains_back_and_the_reason_is_named(five, axis, words):
     _, result, before, after, _ = five
@@ -106,10 +106,20 @@ def test_what_cannot_be_tuned_gets_its_gains_back_and_the_reason_is_named(five, 
     assert words in result.axes[axis].reason
 
 
+def test_a_reversed_encoder_is_seen_and_set_right_and_said(five):
+    target, result, *_ = five
+    right = find_motor("qbl4208").encoder_direction
+    assert target.drives.read(ENCODER_DIRECTION).tolist() == [right] * 5
+    said = f"encoder reversed: 2080h:01 is {right} now, and was {1 - right}"
+    assert [said in axis.notes for axis in result.axes] == [axis == REVERSED for axis in range(5)]
+
+
 def test_the_file_brings_back_what_was(five):
     target, _, before, _, file = five
     restore(target.drives, load_snapshot(file))
     np.testing.assert_array_equal(gains(target.drives), before[0])
+    right = find_motor("qbl4208").encoder_direction
+    assert target.drives.read(ENCODER_DIRECTION).tolist() == [1 - right if k == REVERSED else right for k in range(5)]
 
 
 def test_the_certificate_says_what_was_done(five):

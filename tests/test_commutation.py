@@ -198,9 +198,8 @@ def test_hall_torque_has_the_ripple_of_its_sectors(
     build, true_polarity, polarity, true_direction, direction, true_offset, offset, turned
 ):
     """Current along the sector's middle, 30 degrees off at most: mean factor 3/pi, turned by what is set wrong."""
-    drives = build(48, parameters={**HELD, "motor.hall_offset": math.radians(true_offset)})
-    set_lanes(drives._records, "hall_true_polarity", np.full(48, float(true_polarity)))
-    set_lanes(drives._records, "hall_true_direction", np.full(48, float(true_direction)))
+    wired = {"motor.hall_polarity": true_polarity, "motor.hall_direction": true_direction}
+    drives = build(48, parameters={**HELD, **wired, "motor.hall_offset": math.radians(true_offset)})
     place(drives, around() - math.radians(true_offset))
     drives.write(0x2055, HALL)
     drives.write(HALL_POLARITY, polarity)
@@ -217,8 +216,7 @@ def test_hall_torque_has_the_ripple_of_its_sectors(
 
 def test_halls_wired_in_reverse_turn_nothing(build):
     """The angle runs backwards: the torque's mean over a turn is zero."""
-    drives = build(48, parameters=HELD)
-    set_lanes(drives._records, "hall_true_direction", np.ones(48))
+    drives = build(48, parameters={**HELD, "motor.hall_direction": 1})
     place(drives, around())
     drives.write(0x2055, HALL)
     drives.advance(0.01)
@@ -391,7 +389,13 @@ def test_use_offset_is_the_alignment_from_before(build):
 
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [(ENCODER_DIRECTION, 1), (0x2056, 1), (0x2056, 12), (ENCODER_STEPS, 2048), (ENCODER_STEPS, 40000)],
+    [
+        (ENCODER_DIRECTION, 1 - MOTOR.encoder_direction),
+        (0x2056, 1),
+        (0x2056, 12),
+        (ENCODER_STEPS, 2048),
+        (ENCODER_STEPS, 40000),
+    ],
     ids=["direction", "pole pairs too few", "pole pairs too many", "steps too few", "steps too many"],
 )
 def test_wrong_encoder_direction_pole_pairs_or_steps_end_in_a_fault(build, setting, value):

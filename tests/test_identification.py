@@ -323,10 +323,10 @@ def test_a_brushed_motor_has_no_pole_pairs():
 # --- wiring -----------------------------------------------------------------------------------------------------------
 def test_a_reversed_encoder_is_found_before_torque_is_commanded():
     target = emulated(load="inertia", num_threads=1)
-    target.drives.write("ABN Encoder Settings.Encoder Direction", 1)
+    target.drives.write("ABN Encoder Settings.Encoder Direction", 0)
     found = identify(target)[0]
     assert found.value("encoder_direction") == -1.0
-    assert "2080h:01" in found.estimates["inertia"].reason
+    assert "encoder reversed: write 2080h:01 = 1" in found.estimates["inertia"].reason
     assert np.abs(target.drives.machine.rotor_speed[0]) < 1.0
 
 
@@ -354,7 +354,7 @@ def test_a_ratio_that_is_no_whole_number_fails_the_check_and_no_torque_is_comman
 
 
 @pytest.mark.parametrize(("name", "value", "reason"), [
-    ("ABN Encoder Settings.Encoder Direction", 1, "2080h:01"), ("Motor Pole Pairs", 7, "2056h says 7"),
+    ("ABN Encoder Settings.Encoder Direction", 0, "2080h:01"), ("Motor Pole Pairs", 7, "2056h says 7"),
 ])  # fmt: skip
 def test_three_tenths_of_a_turn_are_enough_to_check_the_wiring(name, value, reason):
     target = emulated(load="inertia", travel=(-0.15 * TURN, 0.15 * TURN), num_threads=1)

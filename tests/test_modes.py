@@ -495,7 +495,7 @@ def test_2058h_never_changes_loop_gain(scaler):
 
 
 def test_2080h_wrong_encoder_direction_does_not_follow(drives):
-    drives.write((0x2080, 1), [0, 1])
+    drives.write((0x2080, 1), [1, 0])  # the encoder of this motor is wired the other way round
     motion.enable(drives, mode="pv")
     drives.write(0x60FF, 500_000)
     drives.advance(0.4)

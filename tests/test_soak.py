@@ -106,6 +106,8 @@ class Soak:
         drives._faults.act(drives._now)
         magnetic, capacitor, driven = self.stored()
         theta, measured, gain = self.lanes("theta_m"), self.lanes("theta_meas"), self.lanes("encoder_gain")
+        wired, told = self.lanes("encoder_true_direction"), self.lanes("encoder_direction")
+        gain = np.where(wired == told, gain, -gain)
         quiet = self.is_quiet()
         quiet[self.moments.pop(drives._now, [])] = False
         group = drives._groups[0]
@@ -203,6 +205,7 @@ def soak(load, seconds, seed):
     run.drives.machine.clear_fault()
     assert run.drives.machine.faults() == []
     assert np.all(run.lanes("encoder_gain") == 1.0)
+    assert np.all(run.lanes("encoder_true_direction") == run.drives.machine.parameters["motor.encoder_direction"])
     assert not run.drives._groups[0].load.plant.jam.any()
     psi = run.drives.machine.parameters["motor.psi_m"]
     np.testing.assert_array_equal(run.lanes("psi_nominal"), psi)  # nothing is left of any fault

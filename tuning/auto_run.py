@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ from drive_env.positioning import POSITION, wrapped
 from tuning.auto_result import AxisRun, Result
 from tuning.ladder import OTHERS
 from tuning.stop_causes import stop_causes
+from tuning.wiring import Key, write_wiring
 
 if TYPE_CHECKING:
     from tuning.certificate import StepResponse
@@ -120,6 +121,10 @@ class Run:
         target = self.target
         here = wrapped(target.drives.read(POSITION) - self._origin) / target.increments()
         return np.minimum(target.low - here, 0.0), np.maximum(target.high - here, 0.0)
+
+    def wire(self, values: Sequence[Mapping[Key, int]]) -> None:
+        """Write the settings that wirings need, of every axis; travel and origin become those that are counted then."""
+        self.target, self._origin = write_wiring(self.target, self._origin, values)
 
     @property
     def look_back_time(self) -> Floats:

@@ -13,6 +13,7 @@ from drive_env import motion
 from drive_env.gains import GAIN_OBJECTS, Gains, write_gains
 from tuning.auto_run import MODE
 from tuning.snapshot import Transaction, restore
+from tuning.wiring import FINDINGS, Key, changes, corrected
 from tuning.working_state import BOTH_ENDS, INPUTS, LIMIT_SWITCHES, MOTOR_TYPE
 
 if TYPE_CHECKING:
@@ -41,18 +42,38 @@ def begin(run: Run) -> None:
 
 
 def commission(run: Run) -> None:
-    """Tell a drive that is fresh from the factory which motor it has; identification looks after itself."""
+    """Tell a drive that is fresh from the factory which motor it has, and any how that is wired.
+
+    Identification did so, too, but left drives as they were.
+    """
     target = run.target
     run.fresh = run.going & (target.drives.read(MOTOR_TYPE) == 0)
+    _wire(run)
     if not run.fresh.any():
         return
-    for name, value in _commissioning(target).items():
-        target.drives.write(name, value, where=run.fresh)
+    for name, value in zip(_keys(target, names := _commissioning(target)), names.values(), strict=True):
+        if name not in FINDINGS:
+            target.drives.write(name, value, where=run.fresh)
     # No axis is at both ends: switches that say so are not there.
     unwired = run.fresh & (target.drives.read(INPUTS) & BOTH_ENDS == BOTH_ENDS)
     target.drives.write(LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
     run.note(unwired, "both limit switches were active, which no axis can be at: they are ignored (2005h)")
     run.note(run.fresh, f"fresh from the factory: commissioned for {target.motor.name} first")
+
+
+def _wire(run: Run) -> None:
+    """Write what the wiring needs: as it was seen, and where nothing was, as a fresh drive's motor is known to be."""
+    target = run.target
+    preset = _commissioning(target)
+    known = {key: value for key, value in zip(_keys(target, preset), preset.values(), strict=True) if key in FINDINGS}
+    wanted: list[dict[Key, int]] = []
+    for k, axis in enumerate(run.axes):
+        seen = {} if axis.identified is None else axis.identified.wiring
+        needed = known | {key: one.needs for key, one in seen.items()} if run.fresh[k] else changes(seen)
+        wanted.append(needed if run.going[k] else {})
+        if run.going[k] and not run.fresh[k]:
+            axis.notes += corrected(seen)
+    run.wire(wanted)
 
 
 def write(run: Run, transaction: Transaction) -> Mask:
@@ -75,6 +96,7 @@ def write(run: Run, transaction: Transaction) -> Mask:
         if run.fresh[k]:
             commissioned = [*_keys(run.target, _commissioning(run.target)), (LIMIT_SWITCHES, 0)]
             wanted |= {key: int(drives.read(key)[k]) for key in commissioned if key in values}
+        wanted |= {key: int(drives.read(key)[k]) for key in FINDINGS if key in values}
         axes.append(wanted | {key: int(column[k]) for key, column in kept.items()})
     restore(drives, replace(transaction.before, axes=tuple(axes)), going, whole=False)
     for axis in np.flatnonzero(going):

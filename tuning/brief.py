@@ -71,6 +71,7 @@ class _Brief(Experiments):
     """Those experiments, with another middle."""
 
     thorough = False
+    corrects = True  # a tuner is to leave a drive that turns
 
     def __init__(self, target: Target, where: NDArray[np.bool_], progress: Progress) -> None:
         super().__init__(target, where, progress)

@@ -1,9 +1,9 @@
-"""Pole pairs and direction of the encoder: the field is turned in open loop, and the encoder must follow it.
+"""Pole pairs, and which way encoder and halls are wired: the field is turned in open loop, and they must follow it.
 
 With commutation in open loop (2055h) the current of 2004h points along an angle that the velocity demand turns
 (2102h). The rotor follows: electrical turns of the field over turns that the encoder counts are the pole pairs, and
 the sign says whether it counts in the direction in which the field turns. Commutation by encoder needs both to be
-right before any torque is commanded: a reversed encoder makes a motor run away.
+right before any torque is commanded: a reversed encoder makes a motor run away. So do halls where they commutate.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from tuning.identification import Estimate, refused
 from tuning.stop_causes import stop_causes
+from tuning.wiring import Halls, judge_halls
 from tuning.working_state import (
     BY_FIELD,
     COMMUTATION,
@@ -35,7 +36,7 @@ from tuning.working_state import (
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FIELD_ANGLE, ENCODER_ANGLE = 0x2102, 0x2103  # 1/65536 electrical turn
+FIELD_ANGLE, HALL_ANGLE = 0x2102, 0x2104  # 1/65536 electrical turn
 RAISE, REST, TURN = 20, 60, 240  # cycles: the current comes (gravity does not wait), the rotor rests, the field turns
 MOST_TURN, LEAST_TURN = 1.0, 0.2  # electrical turns of the field
 SHARE = 0.9  # of what current there is
@@ -51,6 +52,7 @@ class EncoderCheck(NamedTuple):
     pole_pairs: Estimate
     direction: Estimate
     ratio: float = math.nan  # of the field's turns to the encoder's, where the rotor followed
+    halls: Halls = Halls()
 
     @property
     def is_good(self) -> bool:
@@ -81,7 +83,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
         drives.write(COMMUTATION, BY_FIELD, where=where)
         drives.write(OPEN_LOOP_CURRENT, 0, where=where)
         enable(working, "csv", where)
-        away, back, field, reasons = _turn(working, where, configured)
+        away, back, field, halls, reasons = _turn(working, where, configured)
         alive = still_enabled(working, drives.read(STATUS))
     finally:
         switch_off(drives, where)
@@ -101,7 +103,8 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
             )
             found.append(EncoderCheck(refused("1", reason), refused("1", reason)))
         else:
-            found.append(_judge(field[k], shaft[k] * away[k], shaft[k] * back[k], target.motor.n_p))
+            check = _judge(field[k], shaft[k] * away[k], shaft[k] * back[k], target.motor.n_p)
+            found.append(check._replace(halls=halls[k]) if check.direction.is_known else check)
     return found
 
 
@@ -131,11 +134,12 @@ def _way(working: Working) -> tuple[Floats, Mask]:
     return sign * way * n_p, np.asarray(way >= LEAST_TURN * 2.0 * np.pi / n_p)
 
 
-def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Floats, Floats, list[str]]:
+def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Floats, Floats, list[Halls], list[str]]:
     """Turn the fields there and back.
 
     Returns:
-        How far the rotors went [rad], there and back, and the fields [rad], and why an axis was not turned.
+        How far the rotors went [rad], there and back, and the fields [rad], what the halls said on the way there, and
+        why an axis was not turned.
     """
     drives = working.target.drives
     current = np.rint(1e3 * SHARE * working.current).astype(np.int64)
@@ -148,26 +152,29 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     turn = np.where(able, turn, 0.0)
     # Smooth, so that the rotor does not swing: a raised cosine of speed.
     shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(TURN) + 0.5) / TURN)
-    fields = [_field(working)]
+    seen = [(_angle(working, FIELD_ANGLE), _angle(working, HALL_ANGLE))]
     for sign in (1.0, -1.0):
         speed = sign * turn / configured / (TURN * CYCLE) * shape[:, None]
         raw = np.where(where, np.rint(speed * working.increments), 0).astype(np.int64)
         raw[-1] = 0
         passed = np.zeros(len(turn))
-        before = fields[-1]
+        before = _angle(working, FIELD_ANGLE)
         for k in range(0, TURN, TURN // 10):
             drives.record([POSITION], TURN // 10 * CYCLE, play={TARGET_VELOCITY: raw[k : k + TURN // 10]})
-            now = _field(working)
+            now = _angle(working, FIELD_ANGLE)
+            if sign > 0.0:
+                seen.append((now, _angle(working, HALL_ANGLE)))
             passed += (now - before + np.pi) % (2.0 * np.pi) - np.pi
             before = now
             stay_inside(working, where)
-        fields.append(before)
         stands.append(_rest(working))
         if sign > 0.0:
             turned = passed
     short = f"{TOO_SHORT}: the field pulled the rotor to where less than {LEAST_TURN:g} electrical turns are free"
     reasons = [short if chosen and not can else "" for chosen, can in zip(where, able, strict=True)]
-    return stands[1] - stands[0], stands[2] - stands[1], turned, reasons
+    field, hall = np.array(seen).transpose(1, 2, 0)
+    halls = [judge_halls(*both) for both in zip(field, hall, strict=True)]
+    return stands[1] - stands[0], stands[2] - stands[1], turned, halls, reasons
 
 
 def stay_inside(working: Working, where: Mask) -> None:
@@ -178,8 +185,8 @@ def stay_inside(working: Working, where: Mask) -> None:
         switch_off(working.target.drives, out)
 
 
-def _field(working: Working) -> Floats:
-    return np.asarray(working.target.drives.read(FIELD_ANGLE) * (2.0 * np.pi / 65536.0))
+def _angle(working: Working, name: int) -> Floats:
+    return np.asarray(working.target.drives.read(name) * (2.0 * np.pi / 65536.0))
 
 
 def _rest(working: Working) -> Floats:

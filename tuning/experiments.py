@@ -19,10 +19,16 @@ from tuning.standstill import standstill_resistances
 from tuning.stop_causes import stop_causes
 from tuning.target import Target, timed
 from tuning.winding import Winding, identify_winding, pulse, to_torque_mode
+from tuning.wiring import FINDINGS, Settings, changes, finding, needed, write_wiring
 from tuning.working_state import (
+    ALIGNED_BY_HALLS,
+    BY_ENCODER,
+    BY_HALLS,
+    COMMUTATION,
     CURRENT,
     CYCLE,
     GUESS,
+    INIT_MODE,
     STATUS,
     Working,
     cautious_bandwidth,
@@ -61,6 +67,7 @@ class Experiments:
     """
 
     thorough = True  # also what only tells better what is told
+    corrects = False  # drives that somebody set up go on with what their wiring needs, too
 
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
         self.target, self.where, self.progress = target, where, progress
@@ -69,6 +76,7 @@ class Experiments:
         self.found: list[dict[str, Estimate]] = [
             {name: refused(UNITS[name], "not asked for") for name in NAMES} for _ in range(target.num_axes)
         ]
+        self._wiring: list[Settings] = [{} for _ in range(target.num_axes)]
 
     def run(self) -> list[Identification]:
         """Do them all."""
@@ -83,8 +91,8 @@ class Experiments:
                         self.turn(replace(working, where=good))
                 self.calm(working)
         self.progress("done", 1.0)
-        return [Identification(found, clock.seconds if chosen else 0.0)
-                for found, chosen in zip(self.found, self.where, strict=True)]  # fmt: skip
+        return [Identification(found, clock.seconds if chosen else 0.0, wiring=wiring)
+                for found, chosen, wiring in zip(self.found, self.where, self._wiring, strict=True)]  # fmt: skip
 
     def begin(self, what: str, share: float, names: tuple[str, ...]) -> None:
         """Tell what is under way and the share done; what it and all after it are to say has these names."""
@@ -108,7 +116,7 @@ class Experiments:
     def check(self, working: Working) -> Mask:
         """Check the encoders and return the axes whose torque may be commanded."""
         self.begin("pole pairs and encoder", 0.0, NAMES)
-        checks: list[EncoderCheck] = check_encoders(working)
+        checks = self._corrected(working, check_encoders(working))
         good = working.where.copy()
         for k in np.flatnonzero(working.where):
             check = checks[k]
@@ -121,13 +129,44 @@ class Experiments:
             self._at_rest = standstill_resistances(replace(working, where=good))
         return good
 
+    def _corrected(self, working: Working, checks: list[EncoderCheck]) -> list[EncoderCheck]:
+        """Set drives up for the wiring that was seen, where they may be, and look again; it is taken back."""
+        has = {key: working.target.drives.read(key) for key in FINDINGS}
+        again = np.zeros(len(checks), bool)
+        for k in map(int, np.flatnonzero(working.where)):
+            own = {key: int(values[k]) for key, values in has.items()}
+            self._wiring[k] = needed(own, checks[k].direction.value, checks[k].halls)
+            again[k] = bool(changes(self._wiring[k])) and (self.corrects or working.fresh[k])
+        # What its halls aligned when it was first enabled stays so until it is switched off.
+        again &= ~_aligned_by_halls(working)
+        if not again.any():
+            return checks
+        values = [changes(wiring) if chosen else {} for wiring, chosen in zip(self._wiring, again, strict=True)]
+        working.target, working.origin = write_wiring(working.target, working.origin, values)
+        second = check_encoders(replace(working, where=again))
+        for k in np.flatnonzero(again):
+            if not second[k].is_good:
+                self._wiring[k] = {}  # it does not do what the drive was told
+        return [new if chosen else old for old, new, chosen in zip(checks, second, again, strict=True)]
+
     def _wrong(self, working: Working, k: int, check: EncoderCheck) -> str:
         """Return why no torque may be commanded, if so."""
         target = working.target
+        remedy = "; ".join(finding(self._wiring[k]))
+        if remedy and _aligned_by_halls(working)[k]:
+            return (
+                f"{remedy}, then switch the drive off and on, since its halls tell it the encoder's angle (2080h:03), "
+                "and identify again"
+            )
         if not check.is_good:
             return (
-                "the encoder counts against the field, and torque would make the motor run away: turn 2080h:01 (or "
-                "swap two motor phases), then identify again"
+                "the encoder counts against the field, and torque would make the motor run away: "
+                f"{remedy or 'the drive does not heed 2080h:01'} (or swap two motor phases), then identify again"
+            )
+        if target.drives.read(COMMUTATION)[k] == BY_HALLS and (check.halls.reversed or check.halls.inverted):
+            return (
+                "the halls do not tell the angle of the field, and torque would lock the motor: "
+                f"{remedy or 'the drive does not heed 2070h'}, then identify again"
             )
         configured = int(target.drives.read(POLE_PAIRS)[k])
         if check.pole_pairs.is_known and round(check.pole_pairs.value) != configured:
@@ -265,6 +304,13 @@ class Experiments:
         for name in names:
             if not self.found[k][name].is_known and self.found[k][name].reason in ("", "not asked for"):
                 self.found[k][name] = refused(UNITS[name], reason)
+
+
+def _aligned_by_halls(working: Working) -> Mask:
+    """Return which drives commutate by an encoder that the halls align."""
+    drives = working.target.drives
+    by_encoder = drives.read(COMMUTATION) == BY_ENCODER
+    return np.asarray(by_encoder & (drives.read(INIT_MODE) == ALIGNED_BY_HALLS))
 
 
 def _in_real_time(working: Working) -> bool:

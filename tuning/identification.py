@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from tuning.target import Target
+    from tuning.wiring import Settings
 
 Mask = NDArray[np.bool_]
 Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
@@ -59,11 +60,14 @@ class Identification:
         drive_time: Time that passed on the drive [s].
         told: What is identified, by the same names, where `estimates` have guesses that only a tuner should work with;
             None where they have none.
+        wiring: What is known of the cable: the settings that encoder and halls need, by object, and what the drive has.
+            With others than it needs, its motor runs away or is locked.
     """
 
     estimates: Mapping[str, Estimate]
     drive_time: float
     told: Mapping[str, Estimate] | None = None
+    wiring: Settings = field(default_factory=dict)
 
     def value(self, name: str) -> float:
         """Return a value, nan where it was refused."""

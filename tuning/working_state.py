@@ -19,6 +19,7 @@ from drive_env import motion
 from drive_env.gains import GAIN_OBJECTS, gains_from_bandwidths, write_gains
 from drive_env.motors import Motor
 from tuning.target import Target
+from tuning.wiring import FINDINGS
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -29,17 +30,19 @@ POSITION, VELOCITY, CURRENT, DEMANDED = 0x6064, 0x606C, 0x6077, 0x6062
 TARGET_TORQUE, TARGET_VELOCITY, TARGET_POSITION, STATUS = 0x6071, 0x60FF, 0x607A, 0x6041
 TORQUE_P, TORQUE_I, TORQUE_SUM = (0x2041, 1), (0x2041, 2), (0x2041, 4)
 MOTOR_TYPE, COMMUTATION, POLE_PAIRS, OPEN_LOOP_CURRENT = 0x2050, 0x2055, 0x2056, 0x2004
-MAX_CURRENT, ENCODER_DIRECTION, ENCODER_STEPS, SHAFT_DIRECTION = 0x2003, (0x2080, 1), (0x2080, 2), 0x2057
+MAX_CURRENT, ENCODER_STEPS, SHAFT_DIRECTION = 0x2003, (0x2080, 2), 0x2057
 FOLLOWING_WINDOW, LIMIT_SWITCHES, INPUTS, MOTOR_FLAGS, INIT_MODE = 0x6065, 0x2005, 0x60FD, 0x2101, (0x2080, 3)
 BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
 STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is aligned
 # What experiments change, in the order in which it is given back.
 CHANGED = (
-    MAX_CURRENT, OPEN_LOOP_CURRENT, *GAIN_OBJECTS, MOTOR_TYPE, COMMUTATION, POLE_PAIRS, ENCODER_STEPS, 0x6083, 0x6084,
-    0x6085, FOLLOWING_WINDOW, LIMIT_SWITCHES, TARGET_VELOCITY, TARGET_POSITION, TARGET_TORQUE, (0x60C2, 1), (0x60C2, 2),
+    MAX_CURRENT, OPEN_LOOP_CURRENT, *GAIN_OBJECTS, MOTOR_TYPE, COMMUTATION, POLE_PAIRS, ENCODER_STEPS, *FINDINGS,
+    0x6083, 0x6084, 0x6085, FOLLOWING_WINDOW, LIMIT_SWITCHES, TARGET_VELOCITY, TARGET_POSITION, TARGET_TORQUE,
+    (0x60C2, 1), (0x60C2, 2),
 )  # fmt: skip
 BRUSHED, BRUSHLESS = 1, 3  # 2050h
-BY_FIELD, BY_ENCODER = 1, 3  # 2055h
+BY_FIELD, BY_HALLS, BY_ENCODER = 1, 2, 3  # 2055h
+ALIGNED_BY_HALLS = 2  # 2080h:03
 
 CURRENT_HZ, VELOCITY_HZ, POSITION_HZ = 300.0, 20.0, 5.0  # cautious bandwidths, of data sheet values
 INTEGRATION = 5.0  # T_i as a multiple of 1/w_v
@@ -61,6 +64,7 @@ class Working:
         origin: Position of every axis when the target was made known [inc].
         increments: Position increments per radian.
         current: Most that may be asked for [A], of every axis: the target's limit, or the drive's own if that is lower.
+        fresh: Axes whose drives knew no motor.
     """
 
     target: Target
@@ -68,6 +72,7 @@ class Working:
     origin: Integers
     increments: Floats
     current: Floats
+    fresh: Mask
 
     @property
     def base(self) -> Floats:
@@ -152,7 +157,7 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
     drives.write(FOLLOWING_WINDOW, _raw(200.0 * math.pi * scale), where=axes)
     drives.write((0x60C2, 1), 1, where=axes)
     drives.write((0x60C2, 2), -3, where=axes)
-    return Working(target, axes, drives.read(POSITION), increments, current)
+    return Working(target, axes, drives.read(POSITION), increments, current, fresh)
 
 
 def _give_back(target: Target, axes: Mask, before: Mapping[Any, Integers], mode: Integers) -> None:

@@ -58,13 +58,14 @@ def _multiplied(sound: Floats, given: Given, rated: float) -> Floats:
 
 
 ENCODER_GAIN = Quantity("record", "encoder_gain")
+ENCODER_DIRECTION = Quantity("record", "encoder_true_direction")
 ENCODER_NOISE = Quantity("record", "encoder_noise")
 
 # Temperatures act on R_s and psi_m each millisecond, so what is changed is their value at 25 degC.
 CHANGES: dict[str, tuple[Change, ...]] = {
     "encoder_lost_counts": (Change(ENCODER_GAIN, lambda sound, given, rated: sound * (1.0 - given["share"])),),
     "encoder_stuck": (Change(ENCODER_GAIN, _vanished),),
-    "encoder_reversed": (Change(ENCODER_GAIN, lambda sound, given, rated: -sound),),
+    "encoder_reversed": (Change(ENCODER_DIRECTION, lambda sound, given, rated: 1.0 - sound),),
     "encoder_noise": (Change(ENCODER_NOISE, lambda sound, given, rated: np.hypot(sound, given["angle"])),),
     "halls_lost": (_record("hall_broken", _broken),),
     "current_offset": (_record("adc_offset_error", lambda sound, given, rated: sound + given["current"]),),

@@ -12,10 +12,19 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.faults.effects import ENCODER_GAIN, ENCODER_NOISE, MOMENTS, Change, Quantity, changes_of
+from drive_env.faults.effects import (
+    ENCODER_DIRECTION,
+    ENCODER_GAIN,
+    ENCODER_NOISE,
+    MOMENTS,
+    Change,
+    Quantity,
+    changes_of,
+)
 from drive_env.faults.schedule import ENABLED, NEVER, NO_CONDITION, Condition, Order, cycles_of
 from drive_env.faults.table import Row, checked_parameters, find_fault
 from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.parameters import change_encoder
 
 if TYPE_CHECKING:
     from drive_env.drives import EmulatedDrives
@@ -323,27 +332,15 @@ class MachineFaults:
             for group in drives._groups:
                 group.load.set(quantity.name, per_machine[group.machines], machines[group.machines])
             drives._refresh_inertia()
-        elif quantity == ENCODER_GAIN:
-            self._set_encoder_gain(values, axes)
+        elif quantity in (ENCODER_GAIN, ENCODER_DIRECTION):
+            change_encoder(drives._records, quantity.name, values, axes)
         else:
             set_lanes(drives._records, quantity.name, values, axes, quantity.part)
-
-    def _set_encoder_gain(self, gain: Floats, axes: Mask) -> None:
-        """Let encoders count otherwise from here on: an incremental encoder keeps what it has counted."""
-        records, count = self._drives._records, self._drives.num_axes
-
-        def lanes(name: str) -> Floats:
-            return get_lanes(records, name, count).astype(float)
-
-        edges = (lanes("theta_m") + lanes("encoder_error")) * lanes("encoder_counts") / TWO_PI
-        now, then = np.floor(edges * lanes("encoder_gain")), np.floor(edges * gain)
-        set_lanes(records, "encoder_gain", gain, axes)
-        for name in ("count", "count_zero"):
-            set_lanes(records, name, lanes(name) + then - now, axes)
 
     def _jump(self, angle: float, axes: Mask) -> None:
         """Put the counters off by an angle [rad], as if so many edges came within one sample."""
         records, count = self._drives._records, self._drives.num_axes
-        counts = np.rint(angle * get_lanes(records, "encoder_counts", count).astype(float) / TWO_PI)
+        forwards = 1.0 - 2.0 * get_lanes(records, "encoder_true_direction", count).astype(float)
+        counts = np.rint(angle * forwards * get_lanes(records, "encoder_counts", count).astype(float) / TWO_PI)
         for name in ("count", "count_zero"):
             set_lanes(records, name, get_lanes(records, name, count).astype(float) - counts, axes)

@@ -25,7 +25,14 @@ from drive_env.firmware.power_stage import (
     refresh_winding,
 )
 from drive_env.firmware.record import LANES, RECORD
-from drive_env.firmware.sensors import measure_angle, measure_currents, measure_halls, measure_motion, shake_encoders
+from drive_env.firmware.sensors import (
+    encoder_count,
+    measure_angle,
+    measure_currents,
+    measure_halls,
+    measure_motion,
+    shake_encoders,
+)
 from mechanics import stepping
 from mechanics.bundle import Bundle, Cube, Matrix, Numbers, reader
 from mechanics.calls import call_hook, next_number
@@ -457,7 +464,7 @@ def power_on(records, where):
         count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI)
         gain = drive.encoder_gain[lane]
         told = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI * gain
-        drive.count[lane] = np.floor(told)
+        drive.count[lane] = encoder_count(told, drive.encoder_true_direction[lane])
         drive.count_zero[lane] = drive.count[lane]
         drive.angle_zero[lane] = (
             drive.n_p[lane] * (count + 0.5) * TWO_PI / drive.encoder_counts[lane] + drive.commutation_offset[lane]

@@ -132,6 +132,7 @@ PARAMETERS = (
     Field("thermal_resistance", "f8", "K/W", "winding to ambient", 1.0),
     Field("thermal_time", "f8", "s", "of winding and housing", 600.0),
     Field("ambient", "f8", "K", "ambient temperature above 0 degC", 25.0),
+    Field("encoder_true_direction", "f8", "", "1: channels A and B are exchanged, the encoder counts backwards"),
     Field("hall_true_polarity", "f8", "", "1: the halls' levels are inverted"),
     Field("hall_true_direction", "f8", "", "1: the halls are wired in reverse order"),
     Field("hall_true_offset", "f8", "rad", "electrical angle of the rotor at the first edge"),
@@ -144,7 +145,7 @@ PARAMETERS = (
     Field("encoder_line_phase", "f8", "rad", "phase of that error"),
     Field("commutation_offset", "f8", "rad", "error of the electrical angle after alignment"),
     # Faults that come and go (drive_env/faults); a sound machine has the initial values.
-    Field("encoder_gain", "f8", "1", "counts per true count: below 1 some are lost, 0 stuck, -1 counts backwards", 1.0),
+    Field("encoder_gain", "f8", "1", "counts per true count: below 1 some are lost, 0 stuck", 1.0),
     Field("encoder_noise", "f8", "rad", "rms noise of the encoder's angle"),
     Field("wired", "i4", "", "inputs (bits of 60FDh) that a switch is connected to"),
     Field("enable_input", "i4", "", "1: the enable input is closed", 1),

@@ -33,6 +33,16 @@ def shake_encoders(drive):
 
 
 @inlined
+def encoder_count(edges, backwards):
+    """Return what the counter shows after so many edges, whole or not: counted backwards below 0 where that is 1.
+
+    Edge 0 lies between 0 and -1, however it is wired: the drive's own direction, 2080h:01, gives the same angle again.
+    """
+    count = np.floor(edges)
+    return count + backwards * (-1.0 - 2.0 * count)
+
+
+@inlined
 def measure_motion(drive, h):
     """Read the encoder at the velocity loop's rate, period h [s]: writes theta_meas, omega_meas.
 
@@ -42,7 +52,8 @@ def measure_motion(drive, h):
     for lane in range(LANES):
         s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
         drive.encoder_error[lane] = drive.encoder_line_error[lane] * s + drive.encoder_shake[lane]
-        count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.counts_per_rad[lane])
+        edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.counts_per_rad[lane]
+        count = encoder_count(edges, drive.encoder_true_direction[lane])
         before = drive.count[lane]
         count = before if drive.encoder_broken[lane] > 0.5 else count
         shaft = 1.0 - 2.0 * drive.shaft_direction[lane]
@@ -106,7 +117,8 @@ def measure_halls(drive, dt):
 def measure_angle(drive, dt):
     """Find the electrical angle of the commutation in use, every current tick of dt [s]: writes sin_meas, cos_meas."""
     for lane in range(LANES):
-        count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.counts_per_rad[lane])
+        edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.counts_per_rad[lane]
+        count = encoder_count(edges, drive.encoder_true_direction[lane])
         count = drive.count[lane] if drive.encoder_broken[lane] > 0.5 else count
         turns = (count - drive.count_zero[lane]) * drive.turns_per_count[lane]
         encoder = drive.angle_zero[lane] + drive.pole_pairs[lane] * turns * TWO_PI

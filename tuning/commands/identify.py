@@ -86,15 +86,20 @@ def identify(
 
 def row(found: Identification) -> dict[str, Any]:
     """Return an identification as JSON knows it: nan, which it does not know, is null."""
+    from tuning.wiring import named
+
     estimates = {
         name: {key: None if isinstance(value, float) and not math.isfinite(value) else value
                for key, value in estimate._asdict().items()}
         for name, estimate in found.estimates.items()
     }  # fmt: skip
-    return {"drive_time": found.drive_time, "estimates": estimates}
+    wiring = {named(key): setting._asdict() for key, setting in found.wiring.items()}
+    return {"drive_time": found.drive_time, "estimates": estimates, "wiring": wiring}
 
 
 def _print(found: list[Identification]) -> None:
+    from tuning.wiring import finding
+
     columns = (Column("", "text"), Column("value"), Column("95 % interval", "text"), Column("unit", "name"))
     for axis, one in enumerate(found):
         head = f"axis {axis}: " if len(found) > 1 else ""
@@ -109,3 +114,5 @@ def _print(found: list[Identification]) -> None:
                 rows.append((TITLES[name], "-", "as above" if estimate.reason == said else estimate.reason, ""))
                 said = estimate.reason
         print_table(columns, rows, f"{head}{one.drive_time:.1f} s of drive time")
+        for line in finding(one.wiring):
+            print(f"{head}{line}")

@@ -1,0 +1,147 @@
+"""How a motor's cable is wired, as the field shows it, and the settings with which a drive makes up for that.
+
+The field turns in open loop and takes the rotor along; what encoder and halls then tell says which way they are wired.
+2080h:01 makes up for a reversed encoder, 2070h:01 for halls of inverted level, 2070h:02 for halls in reverse order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.safety.rotor import wrapped
+
+if TYPE_CHECKING:
+    from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Key = tuple[int, int]
+
+ENCODER_DIRECTION, HALL_POLARITY, HALL_DIRECTION = (0x2080, 1), (0x2070, 1), (0x2070, 2)
+# What is wrong with a cable where the drive is set otherwise than it is wired.
+FINDINGS: dict[Key, str] = {
+    ENCODER_DIRECTION: "encoder reversed",
+    HALL_POLARITY: "hall levels inverted",
+    HALL_DIRECTION: "halls in reverse order",
+}
+POSITION = 0x6064
+SETTLED = 0.002  # s after which a position is told in the new direction
+
+LEAST_HALL_TURN = 2.6  # electrical rad of the field: two edges at least, from wherever it begins
+HALL_SLACK = 0.5  # by which their way may differ from the field's: a sector of three
+CLEAR = np.radians(60.0)  # of what their angle is off: beyond half a sector and what friction holds the rotor back
+
+
+class Halls(NamedTuple):
+    """What the halls say of one axis: whether they count against the field, and stand opposite to it; None unknown."""
+
+    reversed: bool | None = None
+    inverted: bool | None = None
+    reason: str = ""
+
+
+class Setting(NamedTuple):
+    """What an object is, and what the wiring needs it to be."""
+
+    has: int
+    needs: int
+
+
+Settings = Mapping[Key, Setting]
+
+
+def judge_halls(field: Floats, halls: Floats) -> Halls:
+    """Return what angles of the field and of the halls [electrical rad] say, shape (n,), read while the field turns."""
+
+    def turned(angle: Floats) -> float:
+        return float(_wrapped(np.diff(angle)).sum())
+
+    way = turned(field)
+    if abs(way) < LEAST_HALL_TURN:
+        return Halls(reason=f"the field turned {abs(way):.2g} rad, and {LEAST_HALL_TURN:g} are needed for the halls")
+    ratio = turned(halls) / way
+    if abs(abs(ratio) - 1.0) > HALL_SLACK:
+        return Halls(reason=f"the halls turned {ratio:.2g} times as far as the field: are they connected?")
+    backwards = ratio < 0.0
+    off = float(np.angle(np.exp(1j * (halls - np.sign(ratio) * field)).mean()))
+    if CLEAR < abs(off) < np.pi - CLEAR:
+        return Halls(backwards, None, f"the halls are off by {np.degrees(off):.0f} degrees: correct 2070h:04")
+    return Halls(backwards, abs(off) > 0.5 * np.pi)
+
+
+def needed(reads: Mapping[Key, int], encoder: float, halls: Halls) -> Settings:
+    """Return the settings that a wiring needs, as far as it is known.
+
+    Args:
+        reads: The objects as they are.
+        encoder: 1 where the encoder counts with the field, -1 against it, nan where it is not known.
+        halls: What they say.
+    """
+    found = {
+        ENCODER_DIRECTION: None if np.isnan(encoder) else encoder < 0.0,
+        HALL_POLARITY: halls.inverted,
+        HALL_DIRECTION: halls.reversed,
+    }
+    return {key: Setting(reads[key], reads[key] ^ wrong) for key, wrong in found.items() if wrong is not None}
+
+
+def changes(settings: Settings) -> dict[Key, int]:
+    """Return what must be written."""
+    return {key: one.needs for key, one in settings.items() if one.has != one.needs}
+
+
+def finding(settings: Settings) -> list[str]:
+    """Return in words what is wrong, with the remedy: "encoder reversed: write 2080h:01 = 1"."""
+    return [f"{FINDINGS[key]}: write {named(key)} = {value}" for key, value in changes(settings).items()]
+
+
+def corrected(settings: Settings) -> list[str]:
+    """Return in words what was wrong, once it is written: "encoder reversed: 2080h:01 is 1 now, and was 0"."""
+    wrong = changes(settings)
+    return [f"{FINDINGS[key]}: {named(key)} is {wrong[key]} now, and was {settings[key].has}" for key in wrong]
+
+
+def named(key: Key) -> str:
+    """Return an object as the manual writes it."""
+    return f"{key[0]:04X}h:{key[1]:02d}"
+
+
+def write_wiring(target: Target, origin: Integers, values: Sequence[Mapping[Key, int]]) -> tuple[Target, Integers]:
+    """Write settings of axes that are off, and return the target and where its rotors had begun [inc], as then counted.
+
+    A drive that counts the other way shows another position where the rotor is, and nobody knows whether a travel was
+    meant in the old direction or in the new: what is left is free to both sides.
+
+    Args:
+        target: The axes.
+        origin: Their positions where the travel was given.
+        values: What to write, by object, of every axis.
+    """
+    drives, increments = target.drives, target.increments()
+    before, counted = drives.read(POSITION), drives.read(ENCODER_DIRECTION)
+    for key in FINDINGS:
+        where = np.array([key in axis for axis in values])
+        if where.any():
+            drives.write(key, np.array([axis.get(key, 0) for axis in values], np.int64), where=where)
+    turned = drives.read(ENCODER_DIRECTION) != counted
+    if not turned.any():
+        return target, origin
+    drives.advance(SETTLED)
+    gone = wrapped(before - origin)
+    now = wrapped(drives.read(POSITION) + gone)
+    free = np.minimum(-target.low, target.high)
+    # A place to either side, so that the travel still holds where the rotor stands.
+    here = np.abs(gone) / increments
+    room = np.where(turned, np.maximum(free, here), np.inf)
+    narrowed = replace(target, low=np.maximum(target.low, -room), high=np.minimum(target.high, room))
+    return narrowed, np.where(turned, now, origin)
+
+
+def _wrapped(angle: Floats) -> Floats:
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
