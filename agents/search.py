@@ -186,7 +186,7 @@ def _sampler(known: Any, seed: int) -> Any:
     """Return Optuna's own sampler, which draws from what is known in place of what the study has meanwhile."""
     from optuna.samplers import TPESampler
 
-    class FromTheRoundsBefore(TPESampler):
+    class FromTheRoundsBefore(TPESampler):  # type: ignore[misc]  # Optuna has no types
         def sample_independent(self, _study: Any, trial: Any, name: str, distribution: Any) -> Any:
             return super().sample_independent(known, trial, name, distribution)
 

@@ -26,6 +26,9 @@ logger = logging.getLogger(__name__)
 
 _DIGEST = hashlib.sha256().digest_size
 
+# What is logged of each kernel that is not there, with its name, before and after it is compiled; at level DEBUG.
+COMPILING, COMPILED = "compiling the kernel %s", "compiled the kernel %s"
+
 
 class KernelCache(FunctionCache):  # type: ignore[misc]  # Numba has no types
     """Numba's cache of a function's kernels, with files of ours.
@@ -65,8 +68,7 @@ class KernelFiles:
         try:
             content = path.read_bytes()
         except OSError:
-            _tell_compiling()
-            return None
+            return self._missing()
         digest, data = content[:_DIGEST], content[_DIGEST:]
         if hashlib.sha256(data).digest() == digest:
             with suppress(Exception):  # whole and ours, but perhaps of another version of what Numba stands on
@@ -75,10 +77,11 @@ class KernelFiles:
                     return kernel
         logger.warning("the compiled kernel %s is damaged or of another version; it is compiled anew", path)
         _remove(path)
-        return None
+        return self._missing()
 
     def save(self, key: Any, kernel: Any) -> None:
         """Keep a kernel; where that is impossible (disk full, folder gone), say so once and go on without."""
+        logger.debug(COMPILED, self._name)
         data = dumps((self._identity(key), kernel))
         path = self._path(key)
         beside = path.with_name(f"{path.name}.{uuid.uuid4().hex[:16]}")  # two processes may write the same kernel
@@ -94,6 +97,10 @@ class KernelFiles:
         """Forget what was kept."""
         for path in self._folder.glob(f"{self._name}.*.kernel"):
             _remove(path)
+
+    def _missing(self) -> None:
+        _tell_compiling()
+        logger.debug(COMPILING, self._name)
 
     def _identity(self, key: Any) -> str:
         """Return all that a kernel depends on besides the sources in the folder's name, as text."""

@@ -7,18 +7,24 @@ import io
 import json
 import logging
 import os
+import re
 import subprocess
 import sys
 import warnings
+from collections import defaultdict
+from contextlib import contextmanager, nullcontext
 
 import pytest
 import typer
+from numba.core import event
+from rich.console import Console
 from typer.testing import CliRunner
 
 import agents.cli
 import drive_env.cli
 import tuning.cli
-from drive_env.tools import compiling
+from drive_env.tools import compile_bar, compiling
+from drive_env.tools.options import progress_on
 from drive_env.tools.program import Quiet, Verbose, say_as_much
 from mechanics import kernel_files
 
@@ -125,8 +131,18 @@ def test_kernels_are_compiled_ahead_and_once():
 @pytest.mark.slow
 def test_after_that_drives_and_environments_compile_nothing(tmp_path):
     cache = {"DRIVE_ENV_CACHE": str(tmp_path)}
-    done = run("drive-env", "compile", **cache)
+    counted = (
+        "import sys; sys.stderr.isatty = lambda: True\n"
+        "from drive_env.tools import compile_bar, compiling\n"
+        "bar = compile_bar.show_compiling(); compiling.compile_kernels(); print('functions', bar.done)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", counted], env=os.environ | cache, capture_output=True, text=True, check=True
+    )
     assert "kernels in " in done.stdout, done.stderr
+    # What the bar's length is made of is what Numba compiles, about.
+    functions = int(done.stdout.split()[-1])
+    assert functions == pytest.approx(sum(compile_bar.FUNCTIONS.values()), rel=0.15)
     again = run("drive-env", "--verbose", "compile", **cache)
     assert "nothing to compile" in again.stdout
     assert "compiling" not in again.stderr
@@ -140,23 +156,69 @@ def test_kernels_that_cannot_be_kept_are_told(tmp_path, monkeypatch):
     assert f"no kernel could be kept in {tmp_path / 'none'}; name a folder" in result.stderr
 
 
-@pytest.mark.parametrize(("terminal", "quiet", "told"), [(True, False, 1), (True, True, 0), (False, False, 0)])
-def test_a_cold_start_says_once_that_it_compiles_where_somebody_sits_before_it(monkeypatch, terminal, quiet, told):
-    class Stream(io.StringIO):
-        def isatty(self) -> bool:
-            return terminal
-
-    kernels = logging.getLogger("mechanics.kernel_files")
+# --- a cold start ---------------------------------------------------------------------------------------------------
+@pytest.fixture
+def compiling_seen(monkeypatch):
+    """What compiles three kernels of two functions each; returns what stderr got."""
+    kernels = logging.getLogger(compile_bar.KERNELS)
     monkeypatch.setattr(kernels, "handlers", [])
     monkeypatch.setattr(kernels, "level", kernels.level)
-    monkeypatch.setattr(kernels, "propagate", True)
-    monkeypatch.setattr(sys, "stderr", Stream())
+    monkeypatch.setattr(event, "_registered", defaultdict(list))
+    monkeypatch.setattr(compile_bar, "shown", [])
+    monkeypatch.setattr(compile_bar, "FUNCTIONS", dict.fromkeys(compile_bar.ALWAYS, 2))
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERM", "xterm")
     kernel_files._tell_compiling.cache_clear()
-    try:
+
+    def compile_all(folder, terminal, quiet, around=nullcontext):
+        class Stream(io.StringIO):
+            def isatty(self) -> bool:
+                return terminal
+
+        monkeypatch.setattr(sys, "stderr", Stream())
+        monkeypatch.setattr(logging.getLogger(), "handlers", [])  # pytest's, which none of our programs has
         with warnings.catch_warnings():
             say_as_much(quiet, False)
-        for _ in range(2):
-            kernel_files._tell_compiling()
-        assert sys.stderr.getvalue().count("compiling the kernels: once for this installation") == told
-    finally:
-        logging.disable(logging.NOTSET)
+        with around():
+            for name in compile_bar.ALWAYS:
+                files = kernel_files.KernelFiles(folder, f"{name}-1.py311", "stamp")
+                assert files.load("key") is None
+                for _ in range(2):
+                    with event.trigger_event("numba:compile"):
+                        pass
+                files.save("key", "kernel")
+                assert files.load("key") == "kernel"
+        return sys.stderr.getvalue()
+
+    yield compile_all
+    logging.disable(logging.NOTSET)
+
+
+def test_a_cold_start_says_so_with_a_bar_that_counts_what_is_compiled(compiling_seen, tmp_path):
+    seen = compiling_seen(tmp_path, terminal=True, quiet=False)
+    assert seen.count("compiling the kernels: once for this installation") == 1
+    bar = logging.getLogger(compile_bar.KERNELS).handlers[0]
+    assert (bar.done, bar.total) == (6, 6)
+    # 80 columns hold it, it went on from kernel to kernel, and it left the terminal as it was.
+    shares = [int(share) for share in re.findall(r"compiling, once .*?(\d+)%", seen)]
+    assert shares == sorted(shares) and {0, 33, 67, 100} <= set(shares)
+    assert seen.count("\x1b[?25l") == seen.count("\x1b[?25h") == 3  # the cursor
+
+
+def test_it_is_a_line_of_the_bars_that_are_there(compiling_seen, tmp_path):
+    @contextmanager
+    def working():
+        with progress_on(Console(file=io.StringIO())), progress_on(Console(file=sys.stderr)) as bars:
+            bars.add_task("working", total=1.0)
+            yield
+            assert [task.visible for task in bars.tasks] == [True, False]
+
+    seen = compiling_seen(tmp_path, terminal=True, quiet=False, around=working)
+    assert "compiling, once" in seen and seen.count("\x1b[?25l") == 1
+
+
+@pytest.mark.parametrize(("terminal", "quiet", "lines"), [(False, False, 1), (False, True, 0), (True, True, 0)])
+def test_without_a_terminal_it_is_a_line_and_with_quiet_nothing(compiling_seen, tmp_path, terminal, quiet, lines):
+    seen = compiling_seen(tmp_path, terminal, quiet)
+    assert seen.count("compiling the kernels: once for this installation") == lines
+    assert len(seen.splitlines()) == lines

@@ -324,6 +324,7 @@ def _elsewhere(
         elsewhere(workers, cluster, "give the command again") as pool,
         progress_bar(f"{loaded.name}, elsewhere") as show,
     ):
+        assert pool is not None
         return evaluate_elsewhere(written, loaded.environment, configuration, pool, told=show, **given)
 
 

@@ -182,6 +182,18 @@ def progress_on(console: Console, *, transient: bool = False) -> Progress:
     """Return bars for a console: what is under way, the share done and the time since; transient ones vanish."""
     from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
+    from drive_env.tools.compile_bar import shown
+
+    class Bars(Progress):
+        def start(self) -> None:
+            shown.append(self)
+            super().start()
+
+        def stop(self) -> None:
+            if self in shown:
+                shown.remove(self)
+            super().stop()
+
     columns = (
         SpinnerColumn(),
         TextColumn("{task.description}"),
@@ -189,7 +201,7 @@ def progress_on(console: Console, *, transient: bool = False) -> Progress:
         TaskProgressColumn(),
         TimeElapsedColumn(),
     )
-    return Progress(*columns, console=console, transient=transient, disable=is_quiet())
+    return Bars(*columns, console=console, transient=transient, disable=is_quiet())
 
 
 def print_json(value: Any) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import importlib.metadata
 import logging
-import sys
 import warnings
 from typing import Annotated
 
 import typer
+
+from drive_env.tools.compile_bar import show_compiling
 
 PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
 
@@ -37,12 +38,8 @@ def say_as_much(quiet: bool, verbose: bool) -> None:
     if quiet:
         warnings.simplefilter("ignore")
         logging.disable(logging.WARNING)
-    elif sys.stderr.isatty():
-        # Whoever sits before a terminal that is silent for half a minute thinks that it hangs.
-        kernels = logging.getLogger("mechanics.kernel_files")
-        kernels.setLevel(logging.INFO)
-        kernels.addHandler(logging.StreamHandler())
-        kernels.propagate = False
+    else:  # a program that is silent for half a minute seems to hang
+        show_compiling()
     if verbose:
         logging.basicConfig(format="%(message)s")
         for name in PACKAGES:

@@ -7,7 +7,6 @@ import os
 import secrets
 import signal
 import sys
-import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -24,11 +23,9 @@ if TYPE_CHECKING:
 
 PORT = 29636  # no service is registered there, and no system gives it to others
 LOOPBACK = "127.0.0.1"
-PATIENCE = 8.0  # s after which a user wants to know what takes so long
 AUTO = "auto"  # as --token
 NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then hears nobody
 TOKEN_BYTES = 12  # of chance: 16 characters
-COMPILING = "drive-env: compiling the kernels, once; about 30 seconds"
 # SDO of any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1 synchronous.
 WARM_UP_REQUESTS = tuple(
     bytes.fromhex(text)
@@ -179,11 +176,7 @@ def _server(
             _fail(f"{error}; say --token auto, --token TEXT of 8 characters or more, or --listen {LOOPBACK}")
     else:
         transport = _can_port(interface, channel, bus.bit_rate)
-    waiting = threading.Timer(PATIENCE, lambda: print(COMPILING, file=sys.stderr, flush=True))
-    waiting.daemon = True
-    waiting.start()
     _warm_up(bus)
-    waiting.cancel()
     return Server(world, transport)
 
 

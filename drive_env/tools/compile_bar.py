@@ -1,0 +1,108 @@
+"""What a cold start shows on stderr while Numba compiles the kernels: a line, and on a terminal a bar."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+KERNELS = "mechanics.kernel_files"  # who logs what is compiled
+# Functions that Numba compiles for a kernel, its stages included, if those above were compiled before. Whatever runs
+# drives takes the first three.
+FUNCTIONS = {
+    "cycle.power_on": 22, "cycle.write_events": 29, "cycle.run": 72, "process_image.from_od": 2,
+    "process_image.to_od": 2, "tracking_cycle.describe_lanes": 3, "tracking_cycle.act": 5, "tracking_cycle.observe": 1,
+    "exchange.convert_in": 2, "exchange.convert_out": 2,
+}  # fmt: skip
+ALWAYS = ("cycle.power_on", "cycle.write_events", "cycle.run")
+OF_OTHERS = 1
+
+# Bars that are on the terminal now, the last on top: a second display beside one would tear both.
+shown: list[Progress] = []
+
+
+def show_compiling() -> CompileBar:
+    """Let a program show what is compiled from now on, and return what shows it."""
+    kernels = logging.getLogger(KERNELS)
+    for handler in [one for one in kernels.handlers if isinstance(one, CompileBar)]:
+        kernels.removeHandler(handler)
+    bar = CompileBar()
+    kernels.addHandler(bar)
+    kernels.setLevel(logging.DEBUG)
+    return bar
+
+
+class CompileBar(logging.Handler):
+    """Shows what `mechanics.kernel_files` logs: lines as they are, kernels as a bar whose parts are functions."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.done = self.total = 0
+        self._needed: set[str] = set()
+        self._own: Progress | None = None  # made where no other bars are
+        self._bars: Progress | None = None
+        self._task: TaskID | None = None
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show a record."""
+        from mechanics.kernel_files import COMPILED, COMPILING
+
+        if record.levelno > logging.DEBUG:
+            if not logging.getLogger().handlers:  # with --verbose the log has it
+                print(record.getMessage(), file=sys.stderr, flush=True)
+        elif sys.stderr.isatty() and record.msg == COMPILING:
+            self._begin(str(record.args[0]).partition("-")[0] if isinstance(record.args, tuple) else "")
+        elif record.msg == COMPILED:
+            self._end()
+
+    def count(self) -> None:
+        """Count a function that was compiled."""
+        self.done += 1
+        self.total = max(self.total, self.done)
+        if self._bars is not None and self._task is not None:
+            self._bars.update(self._task, completed=self.done, total=self.total)
+
+    def _begin(self, kernel: str) -> None:
+        from rich.console import Console
+
+        from drive_env.tools.options import progress_on
+
+        if not self._needed:
+            self._watch()
+        needed = set(ALWAYS if kernel in ALWAYS else [kernel]) - self._needed
+        self._needed |= needed
+        self.total += sum(FUNCTIONS.get(name, OF_OTHERS) for name in needed)
+        self._end()
+        self._own = self._own or progress_on(Console(file=sys.stderr), transient=True)
+        bars = next((one for one in reversed(shown) if one.console.is_terminal), self._own)
+        if bars is not self._bars or self._task is None:
+            self._bars, self._task = bars, bars.add_task("compiling, once", total=self.total)
+        # Kernel after kernel it is the same bar, which goes on counting the time.
+        bars.update(self._task, completed=self.done, total=self.total, visible=True)
+        if bars is self._own:
+            bars.start()
+
+    def _end(self) -> None:
+        if self._bars is not None and self._task is not None:
+            if self._bars is self._own:
+                self._bars.stop()
+            self._bars.update(self._task, visible=False)
+
+    def _watch(self) -> None:
+        from numba.core import event
+
+        bar = self
+
+        class Listener(event.Listener):  # type: ignore[misc]  # Numba has no types
+            def on_start(self, _event: Any) -> None:
+                pass
+
+            def on_end(self, _event: Any) -> None:
+                bar.count()
+
+        event.register("numba:compile", Listener())
+        atexit.register(self._end)  # a terminal gets its cursor back, whatever ends the program
