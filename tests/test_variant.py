@@ -24,6 +24,8 @@ from drive_env.dictionary.access import CANNOT_BE_STORED, READ_ONLY, VALUE_RANGE
 from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
 from drive_env.firmware.record import set_lanes
 from drive_env.master.errors import BusError
+from drive_env.safety.errors import SafetyError
+from drive_env.safety.limits import Limits
 from drive_env.speeds import per_increment
 from tuning.experiment import load_experiment, resolve
 from tuning.moves import POSITIONS, SPEEDS, MoveCounter
@@ -445,6 +447,40 @@ def test_on_a_bus_it_is_the_same_to_the_integer(safety):
         assert far.device.name == NAME
         for told, known in zip(programme(far), programme(near), strict=True):
             np.testing.assert_array_equal(told, known)
+
+
+@pytest.mark.parametrize("device", [BASE.name, NAME])
+def test_the_envelope_holds_speeds_and_ramps_in_whatever_they_count(device):
+    with on_a_bus(device) as drives:
+        for refused, taken in (("6001 rpm", "5999 rpm"), ("-6001 rpm", "-5999 rpm")):
+            drives.write("Target velocity", taken)
+            with pytest.raises(SafetyError, match=r"60FFh:00 Target velocity = .* is beyond the limit (6000|6553600);"):
+                drives.write("Target velocity", refused)
+        drives.write("Target velocity", 0)
+        # A quick stop within a second is what torques want of 6,000 rpm.
+        drives.write("Quick stop deceleration", "99 rev/s^2")
+        with pytest.raises(SafetyError, match=r"6085h = (5940|6488064) is too slow .* 6085h at (6000|6553600) or more"):
+            motion.enable(drives, mode="cst")
+        # In pv it is the limit of speed, then: 300 rpm.
+        motion.disable(drives)
+        drives.write("Quick stop deceleration", "5 rev/s^2")
+        drives.write("Target velocity", "299 rpm")
+        with pytest.raises(SafetyError, match=r"limit (300|327680); .* the quick stop's ramp, 6085h: no axis may be"):
+            drives.write("Target velocity", "301 rpm")
+        drives.write("Target velocity", "250 rpm")
+        motion.enable(drives, mode="pv")
+        drives.advance(0.2)
+        with pytest.raises(SafetyError, match=r"6085h:00 .* would not stop it within 1 s from its 2[0-9]{5} pps"):
+            drives.write("Quick stop deceleration", "4 rev/s^2")
+
+
+@pytest.mark.parametrize("device", [BASE.name, NAME])
+def test_the_envelope_stops_an_axis_that_is_faster_than_its_limit(device):
+    turn = {BASE.name: TURN / 60.0, NAME: 1.0}[device]
+    with on_a_bus(device, safety=Limits(velocity=400 * turn)) as drives:
+        motion.enable(drives, mode="cst")
+        with pytest.raises(SafetyError, match="606Ch:00 Velocity actual value"):
+            drives.record([0x606C], 0.5, {0x6071: np.full(500, 800)})
 
 
 # --- who reads speeds -------------------------------------------------------------------------------------------------
