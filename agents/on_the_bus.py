@@ -51,6 +51,7 @@ def target_for(
     """
     from drive_env.can_drives import CanDrives
     from drive_env.safety.limits import Limits
+    from drive_env.speeds import per_increment
     from tuning.target import FREE, LOCKSTEP_PATIENCE, on_bus
 
     more: dict[str, Any] = {"device": device, "interface": interface, "channel": channel, "nodes": nodes}
@@ -64,9 +65,10 @@ def target_for(
         lanes.close()
         with CanDrives(**more) as drives:
             turn, at = drives.read(POSITION_SCALER), drives.read(0x6064)
+            speed_turn = turn * per_increment(drives, 0x606C)
         reach = POSITION_SLACK * amplitude * turn
         position = ((at - reach).tolist(), (at + reach).tolist())
-        velocity = (SPEED_SLACK * speed * turn).tolist()
+        velocity = (SPEED_SLACK * speed * speed_turn).tolist()
     # A trial of gains may oscillate: it sees that and stops the lane by itself.
     oscillation = environment_name(environment) != "ServoDrive/GainTuning-v0"
     limits = Limits(position=position, velocity=velocity, oscillation=oscillation, stall=guard.stall)

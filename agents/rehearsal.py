@@ -132,7 +132,7 @@ def _state(target: Target, axis: int) -> Iterator[Check]:
                                    "once; remove its cause first")  # fmt: skip
     else:
         yield Check("state", OK, text)
-    speed = abs(_read(target, 0x606C, axis)) / target.increments()[axis]
+    speed = abs(_read(target, 0x606C, axis)) / target.speed_counts()[axis]
     if speed > AT_REST * target.speed:
         yield Check("standstill", NO, f"the axis turns at {speed:.3g} rad/s; bring it to rest")
     else:
@@ -288,7 +288,7 @@ LOOKS = (_identity, _state, _answers, _samples, _error_control, _motor, _supply,
 def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, str, bool]]:
     """Yield the objects that a run writes: which, between which limits, what for, and whether that stays."""
     turn = target.increments()
-    speed = round(float(np.max(target.speed * turn)))
+    speed = round(float(np.max(target.speed * target.speed_counts())))
     ends = target.low * turn, target.high * turn
     here = target.drives.read(0x6064)
     finite = all(np.isfinite(end).all() for end in ends)

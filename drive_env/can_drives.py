@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.arguments import checked_mask, object_names, whole_cycles
+from drive_env.devices import device_of, find_device
 from drive_env.dictionary.access import ObjectAccessError, check_readable, check_writable, checked_values
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.emergency import EmergencyMessage
@@ -431,7 +432,7 @@ class CanDrives:
         known = self._description.dictionary
         for k, node in enumerate(self.nodes):
             axis = k * self._description.num_axes
-            self._wake(node, axis)
+            kind = self._wake(node, axis)
             for key, what in _IDENTITY.items():
                 if not self._description.has(key):
                     continue
@@ -442,18 +443,33 @@ class CanDrives:
                         f"node {node} is not a {self._description.name}: its {what} ({entry.label}) is {found:X}h, and "
                         f"the EDS says {entry.default:X}h; give its own EDS (eds=..., --eds)"
                     )
+            self._check_variant(node, kind)
             if self._description.has(_EMCY_COB_ID):
                 self._network.move_emergencies(node, self.read_axis(known.find(_EMCY_COB_ID), axis))
 
-    def _wake(self, node: int, axis: int) -> None:
-        """Have a node answer; one that is stopped, as it is after a master died, is woken first."""
+    def _check_variant(self, node: int, kind: int) -> None:
+        """Raise BusError for a node that is another variant of the device, which may count in other units."""
+        name, known = self._description.name, self._description.dictionary
+        if self.device is None or kind == known.find(_DEVICE_TYPE).default:
+            return
+        vendor, product = (int(known.find((0x1018, sub)).default) for sub in (1, 2))
+        other = device_of(kind, vendor, product)
+        if other is not None and find_device(other).new_dictionary().find(_DEVICE_TYPE).default == kind:
+            raise BusError(
+                f"node {node} is a {other}, not a {name}: its device type (1000h:00) is {kind:08X}h; name it so "
+                f"(device={other!r}, --device {other})"
+            )
+
+    def _wake(self, node: int, axis: int) -> int:
+        """Have a node answer, and return its 1000h; one that is stopped, as it is after a master died, is woken."""
         entry = self._description.dictionary.find(_DEVICE_TYPE)
         try:
-            self.read_axis(entry, axis)
+            return int(self.read_axis(entry, axis))
         except NoAnswerError:
             self._network.command(PRE_OPERATIONAL, (node,))
-            self.read_axis(entry, axis)
+            kind = int(self.read_axis(entry, axis))
             logger.warning("node %d was stopped (a master that died?) and is pre-operational now", node)
+            return kind
 
     def _enter(self) -> None:
         if self._closed:

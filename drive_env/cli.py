@@ -8,6 +8,7 @@ import typer
 
 from drive_env.tools.check_model import check_model
 from drive_env.tools.compiling import compile_kernels
+from drive_env.tools.eds import print_eds
 from drive_env.tools.fault import fault
 from drive_env.tools.get import get, set_object
 from drive_env.tools.jog import jog
@@ -40,7 +41,7 @@ PANELS = {
         ("jog", jog),
     ),
     "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
-    "This installation": (("list", list_names), ("compile", compile_kernels)),
+    "This installation": (("list", list_names), ("eds", print_eds), ("compile", compile_kernels)),
     "Frames": (("log", log), ("replay", replay)),
     "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("check-model", check_model)),
 }

@@ -136,9 +136,12 @@ class EmulatedDrives:
         self._faults = MachineFaults(self)
         self.machine = Machines(self)
         preset = {} if motor is None else self.device.preset(motor)
-        if motor is not None and not self.load.has_switches:
-            preset = {"Limit switches": 3, **preset}
+        if motor is not None:
+            preset = {"Limit switches": 0 if self.load.has_switches else 3, **preset}
         self._objects = LiveDictionary(self.device, self._records, self.num_axes, preset)
+        serial = self.device.canopen.objects.get("serial_number")
+        if serial is not None:
+            self._objects.engrave(serial, np.repeat(np.array(numbers) + 1, self.load.num_axes))
         self._objects.restart(np.ones(self.num_axes, bool))
         self._scale: tuple[int, list[float | None]] = (-1, [])
 

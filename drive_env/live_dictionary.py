@@ -83,6 +83,18 @@ class LiveDictionary:
         entry = self.entries.find(name)
         self._set_value(entry, checked_values(entry, raw, self.num_axes), np.ones(self.num_axes, bool))
 
+    def engrave(self, name: ObjectName, raw: ArrayLike, where: Mask | None = None) -> None:
+        """Set what a read-only object shows for ever, a serial number for instance, of the axes where the mask is true.
+
+        Its range is checked.
+        """
+        entry = self.entries.find(name)
+        values = checked_values(entry, raw, self.num_axes)
+        axes = np.ones(self.num_axes, bool) if where is None else where
+        self._set_value(entry, values, axes)
+        key = (entry.index, entry.sub)
+        self._stored[key] = np.where(axes, values, self._stored[key])
+
     def restart(self, axes: Mask) -> None:
         """Restore the stored values of the axes where the mask is true, and start their firmware anew."""
         before = self._context()

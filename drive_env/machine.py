@@ -202,14 +202,19 @@ class Machines:
 
     @property
     def analog_inputs(self) -> NDArray[np.int64]:
-        """Readings of the analog inputs (270Eh), 0...4095, shape (2, num_axes); set them likewise."""
-        return np.stack([self._drives.read((0x270E, k)) for k in (1, 2)])
+        """Readings of the analog inputs (270Eh), 0...4095, shape (inputs, num_axes); set them likewise."""
+        return np.stack([self._drives.read(key) for key in self._analog_inputs()])
 
     @analog_inputs.setter
     def analog_inputs(self, value: ArrayLike) -> None:
-        values = np.broadcast_to(np.asarray(value), (2, self._drives.num_axes))
-        for k, raw in enumerate(values, 1):
-            self._drives._objects.impose((0x270E, k), raw)
+        keys = self._analog_inputs()
+        values = np.broadcast_to(np.asarray(value), (len(keys), self._drives.num_axes))
+        for key, raw in zip(keys, values, strict=True):
+            self._drives._objects.impose(key, raw)
+
+    def _analog_inputs(self) -> list[tuple[int, int]]:
+        entries = self._drives._objects.entries
+        return [(entry.index, entry.sub) for entry in entries if entry.index == 0x270E and entry.sub > 0]
 
     @property
     def temperatures(self) -> tuple[Floats, Floats]:

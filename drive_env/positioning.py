@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import motion
 from drive_env.motors import Motor
+from drive_env.speeds import per_increment
 
 if TYPE_CHECKING:
     from mechanics.load import Load
@@ -37,7 +38,7 @@ DEMAND, STATUS = 0x6062, 0x6041
 
 
 class Move(NamedTuple):
-    """A positioning move: 607Ah from rest at 0, 6081h and 6083h, and what it is in SI, each of shape (num_axes,)."""
+    """A positioning move: 607Ah from rest at 0, its speed and ramp, and what it is in SI, each of shape (num_axes,)."""
 
     distance: Integers  # inc, with its sign
     velocity: Integers  # pps
@@ -88,9 +89,9 @@ def power_up(drives: motion.Drives, where: Mask | None = None) -> None:
 
 def write_profile(drives: motion.Drives, move: Move, where: Mask | None = None) -> None:
     """Write the speed and the ramps of a move."""
-    drives.write(0x6081, move.velocity, where=where)
-    drives.write(0x6083, move.acceleration, where=where)
-    drives.write(0x6084, move.acceleration, where=where)
+    for name, value in ((0x6081, move.velocity), (0x6083, move.acceleration), (0x6084, move.acceleration)):
+        # Rounded up, where a drive counts in rpm: the profile ends in time.
+        drives.write(name, np.ceil(value * per_increment(drives, name)).astype(np.int64), where=where)
 
 
 def start(drives: motion.Drives, target: Integers, where: Mask | None = None) -> None:

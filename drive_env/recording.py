@@ -107,7 +107,7 @@ class Recorder:
         """Remember how things stand now, once per period, while someone else lets time pass.
 
         Args:
-            wanted: What a master follows that sends the drives something else: position [inc] and velocity [inc/s],
+            wanted: What a master follows that sends the drives something else: position [inc] and velocity [60FFh],
                 (num_axes,) each.
         """
         none = np.full(self.num_axes, np.nan)

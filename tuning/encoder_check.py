@@ -155,7 +155,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     seen = [(_angle(working, FIELD_ANGLE), _angle(working, HALL_ANGLE))]
     for sign in (1.0, -1.0):
         speed = sign * turn / configured / (TURN * CYCLE) * shape[:, None]
-        raw = np.where(where, np.rint(speed * working.increments), 0).astype(np.int64)
+        raw = np.where(where, np.rint(speed * working.speed_counts()), 0).astype(np.int64)
         raw[-1] = 0
         passed = np.zeros(len(turn))
         before = _angle(working, FIELD_ANGLE)

@@ -18,6 +18,7 @@ from drive_env.devices import Device, find_device
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.motors import find_motor
+from drive_env.speeds import per_increment_of
 from mechanics.loads import find_load
 from mechanics.untrusted import read_toml
 from tuning.metrics import TRACKING, metric_names
@@ -66,13 +67,13 @@ class Excitation:
     acceleration_rpm_per_s: float | None = None
     acceleration_pps2: float | None = None
 
-    def raw_velocity(self, position_scaler: int) -> int:
-        """Return the step as 60FFh wants it [pps], for a scaler [inc/rev]."""
-        return _raw(self.velocity_rpm, self.velocity_pps, position_scaler)
+    def raw_velocity(self, entry: Entry, position_scaler: int) -> int:
+        """Return the step as 60FFh wants it, for a scaler [inc/rev]."""
+        return _raw(self.velocity_rpm, self.velocity_pps, entry, position_scaler)
 
-    def raw_acceleration(self, position_scaler: int) -> int:
-        """Return the profile acceleration as 6083h wants it [pps^2]."""
-        return _raw(self.acceleration_rpm_per_s, self.acceleration_pps2, position_scaler)
+    def raw_acceleration(self, entry: Entry, position_scaler: int) -> int:
+        """Return the profile acceleration as 6083h wants it."""
+        return _raw(self.acceleration_rpm_per_s, self.acceleration_pps2, entry, position_scaler)
 
 
 @dataclass(frozen=True)
@@ -130,8 +131,8 @@ class Resolved(NamedTuple):
     device: Device
     entries: tuple[Entry, ...]
     position_scaler: int  # inc/rev
-    velocity: int  # pps
-    acceleration: int  # pps^2
+    velocity: int  # as 60FFh counts it
+    acceleration: int  # as 6083h does
 
 
 def load_experiment(config: str | Path | None = None, **overrides: Any) -> Experiment:
@@ -182,8 +183,8 @@ def resolve(experiment: Experiment) -> Resolved:
     scaler = {dictionary.find(name).label: value for name, value in preset.items()}.get(
         dictionary.find(POSITION_SCALER).label, scaler
     )
-    velocity = experiment.excitation.raw_velocity(scaler)
-    acceleration = experiment.excitation.raw_acceleration(scaler)
+    velocity = experiment.excitation.raw_velocity(dictionary.find(TARGET_VELOCITY), scaler)
+    acceleration = experiment.excitation.raw_acceleration(dictionary.find(ACCELERATION), scaler)
     for key, raw, target in (("velocity", velocity, TARGET_VELOCITY), ("acceleration", acceleration, ACCELERATION)):
         entry = dictionary.find(target)
         assert entry.low is not None and entry.high is not None, "both are numbers"
@@ -312,11 +313,11 @@ def _is_multiple(value: float, unit: float) -> bool:
     return abs(round(value / unit) * unit - value) < 1e-9
 
 
-def _raw(in_rpm: float | None, in_pps: float | None, position_scaler: int) -> int:
-    """Return pps from rpm, or pps^2 from rpm/s."""
+def _raw(in_rpm: float | None, in_pps: float | None, entry: Entry, position_scaler: int) -> int:
+    """Return a speed in rpm or pps, or an acceleration in rpm/s or pps^2, as the object counts it."""
     value = in_rpm * position_scaler / 60.0 if in_rpm is not None else in_pps
     assert value is not None, "the parser lets exactly one through"
-    return round(value)
+    return round(value * per_increment_of(entry.unit, position_scaler))
 
 
 # --- the TOML ---------------------------------------------------------------------------------------------------------

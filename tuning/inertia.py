@@ -193,7 +193,7 @@ def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
     error = np.zeros(len(begin))
     for k in range(0, len(plan.speed), CORRECTION):
         part = plan.speed[k : k + CORRECTION] + np.clip(FOLLOW * error, -0.3 * fastest, 0.3 * fastest)
-        raw = np.where(working.where, np.rint(part * working.increments), 0).astype(np.int64)
+        raw = np.where(working.where, np.rint(part * working.speed_counts()), 0).astype(np.int64)
         trace = drives.record([POSITION, CURRENT, STATUS], len(raw) * CYCLE, play={TARGET_VELOCITY: raw})
         angles.append(working.angle(trace[POSITION]))
         currents.append(trace[CURRENT] * 1e-3)
@@ -233,7 +233,7 @@ def are_linked(working: Working) -> bool:
     shape = _bump(1.0)
     pulled = np.zeros(target.num_axes, bool)
     for sign in (1.0, -1.0):
-        raw = np.where(first, np.rint(sign * np.outer(shape, way) * working.increments), 0).astype(np.int64)
+        raw = np.where(first, np.rint(sign * np.outer(shape, way) * working.speed_counts()), 0).astype(np.int64)
         trace = drives.record([CURRENT, POSITION], len(raw) * CYCLE, play={TARGET_VELOCITY: raw})
         if sign > 0.0:
             current, angle = trace[CURRENT] * 1e-3, working.angle(trace[POSITION])

@@ -17,6 +17,7 @@ from drive_env import motion
 from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.positioning import CURRENT, CYCLE, POSITION, STATUS, VELOCITY, wrapped
+from drive_env.speeds import per_increment
 from tuning.moves import MoveCounter
 from tuning.target import POSITION_SCALER, Target
 
@@ -71,8 +72,9 @@ class MeteredDrives:
         self._low, self._high = (ends * scaler / (2.0 * np.pi) for ends in (target.low, target.high))
         self._slack = SLACK * scaler
         limit = target.speed * scaler / (2.0 * np.pi)
-        self._fastest = OVERSPEED * limit
-        self._counter = MoveCounter(limit, target.current * 1e3)
+        counts = per_increment(drives, VELOCITY)
+        self._fastest = OVERSPEED * limit * counts
+        self._counter = MoveCounter(limit, target.current * 1e3, counts)
         self._rated = target.motor.rated_current
         self._outside: Mask = np.zeros((len(KINDS), count), bool)
         self._last_current = np.zeros(count)

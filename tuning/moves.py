@@ -29,19 +29,20 @@ class MoveCounter:
     """Counts moves by what is written and played.
 
     Args:
-        speed: Fastest that axes may be turned [pps], shape (num_axes,).
+        speed: Fastest that axes may be turned [inc/s], shape (num_axes,).
         current: Most that may be asked for [mA].
+        per_increment: Counts of a speed per increment a second.
 
     Attributes:
         moves: Of each axis so far, (num_axes,).
     """
 
-    def __init__(self, speed: Floats, current: float) -> None:
+    def __init__(self, speed: Floats, current: float, per_increment: Floats | float = 1.0) -> None:
         count = len(speed)
         self.moves = np.zeros(count, np.int64)
         self._slow: dict[Key, Floats] = {
             **dict.fromkeys(POSITIONS, SLOW * speed * CYCLE),
-            **dict.fromkeys(SPEEDS, SLOW * speed),
+            **dict.fromkeys(SPEEDS, SLOW * speed * per_increment),
             **dict.fromkeys(TORQUES, np.full(count, WEAK * current)),
         }
         self._word = np.zeros(count, np.int64)

@@ -139,7 +139,7 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
     height = np.minimum(
         np.maximum(SHARE * target.motor.rated_current, OVER_FRICTION * dry), np.minimum(limit, target.current)
     )
-    scale, origin = target.increments(), drives.read(POSITION)
+    scale, counts, origin = target.increments(), target.speed_counts(), drives.read(POSITION)
     low, high = TRAVEL_SHARE * target.low * scale, TRAVEL_SHARE * target.high * scale
     drives.write(TARGET_TORQUE, 0, where=axes)
     motion.enable(drives, mode="cst", where=axes)
@@ -152,7 +152,7 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
         for k in range(cycles):
             played = {TARGET_TORQUE: np.rint(1e3 * torque)[None].astype(np.int64)}
             trace = drives.record([VELOCITY, CURRENT, POSITION], CYCLE, play=played)
-            speed[k] = trace[VELOCITY][0] / scale
+            speed[k] = trace[VELOCITY][0] / counts
             current[k] = trace[CURRENT][0] * 1e-3
             way = wrapped(trace[POSITION][0] - origin)
             inside &= (way > low) & (way < high)

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env import motion
 from drive_env.dictionary.entries import ObjectName
 from drive_env.positioning import wrapped
+from drive_env.speeds import per_increment
 from tuning.excitation import Lines, periodic
 from tuning.target import POSITION_SCALER, Target
 
@@ -76,6 +77,8 @@ class Shaker:
         self._target, self._drives, self._loop, self._where = target, target.drives, loop, where
         self._lines, self._kind = lines, kind
         self.radians = 2.0 * math.pi / np.maximum(np.asarray(self._drives.read(POSITION_SCALER), float), 1.0)
+        # Of a count of the loop's set-point.
+        self.per_count = self.radians / per_increment(self._drives, SEEN[loop])
         self.traced_time = 0.0  # s that passed in traces, which a target's clock does not see
         self.fastest = np.full(target.num_axes, 0.4 * target.speed)  # on the way back [rad/s]
 
@@ -134,9 +137,9 @@ class Shaker:
         back = np.repeat(np.arange(passes) % 2 == 1, cycles // passes + 1)[:cycles, None]
         row = np.arange(cycles) % self._lines.samples
         shaking = np.where(back, wave[::-1][row], wave[row])
-        raw = np.rint((path + fade * shaking) / self.radians - self._offset)
+        raw = np.rint((path + fade * shaking) / self.per_count - self._offset)
         seen, fast, enabled = self._play(raw.astype(np.int64), traced)
-        played = (raw + self._offset) * self.radians - path
+        played = (raw + self._offset) * self.per_count - path
         chosen = np.flatnonzero(inside)
         answer = seen[SEEN[self._loop]]
         if self._loop == "position":
@@ -148,7 +151,7 @@ class Shaker:
             quick = [(signal - np.repeat(path, windows, axis=0))[within] for signal in fast]
         return Pass(
             played[chosen],
-            (answer * self.radians - path)[chosen],
+            (answer * self.per_count - path)[chosen],
             np.asarray(seen[CURRENT][chosen] * 1e-3),
             quick[0],
             quick[1],
@@ -194,7 +197,7 @@ class Shaker:
         names = signals[self._loop]
         fast = trace_loops(self._drives, [*names, "torque_meas"], duration, play).signals
         windows = len(fast[names[0]]) // len(raw)
-        seen = {SEEN[self._loop]: np.rint(fast[names[1]][::windows] / self.radians).astype(np.int64)}
+        seen = {SEEN[self._loop]: np.rint(fast[names[1]][::windows] / self.per_count).astype(np.int64)}
         seen[CURRENT] = np.rint(fast["torque_meas"][::windows] * 1e3).astype(np.int64)
         mask, value = motion.OPERATION_ENABLED
         enabled = self._drives.read(STATUS) & mask == value
@@ -216,7 +219,7 @@ class Shaker:
             velocity = np.concatenate([velocity, np.zeros((SETTLING, velocity.shape[1]))])
         path = velocity if self._loop == "velocity" else self._position(velocity)
         name = SET_POINT[self._loop]
-        raw = np.rint(path / self.radians - self._offset).astype(np.int64)
+        raw = np.rint(path / self.per_count - self._offset).astype(np.int64)
         drives.record([POSITION], len(raw) * CYCLE, {name: np.where(where, raw, drives.read(name))})
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import EmulatedDrives, motion
+from drive_env.speeds import per_increment_of
 from drive_env.trace import Trace
 from mechanics.loads import find_load
 from mechanics.model import COPIES_PER_MODEL
@@ -311,7 +312,8 @@ def _record(
         traces.append(drives.record([VELOCITY, CURRENT], round((end - start) / period) * period, period=period))
         report(end / excitation.duration)
     t = np.arange(sum(map(len, traces)), dtype=np.float64) * excitation.sampling_period
-    rpm = 60.0 / resolved.position_scaler
+    velocity_unit = resolved.device.bindings[VELOCITY, 0].unit
+    rpm = 60.0 / resolved.position_scaler / per_increment_of(velocity_unit, resolved.position_scaler)
     ramp = np.clip((t - excitation.velocity_time) * resolved.acceleration, 0.0, abs(resolved.velocity))
     recording = Recording(
         t=t,

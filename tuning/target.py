@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drive_env.speeds import per_increment
+
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.motors import Motor
@@ -105,6 +107,10 @@ class Target:
     def increments(self) -> Floats:
         """Return the position increments per radian of every rotor, 2058h over 2 pi, shape (num_axes,)."""
         return np.asarray(self.drives.read(POSITION_SCALER), float) / (2.0 * math.pi)
+
+    def speed_counts(self) -> Floats:
+        """Return the counts of 606Ch and 60FFh per rad/s of every rotor, shape (num_axes,)."""
+        return np.asarray(self.increments() * per_increment(self.drives, 0x606C))
 
     def close(self) -> None:
         """Close the drives."""
@@ -340,5 +346,5 @@ def _hold_to_travel(target: Target) -> None:
     width = np.where(np.isfinite(target.high - target.low), target.high - target.low, 0.0)
     slack = np.clip(SLACK * width, *SLACK_ENDS)
     low, high = here + (target.low - slack) * scale, here + (target.high + slack) * scale
-    speed = np.ceil(SPEED_SLACK * target.motor.rated_speed * scale)
+    speed = np.ceil(SPEED_SLACK * target.motor.rated_speed * target.speed_counts())
     drives.safety.change(Limits(position=(low.tolist(), high.tolist()), velocity=speed.tolist()))

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env import motion
 from drive_env.gains import GAIN_OBJECTS, gains_from_bandwidths, write_gains
 from drive_env.motors import Motor
+from drive_env.speeds import per_increment
 from tuning.target import Target
 from tuning.wiring import FINDINGS
 
@@ -86,6 +87,10 @@ class Working:
         away = np.asarray(position, float) - self.origin
         return np.asarray(((away + 2.0**31) % 2.0**32 - 2.0**31) / self.increments)
 
+    def speed_counts(self) -> Floats:
+        """Return the counts of 606Ch and 60FFh per rad/s, shape (num_axes,)."""
+        return np.asarray(self.increments * per_increment(self.target.drives, VELOCITY))
+
     def room(self) -> tuple[Floats, Floats]:
         """Return how far the rotors may turn from where they are now [rad], down and up."""
         here = self.angle(self.target.drives.read(POSITION))
@@ -152,7 +157,7 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
     drives.write(MAX_CURRENT, np.rint(current * 1e3).astype(np.int64), where=axes)
     scale = increments
     for ramp in (0x6083, 0x6084, 0x6085):
-        drives.write(ramp, _raw(10.0 * target.speed * scale), where=axes)
+        drives.write(ramp, _raw(10.0 * target.speed * scale * per_increment(drives, ramp)), where=axes)
     # Slow loops lag by turns: what the experiments allow is watched by them, not by this window.
     drives.write(FOLLOWING_WINDOW, _raw(200.0 * math.pi * scale), where=axes)
     drives.write((0x60C2, 1), 1, where=axes)

@@ -23,7 +23,7 @@ from drive_env.dictionary.access import (
     check_allowed,
     check_limits,
 )
-from drive_env.dictionary.entries import Entry, ObjectDictionary
+from drive_env.dictionary.entries import EdsText, Entry, ObjectDictionary
 
 Key = tuple[int, int]
 
@@ -48,7 +48,7 @@ TO_MAPPING = 0x200  # from a PDO's communication parameter to its mapping
 
 
 @cache
-def _factory(path: Path, node_id: int) -> dict[Key, int | str]:
+def _factory(path: Path | EdsText, node_id: int) -> dict[Key, int | str]:
     return {(entry.index, entry.sub): entry.default for entry in ObjectDictionary(path, node_id)}
 
 
@@ -113,7 +113,7 @@ class ModuleObjects:
         check = _rule(entry.index)
 
         def write(raw: int) -> None:
-            values[key] = raw | frames.NO_REMOTE if _is_pdo_id(entry) else raw
+            values[key] = raw | self._fixed(entry)
             self._changed(entry.index)
 
         def checked(raw: int) -> None:
@@ -125,6 +125,16 @@ class ModuleObjects:
                 check(self, entry, raw)
 
         return Port(entry, read, checked, write)
+
+    def _fixed(self, entry: Entry) -> int:
+        """Return the bits that are set whatever is written: bit 30 of a PDO's COB-ID, where the factory's has it."""
+        return self.factory_value(entry) & frames.NO_REMOTE if _is_pdo_id(entry) else 0
+
+    def factory_value(self, entry: Entry) -> int:
+        """Return the factory's number of an object, with node 1's COB-IDs."""
+        raw = self.factory(1)[entry.index, entry.sub]
+        assert isinstance(raw, int), "a text is no number"
+        return raw
 
     def find(self, index: int, sub: int) -> Entry:
         """Return an entry of the device's dictionary; 06020000h or 06090011h if there is none."""
@@ -170,9 +180,11 @@ def _check_identifier(objects: ModuleObjects, entry: Entry, raw: int) -> None:
 
 def _check_sync_id(objects: ModuleObjects, entry: Entry, raw: int) -> None:
     # Bit 30 would make the device produce SYNC, at a period that it has no object for (1006h).
-    _check_bits(entry, raw, frames.IDENTIFIER)
-    if frames.is_restricted(raw):
-        raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {raw:03X}h, which CiA 301 reserves")
+    # Bit 31 says nothing by CiA 301; it is taken where the factory's value has it.
+    _check_bits(entry, raw, frames.IDENTIFIER | objects.factory_value(entry) & frames.INVALID)
+    identifier = raw & frames.IDENTIFIER
+    if frames.is_restricted(identifier):
+        raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {identifier:03X}h, which CiA 301 reserves")
 
 
 def _check_emergency_id(objects: ModuleObjects, entry: Entry, raw: int) -> None:

@@ -502,6 +502,10 @@ class Node:
         ):
             if role in canopen.objects:
                 module.commands[canopen.objects[role]] = signed_command(signature, code, action)
+        serial = canopen.objects.get("serial_number")
+        if serial is not None:
+            self._objects.engrave(serial, self._given_id, self._mask)
+            module.readers[serial] = lambda: int(self._objects.read(serial)[self.first_axis])
         subs = module.subs(communication.ERROR_HISTORY)
         self._history = ErrorHistory(len(subs))
         if subs:

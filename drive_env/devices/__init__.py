@@ -10,8 +10,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from drive_env.devices.variants import compose_eds, converted_preset, merged, parse_key, variant_bindings
 from drive_env.dictionary.bindings import Binding
-from drive_env.dictionary.entries import ObjectDictionary
+from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from mechanics.near_names import did_you_mean
 
 FOLDER = Path(__file__).parent
@@ -106,7 +107,7 @@ class Device(NamedTuple):
     name: str
     title: str
     num_axes: int
-    eds: Path
+    eds: Path | EdsText
     bindings: dict[tuple[int, int], Binding]
     current_rate: float
     velocity_rate: float
@@ -131,6 +132,7 @@ class Device(NamedTuple):
     axis_offsets: tuple[AxisOffset, ...]
     canopen: CanopenBehaviour
     master: MasterHints
+    variant_of: str = ""
 
     def new_dictionary(self, node_id: int = 1) -> ObjectDictionary:
         """Return the object dictionary of a node of this device."""
@@ -150,12 +152,32 @@ class Device(NamedTuple):
         if not path.exists():
             names = ", ".join(sorted(p.stem for p in self.presets.glob("*.toml")))
             raise ValueError(f"device {self.name} has no preset for motor {motor!r}; it has {names}")
-        return dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
+        preset: dict[str, int] = dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
+        if not self.variant_of:
+            return preset
+        before = find_device(self.variant_of).bindings
+        return converted_preset(preset, self.new_dictionary(), before, self.bindings)
 
 
 def device_names() -> list[str]:
     """Return the names of the devices there are."""
     return sorted(path.parent.name for path in FOLDER.glob("*/device.toml"))
+
+
+def device_of(kind: int, vendor: int | None, product: int | None) -> str | None:
+    """Return the name of the device that a node says that it is, None of one that is not known.
+
+    Args:
+        kind: Its 1000h; a device and its variants, which are one product, are told by it.
+        vendor: Its 1018h:01.
+        product: Its 1018h:02.
+    """
+    found = []
+    for name in device_names():
+        dictionary = find_device(name).new_dictionary()
+        if (vendor, product) == tuple(dictionary.find((0x1018, sub)).default for sub in (1, 2)):
+            found.append((dictionary.find(0x1000).default != kind, name))
+    return min(found)[1] if found else None
 
 
 @cache
@@ -165,14 +187,22 @@ def find_device(name: str) -> Device:
     if name not in device_names():
         near = did_you_mean(name, device_names())
         raise ValueError(f"no device is named {name!r}; there are {', '.join(device_names())}{near}")
-    data = tomllib.loads((folder / "device.toml").read_text(encoding="utf-8"))
-    rows: tuple[Binding, ...] = importlib.import_module(f"drive_env.devices.{name}.bindings").BINDINGS
+    data = own = _read(folder)
+    if "variant_of" in own:
+        base = find_device(own["variant_of"])
+        folder = FOLDER / base.name
+        data = merged(_read(folder), own)
+        eds: Path | EdsText = compose_eds(f"{name}.eds", base.eds.read_text(encoding="utf-8"), own)
+        bindings = variant_bindings(base.bindings, own["objects"])
+    else:
+        rows: tuple[Binding, ...] = importlib.import_module(f"drive_env.devices.{name}.bindings").BINDINGS
+        eds, bindings = folder / data["eds"], {(row.index, row.sub): row for row in rows}
     return Device(
         name=data["name"],
         title=data["title"],
         num_axes=data["axes"],
-        eds=folder / data["eds"],
-        bindings={(row.index, row.sub): row for row in rows},
+        eds=eds,
+        bindings=bindings,
         current_rate=data["rates"]["current"],
         velocity_rate=data["rates"]["velocity"],
         profile_rate=data["rates"]["profile"],
@@ -186,9 +216,9 @@ def find_device(name: str) -> Device:
         nominal_current=data["current"]["nominal"],
         overload_time=data["current"]["overload_time"],
         standstill=data["motion"]["standstill"],
-        write_states={_key(text): state for text, state in data["states"].items()},
+        write_states={parse_key(text): state for text, state in data["states"].items()},
         allowed_values=allowed_values(data),
-        unsupported=frozenset(_key(text) for text in data["unsupported"]["objects"]),
+        unsupported=frozenset(parse_key(text) for text in data["unsupported"]["objects"]),
         refuses_same_mode=data["quirks"]["refuses_same_mode"],
         emergencies={n: Emergency(e["code"], tuple(e["bytes"])) for n, e in data["emergencies"].items()},
         stage={n: StageParameter(**row) for n, row in data["stage"].items()},
@@ -196,7 +226,12 @@ def find_device(name: str) -> Device:
         axis_offsets=tuple(AxisOffset(**row) for row in data["axis_offsets"]),
         canopen=_canopen(data["canopen"]),
         master=_master(data["master"]),
+        variant_of=data.get("variant_of", ""),
     )
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    return tomllib.loads((folder / "device.toml").read_text(encoding="utf-8"))
 
 
 def allowed_values(data: dict[str, Any]) -> dict[tuple[int, int], tuple[int, ...]]:
@@ -204,7 +239,7 @@ def allowed_values(data: dict[str, Any]) -> dict[tuple[int, int], tuple[int, ...
     rows: dict[str, list[int | str]] = dict(data["values"])
     if data["quirks"]["strict_transmission_types"]:
         rows |= data["strict_transmission_types"]
-    return {_key(text): tuple(value for item in items for value in _values(item)) for text, items in rows.items()}
+    return {parse_key(text): tuple(value for item in items for value in _values(item)) for text, items in rows.items()}
 
 
 def _values(item: int | str) -> Sequence[int]:
@@ -224,7 +259,7 @@ def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
         inhibit_unit=data["inhibit_unit"],
         event_unit=data["event_unit"],
         error_behaviour={int(value): state for value, state in data["error_behaviour"].items()},
-        objects={role: _key(text) for role, text in data["objects"].items()},
+        objects={role: parse_key(text) for role, text in data["objects"].items()},
         save_signature=data["save_signature"],
         load_signature=data["load_signature"],
         bootloader_signature=data["bootloader_signature"],
@@ -235,16 +270,11 @@ def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
 def _master(data: dict[str, Any]) -> MasterHints:
     return MasterHints(
         rpdo_type=data["rpdo_type"],
-        current_limit=_key(data["current_limit"]),
+        current_limit=parse_key(data["current_limit"]),
         timeout=data["timeout"],
         timeouts={int(index, 16): time for index, time in data["timeouts"].items()},
-        position_scale=_key(data["position_scale"]) if "position_scale" in data else None,
-        turns_positions_round=tuple(_key(text) for text in data["turns_positions_round"]),
+        position_scale=parse_key(data["position_scale"]) if "position_scale" in data else None,
+        turns_positions_round=tuple(parse_key(text) for text in data["turns_positions_round"]),
         commands={int(index, 16): what for index, what in data.get("commands", {}).items()},
         addresses={int(index, 16): what for index, what in data.get("addresses", {}).items()},
     )
-
-
-def _key(text: str) -> tuple[int, int]:
-    index, sub = text.split(":")
-    return int(index, 16), int(sub)

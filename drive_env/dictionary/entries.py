@@ -58,19 +58,34 @@ class Entry:
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
-def read_eds(path: Path, node_id: int = 1) -> canopen.ObjectDictionary:
+@dataclass(frozen=True, slots=True)
+class EdsText:
+    """An EDS that lies in no file: that of a variant is composed of its device's and a few rows."""
+
+    name: str
+    text: str
+
+    def read_text(self, encoding: str = "utf-8") -> str:
+        """Return the text, as a path does."""
+        return self.text
+
+
+def read_eds(path: Path | EdsText, node_id: int = 1) -> canopen.ObjectDictionary:
     """Return python-canopen's model of an EDS; a file that is not UTF-8 is read as cp1252, which many vendors' are.
 
     Bytes that cp1252 lacks stand in names and comments alone, where they are shown as unknown.
     """
+    source = io.StringIO(path.text if isinstance(path, EdsText) else _read_text(path))
+    source.name = path.name if isinstance(path, EdsText) else str(path)
+    return canopen.import_od(source, node_id)
+
+
+def _read_text(path: Path) -> str:
     raw = read_bytes(path)
     try:
-        text = raw.decode("utf-8-sig")
+        return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
-        text = raw.decode("cp1252", errors="replace")
-    source = io.StringIO(text)
-    source.name = str(path)
-    return canopen.import_od(source, node_id)
+        return raw.decode("cp1252", errors="replace")
 
 
 class ObjectDictionary:
@@ -81,7 +96,7 @@ class ObjectDictionary:
         node_id: For defaults that depend on it.
     """
 
-    def __init__(self, path: Path, node_id: int = 1) -> None:
+    def __init__(self, path: Path | EdsText, node_id: int = 1) -> None:
         self.path = path
         self._entries: dict[tuple[int, int], Entry] = {}
         self._names: dict[str, tuple[int, int]] = {}

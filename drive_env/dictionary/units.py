@@ -48,6 +48,8 @@ UNITS: dict[str, Unit] = {
         Unit("pps", "increments per second", lambda c: TWO_PI / c.position_scaler),
         Unit("pps^2", "increments per second squared", lambda c: TWO_PI / c.position_scaler),
         Unit("rpm", "revolutions per minute", lambda c: RPM),
+        Unit("rpm/s", "revolutions per minute, per second", lambda c: RPM),
+        Unit("1/1000", "thousandths", lambda c: 1e-3),
         Unit("1/65536 rev", "1/65536 revolution", lambda c: TWO_PI / 65536.0),
         Unit("current P", "Q8.8: duty LSB per current LSB", lambda c: 1.0 / (256.0 * 32768.0 * c.current_lsb)),
         Unit("velocity P", "Q8.8: current LSB per rpm", lambda c: c.current_lsb / (256.0 * RPM)),

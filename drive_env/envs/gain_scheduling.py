@@ -23,6 +23,7 @@ from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
 from drive_env.gains import FITTED_RULE, RAW_MAX, rule_gains, small_time_constants, write_gains
 from drive_env.motors import find_motor
+from drive_env.speeds import per_increment
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
 
@@ -327,6 +328,8 @@ class GainScheduling(Lanes):
         self._acceleration_scale = np.tile(self.reach.acceleration, self.num_envs)
         self._rated_current = motor.rated_current
         self._per_rad = self.drives.read(INCREMENTS_PER_TURN) / (2.0 * np.pi)
+        self._speed_counts = self._per_rad * per_increment(self.drives, VELOCITY)
+        self._counts = self._per_rad if self.config.mode == "csp" else self._speed_counts  # of the set-point
 
     def _prepare_machines(self) -> None:
         machine, laws = self.drives.machine, self.config.distributions
@@ -363,7 +366,7 @@ class GainScheduling(Lanes):
         """Return set-points [drive units] of cycles from the lanes' present step on, (cycles, num_envs, axes)."""
         position, velocity, _ = self._programme.rows(self._now * self._cycles, cycles, self.reach)
         way, start = (position, self._origin) if self.config.mode == "csp" else (velocity, 0)
-        found: Integers = start + np.rint(way * self._per_rad).astype(np.int64)
+        found: Integers = start + np.rint(way * self._counts).astype(np.int64)
         return found.reshape(len(cycles), self.num_envs, self._axes)
 
     def _through_bus(self) -> Integers:
@@ -404,9 +407,9 @@ class GainScheduling(Lanes):
         """
         due = np.concatenate([self._acting[None], targets[:-1]])
         self._acting = targets[-1]
-        velocity = np.asarray(rows[VELOCITY] / self._per_rad, float)
+        velocity = np.asarray(rows[VELOCITY] / self._speed_counts, float)
         actual = rows[POSITION] if self.config.mode == "csp" else rows[VELOCITY]
-        error = np.asarray((due.reshape(self._cycles, -1) - actual) / self._per_rad, float)
+        error = np.asarray((due.reshape(self._cycles, -1) - actual) / self._counts, float)
         return error, velocity, np.asarray(rows[CURRENT] * 1e-3, float)
 
     def _seen(self, error: Floats, velocity: Floats, current: Floats) -> tuple[Floats, Floats, Floats]:

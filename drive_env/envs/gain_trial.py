@@ -32,6 +32,7 @@ from drive_env.positioning import (
     write_profile,
 )
 from drive_env.score import Terms, cost
+from drive_env.speeds import per_increment
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -148,7 +149,7 @@ class Trials:
             traces.append(self._record(objects, TRIAL))
         position, velocity, current = (np.concatenate([trace[name] for trace in traces]) for name in objects)
         angle = wrapped(position - origin) / move.increments
-        speed = velocity / scaler * 2.0 * np.pi
+        speed = velocity / (scaler * per_increment(drives, VELOCITY)) * 2.0 * np.pi
         return _momentum_balance(angle, speed, current * 1e-3, self._motor), origin
 
     def run(

@@ -21,6 +21,7 @@ from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines
 from drive_env.envs.trajectories import TRAJECTORIES, draw
 from drive_env.exchange import Hooks, exchange
+from drive_env.speeds import per_increment
 
 CYCLE = 0.001  # s, one communication cycle
 
@@ -256,11 +257,13 @@ class Tracking(Lanes):
         per_turn = drives.read(POSITION_SCALER).astype(float)
         scales = np.empty((self.drives.num_axes, 4))
         scales[:, 0] = config.amplitude * per_turn
-        scales[:, 1] = config.speed * per_turn
+        counts = per_turn * per_increment(drives, 0x606C)
+        scales[:, 1] = config.speed * counts
         scales[:, 2] = drives.read(MAXIMUM_CURRENT)
         full = {"csp": 1.25 * scales[:, 0], "csv": 1.25 * scales[:, 1], "cst": scales[:, 2]}
         scales[:, 3] = full[str(config.mode)] * (1.0 if config.action == "direct" else config.offset)
         self._per_turn = per_turn.reshape(n, -1)[:, 0]
+        self._speed_counts = counts.reshape(n, -1)[:, 0]
         target, offset = OBJECTS[str(config.mode)]
         play = (target,) if config.action == "direct" else (target, offset)
         self._acts_on_position = play[-1] == 0x607A
@@ -294,7 +297,7 @@ class Tracking(Lanes):
         self._pictures = Pictures(drives, self.render_mode, period) if self.render_mode else None
 
     def _profile_scales(self) -> Floats:
-        """Return raw units of the target per unit of the reference's row: increments, pps, or mA per pps^2."""
+        """Return raw units of the target per unit of the reference's row: 1, in cst mA per inc/s^2."""
         config, drives = self.config, self.drives
         if config.mode != "cst":
             return np.ones(drives.num_axes)
@@ -348,7 +351,7 @@ class Tracking(Lanes):
         return bool(own.ended[0].any())
 
     def _followed(self) -> tuple[Floats, Floats]:
-        """Return the reference for how the drives stand now: position [inc] and velocity [inc/s], (num_axes,) each."""
+        """Return the reference for how the drives stand now: position [inc] and velocity, (num_axes,) each."""
         own = self._episodes
         at = np.clip(own.lanes["step"] * self.config.cycles, 0, own.reference.shape[2] - 1)
         position, velocity = np.repeat(own.reference[np.arange(self.num_envs), :2, at], self._axes, axis=0).T
@@ -379,6 +382,7 @@ class Tracking(Lanes):
             turns = draw(str(config.trajectory), self.rngs[lane], own.reference.shape[2], CYCLE,
                          float(config.amplitude or 0.0), float(config.speed or 0.0))  # fmt: skip
             own.reference[lane] = turns * self._per_turn[lane]
+            own.reference[lane, 1] = turns[1] * self._speed_counts[lane]
         own.lanes["step"][mask] = 0
         own.lanes["steps"][mask] = config.steps
 

@@ -54,7 +54,7 @@ class Episodes(Bundle):
 
     lanes: Lanes  # (n,)
     action: Vector  # -1...1, (axes,)
-    scales: Matrix  # amplitude [inc], speed [inc/s], current limit [mA], full scale of the action [raw], (axes, 4)
+    scales: Matrix  # amplitude [inc], speed [606Ch], current limit [mA], full scale of the action [raw], (axes, 4)
     origin: Vector  # position at the episode's start [inc], (axes,)
     actions: Line  # raw values on their way to the drives, one for each of a lane's axes
     observations: Line  # status, position, velocity, torque of each axis on their way, and their cycle's number

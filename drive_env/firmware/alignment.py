@@ -17,6 +17,7 @@ DC, BLDC = 1.0, 3.0
 DISABLED, OPEN_LOOP, HALL, ENCODER = 0.0, 1.0, 2.0, 3.0
 FORCED, DC_FRAME = 4.0, 5.0
 ESTIMATE, USE_OFFSET, USE_HALL = 0, 1, 2
+VELOCITY_BY_HALL = 1.0  # 2042h:05
 
 # States of the initialisation.
 NEEDED, FIRST_ANGLE, SECOND_ANGLE, DONE, FAILED = 0, 1, 2, 3, 4
@@ -111,9 +112,11 @@ def commutate(drive, lane, dt):
 
 @stage
 def needs_halls(drive, lane):
-    """Return whether the halls tell the angle, or have to at the initialisation of the encoder."""
-    return drive.angle_source[lane] == HALL or (
-        drive.angle_source[lane] == ENCODER and drive.encoder_init_mode[lane] == USE_HALL
+    """Return whether the halls tell the angle or the velocity, or have to at the initialisation of the encoder."""
+    return (
+        drive.angle_source[lane] == HALL
+        or drive.velocity_sensor[lane] == VELOCITY_BY_HALL
+        or (drive.angle_source[lane] == ENCODER and drive.encoder_init_mode[lane] == USE_HALL)
     )
 
 

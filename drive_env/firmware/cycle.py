@@ -191,7 +191,7 @@ def supervise(drive, rates):
     drive.block_has_open_phase[0] = 0
     drive.block_has_noisy_encoder[0] = 0
     for lane in range(LANES):
-        if drive.angle_source[lane] == alignment.HALL:
+        if drive.angle_source[lane] == alignment.HALL or drive.velocity_sensor[lane] == alignment.VELOCITY_BY_HALL:
             drive.block_uses_halls[0] = 1
         if drive.open_a[lane] > 0.0 or drive.open_b[lane] > 0.0 or drive.open_c[lane] > 0.0:
             drive.block_has_open_phase[0] = 1

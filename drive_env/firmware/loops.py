@@ -19,7 +19,7 @@ def motion_loops(drive):
         position_error = drive.position_demand[lane] - drive.theta_meas[lane]
         omega_ref = drive.position_p[lane] * position_error if level == 2 else drive.velocity_demand[lane]
         error = omega_ref - drive.omega_meas[lane]
-        i_max = drive.i_max[lane]
+        i_max = drive.i_max[lane] * drive.current_share[lane]
         proportional = drive.velocity_p[lane] * error
         total = clip(drive.velocity_sum[lane] + proportional * drive.velocity_i[lane], i_max)
         i_loop = clip(proportional + total, i_max)

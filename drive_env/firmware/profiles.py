@@ -23,6 +23,12 @@ def ramp(v, v_end, rate, dt):
 
 
 @stage
+def limited(v, limit):
+    """Return a velocity [rad/s] within a limit of its size, positive; a limit of 0 is none."""
+    return v if limit <= 0.0 else min(max(v, -limit), limit)
+
+
+@stage
 def unwrapped(target, position, scaler):
     """Return an absolute target [rad] in the turn of the 32-bit counter in which the position [rad] is.
 

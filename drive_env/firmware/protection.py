@@ -142,7 +142,8 @@ def conditions(drive, lane):
         bits |= 1 << WARM
         if drive.T_stage[lane] > drive.error_temperature[lane]:
             bits |= 1 << OVERTEMPERATURE
-    if drive.hall_broken[lane] > 0.0 and alignment.needs_halls(drive, lane):
+    # A brushed motor has none.
+    if (drive.hall_broken[lane] > 0.0 or drive.is_dc[lane] == 1.0) and alignment.needs_halls(drive, lane):
         # All three lines alike is a pattern that no rotor position gives.
         bits |= 1 << HALL_ERROR
     if (drive.inputs[lane] & inputs.ENABLE) == 0:

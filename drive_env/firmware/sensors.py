@@ -70,7 +70,9 @@ def measure_motion(drive, h):
         by_hall = (1.0 if drive.angle_source[lane] == 2.0 else 0.0) * (1.0 - drive.always_use_encoder[lane])
         speed = (count - before) * per_count / h
         position = (count - drive.count_zero[lane]) * per_count
-        raw = hall_speed if by_hall > 0.5 else speed
+        sensor = drive.velocity_sensor[lane]
+        speed_by_hall = by_hall if sensor == 0.0 else (1.0 if sensor == 1.0 else 0.0)
+        raw = hall_speed if speed_by_hall > 0.5 else speed
         position = hall_position if by_hall > 0.5 else position
         drive.count[lane] = count
         drive.theta_meas[lane] = position - drive.home_shift[lane]

@@ -13,7 +13,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 
 from drive_env.devices import AxisOffset, Device, MasterHints, find_device
 from drive_env.dictionary.access import WRONG_TYPE, ObjectAccessError
-from drive_env.dictionary.entries import INTEGER_TYPES, Entry, ObjectDictionary, ObjectName, read_eds
+from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, Entry, ObjectDictionary, ObjectName, read_eds
 
 Key = tuple[int, int]
 
@@ -203,7 +203,7 @@ def _check_kinds(path: Path, types: dict[Key, ODVariable], axes: int) -> None:
                 )
 
 
-def _read_types(path: Path) -> dict[Key, ODVariable]:
+def _read_types(path: Path | EdsText) -> dict[Key, ODVariable]:
     types = {}
     for item in read_eds(path).values():
         for variable in [item] if isinstance(item, ODVariable) else item.values():

@@ -25,7 +25,8 @@ Mask = NDArray[np.bool_]
 POSITION_LOW, POSITION_HIGH, FOLLOWING_WINDOW = (0x607D, 1), (0x607D, 2), (0x6065, 0)
 MAX_PROFILE_VELOCITY, MAX_MOTOR_SPEED = (0x607F, 0), (0x6080, 0)
 ACCELERATION, DECELERATION, QUICK_STOP_DECELERATION = (0x6083, 0), (0x6084, 0), (0x6085, 0)
-COUNTED = "pps"  # speeds in increments per second; other units are not set off against positions
+COUNTED = "pps"  # speeds in increments per second
+BY_MINUTE = ("rpm", "rpm/s")  # which the scale of positions turns into increments; other units are not set off
 # A settled axis swings by some counts around its target [inc], though by no more than so much of a turn [rev].
 SETTLED, SETTLED_TURNS = 200.0, 0.02
 SLACK_TURNS = 0.02  # besides, of a move that is meant to end at a limit: noise and overshoot may take it past [rev]
@@ -42,13 +43,14 @@ class Bounds:
         settled: How far a settled axis swings around its place [inc].
         slack: How far beyond them is no leaving [inc].
         velocity: Highest speed [unit of 606Ch].
+        count: Increments a second of a count of 606Ch; nan where its unit tells none.
         current: Highest current [unit of 6077h].
         following: Largest following error [inc].
         braking: Deceleration of a quick stop [inc/s^2]; 0 where it is not known.
         profile: Highest deceleration of a profile [inc/s^2], or `braking`.
         rest: Speed below which an axis is at rest [inc/s].
         default_speed: Whether the speed limit is ours, for want of another.
-        speed: Highest speed by positions [inc/s], where the unit of 606Ch is not known; else infinite.
+        speed: Highest speed by positions [inc/s], where 606Ch does not count increments; else infinite.
     """
 
     low: Integers
@@ -57,6 +59,7 @@ class Bounds:
     settled: Floats
     slack: Floats
     velocity: Integers
+    count: Floats
     current: Integers
     following: Integers
     braking: Floats
@@ -89,11 +92,17 @@ def read_bounds(limits: Limits, drives: CanDrives, rotor: RotorAngle, ends: tupl
     high = np.where(high >= 2**60, NO_LIMIT, high)
 
     known_scale = rotor.scale > 1.0
-    counted = drives.description.has(VELOCITY) and drives.description.dictionary.find(VELOCITY).unit == COUNTED
+    known = drives.description
+    unit = known.dictionary.find(VELOCITY).unit if known.has(VELOCITY) else ""
+    count = increments_per_count(unit, rotor.scale)
+    told = ~np.isnan(count)
     velocity = _magnitude(drives, given(limits.velocity, drives.num_axes), MAX_PROFILE_VELOCITY)
-    ours = (velocity >= NO_LIMIT) & known_scale & counted
-    velocity = np.where(ours, np.rint(DEFAULT_SPEED * rotor.scale), velocity).astype(np.int64)
-    braking = _rate(drives, QUICK_STOP_DECELERATION)
+    ours = (velocity >= NO_LIMIT) & known_scale & told
+    default = np.rint(DEFAULT_SPEED * rotor.scale / np.where(told, count, 1.0))
+    velocity = np.where(ours, default, velocity).astype(np.int64)
+    braking = _rate(drives, QUICK_STOP_DECELERATION, rotor.scale)
+    # What a revolution counts may be mistaken: a speed in rpm is told by positions, too.
+    by_position = np.where(told & (velocity < NO_LIMIT), velocity * np.nan_to_num(count), 0.0)
     settled = np.where(known_scale, np.minimum(SETTLED, SETTLED_TURNS * rotor.scale), SETTLED)
     return Bounds(
         low,
@@ -102,13 +111,14 @@ def read_bounds(limits: Limits, drives: CanDrives, rotor: RotorAngle, ends: tupl
         settled,
         settled + np.where(known_scale, SLACK_TURNS * rotor.scale, 0.0),
         velocity,
+        count,
         _magnitude(drives, given(limits.current, drives.num_axes), drives.description.hints.current_limit),
         _magnitude(drives, given(limits.following_error, drives.num_axes), FOLLOWING_WINDOW),
         braking,
-        np.maximum.reduce([braking, _rate(drives, ACCELERATION), _rate(drives, DECELERATION)]),
+        np.maximum.reduce([braking, *(_rate(drives, key, rotor.scale) for key in (ACCELERATION, DECELERATION))]),
         np.where(known_scale, REST_TURNS * rotor.scale, REST_INCREMENTS),
         ours,
-        np.where(known_scale & (not counted), DEFAULT_SPEED * rotor.scale, np.inf),
+        np.where(known_scale & (unit != COUNTED), np.maximum(DEFAULT_SPEED * rotor.scale, by_position), np.inf),
     )
 
 
@@ -148,9 +158,24 @@ def _magnitude(drives: CanDrives, user: Floats, key: Key) -> Integers:
     return result
 
 
-def _rate(drives: CanDrives, key: Key) -> Floats:
+def increments_per_count(unit: str, scale: Floats) -> Floats:
+    """Return the increments a second (or second squared) of a count of a speed (or an acceleration), nan if unknown.
+
+    Args:
+        unit: As the EDS names it.
+        scale: Increments of a revolution, shape (num_axes,); 1 and less where they are not known.
+    """
+    if unit in (COUNTED, f"{COUNTED}^2"):
+        return np.ones(len(scale))
+    return np.where(scale > 1.0, scale / 60.0, np.nan) if unit in BY_MINUTE else np.full(len(scale), np.nan)
+
+
+def _rate(drives: CanDrives, key: Key, scale: Floats) -> Floats:
     """Return a deceleration [inc/s^2]; 0 where the drive has none, or counts it in units that we do not know."""
     known = drives.description
-    if not known.has(key) or known.dictionary.find(key).unit != f"{COUNTED}^2":
+    if not known.has(key):
         return np.zeros(drives.num_axes)
-    return read_own(drives, key, 0).astype(float)
+    count = increments_per_count(known.dictionary.find(key).unit, scale)
+    if np.isnan(count).all():
+        return np.zeros(drives.num_axes)
+    return np.asarray(read_own(drives, key, 0) * np.nan_to_num(count), float)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from drive_env.dictionary.entries import Entry
 from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
-from drive_env.safety.bounds import COUNTED, QUICK_STOP_DECELERATION, SLACK_TURNS, read_own
+from drive_env.safety.bounds import QUICK_STOP_DECELERATION, SLACK_TURNS, increments_per_count, read_own
 from drive_env.safety.errors import SafetyError
 from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, given
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce, bound_text
@@ -276,10 +277,13 @@ class Commands:
 
     def _check_braking(self, entry: Entry, raw: Integers, where: Mask) -> None:
         """Raise SafetyError for a ramp that would let an axis that is turning run on."""
-        if entry.unit != f"{COUNTED}^2":
+        count = increments_per_count(entry.unit, self._axes.rotor.scale)
+        where = where & ~np.isnan(count)
+        if not where.any():
             return
         raw = np.atleast_2d(raw).min(axis=0)
-        wrong = np.flatnonzero(where & self._axes.live & (raw * STOP_WITHIN < np.abs(self._axes.velocity)))
+        ramp = raw * np.nan_to_num(count)
+        wrong = np.flatnonzero(where & self._axes.live & (ramp * STOP_WITHIN < np.abs(self._axes.velocity)))
         if wrong.size:
             axis = int(wrong[0])
             raise SafetyError(
@@ -287,8 +291,8 @@ class Commands:
                 f"{abs(self._axes.velocity[axis]):.0f} pps; nothing was sent. Choose more, or stop it first"
             )
         axes = where & self._axes.may_turn
-        if np.any(slow := axes & (raw < self._unramped_ramp())):
-            self._refuse_mode(slow & np.isin(self._modes(), UNRAMPED_MODES), raw)
+        if np.any(slow := axes & (ramp < self._unramped_ramp())):
+            self._refuse_mode(slow & np.isin(self._modes(), UNRAMPED_MODES), ramp)
         self._check_speeds(axes, self._modes(), {**RUNNING_SPEEDS, **MOVING_SPEEDS}, raw * STOP_WITHIN)
 
     def check_modes(
@@ -311,8 +315,8 @@ class Commands:
         self._check_resolution(axes)
         now = np.atleast_2d(self._modes() if modes is None else modes)
         known, key = self._drives.description, QUICK_STOP_DECELERATION
-        if known.has(key) and known.dictionary.find(key).unit == f"{COUNTED}^2":
-            slow = axes & (bounds.braking < self._unramped_ramp())
+        if known.has(key):
+            slow = axes & ~np.isnan(self._ramp_count()) & (bounds.braking < self._unramped_ramp())
             self._refuse_mode(slow & np.isin(now, UNRAMPED_MODES).any(axis=0), bounds.braking)
         for row in np.unique(now, axis=0):
             self._check_speeds(axes, row, RUNNING_SPEEDS, bounds.velocity, played)
@@ -358,12 +362,17 @@ class Commands:
         scale = self._axes.rotor.scale
         return np.where(scale > 1.0, DEFAULT_SPEED * scale / STOP_WITHIN, 0.0)
 
+    def _ramp_count(self) -> NDArray[np.float64]:
+        """Return the increments per second squared of a count of 6085h; nan where its unit tells none."""
+        return increments_per_count(self._known.find(QUICK_STOP_DECELERATION).unit, self._axes.rotor.scale)
+
     def _refuse_mode(self, wrong: Mask, ramp: Integers | NDArray[np.float64]) -> None:
         for axis in np.flatnonzero(wrong).tolist():
+            count = self._ramp_count()[axis]
             raise SafetyError(
                 f"axis {axis}: nothing limits the speed in csp, tq or cst, and a quick stop's ramp of 6085h = "
-                f"{ramp[axis]:.0f} is too slow for it; nothing was sent. Have 6085h at "
-                f"{self._unramped_ramp()[axis]:.0f} or more, or choose another mode"
+                f"{ramp[axis] / count:.0f} is too slow for it; nothing was sent. Have 6085h at "
+                f"{math.ceil(self._unramped_ramp()[axis] / count)} or more, or choose another mode"
             )
 
     def _current_origin(self, key: Key) -> str:
@@ -372,7 +381,8 @@ class Commands:
 
     def _velocity_origin(self, axis: int) -> str:
         bounds = self._limits.bounds()
-        if 0.0 < bounds.braking[axis] * STOP_WITHIN <= bounds.velocity[axis]:
+        by_ramp = bounds.braking[axis] * STOP_WITHIN / np.nan_to_num(bounds.count[axis], nan=1.0)
+        if 0.0 < by_ramp <= bounds.velocity[axis] + 1e-6:
             return f"the quick stop's ramp, 6085h: no axis may be faster than it stops within {STOP_WITHIN:g} s"
         if bounds.default_speed[axis]:
             return "Limits(velocity=...): this drive has no limit of its own, and 6,000 rpm are taken"

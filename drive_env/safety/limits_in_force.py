@@ -104,7 +104,9 @@ class LimitsInForce:
             if not self._axes.rotor.is_placed:
                 self.place()
             bounds = read_bounds(self.user, self._drives, self._axes.rotor, self._ends)
-            ramp = np.where(bounds.braking > 0.0, bounds.braking * STOP_WITHIN, float(NO_LIMIT))
+            # A whole number of counts, but for rounding where they are rpm.
+            counts = np.floor(bounds.braking * STOP_WITHIN / np.nan_to_num(bounds.count, nan=1.0) + 1e-6)
+            ramp = np.where(bounds.braking > 0.0, counts, float(NO_LIMIT))
             bounds.velocity = np.minimum(bounds.velocity, np.minimum(ramp, float(NO_LIMIT)).astype(np.int64))
             if generation == self._generation:  # else something changed while another thread's answers were read
                 self.latest = bounds

@@ -84,6 +84,7 @@ def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, st
 
 
 def _look(port: Any, node: int, state: str, timeout: float) -> dict[str, Any]:
+    from drive_env.devices import device_of
     from drive_env.dictionary.access import ObjectAccessError
     from drive_env.master.errors import BusError, NoAnswerError
     from drive_env.master.sdo import SdoClient
@@ -113,18 +114,8 @@ def _look(port: Any, node: int, state: str, timeout: float) -> dict[str, Any]:
         number = read(0x1018, sub)
         if number is not None:
             row[name] = int.from_bytes(number, "little")
-    row["device"] = _known_device(row.get("vendor"), row.get("product"))
+    row["device"] = device_of(row["device type"], row.get("vendor"), row.get("product"))
     return row
-
-
-def _known_device(vendor: int | None, product: int | None) -> str | None:
-    from drive_env.devices import device_names, find_device
-
-    for name in device_names():
-        dictionary = find_device(name).new_dictionary()
-        if (vendor, product) == tuple(dictionary.find((0x1018, sub)).default for sub in (1, 2)):
-            return name
-    return None
 
 
 def _print(found: list[dict[str, Any]], timeout: float) -> None:

@@ -51,7 +51,7 @@ def generate(drive, lane, ramp, dt):
         drive.velocity_demand[lane] = v
         return
     up = drive.acceleration[lane]
-    v_max = drive.max_velocity[lane]
+    v_max = profiles.limited(drive.max_velocity[lane], drive.velocity_limit[lane])
     target = drive.profile_target[lane]
     if up > 0.0 and v_max > 0.0:
         # Factory values of 6081h and 6083h are 0: then there is no speed to move with, and the axis stays.

@@ -1,0 +1,19 @@
+"""`drive-env eds`: the electronic data sheet of an emulated device, for masters of other makers."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from drive_env.tools.options import errors_as_exit_codes
+
+
+def print_eds(
+    device: Annotated[str, typer.Argument(help="Drive by name; drive-env list devices shows them.")],
+) -> None:
+    """Print the EDS of a device: drive-env eds tmcm1636_fw109 > drive.eds."""
+    from drive_env.devices import find_device
+
+    with errors_as_exit_codes():
+        print(find_device(device).eds.read_text(encoding="utf-8"), end="")
