@@ -151,21 +151,20 @@ class Experiments:
     def _wrong(self, working: Working, k: int, check: EncoderCheck) -> str:
         """Return why no torque may be commanded, if so."""
         target = working.target
-        remedy = "; ".join(finding(self._wiring[k]))
-        if remedy and _aligned_by_halls(working)[k]:
-            return (
-                f"{remedy}, then switch the drive off and on, since its halls tell it the encoder's angle (2080h:03), "
-                "and identify again"
-            )
+        aligned = bool(_aligned_by_halls(working)[k])
+        by_halls = aligned or target.drives.read(COMMUTATION)[k] == BY_HALLS
+        remedy = "; ".join(finding(self._wiring[k])) or "the drive does not heed 2080h:01 and 2070h"
+        if aligned:
+            remedy += ", then switch the drive off and on, since its halls tell it the encoder's angle (2080h:03)"
         if not check.is_good:
             return (
-                "the encoder counts against the motor, and torque would make the motor run away: "
-                f"{remedy or 'the drive does not heed 2080h:01'} (or swap two motor phases), then identify again"
+                f"the encoder counts against the motor, and torque would make it run away: {remedy} (or swap two motor "
+                "phases), then identify again"
             )
-        if target.drives.read(COMMUTATION)[k] == BY_HALLS and (check.halls.reversed or check.halls.inverted):
+        if by_halls and (check.halls.reversed or check.halls.inverted):
             return (
-                "the halls do not tell the angle of the field, and torque would lock the motor: "
-                f"{remedy or 'the drive does not heed 2070h'}, then identify again"
+                f"the halls do not tell the angle of the field, and torque would lock the motor: {remedy}, then "
+                "identify again"
             )
         configured = int(target.drives.read(POLE_PAIRS)[k])
         if check.pole_pairs.is_known and round(check.pole_pairs.value) != configured:
