@@ -287,6 +287,8 @@ LOOKS = (_identity, _state, _answers, _samples, _error_control, _motor, _supply,
 # --- what would be written --------------------------------------------------------------------------------------------
 def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, str, bool]]:
     """Yield the objects that a run writes: which, between which limits, what for, and whether that stays."""
+    from tuning.wiring import FINDINGS
+
     turn = target.increments()
     speed = round(float(np.max(target.speed * target.speed_counts())))
     ends = target.low * turn, target.high * turn
@@ -306,6 +308,8 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[tuple[int, int], str, st
         yield (index, 0), "above 0", "ramps of the moves and of a stop", False
     yield (0x2003, 0), f"up to {amperes}", "current limit while it is identified", False
     yield (0x2004, 0), f"0...{amperes}", "current of the encoder's check", False
+    for key, wrong in FINDINGS.items():
+        yield key, "0, 1", f"where the check finds it wrong: {wrong}", True
     yield (0x2055, 0), "1, 3", "open loop for the encoder's check, then the encoder again", False
     yield (0x6065, 0), "up to 100 turns", "following error while it is shaken", False
     for sub, value in ((1, "1"), (2, "-3")):

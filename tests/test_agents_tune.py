@@ -242,6 +242,7 @@ def test_a_wrong_wiring_ends_the_run_before_any_trial_with_code_1_and_the_reason
     reversed_ = (0x2080, 1)
     with emulated("tmcm1636", "inertia", "qbl4208") as target:
         target.drives.write(reversed_, 1 - target.drives.read(reversed_))
+        target.drives.write((0x2080, 3), 2)  # its halls align the encoder once: it is not set right under way
         before = gains(target)
         done = run_agent(target, Contrary(), tmp_path / "before.toml", name="contrary")
         assert done.trials == () and "encoder counts against the motor" in done.result.axes[0].reason

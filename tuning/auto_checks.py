@@ -57,7 +57,7 @@ def wrong_wiring(target: Target, identified: Identification) -> str:
     """Return what is wrong with the wiring, "" if nothing is."""
     direction, pairs = identified.estimates.get("encoder_direction"), identified.estimates.get("pole_pairs")
     if direction is not None and direction.value < 0.0:
-        return "the encoder counts against the motor: swap two phases, or set the encoder's direction (2080h:01)"
+        return identified.estimates["inertia"].reason
     if pairs is not None and pairs.is_known and round(pairs.value) != target.motor.n_p:
         return (
             f"the motor has {pairs.value:.0f} pole pairs, and {target.motor.name} has {target.motor.n_p}: "

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from drive_env import motion
 from drive_env.envs.gain_trial import Identified, Trials
 from drive_env.gains import write_gains
-from tuning.experiments import MECHANICS, PULSED, RESPONSE, UNITS, WORST_MISFIT, Experiments
+from tuning.encoder_check import PULSED
+from tuning.experiments import MECHANICS, RESPONSE, UNITS, WORST_MISFIT, Experiments
 from tuning.frequency_response import measure
 from tuning.identification import NAMES, Estimate, Identification, Progress, refused
 from tuning.oscillation_watch import shaken

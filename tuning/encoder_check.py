@@ -4,6 +4,9 @@ With commutation in open loop (2055h) the current of 2004h points along an angle
 (2102h). The rotor follows: electrical turns of the field over turns that the encoder counts are the pole pairs, and
 the sign says whether it counts in the direction in which the field turns. Commutation by encoder needs both to be
 right before any torque is commanded: a reversed encoder makes a motor run away. So do halls where they commutate.
+
+A brushed motor has no field to turn: a current there and back for some milliseconds, longer and longer until it is
+seen, moves the rotor by some counts and tells the direction before any loop is closed over the encoder.
 """
 
 from __future__ import annotations
@@ -14,7 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.safety.envelope import swinging_allowed
 from tuning.identification import Estimate, refused
+from tuning.oscillation_watch import shaken
 from tuning.stop_causes import stop_causes
 from tuning.wiring import Halls, judge_halls
 from tuning.working_state import (
@@ -26,6 +31,7 @@ from tuning.working_state import (
     POSITION,
     SHAFT_DIRECTION,
     STATUS,
+    TARGET_TORQUE,
     TARGET_VELOCITY,
     Working,
     enable,
@@ -44,6 +50,11 @@ TOO_SHORT = "travel too short"  # how the reason begins where nothing was turned
 MARGIN = 0.1  # rad of room that stays free
 TOLERANCE = 0.35  # of a pole pair: from here on a ratio is no whole number
 STUCK = 0.25  # of the field's turn: a rotor that follows less does not follow
+# Of a brushed motor: shares of the current and cycles of a quarter of the push; counts that must be seen, and how well
+# they must be the push's own (correlation), apart from what falls or coasts.
+PUSHES = ((0.5, 4), (0.5, 8), (SHARE, 16), (SHARE, 32), (SHARE, 64))
+LEAST_COUNTS, LIKENESS = 10, 0.7
+PULSED = 1.2  # of the current limit, RMS over 25 ms: beyond, the current loop does not pulse but oscillates
 
 
 class EncoderCheck(NamedTuple):
@@ -72,8 +83,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
     count = target.num_axes
     if target.motor.kind == "dc":
         none = refused("1", "a brushed motor has no pole pairs")
-        later = refused("1", "a brushed motor has no field to turn; see the current pulses")
-        return [EncoderCheck(none, later)] * count
+        return [EncoderCheck(none, direction) for direction in _push(working)]
     configured = drives.read(POLE_PAIRS).astype(float)
     commutation = drives.read(COMMUTATION)
     where, reasons = able(working)
@@ -106,6 +116,50 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
             check = _judge(field[k], shaft[k] * away[k], shaft[k] * back[k], target.motor.n_p)
             found.append(check._replace(halls=halls[k]) if check.direction.is_known else check)
     return found
+
+
+def _push(working: Working) -> list[Estimate]:
+    """Push brushed motors there and back, and return the directions of their encoders; all axes are off then."""
+    drives, count = working.target.drives, working.target.num_axes
+    found: list[Estimate] = [refused("1", "not asked for")] * count
+    waiting = working.where.copy()
+    try:
+        enable(working, "cst", waiting)
+        with swinging_allowed(drives), shaken(drives, PULSED * working.current):
+            for share, quarter in PUSHES:
+                # As much forth as back, so that the rotor ends at rest and where it was.
+                sign = np.concatenate([np.repeat((1.0, -1.0, -1.0, 1.0), quarter), np.zeros(quarter)])
+                raw = np.where(waiting, sign[:, None] * np.rint(1e3 * share * working.current), 0).astype(np.int64)
+                angle = working.angle(drives.record([POSITION], len(raw) * CYCLE, play={TARGET_TORQUE: raw})[POSITION])
+                stay_inside(working, waiting)
+                alive = still_enabled(working, drives.read(STATUS))
+                for k in np.flatnonzero(waiting):
+                    towards = _likeness(angle[:, k], sign)
+                    seen = np.ptp(angle[:, k]) >= LEAST_COUNTS * 2.0 * np.pi / working.target.motor.encoder_counts
+                    if seen and abs(towards) >= LIKENESS:
+                        found[k] = Estimate(*[float(np.sign(towards))] * 3, "1")
+                    elif not alive[k]:
+                        found[k] = refused("1", "the axis was switched off while it was pushed: it left its travel")
+                    else:
+                        found[k] = refused("1", "the rotor did not follow the current: is it blocked, a cable open?")
+                        continue
+                    waiting[k] = False
+                switch_off(drives, working.where & ~waiting)
+                if not waiting.any():
+                    break
+    finally:
+        switch_off(drives, working.where)
+    return found
+
+
+def _likeness(angle: Floats, torque: Floats) -> float:
+    """Return the correlation, -1...1, of a motion with that of a free mass under a torque; what falls is left out."""
+    t = np.linspace(-1.0, 1.0, len(angle))
+    trend = np.stack([np.ones_like(t), t, t * t], axis=1)
+    pair = np.stack([angle, np.cumsum(np.cumsum(torque))], axis=1)
+    rest = pair - trend @ np.linalg.lstsq(trend, pair, rcond=None)[0]
+    sizes = np.linalg.norm(rest, axis=0)
+    return float(rest[:, 0] @ rest[:, 1] / max(sizes[0] * sizes[1], 1e-30))
 
 
 def able(working: Working) -> tuple[Mask, list[str]]:

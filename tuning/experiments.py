@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drive_env.gains import gains_from_bandwidths, write_gains
 from drive_env.safety.envelope import swinging_allowed
-from tuning.encoder_check import EncoderCheck, check_encoders
+from tuning.encoder_check import PULSED, EncoderCheck, check_encoders
 from tuning.frequency_response import measure
 from tuning.identification import NAMES, Estimate, Identification, Progress, refused
 from tuning.inertia import Mechanics, identify_mechanics
@@ -55,7 +55,6 @@ UNITS = {
 }  # fmt: skip
 MECHANICS, RESPONSE = NAMES[NAMES.index("inertia") :], NAMES[NAMES.index("anti_resonance") :]
 OSCILLATED = "the axis oscillated"  # how the reason begins where one did
-PULSED = 1.2  # of the current limit, RMS over 25 ms: beyond, the current loop does not pulse but oscillates
 
 
 class Experiments:
@@ -152,21 +151,20 @@ class Experiments:
     def _wrong(self, working: Working, k: int, check: EncoderCheck) -> str:
         """Return why no torque may be commanded, if so."""
         target = working.target
-        remedy = "; ".join(finding(self._wiring[k]))
-        if remedy and _aligned_by_halls(working)[k]:
-            return (
-                f"{remedy}, then switch the drive off and on, since its halls tell it the encoder's angle (2080h:03), "
-                "and identify again"
-            )
+        aligned = bool(_aligned_by_halls(working)[k])
+        by_halls = aligned or target.drives.read(COMMUTATION)[k] == BY_HALLS
+        remedy = "; ".join(finding(self._wiring[k])) or "the drive does not heed 2080h:01 and 2070h"
+        if aligned:
+            remedy += ", then switch the drive off and on, since its halls tell it the encoder's angle (2080h:03)"
         if not check.is_good:
             return (
-                "the encoder counts against the field, and torque would make the motor run away: "
-                f"{remedy or 'the drive does not heed 2080h:01'} (or swap two motor phases), then identify again"
+                f"the encoder counts against the motor, and torque would make it run away: {remedy} (or swap two motor "
+                "phases), then identify again"
             )
-        if target.drives.read(COMMUTATION)[k] == BY_HALLS and (check.halls.reversed or check.halls.inverted):
+        if by_halls and (check.halls.reversed or check.halls.inverted):
             return (
-                "the halls do not tell the angle of the field, and torque would lock the motor: "
-                f"{remedy or 'the drive does not heed 2070h'}, then identify again"
+                f"the halls do not tell the angle of the field, and torque would lock the motor: {remedy}, then "
+                "identify again"
             )
         configured = int(target.drives.read(POLE_PAIRS)[k])
         if check.pole_pairs.is_known and round(check.pole_pairs.value) != configured:
@@ -231,9 +229,6 @@ class Experiments:
                 default=both[-1] if _in_real_time(working) else both[0],
             )  # fmt: skip
             self.found[k] |= {"resistance": resistance, "inductance": windings[k].inductance}
-            if working.target.motor.kind == "dc" and windings[k].follows:
-                # Speed followed torque: with a reversed encoder the loops would have run away by now.
-                self.found[k]["encoder_direction"] = Estimate(1.0, 1.0, 1.0, "1")
 
     def _take_mechanics(self, working: Working, mechanics: list[Mechanics]) -> None:
         for k in np.flatnonzero(working.where):

@@ -85,7 +85,6 @@ class Winding(NamedTuple):
 
     resistance: Estimate
     inductance: Estimate
-    follows: bool  # whether speed follows charge, with its sign
 
 
 def loop_gains(working: Working) -> tuple[Floats, float]:
@@ -390,18 +389,11 @@ def _judge(working: Working, axis: _Axis, found: _Fit, window: _Window) -> Windi
             )))  # fmt: skip
         else:
             estimates.append(interval(value, half, float(np.linalg.norm([gain, model, loss * lost])), unit))
-    return Winding(estimates[0], estimates[1], _follows(window))
-
-
-def _follows(window: _Window) -> bool:
-    """Return whether the encoder counts up where the charge drives up: over the pulses, not over a count."""
-    gained = np.gradient(window.turn)
-    charge = window.charge - window.charge.mean()
-    return float(gained @ charge) > 0.3 * float(np.linalg.norm(gained) * np.linalg.norm(charge))
+    return Winding(estimates[0], estimates[1])
 
 
 def _none(reason: str) -> Winding:
-    return Winding(refused("ohm", reason), refused("H", reason), False)
+    return Winding(refused("ohm", reason), refused("H", reason))
 
 
 def to_torque_mode(working: Working, holding: Floats) -> None:
