@@ -429,7 +429,8 @@ def test_over_can_in_lockstep_the_observations_are_the_same(safety):
     ({"step": 0.0}, "step must be finite and more than 0, not 0"),
     ({"stage": 2.0}, "0...1"),
     ({"waveform": 251}, "0...250"),
-    ({"reward": 1}, "no option 'reward'.*gains"),
+    ({"reward": 1}, "reward is a function of observations, actions and info, not 1"),
+    ({"rewards": 1}, "no option 'rewards'.*gains"),
     ({"travel": 0.0}, "not 0"),
 ])  # fmt: skip
 def test_a_wrong_value_names_the_valid_ones(options, says):

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from mechanics.near_names import did_you_mean
 
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
@@ -46,6 +45,8 @@ def make_vec_env(name: str, num_envs: int = 8, **options: Any) -> VecEnv:
         ValueError: For a name that is none; ImportError without Stable-Baselines3 (the extra `agents`).
     """
     if name not in ENVIRONMENTS:
+        from mechanics.near_names import did_you_mean  # not before `commands` has looked whose `mechanics` that is
+
         near = did_you_mean(name, ENVIRONMENTS)
         raise ValueError(f"there is no environment {name!r}{near}; there are {', '.join(ENVIRONMENTS)}")
     try:
