@@ -221,9 +221,7 @@ def test_logs_that_cannot_be_replayed_are_refused(log):
         command_of(Log(log.t[100:], {name: values[100:] for name, values in log.objects.items()}))
     with pytest.raises(ValueError, match="of 1 axes, a machine of load 'gantry' has 2"):
         replay(machines(load="gantry"), log)
-    with pytest.raises(
-        ValueError, match=r"'load.weight' cannot be fitted; did you mean 'load.inertia' .*; there are motor.R_s"
-    ):
+    with pytest.raises(ValueError, match=r"'load.weight' cannot be fitted; did you mean .*; there are motor.R_s"):
         fit(machines(16), log, "two_mass", ["load.weight"])
     with pytest.raises(ValueError, match="at least 16 machines and one parameter, not 4 and 1"):
         fit(machines(4), log, "two_mass", ["load.inertia"])

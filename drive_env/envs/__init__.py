@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-
 if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
