@@ -277,7 +277,8 @@ def change_encoder(records: Records, field: str, values: Floats, axes: Mask) -> 
 
     def count() -> Floats:
         edges = (lanes("theta_m") + lanes("encoder_error")) * lanes("encoder_counts") / (2.0 * np.pi)
-        shown: Floats = encoder_count.py_func(edges * lanes("encoder_gain"), lanes("encoder_true_direction"))
+        gained, backwards = edges * lanes("encoder_gain"), lanes("encoder_true_direction")
+        shown: Floats = encoder_count.py_func(gained, backwards)  # type: ignore[attr-defined]
         return shown
 
     before = count()

@@ -137,7 +137,8 @@ def _push(working: Working) -> list[Estimate]:
                     towards = _likeness(angle[:, k], sign)
                     seen = np.ptp(angle[:, k]) >= LEAST_COUNTS * 2.0 * np.pi / working.target.motor.encoder_counts
                     if seen and abs(towards) >= LIKENESS:
-                        found[k] = Estimate(*[float(np.sign(towards))] * 3, "1")
+                        way = float(np.sign(towards))
+                        found[k] = Estimate(way, way, way, "1")
                     elif not alive[k]:
                         found[k] = refused("1", "the axis was switched off while it was pushed: it left its travel")
                     else:

@@ -143,7 +143,7 @@ class Experiments:
         values = [changes(wiring) if chosen else {} for wiring, chosen in zip(self._wiring, again, strict=True)]
         working.target, working.origin = write_wiring(working.target, working.origin, values)
         second = check_encoders(replace(working, where=again))
-        for k in np.flatnonzero(again):
+        for k in map(int, np.flatnonzero(again)):
             if not second[k].is_good:
                 self._wiring[k] = {}  # it does not do what the drive was told
         return [new if chosen else old for old, new, chosen in zip(checks, second, again, strict=True)]

@@ -123,6 +123,8 @@ def write_wiring(target: Target, origin: Integers, values: Sequence[Mapping[Key,
         origin: Their positions where the travel was given.
         values: What to write, by object, of every axis.
     """
+    if not any(values):
+        return target, origin
     drives, increments = target.drives, target.increments()
     before, counted = drives.read(POSITION), drives.read(ENCODER_DIRECTION)
     for key in FINDINGS:
