@@ -295,7 +295,7 @@ class EmulatedDrives:
 
     def _build_groups(self, physics_steps: int, integrator: str, friction: str) -> list[Group]:
         rates = rates_of(self.device, physics_steps)
-        per_group = copies_per_model(self.load)
+        per_group = copies_per_model(self.load, self.num_machines)
         loads = pack(
             self.load,
             self._armature(),

@@ -12,7 +12,7 @@ import pytest
 from drive_env import EmulatedDrives, motion
 from mechanics.compiled import cached
 from mechanics.loads import LOADS
-from mechanics.model import compile_packed
+from mechanics.model import MANY, compile_packed
 from mechanics.packed import PackedLoad, pack
 from mechanics.stepping import step
 from mechanics.template import Template
@@ -191,6 +191,21 @@ def test_what_follows_from_masses_is_what_mujoco_finds(name):
         mujoco.mj_forward(model, data)
         changed.append((model.body_subtreemass.tobytes(), data.M.tobytes(), data.qfrc_bias.tobytes()))
     assert changed[0] == changed[1]
+
+
+@pytest.mark.parametrize("load", ["two_mass", "gantry"])
+def test_many_machines_in_fewer_models_are_the_same_machines(load, monkeypatch):
+    records, models = [], []
+    for many in (MANY, 200):
+        monkeypatch.setattr("mechanics.model.MANY", many)
+        with EmulatedDrives(load=load, num_machines=200, seed=3, randomise=True) as drives:
+            motion.enable(drives, mode="pv")
+            drives.write("Target velocity", 200_000)
+            drives.advance(0.02)
+            records.append(drives._records.tobytes())
+            models.append([group.load.copies for group in drives._groups])
+    assert models == [[64, 64, 64, 8], [128, 72]]
+    assert records[0] == records[1]
 
 
 # --- divergence -------------------------------------------------------------------------------------------------------
