@@ -507,7 +507,7 @@ def test_of_axes_that_pull_at_one_thing_a_brief_response_says_nothing_of_the_own
     ("winder", "faulhaber_3863", 6),
 ])  # fmt: skip
 def test_over_the_bus_in_lockstep_the_same_comes_out(load, motor, seed):
-    """Issue 7: R and L within 10 % over the bus; all else as in-process, since the integers are the same."""
+    """R and L within 10 % over the bus; all else as in-process, since the integers are the same."""
     with served("calls", load=load, motor=motor, seed=seed) as drives:
         own = emulated("tmcm1636", load, motor, seed=seed, num_threads=1)
         target = Target(drives, own.device, own.motor, own.supply, own.low, own.high, own.speed, own.current)

@@ -82,7 +82,7 @@ class Uneven:
 
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_over_a_bus_in_real_time_resistance_is_told_and_inductance_refused(monkeypatch, seed):
-    """Issue 7: R within 10 % over the bus; L is seen in step with the drive alone."""
+    """R within 10 % over the bus; L is seen in step with the drive alone."""
     with served("calls", load="inertia", seed=seed, randomise=["stage", "motor"]) as bus:
         own = emulated(load="inertia", seed=seed, randomise=["stage", "motor"], num_threads=1)
         drives = Uneven(bus)
