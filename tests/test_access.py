@@ -280,7 +280,8 @@ def test_every_readable_object_reads(drives):
 # What is measured reads what is, not the manual's default of 0.
 LIVE = {
     (0x2101, 0): 1 << 15 | 1 << 8 | 1 << 4,  # table 85: module initialised, stop mode, motor halted
-    (0x2104, 0): 5461,  # the middle of the hall sector at angle 0: 30 degrees of 65536 steps
+    # The middle of the hall sector at angle 0, 30 degrees of 65536 steps, and half a turn: 2070h:01 is not set yet.
+    (0x2104, 0): 5461 - 32768,
     (0x2702, 0): 0b1111,  # limit and home switches that are not connected read active; enabled
     (0x60FD, 0): 0b1111,
     (0x6041, 0): 0x0250,  # switch on disabled, voltage enabled, remote
