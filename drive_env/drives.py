@@ -45,7 +45,7 @@ SWITCHES = ("left", "right", "home")  # bits of 60FDh
 
 MOST_IMAGES = 64  # calls of record that are kept prepared: more than any loop makes in turn
 
-MOST_MACHINES = 65_536  # some 50 kB each: 3 GB
+MOST_MACHINES = 65_536  # some 17 kB each: 1.1 GB
 BRAKE_TORQUE = 2.0  # of the motor's rated torque, usual for holding brakes
 
 
