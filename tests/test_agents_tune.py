@@ -18,8 +18,8 @@ from agents.policies.policy import PolicyError, load_policy
 from agents.shipped import shipped
 from agents.tuner.tune_target import surrogate, tune_target
 from agents.tuner.tuning_run import run as run_agent
+from drive_env.cia402 import OPERATION_ENABLED
 from drive_env.devices import find_device
-from drive_env.drives.motion import OPERATION_ENABLED
 from drive_env.drives.observed import ObservedDrives
 from drive_env.trials.gain_trial import Trials
 from tuning.certificate.certificate import load_certificate

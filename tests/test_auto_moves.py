@@ -372,7 +372,7 @@ def test_gains_that_shake_at_rest_are_eased_until_they_do_not(monkeypatch, tmp_p
 def test_syncs_that_were_late_are_told(late, told):
     """A busy computer tears holes into set-points and samples: whoever reads a certificate of such a run must know."""
     axis = AxisRun(Gains(1, 1, 1, 1, 1), Gains(1, 1, 1, 1, 1))
-    drives = SimpleNamespace(time_waits=False, total_timing=Timing(9000, late, 0.0031))
+    drives = SimpleNamespace(time_waits=False, bus=SimpleNamespace(total_timing=Timing(9000, late, 0.0031)))
     run = SimpleNamespace(target=SimpleNamespace(drives=drives, num_axes=1), axes=[axis], note=None)
     run.reserve = lambda where, text: AutoRun.reserve(run, where, text)
     tell_of_lateness(run)

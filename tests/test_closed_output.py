@@ -10,7 +10,7 @@ import pytest
 if os.name != "posix":
     pytest.skip("pipes end otherwise there", allow_module_level=True)
 
-PROGRAM = "import sys; from drive_env import commands; getattr(commands, sys.argv.pop(1))()"
+PROGRAM = "import sys; from drive_env import programs; getattr(programs, sys.argv.pop(1))()"
 COMMANDS = {
     "help": ("drive_env", "--help"),
     "help of a command": ("drive_tune", "auto", "--help"),

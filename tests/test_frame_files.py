@@ -109,10 +109,10 @@ def test_replay_names_the_formats_that_it_reads(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_log_in_the_background_of_a_script_ends_by_a_signal(tmp_path, number):
     """Such a one begins with SIGINT ignored."""
-    program = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from drive_env import commands; "
+    program = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); from drive_env import programs; "
     file = tmp_path / "frames.pcap"
     process = subprocess.Popen(
-        [sys.executable, "-c", program + "commands.drive_env()", "log", file, "-i", "virtual", "-c", "nobody's"],
+        [sys.executable, "-c", program + "programs.drive_env()", "log", file, "-i", "virtual", "-c", "nobody's"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:

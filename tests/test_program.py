@@ -51,7 +51,7 @@ def test_quiet_and_verbose_exclude_each_other(name):
 
 def run(program, *arguments, **environment):
     return subprocess.run(
-        [sys.executable, "-c", f"import sys; sys.argv[0] = {program!r}; from drive_env import commands as c; "
+        [sys.executable, "-c", f"import sys; sys.argv[0] = {program!r}; from drive_env import programs as c; "
          f"c.{program.replace('-', '_')}()", *arguments],
         env=os.environ | environment, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip

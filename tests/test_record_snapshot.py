@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from drive_env.emulator.live_dictionary import POSITION_SCALER
 from drive_env.firmware.record import RECORD, STATE
+
+POSITION_SCALER = (0x2058, 0)
 
 
 @pytest.fixture

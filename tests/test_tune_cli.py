@@ -252,7 +252,7 @@ def test_the_picture_of_a_comparison_names_its_colour_and_has_every_median_at_it
 def test_a_foreign_package_in_the_way_is_named(tmp_path):
     (tmp_path / "other" / "mechanics").mkdir(parents=True)
     (tmp_path / "other" / "mechanics" / "__init__.py").touch()
-    code = "import sys; sys.path.insert(0, 'other'); from drive_env import commands; commands.drive_tune()"
+    code = "import sys; sys.path.insert(0, 'other'); from drive_env import programs; programs.drive_tune()"
     done = subprocess.run(
         [sys.executable, "-c", code, "sweep"],
         cwd=tmp_path,

@@ -360,6 +360,7 @@ class GainScheduling(Lanes):
             self.base_gains = np.tile(rule_gains(device_of(drives), motor, self._nominal_inertia), (self.num_envs, 1))
         known = device_of(drives).gains
         columns = [known.names.index(name) for name in self.config.gains]
+        self._gain_objects = [known.keys[column] for column in columns]
         self._scheduled = self.base_gains[:, columns]
         self._gain_objects = [known.keys[column] for column in columns]
 
@@ -399,8 +400,8 @@ class GainScheduling(Lanes):
             # A machine that leaves physics ends its lane; who steps it is told so by `info`.
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
             for begin, end in zip(begins, [*begins[1:], self._cycles], strict=True):
-                for k, name in enumerate(self.config.gains):
-                    self.drives.write(GAINS[name], arriving[begin][:, k])
+                for k, key in enumerate(self._gain_objects):
+                    self.drives.write(key, arriving[begin][:, k])
                 play = {TARGETS[self.config.mode]: played[begin:end]}
                 traces.append(self.drives.record(objects, (end - begin) * CYCLE, play=play))
                 if self._pictures is not None:

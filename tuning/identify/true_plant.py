@@ -12,14 +12,14 @@ from mechanics.packed import PackedLoad
 from tuning.response.linear_model import Plant
 
 if TYPE_CHECKING:
-    from drive_env.emulator.emulated_drives import EmulatedDrives
+    from drive_env.drives.interface import Drives
 
 Floats = NDArray[np.float64]
 
 RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is none
 
 
-def true_plant(drives: EmulatedDrives, axis: int = 0) -> Plant:
+def true_plant(drives: Drives, axis: int = 0) -> Plant:
     """Return the plant of an emulated axis, linearised where its load starts, with its first resonance.
 
     Flanks that transmit count as pressed, dry friction and gravity as none.
@@ -29,12 +29,13 @@ def true_plant(drives: EmulatedDrives, axis: int = 0) -> Plant:
     """
     if drives.machine is None:
         raise ValueError("what a machine on a bus truly is cannot be looked up; identify it")
-    if drives.load.num_axes != 1:
-        raise ValueError(f"load {drives.load.name!r} couples {drives.load.num_axes} axes; the model has one")
+    emulated = drives.machine.drives  # whoever observes them
+    if emulated.load.num_axes != 1:
+        raise ValueError(f"load {emulated.load.name!r} couples {emulated.load.num_axes} axes; the model has one")
     true = {name: float(values[axis]) for name, values in drives.machine.parameters.items()}
-    group = next(g for g in drives._groups if g.machines.start <= axis < g.machines.stop)
+    group = next(g for g in emulated._groups if g.machines.start <= axis < g.machines.stop)
     J, viscous, pair = _mechanics(group.load, axis - group.machines.start)
-    motor = drives.motor
+    motor = emulated.motor
     psi = true["motor.psi_m"]
     factor = 1.0 if motor.kind == "dc" else 1.5
     known = {} if pair is None else {"anti_resonance": pair[0], "resonance": pair[1], "damping": pair[2]}
@@ -46,7 +47,7 @@ def true_plant(drives: EmulatedDrives, axis: int = 0) -> Plant:
         emf_constant=motor.n_p * psi,
         inertia=J,
         viscous=viscous,
-        delay=1.0 / drives.device.velocity_rate,
+        delay=1.0 / emulated.device.velocity_rate,
         velocity_filter=true["stage.velocity_filter"],
         counts=round(motor.encoder_counts * true["motor.encoder_interpolation"]),
         **known,

@@ -27,7 +27,7 @@ from drive_env.gains import Gains
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.emulator.emulated_drives import EmulatedDrives
+    from drive_env.drives.interface import Drives
     from drive_env.motors import Motor
     from tuning.identify.identification import Identification
 
@@ -129,7 +129,7 @@ class Plant:
         return cls.from_data_sheet(device, motor, supply, inertia, **known)
 
     @classmethod
-    def from_machine(cls, drives: EmulatedDrives, axis: int = 0) -> Plant:
+    def from_machine(cls, drives: Drives, axis: int = 0) -> Plant:
         """Return what an emulated axis truly is, linearised at its start; for tests.
 
         Raises:
