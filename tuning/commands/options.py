@@ -80,7 +80,8 @@ Cluster = Annotated[
     str | None,
     typer.Option(
         "--cluster",
-        help="Dask scheduler on whose workers to run: tcp://host:port, or tls://host:port?ca=FILE&cert=FILE&key=FILE.",
+        help="Dask scheduler on whose workers to run: tcp://host:port, or tls://host:port followed by "
+        "?ca=FILE&cert=FILE&key=FILE.",
     ),
 ]
 Resume = Annotated[
