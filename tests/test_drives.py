@@ -129,7 +129,7 @@ def test_a_supply_that_cannot_be_is_refused_when_it_is_given_and_when_it_is_set(
 @pytest.mark.parametrize(
     ("options", "meant"),
     [
-        ({"device": "tmcm1637"}, "did you mean 'tmcm1636'?"),
+        ({"device": "tmcm1637"}, "did you mean 'tmcm1636'"),
         ({"load": "two_mas"}, "did you mean 'two_mass'"),
         ({"motor": "qbl4207"}, "did you mean 'qbl4208'?"),
         ({"randomise": ["loads"]}, "did you mean 'load'"),
