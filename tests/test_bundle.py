@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
-from drive_env.emulator.cyclic_control import Exchange, Hooks, exchange
+from drive_env.emulator.cyclic_control import CyclicControl, Hooks, cyclic_control
 from mechanics.bundle import Bundle, Cube, Matrix, Numbers, Vector, reader
 from mechanics.compiled import cached
 
@@ -84,9 +84,9 @@ def test_an_exchange_is_a_call_of_record(threads):
         for drives in (one, other):
             motion.enable(drives, mode="csv")
         calls = np.zeros((3, 2))
-        short = exchange(one, SAMPLED, (0x60FF,), 2, 0.001)
+        short = cyclic_control(one, SAMPLED, (0x60FF,), 2, 0.001)
         short.hooks = Hooks(note_before, note_after, Noted(np.zeros((1, 1)), calls))
-        long = Exchange(other, SAMPLED, (0x60FF,), 2, 0.001)
+        long = CyclicControl(other, SAMPLED, (0x60FF,), 2, 0.001)
         rng = np.random.default_rng(0)
         for k in range(5):
             if k == 3:
@@ -102,7 +102,7 @@ def test_an_exchange_is_a_call_of_record(threads):
 def test_an_integer_out_of_range_is_refused():
     with EmulatedDrives(num_machines=2, num_threads=1) as drives:
         motion.enable(drives, mode="cst")
-        call = exchange(drives, SAMPLED, (0x6071,), 1, 0.001)
+        call = cyclic_control(drives, SAMPLED, (0x6071,), 1, 0.001)
         call.played[:] = 1_000_000_000
         with pytest.raises(ObjectAccessError):
             call.run()

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives
-from drive_env.emulator import cyclic_control as exchange
-from drive_env.emulator import prepared_record as process_image
+from drive_env.emulator import cyclic_control, prepared_record
 from drive_env.emulator.prepared_record import from_od
 from drive_env.envs import bus_delays, tracking_cycle
 from drive_env.firmware import cycle, protection
@@ -180,7 +179,7 @@ def compiled_from(function: object) -> set[str]:
 
 KERNELS = [
     (kernel, module)
-    for module in (cycle, protection, exchange, process_image, tracking_cycle, bus_delays)
+    for module in (cycle, protection, cyclic_control, prepared_record, tracking_cycle, bus_delays)
     for kernel in vars(module).values()
     if hasattr(kernel, "py_func") and kernel.py_func.__module__ == module.__name__ and hasattr(kernel._cache, "flush")
 ]
@@ -193,9 +192,9 @@ def test_a_kernel_is_keyed_by_every_file_that_it_calls_and_by_no_command(kernel,
     assert not [name for name in known if ".tools" in name or ".commands" in name or name.endswith("cli")]
 
 
-def test_the_exchange_is_keyed_by_the_process_image_and_the_firmware_by_no_python_around_it():
+def test_cyclic_control_is_keyed_by_prepared_records_and_the_firmware_by_no_python_around_it():
     assert {"drive_env.emulator.prepared_record", "drive_env.firmware.loops", "mechanics.stepping"} <= sources(
-        exchange
+        cyclic_control
     ).keys()
     assert (
         not {"drive_env.emulator.emulated_drives", "drive_env.emulator.prepared_record", "mechanics.packed"}

@@ -188,7 +188,7 @@ def test_an_action_takes_effect_after_the_delay(delay, rate):
         lanes.reset(seed=0)
         for k in range(12):
             lanes.step(np.full((1, 1), 0.5 if k >= 2 else 0.0, np.float32))
-            plays.append(lanes._exchange.played[0, :, 0].copy())
+            plays.append(lanes._control.played[0, :, 0].copy())
     rows = np.concatenate(plays)
     given = 2 * lanes.config.cycles
     assert np.flatnonzero(rows)[0] == given + delay - 1 and set(rows) == {0, 3500}
@@ -203,7 +203,7 @@ def test_what_is_played(mode, action):
         lanes.reset(seed=0)
         for _ in range(50):
             lanes.step(np.full((1, 1), 0.5, np.float32))
-            plays.append(dict(zip(lanes._exchange.play, lanes._exchange.played.copy(), strict=True)))
+            plays.append(dict(zip(lanes._control.play, lanes._control.played.copy(), strict=True)))
         reference = lanes._episodes.reference[0]
     full = {"csp": 1.25 * 2 * 65536, "csv": 1.25 * 20 * 65536, "cst": 7000}[mode]
     if action == "direct":

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drive_env.dictionary.entries import ObjectName
 from drive_env.drives.interface import Drives
 from drive_env.emulator.group import call_of
-from drive_env.emulator.prepared_record import ProcessImage, from_od_rows, to_od_rows
+from drive_env.emulator.prepared_record import PreparedRecord, from_od_rows, to_od_rows
 from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, Numbers, reader
 from mechanics.calls import address_of_hook, call_hook
 from mechanics.compiled import cached
@@ -39,7 +39,7 @@ class Hooks(NamedTuple):
     bundle: Bundle
 
 
-class Exchange:
+class CyclicControl:
     """A call of `record` with memory of its own, on any Drives.
 
     Attributes:
@@ -118,7 +118,7 @@ def convert_out(address: Any, first: Any, count: Any) -> Any:
     return 1
 
 
-class EmulatedExchange(Exchange):
+class EmulatedCyclicControl(CyclicControl):
     """The same on emulated drives, without the interpreter once it has begun."""
 
     def __init__(
@@ -133,7 +133,7 @@ class EmulatedExchange(Exchange):
         """Let the cycles pass; of axes whose integers are out of range none of the group is run."""
         if self._scale_changes != self._emulated._objects.scale_changes:
             self._prepare()
-        if self._image is None:
+        if self._prepared is None:
             super().run()
             return
         self._refused[0] = 0
@@ -148,40 +148,40 @@ class EmulatedExchange(Exchange):
             drives._objects.recordable(drives._objects.entries.find(name))
         drives._objects.plan_play(dict(zip(self.play, self.played, strict=True)), self._cycles)
         self._scale_changes = drives._objects.scale_changes
-        self._image: ProcessImage | None = drives._objects.process_image(self._objects, self.play)
-        if self._image is None:
+        self._prepared: PreparedRecord | None = drives._objects.prepared_record(self._objects, self.play)
+        if self._prepared is None:
             return
-        image, axes = self._image, drives.num_axes
+        prepared, axes = self._prepared, drives.num_axes
         values = np.zeros((self._cycles, len(self.play), axes))
         samples = np.zeros((self._cycles, len(self._objects), axes))
         self._refused = np.zeros(1, np.int64)
-        rows = image.inputs
+        rows = prepared.inputs
         self._conversion = Conversion(
             played=self.played,
             factors=np.array([row.factor for row in rows], float).reshape(len(rows), axes),
-            codes=image.input_codes,
+            codes=prepared.input_codes,
             values=values,
             sampled=self.sampled,
-            sample_factors=image.factors,
-            sample_codes=image.codes,
+            sample_factors=prepared.factors,
+            sample_codes=prepared.codes,
             samples=samples,
             refused=self._refused,
             before=0 if hooks is None else address_of_hook(hooks.before),
             after=0 if hooks is None else address_of_hook(hooks.after),
             data=0 if hooks is None else hooks.bundle.address,
         )
-        self._call = call_of(values, image.played, samples, image.sampled, 1)
+        self._call = call_of(values, prepared.played, samples, prepared.sampled, 1)
         self._call.replace(
             before=address_of_hook(convert_in), after=address_of_hook(convert_out), data=self._conversion.address
         )
 
 
-def exchange(
+def cyclic_control(
     drives: Drives, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int, period: float
-) -> Exchange:
-    """Return the exchange of some cycles of `period` [s], in the way that is best for these drives."""
+) -> CyclicControl:
+    """Return the control of some cycles of `period` [s], in the way that is best for these drives."""
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
     if isinstance(drives, EmulatedDrives):
-        return EmulatedExchange(drives, objects, play, cycles)
-    return Exchange(drives, objects, play, cycles, period)
+        return EmulatedCyclicControl(drives, objects, play, cycles)
+    return CyclicControl(drives, objects, play, cycles, period)

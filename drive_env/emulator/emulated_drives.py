@@ -33,7 +33,7 @@ from drive_env.emulator.parameters import (
     draw_parameters,
     parameter_table,
 )
-from drive_env.emulator.prepared_record import ProcessImage
+from drive_env.emulator.prepared_record import PreparedRecord
 from drive_env.faults.machine_faults import MachineFaults
 from drive_env.firmware import cycle
 from drive_env.firmware.cycle import Call
@@ -52,7 +52,7 @@ Mask = NDArray[np.bool_]
 
 SWITCHES = ("left", "right", "home")  # bits of 60FDh
 
-MOST_IMAGES = 64  # calls of record that are kept prepared: more than any loop makes in turn
+MOST_PREPARED = 64  # calls of record that are kept prepared: more than any loop makes in turn
 
 MOST_MACHINES = 65_536  # some 17 kB each: 1.1 GB
 BRAKE_TORQUE = 2.0  # of the motor's rated torque, usual for holding brakes
@@ -145,7 +145,7 @@ class EmulatedDrives:
         set_lanes(self._records, "brake_torque", np.full(self.num_axes, BRAKE_TORQUE * self.motor.rated_torque))
         self._now = 0  # cycles since the beginning
         self._schedule: list[tuple[int, str, Floats, Mask]] = []
-        self._images: dict[tuple[ObjectName | None, ...], ProcessImage] = {}  # of calls of record
+        self._prepared: dict[tuple[ObjectName | None, ...], PreparedRecord] = {}  # of calls of record
         warn_of_misfits([group.load for group in self._groups], self.motor)
         self._faults = MachineFaults(self)
         self.machine = Machines(self)
@@ -229,13 +229,13 @@ class EmulatedDrives:
             raise ValueError(f"period must be at least {self._cycle:g} s, not {period:g} s")
         objects, play = object_names(objects), play or {}
         names = (*objects, None, *play)
-        image = self._images.get(names)
-        if image is not None and image.scale_changes == self._objects.scale_changes:
+        prepared = self._prepared.get(names)
+        if prepared is not None and prepared.scale_changes == self._objects.scale_changes:
             values = np.empty((cycles, len(play), self.num_axes))
-            if image.play(play, values):
-                samples = np.empty((-(-cycles // every), len(image.keys), self.num_axes))
-                self._run(cycles, call_of(values, image.played, samples, image.sampled, every))
-                return self._trace(image.read(samples), len(samples), every)
+            if prepared.play(play, values):
+                samples = np.empty((-(-cycles // every), len(prepared.keys), self.num_axes))
+                self._run(cycles, call_of(values, prepared.played, samples, prepared.sampled, every))
+                return self._trace(prepared.read(samples), len(samples), every)
         known = self._objects.entries
         entries = [known.find(name) for name in objects]
         codes = {(e.index, e.sub): self._objects.recordable(e) for e in entries}
@@ -251,9 +251,9 @@ class EmulatedDrives:
         for key in codes:
             if key not in result:
                 result[key] = np.broadcast_to(self._objects.read(key), (rows, self.num_axes))
-        prepared = self._objects.process_image(objects, list(play))
-        if prepared is not None and len(self._images) < MOST_IMAGES:
-            self._images[names] = prepared
+        prepared = self._objects.prepared_record(objects, list(play))
+        if prepared is not None and len(self._prepared) < MOST_PREPARED:
+            self._prepared[names] = prepared
         return self._trace(result, rows, every)
 
     def _trace(self, values: dict[tuple[int, int], Integers], rows: int, every: int) -> Trace:

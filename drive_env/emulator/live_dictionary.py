@@ -29,8 +29,8 @@ from drive_env.dictionary.codec import Code, code_of, decode, encode
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
-from drive_env.emulator.prepared_record import SCALES, ProcessImage, Row
-from drive_env.emulator.record_snapshot import LaneImage
+from drive_env.emulator.prepared_record import SCALES, PreparedRecord, Row
+from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.firmware import cycle
 from drive_env.firmware.modes import MODES
 from drive_env.firmware.record import get_lanes, set_lanes
@@ -63,7 +63,7 @@ class LiveDictionary:
         self._records = records
         self.num_axes = num_axes
         self._scale_changes = 0
-        self._image: LaneImage | None = None  # of what a restart restores
+        self._snapshot: RecordSnapshot | None = None  # of what a restart restores
         self._values: dict[tuple[int, int], Integers | str] = {}
         self._stored = self._commission(preset)
 
@@ -101,9 +101,9 @@ class LiveDictionary:
     def restart(self, axes: Mask) -> None:
         """Restore the stored values of the axes where the mask is true, and start their firmware anew."""
         before = self._context()
-        if self._image is None:
-            self._image = self._stored_image()
-        self._image.restore(axes)
+        if self._snapshot is None:
+            self._snapshot = self._stored_snapshot()
+        self._snapshot.restore(axes)
         for key, raw in self._stored.items():
             values = self._values.get(key)
             if isinstance(values, np.ndarray):
@@ -132,7 +132,7 @@ class LiveDictionary:
             if len(self._stored[key]) < self.num_axes:
                 self._stored[key] = np.repeat(self._stored[key], self.num_axes)
             self._stored[key][axis] = raw
-        self._image = None
+        self._snapshot = None
 
     def write_checked(self, entry: Entry, raw: int, axis: int) -> None:
         """Write an object of one axis that was checked before."""
@@ -145,7 +145,7 @@ class LiveDictionary:
         """How often the scale of positions has been written, on whatever axis."""
         return self._scale_changes
 
-    def process_image(self, sampled: Sequence[ObjectName], played: Sequence[ObjectName]) -> ProcessImage | None:
+    def prepared_record(self, sampled: Sequence[ObjectName], played: Sequence[ObjectName]) -> PreparedRecord | None:
         """Return what a call of `record` needs when it repeats, None if an object needs the long way.
 
         The call was made before, so that everything was found that could be refused but values.
@@ -165,7 +165,7 @@ class LiveDictionary:
             [(row.code.field, row.code.part) for row in sources], [_EVENTS[row.code.event] for row in sources]
         )
         out_of = channels([(row.code.field, row.code.part) for row in rows])
-        return ProcessImage((into, sources), (out_of, rows), self._scale_changes)
+        return PreparedRecord((into, sources), (out_of, rows), self._scale_changes)
 
     def _row(self, entry: Entry) -> Row:
         key = (entry.index, entry.sub)
@@ -227,7 +227,7 @@ class LiveDictionary:
                 self._values[key] = np.repeat(raw, self.num_axes)
         return stored
 
-    def _stored_image(self) -> LaneImage:
+    def _stored_snapshot(self) -> RecordSnapshot:
         """Return the fields that a restart sets from what is stored, converted by the scales that are stored.
 
         A read-only field that the firmware computes is none of them.
@@ -241,7 +241,7 @@ class LiveDictionary:
         ]
         values = [self._from_od(self.codes[key], self._stored[key], context) for key in bound]
         fields = [(self.codes[key].field, self.codes[key].part) for key in bound]
-        return LaneImage(self._records, fields, np.array([np.broadcast_to(value, (length,)) for value in values]))
+        return RecordSnapshot(self._records, fields, np.array([np.broadcast_to(value, (length,)) for value in values]))
 
     def _is_bound(self, entry: Entry) -> bool:
         return (entry.index, entry.sub) in self.codes

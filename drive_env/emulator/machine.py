@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask
 from drive_env.emulator.parameters import check_known, check_parameter
-from drive_env.emulator.record_snapshot import LaneImage
+from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.faults.machine_faults import InjectedFault
 from drive_env.faults.schedule import Order
 from drive_env.firmware.record import STATE, get_lanes, set_lanes
@@ -42,7 +42,7 @@ class Machines:
 
     def __init__(self, drives: EmulatedDrives) -> None:
         self._drives = drives
-        self._rest: LaneImage | None = None  # state of a machine at rest
+        self._rest: RecordSnapshot | None = None  # state of a machine at rest
 
     @property
     def drives(self) -> EmulatedDrives:
@@ -345,7 +345,7 @@ class Machines:
         if self._rest is None:
             parts = [(field, part) for field in STATE for part in range(field.depth)]
             initial = np.array([[field.initial] for field, _ in parts])
-            self._rest = LaneImage(drives._records, [(field.name, part) for field, part in parts], initial)
+            self._rest = RecordSnapshot(drives._records, [(field.name, part) for field, part in parts], initial)
         self._rest.restore(axes)
         set_lanes(drives._records, "random", drives._noise_seeds, axes)
         for live, nominal in (("R_s", "R_nominal"), ("psi_m", "psi_nominal")):

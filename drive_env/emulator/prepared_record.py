@@ -41,7 +41,7 @@ class Row(NamedTuple):
     factor: Floats
 
 
-class ProcessImage:
+class PreparedRecord:
     """What one call plays and samples.
 
     Args:

@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 _AT_ONCE = 4096  # axes whose places in memory are computed together: those of 65,536 would take 100 MB
 
 
-class LaneImage:
+class RecordSnapshot:
     """Fields and the values that they get.
 
     Args:

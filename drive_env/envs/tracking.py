@@ -16,7 +16,7 @@ from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
-from drive_env.emulator.cyclic_control import Hooks, exchange
+from drive_env.emulator.cyclic_control import Hooks, cyclic_control
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
@@ -274,7 +274,7 @@ class Tracking(Lanes):
         target, offset = OBJECTS[str(config.mode)]
         play = (target,) if config.action == "direct" else (target, offset)
         self._acts_on_position = play[-1] == cia402.TARGET_POSITION
-        self._exchange = exchange(drives, SAMPLED, play, config.cycles, CYCLE)
+        self._control = cyclic_control(drives, SAMPLED, play, config.cycles, CYCLE)
         self._bus = BusDelays(n, 2 * cycle.LONGEST_DELAY)
         self._episodes = own = cycle.Episodes(
             lanes=np.zeros(n, cycle.LANE),
@@ -287,8 +287,8 @@ class Tracking(Lanes):
             reference=np.zeros((n, 3, config.steps * config.cycles + cycle.PREVIEW + 1)),
             profile_scale=self._profile_scales(),
             last=np.zeros((drives.num_axes, 2)),
-            played=self._exchange.played,
-            sampled=self._exchange.sampled,
+            played=self._control.played,
+            sampled=self._control.sampled,
             angles=np.zeros(n),
             weights=np.array([config.weights[name] for name in cycle.TERMS]),
             observation=np.zeros((n, *(self.single_observation_space.shape or ())), np.float32),
@@ -298,7 +298,7 @@ class Tracking(Lanes):
             kind=cycle.KINDS[str(config.mode), config.action == "direct"],
             fall=config.task.fall,
         )
-        self._exchange.hooks = Hooks(cycle.act, cycle.observe, own)
+        self._control.hooks = Hooks(cycle.act, cycle.observe, own)
         self._start = np.zeros(drives.num_axes, np.int64)
         period = config.cycles * CYCLE
         self._pictures = Pictures(drives, self.render_mode, period) if self.render_mode else None
@@ -352,7 +352,7 @@ class Tracking(Lanes):
         own.action[:] = np.reshape(action, own.action.shape)
         if self._sensor is not None:
             own.angles[:] = self._sensor()
-        self._exchange.run()
+        self._control.run()
         if self._pictures is not None:
             self._pictures.look(self._followed())
         return bool(own.ended[0].any())
