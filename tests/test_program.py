@@ -23,9 +23,9 @@ from typer.testing import CliRunner
 import agents.commands.cli
 import drive_env.commands.cli
 import tuning.commands.cli
-from drive_env.commands import compile_bar, compiling
-from drive_env.commands.options import progress_on
+from drive_env.commands import compile_bar, compiling, progress
 from drive_env.commands.program import Quiet, Verbose, say_as_much
+from drive_env.commands.progress import progress_on
 from mechanics import kernel_files
 
 APPS = {
@@ -99,7 +99,7 @@ def test_quiet_shows_errors_and_no_progress_bar():
 def test_quiet_hides_bars_and_warnings(capfd):
     from rich.console import Console
 
-    from drive_env.commands.options import progress_on
+    from drive_env.commands.progress import progress_on
 
     app = typer.Typer()
 
@@ -168,7 +168,8 @@ def compiling_seen(monkeypatch):
     monkeypatch.setattr(kernels, "handlers", [])
     monkeypatch.setattr(kernels, "level", kernels.level)
     monkeypatch.setattr(event, "_registered", defaultdict(list))
-    monkeypatch.setattr(compile_bar, "shown", [])
+    monkeypatch.setattr(progress, "shown", [])
+    monkeypatch.setattr(compile_bar, "shown", progress.shown)
     monkeypatch.setattr(compile_bar, "FUNCTIONS", dict.fromkeys(compile_bar.ALWAYS, 2))
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("TERM", "xterm")

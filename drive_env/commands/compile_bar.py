@@ -7,6 +7,8 @@ import logging
 import sys
 from typing import TYPE_CHECKING, Any
 
+from drive_env.commands.progress import progress_on, shown
+
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
@@ -20,9 +22,6 @@ FUNCTIONS = {
 }  # fmt: skip
 ALWAYS = ("cycle.power_on", "cycle.write_events", "cycle.run")
 OF_OTHERS = 1
-
-# Bars that are on the terminal now, the last on top: a second display beside one would tear both.
-shown: list[Progress] = []
 
 
 def show_compiling() -> CompileBar:
@@ -68,8 +67,6 @@ class CompileBar(logging.Handler):
 
     def _begin(self, kernel: str) -> None:
         from rich.console import Console
-
-        from drive_env.commands.options import progress_on
 
         if not self._needed:
             self._watch()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from drive_env.commands.options import Json, errors_as_exit_codes, print_json, progress_on
+from drive_env.commands.options import Json, errors_as_exit_codes, print_json
+from drive_env.commands.progress import progress_on
 
 
 def compile_kernels(json: Json = False) -> None:

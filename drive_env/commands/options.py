@@ -13,13 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from drive_env.commands.program import is_quiet
 from drive_env.programs import CLOSED, output_is_closed
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.progress import Progress
-
     from drive_env.dictionary.entries import ObjectName
     from drive_env.master.can_drives import CanDrives
 
@@ -176,32 +172,6 @@ def fail(error: object, code: int) -> NoReturn:
     """End the command with a red line."""
     typer.secho(f"drive-env: {error}", fg=typer.colors.RED, err=True)
     raise typer.Exit(code)
-
-
-def progress_on(console: Console, *, transient: bool = False) -> Progress:
-    """Return bars for a console: what is under way, the share done and the time since; transient ones vanish."""
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
-
-    from drive_env.commands.compile_bar import shown
-
-    class Bars(Progress):
-        def start(self) -> None:
-            shown.append(self)
-            super().start()
-
-        def stop(self) -> None:
-            if self in shown:
-                shown.remove(self)
-            super().stop()
-
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-    )
-    return Bars(*columns, console=console, transient=transient, disable=is_quiet())
 
 
 def print_json(value: Any) -> None:

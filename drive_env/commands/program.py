@@ -44,8 +44,3 @@ def say_as_much(quiet: bool, verbose: bool) -> None:
         logging.basicConfig(format="%(message)s")
         for name in PACKAGES:
             logging.getLogger(name).setLevel(logging.INFO)
-
-
-def is_quiet() -> bool:
-    """Return whether the program that runs was asked to be quiet: warnings are off."""
-    return not logging.getLogger("drive_env").isEnabledFor(logging.WARNING)

@@ -10,7 +10,8 @@ from typing import Annotated, Any
 
 import typer
 
-from drive_env.commands.options import USER_ERROR, fail, progress_on
+from drive_env.commands.options import USER_ERROR, fail
+from drive_env.commands.progress import progress_on
 from drive_env.programs import CLOSED, output_is_closed
 from mechanics.untrusted import read_text
 

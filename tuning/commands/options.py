@@ -26,7 +26,7 @@ from drive_env.commands.options import Yes as Yes
 from drive_env.commands.options import ask as ask
 from drive_env.commands.options import ending_by, names_a_bus
 from drive_env.commands.options import print_json as print_json
-from drive_env.commands.options import progress_on as progress_on
+from drive_env.commands.progress import progress_on
 
 if TYPE_CHECKING:
     from tuning.snapshot import Transaction

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from drive_env.commands.progress import progress_on
 from drive_env.commands.tables import Column, print_lines, print_names, print_table
 from tuning.commands.options import (
     INTERRUPTED,
@@ -19,7 +20,6 @@ from tuning.commands.options import (
     Workers,
     errors_as_exit_codes,
     fail,
-    progress_on,
     what_an_interrupt_leaves,
 )
 
