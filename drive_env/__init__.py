@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from drive_env.envs import register
 
 if TYPE_CHECKING:
-    from drive_env.dictionary.access import ObjectAccessError as ObjectAccessError
+    from drive_env.dictionary.aborts import ObjectAccessError as ObjectAccessError
     from drive_env.drives import motion as motion
     from drive_env.drives.trace import Trace as Trace
     from drive_env.emulator.emulated_drives import EmulatedDrives as EmulatedDrives

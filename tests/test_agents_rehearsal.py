@@ -19,7 +19,7 @@ from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.canopen.frames import NMT, SDO_REQUEST, Frame
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.sdo import SdoClient
 from tuning.target import on_bus
 

@@ -13,7 +13,7 @@ from canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
-from drive_env.dictionary.access import CANNOT_BE_STORED, NO_SUCH_OBJECT, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
+from drive_env.dictionary.aborts import CANNOT_BE_STORED, NO_SUCH_OBJECT, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
 from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
 
 EDS = find_device("tmcm1636").eds

@@ -23,7 +23,7 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.commands import scan
 from drive_env.commands.cli import PANELS, app
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.trials.replay import command_of, read_log
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.firmware.record import get_lanes, set_lanes
 
 FIRST = np.array([True, False])

@@ -15,7 +15,7 @@ from drive_env import EmulatedDrives, SafetyError, motion
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.errors import refused
 from mechanics.loads import LOADS
 from tuning.commands.options import errors_as_exit_codes, open_target, parse_travel

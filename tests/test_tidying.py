@@ -11,7 +11,7 @@ import pytest
 from scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.tidying import Tidying
 

@@ -20,7 +20,7 @@ from drive_env.canopen.frames import Frame
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
 from drive_env.devices.variants import merged
-from drive_env.dictionary.access import CANNOT_BE_STORED, READ_ONLY, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
+from drive_env.dictionary.aborts import CANNOT_BE_STORED, READ_ONLY, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
 from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
 from drive_env.drives.speeds import per_increment
 from drive_env.firmware.record import set_lanes

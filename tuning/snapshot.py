@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
-from drive_env.dictionary.access import ObjectAccessError, check_in_range, check_writable
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.access import check_in_range, check_writable
 from drive_env.drives.interface import Drives, device_of
 from drive_env.held_signals import held_signals
 from drive_env.master.description import Description, Key, describe

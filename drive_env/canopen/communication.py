@@ -14,14 +14,8 @@ import numpy as np
 
 from drive_env.canopen import frames
 from drive_env.devices import Device
-from drive_env.dictionary.access import (
-    INCOMPATIBLE_PARAMETER,
-    VALUE_RANGE,
-    WRONG_STATE,
-    ObjectAccessError,
-    check_allowed,
-    check_limits,
-)
+from drive_env.dictionary.aborts import INCOMPATIBLE_PARAMETER, VALUE_RANGE, WRONG_STATE, ObjectAccessError
+from drive_env.dictionary.access import check_allowed, check_limits
 from drive_env.dictionary.entries import EdsText, Entry, ObjectDictionary
 from drive_env.node import mapping
 from drive_env.node.axis import Port

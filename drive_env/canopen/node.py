@@ -22,13 +22,8 @@ from drive_env.canopen.error_control import HeartbeatConsumer, HeartbeatProducer
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.nmt import Command, State
 from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
-from drive_env.dictionary.access import (
-    CANNOT_BE_STORED,
-    HARDWARE_ERROR,
-    VALUE_RANGE,
-    ObjectAccessError,
-    check_limits,
-)
+from drive_env.dictionary.aborts import CANNOT_BE_STORED, HARDWARE_ERROR, VALUE_RANGE, ObjectAccessError
+from drive_env.dictionary.access import check_limits
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.firmware.protection import CAUSES, CUT, STOP
 from drive_env.node.axis import Axis, QueuedEmergency

@@ -142,7 +142,7 @@ def ending_by(
         refused: Errors that end it with 1 besides a plain RuntimeError; a bus that cannot be opened is a mistake.
         mistakes: Errors that end it with 2 besides a ValueError, an object that cannot be had and a file's.
     """
-    from drive_env.dictionary.access import ObjectAccessError
+    from drive_env.dictionary.aborts import ObjectAccessError
     from drive_env.master.errors import OpenError
 
     mistaken: tuple[type[Exception], ...] = (ObjectAccessError, ValueError, *mistakes)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from drive_env import cia402
 from drive_env.canopen.frames import EMCY, ERROR_CONTROL, NMT, RPDO, SDO_REQUEST, SDO_RESPONSE, TPDO
 from drive_env.devices import device_names, find_device
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.network import MAX_NODE, PRE_OPERATIONAL

@@ -85,7 +85,7 @@ def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, st
 
 def _look(port: Any, node: int, state: str, timeout: float) -> dict[str, Any]:
     from drive_env.devices import device_of
-    from drive_env.dictionary.access import ObjectAccessError
+    from drive_env.dictionary.aborts import ObjectAccessError
     from drive_env.master.errors import BusError, NoAnswerError
     from drive_env.master.sdo import SdoClient
 

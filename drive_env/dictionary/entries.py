@@ -13,11 +13,7 @@ import canopen
 import numpy as np
 from canopen.objectdictionary import ODVariable, datatypes
 
-from drive_env.dictionary.access import (
-    NO_SUCH_OBJECT,
-    NO_SUCH_SUB_INDEX,
-    ObjectAccessError,
-)
+from drive_env.dictionary.aborts import NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX, ObjectAccessError
 from drive_env.dictionary.roles import Role
 from mechanics.untrusted import read_bytes
 

@@ -15,16 +15,8 @@ from drive_env import cia402
 from drive_env.cia402 import State
 from drive_env.devices import Device
 from drive_env.dictionary import units
-from drive_env.dictionary.access import (
-    CANNOT_BE_STORED,
-    WRONG_STATE,
-    ObjectAccessError,
-    check_allowed,
-    check_in_range,
-    check_readable,
-    check_writable,
-    checked_values,
-)
+from drive_env.dictionary.aborts import CANNOT_BE_STORED, WRONG_STATE, ObjectAccessError
+from drive_env.dictionary.access import check_allowed, check_in_range, check_readable, check_writable, checked_values
 from drive_env.dictionary.codec import Code, code_of, decode, encode
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
 from drive_env.dictionary.roles import Role

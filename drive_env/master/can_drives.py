@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import device_of, find_device
-from drive_env.dictionary.access import ObjectAccessError, check_readable, check_writable, checked_values
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.access import check_readable, check_writable, checked_values
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage

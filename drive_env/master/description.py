@@ -13,7 +13,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 
 from drive_env import cia402
 from drive_env.devices import AxisOffset, Device, MasterHints, find_device
-from drive_env.dictionary.access import WRONG_TYPE, ObjectAccessError
+from drive_env.dictionary.aborts import WRONG_TYPE, ObjectAccessError
 from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, Entry, ObjectDictionary, ObjectName, read_eds
 from drive_env.dictionary.roles import Role
 

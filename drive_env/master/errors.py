@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 
 # CiA 301, table 22 of version 4.2, and what to try.
 _ABORTS = {

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from drive_env import cia402
 from drive_env.canopen.frames import INVALID
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.master.errors import BusError
 

@@ -7,7 +7,7 @@ from functools import partial
 from typing import NamedTuple
 
 from drive_env.canopen.frames import EXTENDED, IDENTIFIER, INVALID, RPDO, TPDO
-from drive_env.dictionary.access import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
+from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.master.description import Description
 from drive_env.master.errors import BusError, RefusedError

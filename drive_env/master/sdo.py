@@ -16,7 +16,7 @@ from canopen.sdo import SdoAbortedError, SdoCommunicationError
 from canopen.sdo.client import SdoClient as CanopenClient
 
 from drive_env.canopen.frames import ERROR_CONTROL, NMT, SDO_REQUEST, SDO_RESPONSE
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.errors import BusError, NoAnswerError, refused
 from drive_env.master.port import Port
 

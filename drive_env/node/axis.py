@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from drive_env.dictionary.access import CANNOT_BE_STORED, ObjectAccessError, check_allowed, check_limits
+from drive_env.dictionary.aborts import CANNOT_BE_STORED, ObjectAccessError
+from drive_env.dictionary.access import check_allowed, check_limits
 from drive_env.dictionary.codec import Code, decode_one, encode_one
 from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.units import Context

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-from drive_env.dictionary.access import NO_DATA, VALUE_RANGE, ObjectAccessError
+from drive_env.dictionary.aborts import NO_DATA, VALUE_RANGE, ObjectAccessError
 
 GENERIC, COMMUNICATION, PROFILE = 0x01, 0x10, 0x20  # bits of 1001h
 

@@ -9,12 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from drive_env.dictionary.access import (
-    CANNOT_BE_MAPPED,
-    PDO_LENGTH_EXCEEDED,
-    UNSUPPORTED_ACCESS,
-    ObjectAccessError,
-)
+from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, UNSUPPORTED_ACCESS, ObjectAccessError
 from drive_env.dictionary.entries import Entry
 
 MAX_BITS = 64

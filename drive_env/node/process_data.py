@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.node import mapping
 from drive_env.node.axis import Port
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from drive_env.dictionary.access import (
+from drive_env.dictionary.aborts import (
     PROTOCOL_TIMED_OUT,
     TOGGLE_NOT_ALTERNATED,
     TOO_LONG,
@@ -16,9 +16,8 @@ from drive_env.dictionary.access import (
     UNKNOWN_COMMAND,
     WRONG_TYPE,
     ObjectAccessError,
-    check_readable,
-    check_writable,
 )
+from drive_env.dictionary.access import check_readable, check_writable
 from drive_env.dictionary.entries import Entry
 from drive_env.node.axis import Port
 

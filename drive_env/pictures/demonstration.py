@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from functools import partial
 
 from drive_env import cia402
 from drive_env.canopen.frames import ERROR_CONTROL
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.description import Description
 from drive_env.master.errors import BusError
 from drive_env.master.port import Port

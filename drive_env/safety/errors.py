@@ -6,7 +6,7 @@ import contextlib
 import logging
 from collections.abc import Iterator
 
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.errors import BusError
 
 logger = logging.getLogger(__name__)

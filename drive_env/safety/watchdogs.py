@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env import cia402
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.errors import BusError
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import POSITION_HIGH

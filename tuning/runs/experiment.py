@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices import Device, find_device
-from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment_of
