@@ -19,7 +19,8 @@ from tuning.compare import comparison as compare_module
 from tuning.compare import tuners
 from tuning.compare.comparison import compare, save
 from tuning.compare.suite import load_suite, open_group
-from tuning.compare.tuners import MissingTunerError, Outcome, find_tuner, search_tuner, tuner_rows
+from tuning.compare.tuners import MissingTunerError, find_tuner, search_tuner, tuner_rows
+from tuning.outcome import Outcome
 from tuning.runs.pools import open_pool
 from tuning.runs.shard_log import ShardLog
 from tuning.search.optimise import Optimised, Row, Settings

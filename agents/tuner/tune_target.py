@@ -14,7 +14,7 @@ from agents.shipped import TUNER, shipped
 if TYPE_CHECKING:
     from agents.policies.guard import GuardLimits
     from drive_env.drives.interface import Drives
-    from tuning.compare.tuners import Outcome
+    from tuning.outcome import Outcome
     from tuning.target import Target
 
 Floats = NDArray[np.float64]
@@ -178,7 +178,7 @@ NOT_OF_DRIVES = ("distributions", "privileged", "stage", "load", "motor", "devic
 
 def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
     """Tune a target with the agent that ships, as `drive-tune rank` wants it (entry point `drive_env.tuners`)."""
-    from tuning.compare.tuners import Outcome
+    from tuning.outcome import Outcome
     from tuning.target import timed
 
     with timed(target) as (watched, clock):

@@ -23,13 +23,13 @@ from tuning.auto.search import compute, identify, prepare
 from tuning.auto.settings import begin, commission, write
 from tuning.auto.trials import prove
 from tuning.identify.quick_identification import identify_briefly
+from tuning.outcome import Outcome
 from tuning.snapshot import Transaction
 from tuning.target import timed
 
 if TYPE_CHECKING:
     from tuning.auto.result import Result
     from tuning.auto.search import Identify
-    from tuning.compare.tuners import Outcome
     from tuning.target import Target
 
 Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
@@ -160,8 +160,6 @@ def tell_of_lateness(run: Run) -> None:
 
 def tune(target: Target, rng: np.random.Generator) -> Outcome:
     """Tune a target as `drive-tune rank` wants it."""
-    from tuning.compare.tuners import Outcome
-
     with tempfile.TemporaryDirectory() as folder:
         found = auto(target, Path(folder) / "before.toml", seed=int(rng.integers(2**31)), keep=False)
     return Outcome(

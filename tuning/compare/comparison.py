@@ -28,9 +28,10 @@ from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import HiddenScore
 from mechanics.untrusted import parse_json
 from tuning.compare.suite import Machine, groups, open_group
-from tuning.compare.tuners import Outcome, RuleTuner, Tuner, find_tuner, identify_all
+from tuning.compare.tuners import RuleTuner, find_tuner, identify_all
 from tuning.drive_audit import KINDS, DriveAudit
 from tuning.identify.moved_inertia import moved_inertia
+from tuning.outcome import Outcome, Tuner
 from tuning.runs.shard_log import ShardLog
 from tuning.search.trial_bench import read_gains
 from tuning.target import Target

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import write_gains
+from tuning.outcome import Outcome, Tuner
 from tuning.search.optimise import Settings, optimise
 from tuning.search.samplers import check_installed
 from tuning.search.trial_bench import TrialBench, read_gains
@@ -28,28 +29,6 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 ENTRY_POINTS = "drive_env.tuners"
-
-
-class Outcome(NamedTuple):
-    """What a tuner did, of every axis.
-
-    gains: Raw integers in the order of `Gains`, shape (num_axes, 5).
-    drive_seconds: Time on the drive [s], (num_axes,).
-    moves: Moves and other excitations, (num_axes,).
-    aborts: What had to be stopped, (num_axes,).
-    violations: How often it left its limits, (num_axes,).
-    notes: What there is to say, one text per axis; "" is nothing.
-    """
-
-    gains: Integers
-    drive_seconds: Floats
-    moves: Integers
-    aborts: Integers
-    violations: Integers
-    notes: tuple[str, ...]
-
-
-Tuner = Callable[[Target, np.random.Generator], Outcome]
 
 
 class Row(NamedTuple):
