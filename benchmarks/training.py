@@ -17,7 +17,7 @@ CORES = 2
 def training(environment: str, section: str | None, rollouts: int) -> dict[str, float]:
     """Return steps/s of the fastest rollout with its update, and the share of its time that the environment took."""
     from agents.training import hyperparameters
-    from agents.training.train import Progress, Run, train
+    from agents.training.train import Progress, TrainingRun, train
 
     given = hyperparameters.load(environment, "ppo", "quick", section=section)
     given["n_timesteps"] = rollouts * given["n_envs"] * given["n_steps"]
@@ -29,7 +29,7 @@ def training(environment: str, section: str | None, rollouts: int) -> dict[str, 
     told: list[Progress] = []
     with tempfile.TemporaryDirectory() as folder:
         # No checkpoint but the last: a short run has as many as a long one.
-        train(Run(environment, "ppo", given, segments=1), folder, report=told.append)
+        train(TrainingRun(environment, "ppo", given, segments=1), folder, report=told.append)
     fastest = max(told, key=lambda progress: progress.speed)
     load, lanes = given["env_kwargs"]["load"], given["n_envs"]
     name = f"PPO, {environment.partition('/')[2]}, {load}, {lanes} lanes, {cores} threads"

@@ -18,7 +18,7 @@ from mechanics.friction import BRISTLE_DAMPING, FrictionModel, find_friction
 from mechanics.load import Load
 from mechanics.load_values import FRICTION_COLUMNS, LoadValues
 from mechanics.modal import Corrections, corrections
-from mechanics.plant import Plant
+from mechanics.plant import PackedPlant
 from mechanics.template import Template
 
 Floats = NDArray[np.float64]
@@ -275,11 +275,11 @@ class PackedLoad:
     def _by_copy(self, array: Floats) -> Floats:
         return array.reshape(self.copies, self.num_dofs)
 
-    def _new_plant(self) -> Plant:
+    def _new_plant(self) -> PackedPlant:
         copies, dofs, axes = self.copies, self.num_dofs, self.num_axes
         rows, frictions, contacts = self._rows, self.num_frictions, len(self.load.contacts)
         elements = len(rows.motion)
-        return Plant(
+        return PackedPlant(
             model_address=self.model._address,
             data_address=self.data._address,
             staggered=self.staggered,

@@ -8,7 +8,7 @@ from mechanics.bundle import Bundle, Cube, Matrix, NumberMatrix, Numbers, Vector
 
 
 @dataclass(eq=False)
-class Plant(Bundle):
+class PackedPlant(Bundle):
     """What the compiled step needs of a packed model; built by packed.py.
 
     C copies, D degrees of freedom each, A axes, F frictions (the axes' bearings first), B contacts, E = F + B

@@ -31,7 +31,7 @@ SETS, LOCAL = 150, 60  # sets, of which the last are drawn around the best so fa
 SPREAD = 0.12  # of a local draw, as a share of the range
 
 
-class Fit(NamedTuple):
+class RuleFit(NamedTuple):
     """A set of constants and its mean of ln hidden J."""
 
     rule: Rule
@@ -64,7 +64,7 @@ class Bench:
         return self.hidden.score(rule_gains(self.device, self.motor, self.inertia, rule))
 
 
-def candidates(seed: int, best: list[Fit]) -> Iterator[Rule]:
+def candidates(seed: int, best: list[RuleFit]) -> Iterator[Rule]:
     """Yield sets of constants, at first over the whole ranges, then around the first of `best`, which the caller keeps.
 
     The constants in force come first, so that a fit never ends worse.
@@ -86,12 +86,12 @@ def candidates(seed: int, best: list[Fit]) -> Iterator[Rule]:
         yield FITTED_RULE._replace(**constants)
 
 
-def fit(benches: list[Bench], seed: int = 0) -> list[Fit]:
+def fit(benches: list[Bench], seed: int = 0) -> list[RuleFit]:
     """Return all sets that were tried, the best first."""
-    best: list[Fit] = []
+    best: list[RuleFit] = []
     for rule in candidates(seed, best):
         logs = np.concatenate([np.log(bench.score(rule).hidden) for bench in benches])
-        best.append(Fit(rule, float(logs.mean())))
+        best.append(RuleFit(rule, float(logs.mean())))
         best.sort(key=lambda one: one.score)
     return best
 

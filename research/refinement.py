@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.policies.agent_file import Bundle, installed, plain
+from agents.policies.agent_file import AgentFile, installed, plain
 from agents.policies.baselines import baseline
 from agents.policies.policy import policy_of
 from agents.training.tasks import configuration_of, make_lanes
@@ -47,7 +47,7 @@ LEAST_DEVIATION = 0.1  # of the first one: what the search keeps
 
 
 @dataclass(frozen=True)
-class Search:
+class RefinementSearch:
     """What is searched for, and how.
 
     Attributes:
@@ -85,9 +85,9 @@ class Search:
 
 # Load -> how its controller is refined.
 SEARCHES = {
-    "two_mass": Search(share=0.85),
-    "gantry": Search(hard=4, machines=16, pool=256, deviation=0.008, share=1.75),
-    "cart_pendulum": Search(
+    "two_mass": RefinementSearch(share=0.85),
+    "gantry": RefinementSearch(hard=4, machines=16, pool=256, deviation=0.008, share=1.75),
+    "cart_pendulum": RefinementSearch(
         start="feed_forward",
         # Swinging counts four times: with the environment's own weights nothing beats following closely, swing or not.
         options=(("mode", "csp"), ("action", "offset"), ("duration", 3.0), ("weights", {"load": 4.0})),
@@ -122,7 +122,9 @@ class Played(NamedTuple):
         return Played(*(values[where] for values in self))
 
 
-def refine(bundle: Bundle, search: Search, seed: int = 0, told: Callable[[int, float], None] | None = None) -> Bundle:
+def refine(
+    bundle: AgentFile, search: RefinementSearch, seed: int = 0, told: Callable[[int, float], None] | None = None
+) -> AgentFile:
     """Return a controller with a refined last layer.
 
     Args:
@@ -182,7 +184,7 @@ def refine(bundle: Bundle, search: Search, seed: int = 0, told: Callable[[int, f
     return with_last_layer(bundle, start + changes(directions, search.share * mean[None], start.shape[1])[0])
 
 
-def cost(found: Played, rival: Played, weight: Floats, search: Search) -> Floats:
+def cost(found: Played, rival: Played, weight: Floats, search: RefinementSearch) -> Floats:
     """Return the cost of candidates, shape (candidates,).
 
     Args:
@@ -200,7 +202,7 @@ def cost(found: Played, rival: Played, weight: Floats, search: Search) -> Floats
 
 
 # --- the last layer ---------------------------------------------------------------------------------------------------
-def linear(load: str, search: Search) -> Bundle:
+def linear(load: str, search: RefinementSearch) -> AgentFile:
     """Return the baseline that a search begins as, as a network of one layer."""
     options = {"load": load, "distributions": load, **dict(search.options)}
     lanes: Any = make_lanes(ENVIRONMENT, 1, options)
@@ -226,10 +228,12 @@ def linear(load: str, search: Search) -> Bundle:
         "figures": {},
         "limits": [f"trained on the load {load!r} alone", *search.limits],
     }
-    return Bundle("mlp", arrays, settings, ENVIRONMENT, configuration, card, installed("drive-env", "numpy", "mujoco"))
+    return AgentFile(
+        "mlp", arrays, settings, ENVIRONMENT, configuration, card, installed("drive-env", "numpy", "mujoco")
+    )
 
 
-def features_of(bundle: Bundle) -> Callable[[Any], Array]:
+def features_of(bundle: AgentFile) -> Callable[[Any], Array]:
     """Return the function from observations (lanes, entries) to what the last layer sees, and 1: (lanes, features)."""
     number = _last(bundle)
     width = bundle.arrays[f"weight_{number}"].shape[0]
@@ -240,13 +244,13 @@ def features_of(bundle: Bundle) -> Callable[[Any], Array]:
     return lambda observation: np.pad(policy.act(observation), ((0, 0), (0, 1)), constant_values=1.0)
 
 
-def last_layer(bundle: Bundle) -> Floats:
+def last_layer(bundle: AgentFile) -> Floats:
     """Return weights of the last layer and, as the last row, its biases, shape (features, axes)."""
     number = _last(bundle)
     return np.vstack([bundle.arrays[f"weight_{number}"], bundle.arrays[f"bias_{number}"]]).astype(float)
 
 
-def with_last_layer(bundle: Bundle, layer: Floats) -> Bundle:
+def with_last_layer(bundle: AgentFile, layer: Floats) -> AgentFile:
     """Return a bundle with another last layer, as `last_layer` has it."""
     number, layer = _last(bundle), layer.astype(np.float32)
     return replace(bundle, arrays={**bundle.arrays, f"weight_{number}": layer[:-1], f"bias_{number}": layer[-1]})
@@ -331,11 +335,11 @@ def machine_seed(seed: int) -> int:
     return int(np.random.SeedSequence([seed, zlib.crc32(b"refinement")]).generate_state(1)[0]) >> 1
 
 
-def _lanes(bundle: Bundle, count: int) -> Any:
+def _lanes(bundle: AgentFile, count: int) -> Any:
     return make_lanes(ENVIRONMENT, count, bundle.configuration, autoreset_mode="NextStep")
 
 
-def _last(bundle: Bundle) -> int:
+def _last(bundle: AgentFile) -> int:
     return max(int(name.removeprefix("weight_")) for name in bundle.arrays if name.startswith("weight_"))
 
 
@@ -367,14 +371,14 @@ def main() -> None:
     print(f"written to {replace(made, card=card).save(arguments.out)}")
 
 
-def _given(path: Path | None, load: str | None) -> tuple[Bundle, Search]:
+def _given(path: Path | None, load: str | None) -> tuple[AgentFile, RefinementSearch]:
     """Return what is refined, and how."""
     if path is None:
         if load is None or not SEARCHES[load].start:
             begins = ", ".join(name for name, search in SEARCHES.items() if search.start)
             raise ValueError(f"give an agent to refine, or one of the loads that begin as a baseline: --load {begins}")
         return linear(load, SEARCHES[load]), SEARCHES[load]
-    bundle = Bundle.load(path)
+    bundle = AgentFile.load(path)
     name = str(bundle.configuration.get("load"))
     if load not in (None, name) or name not in SEARCHES:
         raise ValueError(f"{path} is for the load {name!r}; there are searches for {', '.join(SEARCHES)}")

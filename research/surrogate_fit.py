@@ -23,7 +23,7 @@ WORST = 2.0  # of ln of hidden J over the rule's: how bad bad gains are is nobod
 EPOCHS, BATCH, RATE, DECAY = 30, 128, 4e-3, 2e-3  # BATCH is of machines
 
 
-class Trials(NamedTuple):
+class TrialData(NamedTuple):
     """Trials of machines.
 
     context: Shape (n, 20). gains: ln over the rule's, (n, trials, gains). shown: What they showed, (n, trials, 16).
@@ -36,7 +36,7 @@ class Trials(NamedTuple):
     worth: Array
 
 
-def join(parts: Sequence[Trials]) -> Trials:
+def join(parts: Sequence[TrialData]) -> TrialData:
     """Return the machines of all parts."""
     most = max(part.worth.shape[1] for part in parts)
 
@@ -44,7 +44,7 @@ def join(parts: Sequence[Trials]) -> Trials:
         none = ((0, 0),) * (values.ndim - 2)
         return np.pad(values, ((0, 0), (0, most - values.shape[1]), *none), constant_values=filling)
 
-    return Trials(
+    return TrialData(
         np.concatenate([part.context for part in parts]),
         np.concatenate([padded(part.gains, 0.0) for part in parts]),
         np.concatenate([padded(part.shown, 0.0) for part in parts]),
@@ -89,7 +89,7 @@ class SurrogateNetwork(nn.Module):  # type: ignore[misc]
 
 
 def fit(
-    data: Trials, seed: int, networks: int, progress: Callable[[float], None] = lambda share: None
+    data: TrialData, seed: int, networks: int, progress: Callable[[float], None] = lambda share: None
 ) -> dict[str, Array]:
     """Return the arrays of a surrogate: the normaliser's, and the networks' weights in half precision."""
     normal = _normaliser(data)
@@ -110,7 +110,7 @@ def _part(progress: Callable[[float], None], number: int, count: int, share: flo
     progress((number + share) / count)
 
 
-def _normaliser(data: Trials) -> Normaliser:
+def _normaliser(data: TrialData) -> Normaliser:
     flat = data.shown[np.isfinite(data.worth)]
     return Normaliser(
         data.context.mean(axis=0), 1.0 / (data.context.std(axis=0) + 1e-6),
@@ -118,7 +118,7 @@ def _normaliser(data: Trials) -> Normaliser:
     )  # fmt: skip
 
 
-def _fit_one(data: Trials, normal: Normaliser, seed: int, progress: Callable[[float], None]) -> dict[str, Array]:
+def _fit_one(data: TrialData, normal: Normaliser, seed: int, progress: Callable[[float], None]) -> dict[str, Array]:
     """Return a network's weights, fitted to the worth of all trials, each time knowing other ones of the machine.
 
     It knows the trial at the rule's gains always, of the others a random number, the asked one included or not: so it

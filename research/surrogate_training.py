@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.policies.agent_file import Bundle, installed
+from agents.policies.agent_file import AgentFile, installed
 from agents.tuner.surrogate import CONTEXT, IDENTIFIED, SHOWN, SurrogatePolicy
 from mechanics.untrusted import read_arrays
 from tuning.bootstrap import bootstrap_interval
@@ -98,8 +98,8 @@ def machines_of(load: str, motor: str, count: int, **options: Any) -> Iterator[A
 
 
 def collect(load: str, motor: str, machines: int, trials: int, seed: int, policy: Any = None) -> Any:
-    """Return `Trials` on random machines: of random gains, or of what a policy proposes, shaken a little."""
-    from research.surrogate_fit import Trials
+    """Return `TrialData` on random machines: of random gains, or of what a policy proposes, shaken a little."""
+    from research.surrogate_fit import TrialData
 
     rng = np.random.default_rng(seed)
     G = len(GAINS)
@@ -123,7 +123,7 @@ def collect(load: str, motor: str, machines: int, trials: int, seed: int, policy
             for column, value in zip(columns, found, strict=True):
                 column.append(np.asarray(value, np.float32))
     assert context.shape[1] == CONTEXT
-    return Trials(context, *(np.stack(column, axis=1) for column in columns))
+    return TrialData(context, *(np.stack(column, axis=1) for column in columns))
 
 
 def _random_gains(rng: np.random.Generator, count: int) -> Floats:
@@ -139,11 +139,11 @@ def _shown(observation: Array) -> Array:
     return np.asarray(observation[:, at : at + SHOWN], np.float32)
 
 
-def bundle_of(arrays: Mapping[str, Array], card: Mapping[str, Any]) -> Bundle:
+def bundle_of(arrays: Mapping[str, Array], card: Mapping[str, Any]) -> AgentFile:
     """Return the agent."""
     settings = {"gains": len(GAINS), "step": CONFIGURATION["step"], "low": list(LOW), "high": list(HIGH), **SETTINGS}
     versions = installed("drive-env", "numpy", "torch", "mujoco", "numba")
-    return Bundle("surrogate", arrays, settings, ENVIRONMENT, dict(CONFIGURATION), card, versions)
+    return AgentFile("surrogate", arrays, settings, ENVIRONMENT, dict(CONFIGURATION), card, versions)
 
 
 def train(
@@ -154,7 +154,7 @@ def train(
     rows: Sequence[tuple[str, str]] = TRAINING,
     kept: Path | None = None,
     progress: Callable[[str, float], None] = lambda what, share: None,
-) -> Bundle:
+) -> AgentFile:
     """Return a surrogate trained from nothing, or from the trials that were kept.
 
     Args:
@@ -191,12 +191,12 @@ def train(
 
 
 def _kept(file: Path | None) -> Any:
-    from research.surrogate_fit import Trials
+    from research.surrogate_fit import TrialData
 
     if file is None or not file.exists():
         return None
     stored = read_arrays(file)
-    return Trials(**{name: stored[name] for name in Trials._fields})
+    return TrialData(**{name: stored[name] for name in TrialData._fields})
 
 
 def _keep(file: Path | None, trials: Any) -> Any:
@@ -245,7 +245,7 @@ def figures_of(ratios: Floats) -> dict[str, Any]:
     return figures
 
 
-def judged(made: Bundle) -> Bundle:
+def judged(made: AgentFile) -> AgentFile:
     """Return the agent with figures in its card, of machines that it was not trained on."""
     answers = judge(SurrogatePolicy(made), MACHINES, UNSEEN)
     figures = {

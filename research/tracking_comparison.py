@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluation.scores import FIGURES, Episode, Interval, current, figures, following_error, interval, pole
-from agents.policies.agent_file import Bundle
-from agents.policies.baselines import Law, feed_forward, nothing
+from agents.policies.agent_file import AgentFile
+from agents.policies.baselines import ControlLaw, feed_forward, nothing
 from agents.policies.policy import policy_of
 from agents.shipped import find_agent
 from agents.training.tasks import make_lanes
@@ -83,7 +83,7 @@ class Compared(NamedTuple):
 
 
 def compare(
-    bundle: Bundle,
+    bundle: AgentFile,
     episodes: int = 64,
     seed: int = 43_000,
     rivals: Sequence[str] = tuple(RIVALS),
@@ -193,7 +193,7 @@ def tune(drives: EmulatedDrives, commissioned: NDArray[np.int64]) -> None:
     drives.write(velocity_p(drives.device), np.clip(np.rint(wanted), 1, RAW_MAX).astype(np.int64))
 
 
-def _law(rival: Rival, lanes: Any, seeds: Sequence[int], commissioned: NDArray[np.int64] | None) -> Law:
+def _law(rival: Rival, lanes: Any, seeds: Sequence[int], commissioned: NDArray[np.int64] | None) -> ControlLaw:
     """Return a rival's feed-forward for the machines of these seeds."""
     if not rival.identified:
         return feed_forward(lanes.config)
@@ -230,7 +230,7 @@ def _play(lanes: Any, policy: Any, seeds: Sequence[int], commissioned: NDArray[n
     )  # fmt: skip
 
 
-def _adds(bundle: Bundle) -> bool:
+def _adds(bundle: AgentFile) -> bool:
     """Return whether a controller adds to a cascade, instead of being the only one."""
     return bundle.configuration.get("action") == "offset"
 
@@ -250,7 +250,7 @@ def main() -> None:
         if arguments.episodes < 1 or arguments.seed < 0:
             raise ValueError(f"--episodes {arguments.episodes} must be 1 or more, --seed {arguments.seed} 0 or more")
         path = find_agent(arguments.agent)
-        bundle = Bundle.load(path)
+        bundle = AgentFile.load(path)
         with Progress(console=Console(stderr=True)) as bar:
             task = bar.add_task("episodes", total=1.0)
             found = compare(bundle, arguments.episodes, arguments.seed, tuple(RIVALS) if _adds(bundle) else (),

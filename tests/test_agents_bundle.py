@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from agents.policies import policy as runtime
-from agents.policies.agent_file import ABOUT, Bundle, BundleError, plain
+from agents.policies.agent_file import ABOUT, AgentFile, BundleError, plain
 from agents.policies.policy import ACTIVATIONS, PolicyError, load_policy, measure_latency, policy_of
 
 ENTRIES, ACTIONS = 6, 2
@@ -45,7 +45,7 @@ def bundle(kind="mlp", activation="tanh", output="clip", hidden=(16, 8), **chang
         "card": {"limits": ["none known"]},
         "versions": {"numpy": np.__version__},
     }
-    return Bundle(**given | changes)
+    return AgentFile(**given | changes)
 
 
 def observations(lanes=4, seed=0):
@@ -55,7 +55,7 @@ def observations(lanes=4, seed=0):
 # --- the file ---------------------------------------------------------------------------------------------------------
 def test_what_is_saved_is_loaded(tmp_path):
     made = bundle()
-    found = Bundle.load(made.save(tmp_path / "agent.npz"))
+    found = AgentFile.load(made.save(tmp_path / "agent.npz"))
     assert found.arrays.keys() == made.arrays.keys() and found.hash == made.hash
     for name, array in made.arrays.items():
         assert np.array_equal(found.arrays[name], array) and found.arrays[name].dtype == array.dtype
@@ -82,7 +82,7 @@ def test_a_changed_file_is_refused(tmp_path):
     arrays["bias_0"] = arrays["bias_0"] + np.float32(1e-3)
     np.savez(path, **arrays)
     with pytest.raises(BundleError, match="was changed after it was written"):
-        Bundle.load(path)
+        AgentFile.load(path)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_a_file_that_is_none_is_told(tmp_path, content, message):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(BundleError, match=message):
-        Bundle.load(path)
+        AgentFile.load(path)
 
 
 def another_npz(path):
@@ -119,7 +119,7 @@ def test_a_file_of_another_program_is_told_without_numpys_advice(tmp_path, write
     path = tmp_path / "other.npz"
     write(path)
     with pytest.raises(BundleError) as error:
-        Bundle.load(path)
+        AgentFile.load(path)
     assert str(error.value) == (
         f"{path} is no agent; give the .npz that drive-agent train writes, or the name of an agent that ships"
     )
@@ -131,17 +131,17 @@ def test_what_cannot_be_read_is_told(tmp_path):
     with pytest.raises(
         BundleError, match=r"cannot read .*folder\.npz: .*; give the \.npz that drive-agent train writes"
     ):
-        Bundle.load(path)
+        AgentFile.load(path)
     with pytest.raises(BundleError, match=r"half\.npz is no agent; give"):
         another_about(tmp_path / "half.npz")
-        Bundle.load(tmp_path / "half.npz")
+        AgentFile.load(tmp_path / "half.npz")
 
 
 def test_pickles_are_not_opened(tmp_path):
     path = tmp_path / "agent.npz"
     np.savez(path, **{ABOUT: np.array([{"format": "drive-agent"}], object)})
     with pytest.raises(BundleError, match="is no agent"):
-        Bundle.load(path)
+        AgentFile.load(path)
 
 
 def test_another_format_is_told(tmp_path):
@@ -149,7 +149,7 @@ def test_another_format_is_told(tmp_path):
     about = json.dumps({"format": "drive-agent", "format_version": 2}).encode()
     np.savez(path, **{ABOUT: np.frombuffer(about, np.uint8)})
     with pytest.raises(BundleError, match="has format 2 and this drive-env reads 1"):
-        Bundle.load(path)
+        AgentFile.load(path)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ pytest.importorskip("stable_baselines3")
 
 from agents.commands import train as train_command
 from agents.commands.cli import app
-from agents.policies.agent_file import Bundle
+from agents.policies.agent_file import AgentFile
 
 
 def run(*arguments):
@@ -40,13 +40,13 @@ def test_train_judge_resume_export(tmp_path, shrunk):
     assert found.exit_code == 0, found.output
     assert "ServoDrive/Tracking-v0 ppo: 208 of 200 steps" in found.output and "tracking 0." in found.output
     assert re.search(r"RMS following error \[rev\]: \S+ \(95 % of \S+ to \S+\), median", found.output)
-    bundle = Bundle.load(out / "agent.npz")
+    bundle = AgentFile.load(out / "agent.npz")
     assert bundle.configuration["load"] == "gantry" and bundle.settings["activation"] == "relu"
     figures = bundle.card["figures"]
     assert figures["RMS following error [rev]"]["episodes"] == 3 and figures["violations"] == {}
     assert bundle.card["seeds"] == {"training": 5, "evaluation": "1000000...1000002"}
     again = run("train", "--resume", out, "--trust")  # nothing is left to do: the same agent
-    assert again.exit_code == 0 and Bundle.load(out / "agent.npz").hash == bundle.hash
+    assert again.exit_code == 0 and AgentFile.load(out / "agent.npz").hash == bundle.hash
     exported = run("export", out / "checkpoint.zip", "--trust", "--out", tmp_path / "agent.onnx")
     assert exported.exit_code == 0 and "largest difference from Stable-Baselines3" in exported.output
     assert (tmp_path / "agent.npz").is_file()

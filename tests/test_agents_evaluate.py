@@ -21,7 +21,7 @@ from agents.evaluation.on_the_bus import target_for
 from agents.evaluation.scores import interval
 from agents.evaluation.served import draw_machines, emulated
 from agents.evaluation.sim_versus_bus import HIDDEN, on_both_sides
-from agents.policies.agent_file import Bundle, BundleError
+from agents.policies.agent_file import AgentFile, BundleError
 from agents.policies.guard import GuardLimits
 from agents.policies.open_policy import PolicyNotFoundError, open_policy, opened
 from agents.policies.policy import PolicyError, policy_of
@@ -368,7 +368,7 @@ def test_an_interface_in_the_environment_moves_nothing(tmp_path, monkeypatch):
 def test_a_policy_that_sticks_ends_the_command_with_a_line(tmp_path, served):
     channel, emulated = served
     path = agent(tmp_path / "agent.npz", mode="csv", duration=0.5)
-    made = Bundle.load(path)
+    made = AgentFile.load(path)
     stuck = bundle(arrays=dict(made.arrays) | {"bias_0": np.full(1, 9.0, np.float32)}, configuration=made.configuration)
     stuck.save(path)
     found = run("evaluate", path, "--channel", channel, "--lockstep", "--stall", 30)

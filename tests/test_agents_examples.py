@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.policies.agent_file import Bundle
+from agents.policies.agent_file import AgentFile
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 RUNS = {
@@ -61,6 +61,6 @@ def test_the_1_khz_loop_takes_a_trained_agent(tmp_path, monkeypatch, capsys):
               "action_high": np.ones(1, np.float32), "weight_0": np.array([[2.0], [0.0]], np.float32),
               "bias_0": np.zeros(1, np.float32)}  # fmt: skip
     settings = {"activation": "tanh", "output": "clip", "observation_clip": None}
-    path = Bundle("mlp", arrays, settings, "own").save(tmp_path / "agent.npz")
+    path = AgentFile("mlp", arrays, settings, "own").save(tmp_path / "agent.npz")
     run("policy_at_1_khz", ["--seconds", "0.1", "--agent", str(path)], monkeypatch)
     assert "velocity follows within" in capsys.readouterr().out

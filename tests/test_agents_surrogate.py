@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from agents.policies.agent_file import MAX_BYTES, Bundle
+from agents.policies.agent_file import MAX_BYTES, AgentFile
 from agents.policies.policy import PolicyError, load_policy, policy_of
 from agents.shipped import find_agent, shipped, shipped_names
 from agents.tuner.surrogate import CONTEXT, IDENTIFIED, SHOWN, SurrogatePolicy
@@ -20,7 +20,7 @@ LOW, HIGH = np.array(training.LOW), np.array(training.HIGH)
 
 def trials(machines=1_000, count=6, seed=0):
     """Trials of machines whose best gains nothing tells but a trial, the rule's excepted: it shows how far they are."""
-    from research.surrogate_fit import Trials
+    from research.surrogate_fit import TrialData
 
     rng = np.random.default_rng(seed)
     best = rng.uniform(-1.0, 1.0, (machines, 1, G))
@@ -29,7 +29,7 @@ def trials(machines=1_000, count=6, seed=0):
     shown = np.zeros((machines, count, SHOWN))
     shown[..., :G] = gains - best
     worth = np.abs(gains - best).sum(axis=2) - 2.0
-    return Trials(*(column.astype(np.float32) for column in (context, gains, shown, worth)))
+    return TrialData(*(column.astype(np.float32) for column in (context, gains, shown, worth)))
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_the_next_trial_is_the_best_of_all_candidates_wherever_the_incumbent_is(
 
 
 def test_trials_lie_within_the_range_and_the_action_within_its_bound(bundle, monkeypatch):
-    narrow = Bundle(bundle.kind, bundle.arrays, {**bundle.settings, "step": 0.5}, "none")
+    narrow = AgentFile(bundle.kind, bundle.arrays, {**bundle.settings, "step": 0.5}, "none")
     for one, bound in ((bundle, np.inf), (narrow, 0.5)):
         policy = SurrogatePolicy(one)
         monkeypatch.setattr(policy, "_ask", says(lambda gains: -gains.sum(axis=-1)))
@@ -167,7 +167,7 @@ def test_curiosity_seeks_what_is_not_known(bundle, monkeypatch):
     reached = {}
     for curiosity in (0.0, 2.0):
         policy = SurrogatePolicy(
-            Bundle(bundle.kind, bundle.arrays, {**bundle.settings, "curiosity": curiosity}, "none")
+            AgentFile(bundle.kind, bundle.arrays, {**bundle.settings, "curiosity": curiosity}, "none")
         )
         far = says(lambda gains: gains[..., 2], scale=lambda gains: gains[..., 2])
         monkeypatch.setattr(policy, "_ask", far)
@@ -200,7 +200,7 @@ TRIED = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 
     ((0.0, -0.1, -0.2, -0.3), (0.0, 0.0, 0.0, 1.0), 2),  # caution: of what is sure
 ])  # fmt: skip
 def test_the_answer_is_the_trial_with_the_least_median_that_is_sure(bundle, monkeypatch, median, scale, answer):
-    policy = SurrogatePolicy(Bundle(bundle.kind, bundle.arrays, {**bundle.settings, "caution": 1.0}, "none"))
+    policy = SurrogatePolicy(AgentFile(bundle.kind, bundle.arrays, {**bundle.settings, "caution": 1.0}, "none"))
     for gains in TRIED[:-1]:
         policy._take(after(gains))
     monkeypatch.setattr(policy, "_ask", lambda memory, gains: (np.array([median]), np.array([scale])))
@@ -305,7 +305,7 @@ def test_training_from_nothing_makes_a_tuner_repeats_and_goes_on_from_kept_trial
 def test_a_shipped_agent_is_small_and_has_a_card(name):
     path = shipped(name)
     assert path.stat().st_size < MAX_BYTES
-    card = Bundle.load(path).card
+    card = AgentFile.load(path).card
     assert {"trained", "distribution", "figures", "limits"} <= set(card)
 
 
@@ -319,7 +319,7 @@ def test_agents_are_found_by_name_or_file(tmp_path):
 @pytest.mark.slow
 def test_the_shipped_tuner_performs_as_its_card_says():
     """On the card's own machines, of every kind, figure by figure: they are drawn from a seed and never trained on."""
-    card = Bundle.load(shipped("gain_tuning")).card["figures"]
+    card = AgentFile.load(shipped("gain_tuning")).card["figures"]
     found = training.judge(load_policy(shipped("gain_tuning")), training.MACHINES, card["seed"])
     assert found.ratio.size == card["machines"] >= 200
     for name, figure in training.figures_of(found.ratio).items():
@@ -332,7 +332,7 @@ def test_the_shipped_tuner_performs_as_its_card_says():
 
 def test_the_shipped_tuner_is_of_this_trainings_kind():
     """What acts is what the documented command makes: settings and configuration are those of the code."""
-    ships, made = Bundle.load(shipped("gain_tuning")), training.bundle_of({}, {})
+    ships, made = AgentFile.load(shipped("gain_tuning")), training.bundle_of({}, {})
     assert (ships.kind, ships.configuration) == (made.kind, made.configuration)
     assert ships.settings == json.loads(json.dumps(dict(made.settings)))
 

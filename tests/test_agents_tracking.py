@@ -10,20 +10,20 @@ from test_agents_bundle import bundle as untrained
 
 from agents.evaluation.evaluation import evaluate
 from agents.evaluation.sim_versus_bus import on_both_sides
-from agents.policies.agent_file import Bundle
-from agents.policies.baselines import Law, baseline, feed_forward
+from agents.policies.agent_file import AgentFile
+from agents.policies.baselines import ControlLaw, baseline, feed_forward
 from agents.policies.guard import GuardLimits
 from agents.policies.policy import policy_of
 from agents.shipped import shipped, shipped_names
 from agents.training.tasks import make_lanes
 from drive_env.envs.tracking import TASKS, TrackingConfig
 from research import refinement, tracking_comparison
-from research.refinement import ENVIRONMENT, Played, Search, refine
+from research.refinement import ENVIRONMENT, Played, RefinementSearch, refine
 from research.tracking_comparison import RIVALS, compare, identified_lags, ratio
 
 CONTROLLERS = [name for name in shipped_names() if name.startswith("tracking_")]
 RESIDUAL = ("tracking_gantry", "tracking_two_mass")
-LEADING = Search(start="feed_forward", options=(("mode", "csp"), ("action", "offset"), ("duration", 0.2)))
+LEADING = RefinementSearch(start="feed_forward", options=(("mode", "csp"), ("action", "offset"), ("duration", 0.2)))
 ERROR, CURRENT = "RMS following error [rev]", "RMS current [of the limit]"
 
 
@@ -65,7 +65,7 @@ def test_the_lag_identified_on_a_machine_is_that_of_its_position_gain(monkeypatc
 
 
 def nothing():
-    return Law(lambda rows: np.zeros((len(rows), 1)))
+    return ControlLaw(lambda rows: np.zeros((len(rows), 1)))
 
 
 def test_a_controller_that_is_the_rival_is_no_better_and_no_worse():
@@ -104,7 +104,7 @@ def test_a_tuned_cascade_has_velocity_gains_for_its_inertia():
 
 def test_what_acts_directly_has_no_rival():
     with pytest.raises(ValueError, match="cascades are rivals of a controller with action = 'offset'"):
-        compare(Bundle.load(shipped("tracking_inverted_pendulum")), 1)
+        compare(AgentFile.load(shipped("tracking_inverted_pendulum")), 1)
 
 
 @pytest.mark.parametrize(
@@ -184,17 +184,19 @@ def test_axes_act_as_one():
 def test_current_costs_what_is_above_the_rival_s():
     rival = Played(np.array([0.1, 0.3]), np.array([0.2, 0.2]), np.zeros(2))
     one = np.array([[0.05, 0.15], [0.05, 0.15]]), np.array([[0.1, 0.1], [0.22, 0.22]]), np.zeros((2, 2))
-    found = refinement.cost(Played(*one), rival, np.array([0.5, 0.5]), Search(limit=1.0, price=4.0))
+    found = refinement.cost(Played(*one), rival, np.array([0.5, 0.5]), RefinementSearch(limit=1.0, price=4.0))
     assert found == pytest.approx([0.5, 0.5 + 4.0 * 0.1])
     rewards = Played(np.ones((1, 2)), np.ones((1, 2)), np.array([[1.0, 3.0]]))
-    assert refinement.cost(rewards, rival, np.array([0.75, 0.25]), Search(rival="")) == pytest.approx([-1.5])
+    assert refinement.cost(rewards, rival, np.array([0.75, 0.25]), RefinementSearch(rival="")) == pytest.approx([-1.5])
 
 
 def test_refinement_repeats_and_makes_the_error_smaller():
     """From a cascade that leads by half of what it should."""
     whole = leading()
     half = refinement.with_last_layer(whole, 0.5 * refinement.last_layer(whole))
-    search = Search(limit=2.0, deviation=0.05, pool=12, hard=2, machines=4, candidates=8, elite=3, generations=6)
+    search = RefinementSearch(
+        limit=2.0, deviation=0.05, pool=12, hard=2, machines=4, candidates=8, elite=3, generations=6
+    )
     told = []
     made = refine(half, search, 3, told=lambda generation, cost: told.append(generation))
     again = refine(half, search, 3)
@@ -205,7 +207,7 @@ def test_refinement_repeats_and_makes_the_error_smaller():
 
 def test_only_networks_for_tracking_are_refined():
     with pytest.raises(ValueError, match=r"a network \(mlp\) for ServoDrive/Tracking-v0 can be refined, not surrogate"):
-        refine(Bundle.load(shipped("gain_tuning")), Search())
+        refine(AgentFile.load(shipped("gain_tuning")), RefinementSearch())
 
 
 @pytest.mark.parametrize(
@@ -229,13 +231,13 @@ def test_mistakes_in_a_command_are_told_in_a_line(tmp_path, monkeypatch, capsys,
 
 def test_the_commands_refine_compare_and_write_the_card(tmp_path, monkeypatch, capsys):
     path, out = leading().save(tmp_path / "agent.npz"), tmp_path / "refined.npz"
-    small = Search(pool=4, hard=1, machines=2, candidates=3, elite=2, generations=1)
+    small = RefinementSearch(pool=4, hard=1, machines=2, candidates=3, elite=2, generations=1)
     monkeypatch.setattr(refinement, "SEARCHES", {"two_mass": small})
     monkeypatch.setattr("sys.argv", ["refinement", str(path), "--out", str(out), "--seed", "4"])
     refinement.main()
     monkeypatch.setattr("sys.argv", ["comparison", str(out), "--episodes", "2", "--seed", "9", "--card"])
     tracking_comparison.main()
-    card = Bundle.load(out).card
+    card = AgentFile.load(out).card
     assert card["seeds"]["refinement"] == 4 and card["refinement"]["generations"] == 1
     assert "refined by the cross-entropy method" in card["trained"]
     assert card["seeds"]["evaluation"] == "9...10" and set(card["figures"]["against"]) == set(RIVALS)
@@ -249,7 +251,7 @@ def test_there_is_a_controller_for_each_task():
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_the_shipped_controllers_perform_as_their_cards_say(name):
-    made = Bundle.load(shipped(name))
+    made = AgentFile.load(shipped(name))
     found = evaluate(policy_of(made), made.environment, made.configuration, episodes=16, seed=77_000)
     assert found.interval(ERROR).median < 2.0 * made.card["figures"][ERROR]["median"]
     assert not found.violations
@@ -258,7 +260,7 @@ def test_the_shipped_controllers_perform_as_their_cards_say(name):
 @pytest.mark.parametrize("name", RESIDUAL)
 def test_the_residuals_beat_the_cascade_at_equal_current(name):
     """On the card, and on other machines than those that it tells of."""
-    made = Bundle.load(shipped(name))
+    made = AgentFile.load(shipped(name))
     card = made.card["figures"]["against"]
     assert set(card) == set(RIVALS)
     told = card["csp with 60B0h"]
@@ -273,7 +275,7 @@ def test_the_residuals_beat_the_cascade_at_equal_current(name):
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_a_shipped_controller_acts_the_same_over_can_in_lockstep(name):
     """Machines that are drawn, each in this process and behind its own hub."""
-    made = Bundle.load(shipped(name))
+    made = AgentFile.load(shipped(name))
     options = {**made.configuration, "duration": 0.1}
     patient = GuardLimits(saturation=None, stall=30.0)
     both = on_both_sides(policy_of(made), made.environment, options, machines=2, seed=5, lockstep=True, guard=patient)

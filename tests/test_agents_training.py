@@ -14,7 +14,7 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 
 from agents.evaluation.evaluation import evaluate
-from agents.policies.agent_file import Bundle
+from agents.policies.agent_file import AgentFile
 from agents.policies.baselines import baseline
 from agents.policies.open_policy import open_policy
 from agents.policies.policy import policy_of
@@ -24,7 +24,7 @@ from agents.training import train as training
 from agents.training.hyperparameters import ALGORITHMS, HyperparameterError, read_value
 from agents.training.imitation import imitate
 from agents.training.tasks import ENVIRONMENTS, environment_name, make_lanes
-from agents.training.train import AGENT, CHECKPOINT, TABLE, DivergedError, Run, train
+from agents.training.train import AGENT, CHECKPOINT, TABLE, DivergedError, TrainingRun, train
 from tuning.runs.pools import PoolError
 
 TINY = {"ServoDrive/Tracking-v0": {"duration": 0.01}, "ServoDrive/GainScheduling-v0": {"duration": 0.02},
@@ -43,7 +43,7 @@ def tiny(environment="tracking", algorithm="ppo", timesteps=192, **changes):
     if algorithm != "sac":
         small = {"n_steps": 8, "batch_size": 16, "n_epochs": 2}
     hyperparameters.merge(given, small | changes)
-    return Run(name, algorithm, given, seed=3, segments=4)
+    return TrainingRun(name, algorithm, given, seed=3, segments=4)
 
 
 def weights(bundle):
@@ -61,7 +61,7 @@ def test_one_seed_gives_the_same_agent(algorithm, tmp_path):
 
 def test_another_seed_gives_another_agent(tmp_path):
     run = tiny()
-    other = Run(run.environment, run.algorithm, run.hyperparameters, seed=4, segments=4)
+    other = TrainingRun(run.environment, run.algorithm, run.hyperparameters, seed=4, segments=4)
     assert not np.array_equal(weights(train(run, tmp_path / "a")), weights(train(other, tmp_path / "b")))
 
 
@@ -200,7 +200,7 @@ def test_the_shipped_tuner_is_a_baseline_of_its_own_gains():
     lanes = make_lanes("gain_tuning", 1, {"num_threads": 1})
     policy = baseline("surrogate", "gain_tuning", lanes.config, 3)
     lanes.close()
-    ships = Bundle.load(shipped(TUNER))
+    ships = AgentFile.load(shipped(TUNER))
     assert all(np.array_equal(policy.bundle.arrays[name], array) for name, array in ships.arrays.items())
     assert policy.bundle.settings == {**ships.settings, "step": lanes.config.step}  # the action's bound
     with pytest.raises(ValueError, match="surrogate changes the gains velocity_p, velocity_i, position_p"):
@@ -213,7 +213,7 @@ def both(environment, options, wrapper):
     plain = make_lanes(environment, 4, {**options, "num_threads": 1}, autoreset_mode="SameStep")
     name = environment_name(environment)
     settings = {"n_envs": 4, "env_kwargs": {**options, "num_threads": 1}, "vec_env_wrapper": wrapper}
-    _, env = training.make_env(Run(name, "ppo", settings))
+    _, env = training.make_env(TrainingRun(name, "ppo", settings))
     env.seed(7)
     return plain, plain.reset(seed=7), env, env.reset()
 
@@ -265,7 +265,7 @@ def test_there_are_hyperparameters_for_every_environment_and_algorithm(environme
 @pytest.mark.parametrize("environment", ["gain_tuning", "gain_scheduling"])
 def test_every_environment_trains(environment, algorithm, tmp_path):
     bundle = train(tiny(environment, algorithm, timesteps=64), tmp_path)
-    assert Bundle.load(tmp_path / AGENT).environment == bundle.environment
+    assert AgentFile.load(tmp_path / AGENT).environment == bundle.environment
 
 
 def test_an_asymmetric_critic_sees_the_machine_and_the_actor_does_not(tmp_path):
@@ -425,7 +425,7 @@ def test_a_training_that_diverges_is_a_trial_that_failed(tmp_path, monkeypatch):
 
 def test_a_search_without_any_agent_says_so(tmp_path, monkeypatch):
     run = tiny(timesteps=32, max_grad_norm=1e9)
-    monkeypatch.setitem(search.SPACES, "ppo", (search.Row("learning_rate", choices=(1e6,)),))
+    monkeypatch.setitem(search.SPACES, "ppo", (search.SearchRow("learning_rate", choices=(1e6,)),))
     with pytest.raises(DivergedError, match="all 1 trainings diverged; give a smaller learning_rate"):
         search.search(run.environment, "ppo", run.hyperparameters, tmp_path, trials=1)
 

@@ -12,7 +12,7 @@ from drive_env import cia402, motion
 from drive_env.gains import Gains, write_gains
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.result import AxisRun
-from tuning.auto.run import Run
+from tuning.auto.run import AutoRun
 from tuning.response import frequency_response
 from tuning.response.linear_model import OPEN_LOOPS, Plant
 from tuning.response.margins import Margins, margins
@@ -37,7 +37,7 @@ def test_the_response_is_measured_within_what_is_left_of_the_travel(moved, left,
     monkeypatch.setattr(frequency_response, "measure", measure)
     travel = (-0.3 * TURN, 0.3 * TURN)
     with emulated(load="inertia", travel=travel, num_threads=1) as target, timed(target) as (watched, clock):
-        run = Run(watched, 0, clock, 60.0)
+        run = AutoRun(watched, 0, clock, 60.0)
         motion.enable(target.drives, mode="pp")
         motion.move_to(target.drives, target.drives.read(cia402.POSITION_ACTUAL) + round(moved * 65536))
         run.gains = np.array([[4000, 1500, 500, 300, 100]])

@@ -22,7 +22,7 @@ from tuning.auto.moves import _ease, _keep_what_is_better
 from tuning.auto.one_button import auto, tell_of_lateness
 from tuning.auto.proving import RESTLESS, ProvingGround, Shown
 from tuning.auto.result import AxisRun
-from tuning.auto.run import Run as AutoRun
+from tuning.auto.run import AutoRun
 from tuning.auto.search import calm_gains
 from tuning.auto.trials import faster
 from tuning.auto.twin import Optimum

@@ -9,7 +9,7 @@ from canopen_wire import Wire
 from drive_env import EmulatedDrives
 from drive_env.canopen.emergency import QUEUE
 from drive_env.canopen.frames import Frame
-from drive_env.canopen.nmt import State
+from drive_env.canopen.nmt import NmtState
 from drive_env.devices import find_device
 from drive_env.firmware import fsa
 from drive_env.firmware.protection import CAUSES
@@ -302,7 +302,7 @@ def test_bus_off_stops_the_drive_and_is_told_after_recovery(wire):
         wait 20 ms
     """)
     assert wire.node._axes[0].state == fsa.State.FAULT
-    assert wire.node.state is State.OPERATIONAL
+    assert wire.node.state is NmtState.OPERATIONAL
     wire.node.bus_on(wire.now)
     assert str(wire.take()[0]) == "085  40 81 11 00 FF 00 00 00"
     wire.wait(1)
@@ -328,7 +328,7 @@ def test_recovery_without_bus_off_is_nothing(wire):
 
 
 # --- error behaviour --------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(("raw", "end"), [(0, State.STOPPED), (1, State.OPERATIONAL), (2, State.STOPPED)])
+@pytest.mark.parametrize(("raw", "end"), [(0, NmtState.STOPPED), (1, NmtState.OPERATIONAL), (2, NmtState.STOPPED)])
 def test_an_application_error(wire, raw, end):
     assert wire.value(0x1029, 2) == 1
     assert wire.download(0x1029, 2, raw, 1) == 0
@@ -347,7 +347,7 @@ def test_a_warning_is_no_application_error(wire):
     wire.drives.machine.set_temperatures(25.0, 90.0)
     wire.wait(2)
     assert "085  10 43 00 01 00 00 00 00" in map(str, wire.take())
-    assert wire.node.state is State.OPERATIONAL
+    assert wire.node.state is NmtState.OPERATIONAL
 
 
 @pytest.mark.parametrize("raw", [0, 1])
@@ -356,7 +356,7 @@ def test_in_pre_operational_no_error_changes_the_state(wire, raw):
     wire.enable()
     wire.drives.machine.enable_input = False
     wire.wait(2)
-    assert wire.node.state is State.PRE_OPERATIONAL
+    assert wire.node.state is NmtState.PRE_OPERATIONAL
 
 
 # --- two nodes on one set of drives -----------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.error_control import consumers
-from drive_env.canopen.nmt import State
+from drive_env.canopen.nmt import NmtState
 from drive_env.firmware import fsa
 
 
@@ -160,7 +160,7 @@ def test_the_master_s_own_number_may_be_watched_and_switched_off_again(wire):
     """)
 
 
-@pytest.mark.parametrize(("raw", "end"), [(0, State.STOPPED), (1, State.OPERATIONAL), (2, State.STOPPED)])
+@pytest.mark.parametrize(("raw", "end"), [(0, NmtState.STOPPED), (1, NmtState.OPERATIONAL), (2, NmtState.STOPPED)])
 def test_error_behaviour_of_a_communication_error(wire, raw, end):
     assert wire.download(0x1029, 1, raw, 1) == 0
     wire.enable()
@@ -173,7 +173,7 @@ def test_error_behaviour_of_a_communication_error(wire, raw, end):
     """)
     assert wire.node.state is end
     wire.wait(5)
-    expected = fsa.State.FAULT if end is State.STOPPED else fsa.State.OPERATION_ENABLED
+    expected = fsa.State.FAULT if end is NmtState.STOPPED else fsa.State.OPERATION_ENABLED
     assert wire.node._axes[0].state == expected
 
 

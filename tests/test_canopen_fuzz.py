@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drive_env import EmulatedDrives, ObjectAccessError
 from drive_env.canopen.frames import Frame
-from drive_env.canopen.nmt import State
+from drive_env.canopen.nmt import NmtState
 
 NODE = 5
 PERIOD = 10  # ms between heartbeats
@@ -180,7 +180,7 @@ def fuzz(seed, count):
                 check_dictionary(wire)
         assert {b - a for a, b in pairwise(beats)} == {PERIOD}
         assert len(beats) >= count // 10 // PERIOD
-        assert states == {State.PRE_OPERATIONAL, State.OPERATIONAL, State.STOPPED}
+        assert states == {NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED}
         check_dictionary(wire)
         converse(wire)
         wire.node.power_on(wire.now)

@@ -7,7 +7,7 @@ from canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame
-from drive_env.canopen.nmt import State
+from drive_env.canopen.nmt import NmtState
 from drive_env.canopen.node import Node
 from drive_env.firmware import fsa
 
@@ -27,13 +27,13 @@ def wire(drives):
 def test_a_node_boots_into_pre_operational(drives):
     sent = []
     node = Node(127, drives, send=sent.append)
-    assert node.state is State.INITIALISING
+    assert node.state is NmtState.INITIALISING
     node.receive(Frame(0, b"\x01\x00"), 0.0)
     node.after_cycle(0.001)
     assert sent == [], "it is off"
     node.power_on(0.002)
     assert sent == [Frame(0x77F, b"\x00")]
-    assert node.state is State.PRE_OPERATIONAL
+    assert node.state is NmtState.PRE_OPERATIONAL
 
 
 @pytest.mark.parametrize("node_id", [0, 128, -1])
@@ -47,7 +47,7 @@ def test_a_node_has_axes_that_the_drives_have(drives):
         Node(1, drives, 1, send=print)
 
 
-P, O, S = State.PRE_OPERATIONAL, State.OPERATIONAL, State.STOPPED
+P, O, S = NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED
 TO = {P: "80", O: "01", S: "02"}
 
 
@@ -83,12 +83,12 @@ def test_commands_move_the_state(wire, start, command, end, boots, address):
 @pytest.mark.parametrize("data", ["01 06", "01 7F", "01", "01 05 00", "", "00 05", "03 05", "83 05", "FF 00"])
 def test_what_is_no_command_for_this_node_changes_nothing(wire, data):
     wire.play(f"rx 000  {data}")
-    assert wire.node.state is State.PRE_OPERATIONAL
+    assert wire.node.state is NmtState.PRE_OPERATIONAL
 
 
 def test_a_remote_frame_is_no_command(wire):
     wire.play("rx 000  RTR")
-    assert wire.node.state is State.PRE_OPERATIONAL
+    assert wire.node.state is NmtState.PRE_OPERATIONAL
 
 
 def test_what_lives_in_which_state(wire):

@@ -24,7 +24,7 @@ from tuning.certificate.certificate import (
     Certificate,
     CertificateError,
     FrequencyResponse,
-    Parameter,
+    StatedParameter,
     StepResponse,
     frequency_response,
     identified,
@@ -68,8 +68,8 @@ def certificate():
         reason="all checks passed",
         reservations=(),
         identified={
-            "resistance": Parameter(0.3612, 0.355, 0.367, "ohm"),
-            "resonance": Parameter(math.nan, math.nan, math.nan, "Hz", "travel too short: 0.1 <turns>"),
+            "resistance": StatedParameter(0.3612, 0.355, 0.367, "ohm"),
+            "resonance": StatedParameter(math.nan, math.nan, math.nan, "Hz", "travel too short: 0.1 <turns>"),
         },
         before=tuple(BEFORE_GAINS),
         after=tuple(AFTER_GAINS),
@@ -291,7 +291,7 @@ def test_what_a_tuner_guessed_is_in_neither_file(certificate):
 
 def test_what_has_no_guesses_is_identified_as_it_is():
     known = Estimate(0.36, 0.35, 0.37, "ohm")
-    assert identified(Identification({"resistance": known}, 4.0)) == {"resistance": Parameter(*known)}
+    assert identified(Identification({"resistance": known}, 4.0)) == {"resistance": StatedParameter(*known)}
 
 
 def test_an_axis_of_which_nothing_is_known_has_a_report_too(certificate):

@@ -13,7 +13,7 @@ from drive_env import motion
 from drive_env.commands.check_model import _print
 from drive_env.commands.cli import app
 from drive_env.envs.randomisation import Distributions
-from drive_env.trials.replay import Difference, Log
+from drive_env.trials.replay import Log, LogDifference
 
 DONE, USER_ERROR = 0, 2
 
@@ -99,7 +99,7 @@ def test_the_settings_of_the_real_drive_count(tmp_path):
 def test_late_and_early_are_told(capsys, shift, says):
     with machines() as drives:
         dictionary = drives.device.new_dictionary()
-    row = Difference(*(np.array([value]) for value in (0.123, shift, 0.0456)))
+    row = LogDifference(*(np.array([value]) for value in (0.123, shift, 0.0456)))
     _print({POSITION: row}, dictionary, None, None)
     assert capsys.readouterr().out == (
         "6064h:00 Position actual value: off by 12.30 % of its range (RMS); " + says + ", 4.56 % without that\n"

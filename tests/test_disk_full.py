@@ -23,7 +23,7 @@ from drive_env.commands.cli import app as drive_env
 from drive_env.devices import find_device
 from drive_env.whole_file import files_to_be, write_whole
 from tuning.auto import one_button as auto_module
-from tuning.auto.run import Run
+from tuning.auto.run import AutoRun
 from tuning.commands.cli import app as drive_tune
 from tuning.search import trials_files
 from tuning.snapshot import load_snapshot
@@ -72,14 +72,14 @@ def tune(program, bus, out):
 def test_a_tuning_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, monkeypatch, program, file):
     """before.toml is written twice: before anything is changed, and before the drive is to keep the gains."""
     out = tmp_path / "run"
-    result = Run.result
+    result = AutoRun.result
 
     def disk_is_full(self, *arguments):
         assert (out / "before.toml").is_file()
         full(out / file)
         return result(self, *arguments)
 
-    monkeypatch.setattr(Run, "result", disk_is_full)
+    monkeypatch.setattr(AutoRun, "result", disk_is_full)
     with node() as (machine, bus):
         before = gains(machine)
         done = tune(program, bus, out)
@@ -267,7 +267,7 @@ def tiny_disk(place, kilobytes):
 @pytest.mark.skipif(sys.platform != "linux", reason="tmpfs")
 @pytest.mark.usefixtures("quick")
 def test_a_real_disk_that_holds_the_way_back_and_no_report(tmp_path, monkeypatch):
-    result = Run.result
+    result = AutoRun.result
 
     def fill(self, *arguments):
         with pytest.raises(OSError, match=SAID), (tmp_path / "disk" / "others").open("wb", buffering=0) as others:
@@ -275,7 +275,7 @@ def test_a_real_disk_that_holds_the_way_back_and_no_report(tmp_path, monkeypatch
                 others.write(bytes(4096))
         return result(self, *arguments)
 
-    monkeypatch.setattr(Run, "result", fill)
+    monkeypatch.setattr(AutoRun, "result", fill)
     with tiny_disk(tmp_path / "disk", 64) as disk, node() as (machine, bus):
         before = gains(machine)
         done = tune(drive_tune, bus, disk / "run")

@@ -23,7 +23,7 @@ from tuning.compare.tuners import MissingTunerError, find_tuner, search_tuner, t
 from tuning.outcome import Outcome
 from tuning.runs.pools import open_pool
 from tuning.runs.shard_log import ShardLog
-from tuning.search.optimise import Optimised, Row, Settings
+from tuning.search.optimise import Optimised, Settings, TrialRow
 from tuning.search.trial_bench import read_gains
 from tuning.search.trials_files import trials_figure
 
@@ -418,4 +418,4 @@ def test_the_picture_shows_the_trials_of_every_search():
 
 
 def row(search, number, cost):
-    return Row(search, number, np.ones((1, 5), int), cost, (0.0, 0.0, 0.0), False)
+    return TrialRow(search, number, np.ones((1, 5), int), cost, (0.0, 0.0, 0.0), False)

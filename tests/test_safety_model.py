@@ -19,8 +19,7 @@ from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.canopen.nmt import SERVICES, Command
-from drive_env.canopen.nmt import State as Nmt
+from drive_env.canopen.nmt import SERVICES, Command, NmtState
 from drive_env.cia402 import STATE_CODING, State
 from drive_env.master.errors import BusError
 from drive_env.master.port import Port, open_bus
@@ -291,7 +290,7 @@ def test_the_emulated_node_and_the_model_agree_on_random_walks(drives):
     choose = random.Random(1)
     trace = follow(drives, lambda drive: choose.choice(EVENTS), 3000)
     assert {drive.fsa for drive, _ in trace} == set(State) - {State.NOT_READY_TO_SWITCH_ON}
-    assert {drive.nmt for drive, _ in trace} == {Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL, Nmt.STOPPED}
+    assert {drive.nmt for drive, _ in trace} == {NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL, NmtState.STOPPED}
 
 
 class Tour:
@@ -401,7 +400,7 @@ class Seen(NamedTuple):
     """What can be seen of a drive, by its truth: state, NMT state, whether 1016h watches somebody."""
 
     fsa: State
-    nmt: Nmt
+    nmt: NmtState
     watches: bool
 
 

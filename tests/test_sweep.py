@@ -25,7 +25,7 @@ from tuning.runs.experiment import (
     load_experiment,
     resolve,
 )
-from tuning.runs.metrics import METRICS, TRACKING, Recording
+from tuning.runs.metrics import METRICS, TRACKING, MoveRecording
 
 P, I, TORQUE_P = "2042h:01", "2042h:02", "2041h:01"
 SHORT = Excitation(
@@ -191,7 +191,7 @@ def lag(time_constant, *, height=1500.0, ringing=0.0, rumble=0.0):
     speed = height * -np.expm1(-since / time_constant) + ringing * np.sin(200 * np.pi * since)
     current = rumble * np.sin(200 * np.pi * since)
     reference = np.where(t >= 0.02, height, 0.0)
-    return Recording(t, reference, speed[:, None], current[:, None], np.array([7.0]), 0.02, 0.2)
+    return MoveRecording(t, reference, speed[:, None], current[:, None], np.array([7.0]), 0.02, 0.2)
 
 
 def test_metrics_of_a_first_order_lag_against_closed_forms():

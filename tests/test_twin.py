@@ -15,14 +15,25 @@ from drive_env.gains import Gains, rule_gains
 from drive_env.motors import find_motor
 from drive_env.trials.gain_trial import OSCILLATION
 from tuning.auto import twin
-from tuning.auto.twin import LEAST, WORLDS, Friction, Known, Spread, Twins, World, known_of, search, twin_parameters
+from tuning.auto.twin import (
+    LEAST,
+    WORLDS,
+    FrictionGuess,
+    Known,
+    MachineVariant,
+    Spread,
+    Twins,
+    known_of,
+    search,
+    twin_parameters,
+)
 from tuning.identify.identification import Estimate, Identification, refused
 from tuning.response.linear_model import Plant
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
 RIGID = Plant.from_data_sheet(DEVICE, MOTOR, 22.0, 2e-5, R=0.41, L=5.5e-4, velocity_filter=260.0)
 ELASTIC = replace(RIGID, anti_resonance=70.0, resonance=141.0, damping=0.03)
-KNOWN = Known(RIGID, Friction(0.1, 2e-4), math.inf)
+KNOWN = Known(RIGID, FrictionGuess(0.1, 2e-4), math.inf)
 ONE = WORLDS[:1]
 
 
@@ -59,7 +70,7 @@ def at_speed(load, parameters, torque, speed_rpm):
 def test_the_twin_takes_the_current_that_was_identified(plant):
     """i = offset + coulomb sign(omega) + viscous omega, of a machine that is measured like any other."""
     coulomb, viscous, offset = 0.2, 4e-3, 0.5
-    known = KNOWN._replace(plant=plant, friction=Friction(coulomb, viscous), offset=offset)
+    known = KNOWN._replace(plant=plant, friction=FrictionGuess(coulomb, viscous), offset=offset)
     with Twins(DEVICE, MOTOR, [known], scaler(), 1, worlds=ONE) as twins:
         pull = float(twins._parts[0]._hidden._constant[0])
     values = twin_parameters(DEVICE, MOTOR, known) | {"motor.cogging_torque": 0.0}
@@ -70,7 +81,7 @@ def test_the_twin_takes_the_current_that_was_identified(plant):
 
 
 def test_friction_is_what_a_rough_world_has_less_of():
-    rough = twin_parameters(DEVICE, MOTOR, KNOWN, World("rough", friction=0.4))
+    rough = twin_parameters(DEVICE, MOTOR, KNOWN, MachineVariant("rough", friction=0.4))
     dry = rough["motor.coulomb"] + rough["load.coulomb"]
     assert dry == pytest.approx(0.4 * 0.1 * MOTOR.torque_constant)
     assert rough["load.breakaway"] == pytest.approx(1.5 * rough["load.coulomb"])
@@ -83,7 +94,7 @@ def test_a_resonance_too_fast_for_the_physics_is_taken_as_rigid():
 
 
 def test_a_world_is_as_far_off_as_the_interval_says_but_not_farther_than_makes_sense():
-    world = World("off", inertia=0.05, filter=-0.1)
+    world = MachineVariant("off", inertia=0.05, filter=-0.1)
 
     def off(spread):
         values = twin_parameters(DEVICE, MOTOR, KNOWN._replace(spread=spread), world)
@@ -106,7 +117,7 @@ def identification(**values):
 
 def test_intervals_become_the_twins_doubt_and_what_was_refused_the_greatest():
     found = known_of(RIGID, identification(velocity_filter=(260.0, 0.2), resonance=(141.0, 0.05)), 3.0)
-    assert found.friction == Friction(0.1, 2e-4)
+    assert found.friction == FrictionGuess(0.1, 2e-4)
     assert found.spread == pytest.approx(Spread(inertia=0.1, anti_resonance=0.0, resonance=0.05, filter=0.2))
     without = known_of(RIGID, identification(coulomb=(math.nan, 0.0)), 3.0)
     assert without.friction.coulomb == 0.0

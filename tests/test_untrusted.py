@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from agents.commands.cli import app as agent_app
 from agents.evaluation import episode_log
-from agents.policies.agent_file import Bundle, BundleError
+from agents.policies.agent_file import AgentFile, BundleError
 from agents.training import hyperparameters
 from drive_env.bus.config import BusConfigError, load_bus
 from drive_env.commands.cli import app as env_app
@@ -185,7 +185,7 @@ def test_arrays_that_are_not_what_they_say(kind, tmp_path, memory):
         read_arrays(path)
     assert "\n" not in str(told.value)
     with pytest.raises(BundleError, match=r"agent\.npz is no agent"):
-        Bundle.load(path)
+        AgentFile.load(path)
     with pytest.raises(ValueError, match=r"agent\.npz holds no episodes"):
         episode_log.load(path)
 

@@ -11,7 +11,7 @@ from drive_env.bus.faults import Faults
 from drive_env.bus.wire import Wire
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
-from drive_env.canopen.nmt import State
+from drive_env.canopen.nmt import NmtState
 
 SYNC = Frame(0x080)
 
@@ -409,7 +409,7 @@ def test_a_node_that_is_reset_boots_after_its_time_and_is_deaf_until_then(comman
     answers = [(time, frame) for time, frame in heard if not frame.startswith(("605", "000"))]
     assert [frame for _, frame in answers] == ["705  00", "585  4F 01 10 00 00 00 00 00"]
     assert answers[0][0] == pytest.approx(0.01 + drives.device.canopen.boot_time, abs=0.002)
-    assert node.state is State.PRE_OPERATIONAL
+    assert node.state is NmtState.PRE_OPERATIONAL
     world.close()
 
 

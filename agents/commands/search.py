@@ -48,7 +48,7 @@ def search(
     """
     with errors_as_exit_codes():
         from agents.commands.train import with_load
-        from agents.training.search import BEST, Trial
+        from agents.training.search import BEST, SearchTrial
         from agents.training.search import search as run_search
         from agents.training.tasks import ENVIRONMENTS, environment_name
 
@@ -61,7 +61,7 @@ def search(
         short = ENVIRONMENTS[environment_name(environment)].short
         folder = Path("runs") / f"search-{short}-{algorithm}" if out is None else out
 
-        def tell(trial: Trial, best: Trial | None) -> None:
+        def tell(trial: SearchTrial, best: SearchTrial | None) -> None:
             score = "diverged" if trial.score is None else f"{trial.score:.4g}"
             so_far = "none yet" if best is None else f"{best.score:.4g} of trial {best.number}"
             print(f"trial {trial.number}: {score}; best {so_far}", flush=True)

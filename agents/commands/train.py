@@ -56,7 +56,7 @@ def train(
     """
     with errors_as_exit_codes():
         from agents.training.tasks import ENVIRONMENTS
-        from agents.training.train import AGENT, CHECKPOINT, CURVE, Run, clear, run_to_resume, with_figures
+        from agents.training.train import AGENT, CHECKPOINT, CURVE, TrainingRun, clear, run_to_resume, with_figures
         from agents.training.train import train as run_training
 
         if resume is None:
@@ -67,7 +67,7 @@ def train(
                 if steps < 1:
                     raise ValueError(f"--steps {steps} must be 1 or more")
                 given["n_timesteps"] = steps
-            run = Run(environment, algorithm, given, seed=seed, preset=preset)
+            run = TrainingRun(environment, algorithm, given, seed=seed, preset=preset)
             folder = new_folder(out, f"{ENVIRONMENTS[run.environment].short}-{algorithm}")
         else:
             given_too = [name for name in given_options(context) if name not in ("--resume", "--trust")]

@@ -33,7 +33,7 @@ PATIENCE = 30.0  # s, for a node in this process: one that is slow says that the
 
 if TYPE_CHECKING:
     from agents.tuner.tune_target import TrialShown
-    from agents.tuner.tuning_run import Run
+    from agents.tuner.tuning_run import TunerRun
     from tuning.target import Target
 
 
@@ -211,7 +211,7 @@ def _what_is_written(group: list[Any]) -> str:
     return f"  {objects}: {first.why}; now {now}{to}{'; stays' if first.stays else ''}"
 
 
-def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, json: bool) -> Run:
+def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, json: bool) -> TunerRun:
     from agents.tuner.tuning_run import run
 
     def show(trial: TrialShown) -> None:
@@ -244,7 +244,7 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
     )  # fmt: skip
 
 
-def _report(done: Run, folder: Path, json: bool, bus: bool) -> None:
+def _report(done: TunerRun, folder: Path, json: bool, bus: bool) -> None:
     result, rule = done.result, float(done.trials[0].measured[0]) if done.trials else None
     axis, seconds = result.axes[0], float(result.drive_seconds[0])
     refused = [f"axis {k} was rolled back: {one.reason}" for k, one in enumerate(result.axes) if not one.accepted]
@@ -266,7 +266,7 @@ def _report(done: Run, folder: Path, json: bool, bus: bool) -> None:
         raise typer.Exit(REFUSED)
 
 
-def _print(done: Run, refused: list[str], rule: float | None) -> None:
+def _print(done: TunerRun, refused: list[str], rule: float | None) -> None:
     from drive_env.devices import find_device
 
     result = done.result
@@ -299,7 +299,7 @@ def _print(done: Run, refused: list[str], rule: float | None) -> None:
     print_lines(lines)
 
 
-def _answer(done: Run) -> str:
+def _answer(done: TunerRun) -> str:
     """Return which trial the agent stays with, and why where another one measured better; "" if it is none of them."""
     from agents.tuner.tune_target import best_unstopped
 

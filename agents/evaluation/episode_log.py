@@ -16,7 +16,7 @@ from agents.policies.guard import PATIENT, GuardedPolicy
 from mechanics.untrusted import parse_json, read_arrays
 
 
-class Recording(NamedTuple):
+class EpisodeRecording(NamedTuple):
     """Episodes as a policy saw them: observations (steps, entries) and actions (steps, actions) of each, and seeds."""
 
     environment: str
@@ -47,7 +47,7 @@ def save(path: Path, environment: str, configuration: dict[str, Any], episodes: 
     )
 
 
-def load(path: Path) -> Recording:
+def load(path: Path) -> EpisodeRecording:
     """Read what `save` wrote.
 
     Raises:
@@ -64,7 +64,7 @@ def load(path: Path) -> Recording:
             raise ValueError("it holds values that are no numbers")
         observations, actions = (np.split(one, np.cumsum(lengths)[:-1]) for one in rows)
         configuration, seeds = dict(about["configuration"]), [int(seed) for seed in about["seeds"]]
-        return Recording(str(about["environment"]), configuration, seeds, observations, actions)
+        return EpisodeRecording(str(about["environment"]), configuration, seeds, observations, actions)
     except FileNotFoundError:
         raise ValueError(f"there is no file {path}") from None
     except (OSError, KeyError, ValueError, TypeError, OverflowError) as error:
@@ -73,7 +73,7 @@ def load(path: Path) -> Recording:
         ) from None
 
 
-def repeat(policy: Any, recording: Recording, told: Callable[[float], None] = lambda share: None) -> Repeated:
+def repeat(policy: Any, recording: EpisodeRecording, told: Callable[[float], None] = lambda share: None) -> Repeated:
     """Return how far a policy's actions on the recorded observations lie from the recorded ones.
 
     Args:

@@ -148,10 +148,10 @@ def _add_hidden(machines: Sequence[Machine], sides: Sequence[Evaluation]) -> Non
     """Add hidden J of the answers, which no bus shows: the machines are known here."""
     from drive_env.motors import find_motor
     from tuning.compare.comparison import Yardstick
-    from tuning.compare.suite import Machine as OfSuite
+    from tuning.compare.suite import SuiteMachine
 
     group = [
-        OfSuite(str(k), row.device, row.load, row.motor, row.parameters, find_motor(row.motor).voltage)
+        SuiteMachine(str(k), row.device, row.load, row.motor, row.parameters, find_motor(row.motor).voltage)
         for k, row in enumerate(machines)
     ]
     yardstick = Yardstick(group, num_threads=1)

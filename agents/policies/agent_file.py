@@ -35,7 +35,7 @@ class BundleError(ValueError):
 
 
 @dataclass(frozen=True)
-class Bundle:
+class AgentFile:
     """A trained agent as data.
 
     Attributes:
@@ -96,7 +96,7 @@ class Bundle:
         return path
 
     @classmethod
-    def load(cls, path: str | Path) -> Bundle:
+    def load(cls, path: str | Path) -> AgentFile:
         """Read a bundle.
 
         Raises:

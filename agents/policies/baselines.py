@@ -32,10 +32,10 @@ BALANCE = {2: 0.44, 3: 0.57, 8: 5.3, 9: 0.33}
 
 def nothing(axes: int) -> Any:
     """Return the policy of so many actions that adds nothing."""
-    return Law(lambda rows: np.zeros((len(rows), axes)))
+    return ControlLaw(lambda rows: np.zeros((len(rows), axes)))
 
 
-class Law:
+class ControlLaw:
     """A function of observations, shape (lanes, entries), as a policy."""
 
     def __init__(self, function: Any) -> None:
@@ -51,15 +51,15 @@ class Law:
         """Do nothing."""
 
 
-def state_feedback(configuration: Any) -> Law:
+def state_feedback(configuration: Any) -> ControlLaw:
     """Return the law that holds the inverted pendulum through cst: BALANCE on its state."""
     if configuration.load != "inverted_pendulum" or configuration.mode != "cst" or configuration.action != "direct":
         raise ValueError("state_feedback holds the load inverted_pendulum in mode cst with action = 'direct'")
     entries, weights = list(BALANCE), np.array(list(BALANCE.values()))
-    return Law(lambda rows: (rows[:, entries] @ weights)[:, None])
+    return ControlLaw(lambda rows: (rows[:, entries] @ weights)[:, None])
 
 
-def feed_forward(configuration: Any, lags: Any = None) -> Law:
+def feed_forward(configuration: Any, lags: Any = None) -> ControlLaw:
     """Return the identified feed-forward for a configuration of Tracking whose action is the offset.
 
     csp: 60B0h leads by the lags, those of the load or given ones, each a number or of shape (lanes, axes). csv: a
@@ -89,16 +89,16 @@ def feed_forward(configuration: Any, lags: Any = None) -> Law:
     def acceleration_of(rows: Any) -> Any:
         return (rows[:, :, SPEED_LATER] - rows[:, :, SPEED]) * speed / PREVIEW
 
-    return Law({"csp": lead, "csv": loop}.get(mode, lambda rows: np.zeros(rows_of(rows).shape[:2])))
+    return ControlLaw({"csp": lead, "csv": loop}.get(mode, lambda rows: np.zeros(rows_of(rows).shape[:2])))
 
 
 def surrogate(configuration: Any) -> Any:
     """Return the shipped tuner for a configuration of GainTuning with the gains that it was trained for."""
-    from agents.policies.agent_file import Bundle
+    from agents.policies.agent_file import AgentFile
     from agents.policies.policy import policy_of
     from agents.shipped import TUNER, shipped
 
-    bundle = Bundle.load(shipped(TUNER))
+    bundle = AgentFile.load(shipped(TUNER))
     own = tuple(bundle.configuration["gains"])
     if tuple(configuration.gains) != own or configuration.waveform:
         raise ValueError(f"surrogate changes the gains {', '.join(own)} and sees no waveform; configure that")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.policies.agent_file import Bundle, BundleError
+from agents.policies.agent_file import AgentFile, BundleError
 
 OPSET, IR_VERSION = 17, 8  # old enough for the runtimes of the last years
 TOLERANCE = 1e-5  # of an action's range: float32 adds up in another order there
@@ -48,7 +48,7 @@ class Graph:
         return names[0] if outputs == 1 else names
 
 
-def to_onnx(bundle: Bundle) -> Any:
+def to_onnx(bundle: AgentFile) -> Any:
     """Return the ONNX model of a bundle.
 
     Raises:
@@ -82,7 +82,7 @@ def to_onnx(bundle: Bundle) -> Any:
     return model
 
 
-def export(bundle: Bundle, path: str | Path) -> float:
+def export(bundle: AgentFile, path: str | Path) -> float:
     """Write a bundle as ONNX and return the largest difference of an action from NumPy's, as a share of its range.
 
     Raises:
@@ -100,7 +100,7 @@ def export(bundle: Bundle, path: str | Path) -> float:
     return worst
 
 
-def compare(bundle: Bundle, path: str | Path, act: Callable[[Any], Any] | None = None, steps: int = 200) -> float:
+def compare(bundle: AgentFile, path: str | Path, act: Callable[[Any], Any] | None = None, steps: int = 200) -> float:
     """Return the largest difference of an ONNX model's actions from another policy's, as a share of their range.
 
     Args:
@@ -120,7 +120,7 @@ def compare(bundle: Bundle, path: str | Path, act: Callable[[Any], Any] | None =
     return worst
 
 
-def trial_observations(bundle: Bundle, steps: int = 200) -> NDArray[np.float32]:
+def trial_observations(bundle: AgentFile, steps: int = 200) -> NDArray[np.float32]:
     """Return observations as a training had them and far beyond, shape (steps, 16, entries)."""
     mean, scale = bundle.arrays["observation_mean"], bundle.arrays["observation_scale"]
     rng = np.random.default_rng(0)
@@ -129,7 +129,7 @@ def trial_observations(bundle: Bundle, steps: int = 200) -> NDArray[np.float32]:
     return np.asarray(mean + noise, np.float32)
 
 
-def _enter(graph: Graph, bundle: Bundle) -> str:
+def _enter(graph: Graph, bundle: AgentFile) -> str:
     clip = bundle.settings.get("observation_clip")
     if clip is None:
         return "observation"
@@ -141,7 +141,7 @@ def _enter(graph: Graph, bundle: Bundle) -> str:
     return str(graph.add("Cast", x, to=1))
 
 
-def _leave(graph: Graph, bundle: Bundle, x: str) -> None:
+def _leave(graph: Graph, bundle: AgentFile, x: str) -> None:
     low, high = (np.asarray(bundle.arrays[f"action_{end}"], np.float32) for end in ("low", "high"))
     if bundle.settings["output"] == "clip":
         x = graph.add("Max", x, graph.constant(low))
@@ -152,7 +152,7 @@ def _leave(graph: Graph, bundle: Bundle, x: str) -> None:
     graph.add("Add", x, graph.constant(low + np.float32(0.5) * (high - low)), named="action")
 
 
-def _layers(graph: Graph, bundle: Bundle, x: str) -> str:
+def _layers(graph: Graph, bundle: AgentFile, x: str) -> str:
     count = sum(name.startswith("weight_") for name in bundle.arrays)
     for k in range(count):
         weight, bias = (graph.constant(bundle.arrays[f"{name}_{k}"]) for name in ("weight", "bias"))
@@ -163,11 +163,11 @@ def _layers(graph: Graph, bundle: Bundle, x: str) -> str:
     return x
 
 
-def _mlp(graph: Graph, bundle: Bundle, x: str) -> tuple[str, list[Any], list[Any]]:
+def _mlp(graph: Graph, bundle: AgentFile, x: str) -> tuple[str, list[Any], list[Any]]:
     return _layers(graph, bundle, x), [], []
 
 
-def _lstm(graph: Graph, bundle: Bundle, x: str) -> tuple[str, list[Any], list[Any]]:
+def _lstm(graph: Graph, bundle: AgentFile, x: str) -> tuple[str, list[Any], list[Any]]:
     cells = len(bundle.arrays["lstm_state"])
     gates = graph.add(
         "Gemm", x, graph.constant(bundle.arrays["lstm_input"]), graph.constant(bundle.arrays["lstm_bias"])
@@ -188,7 +188,7 @@ def _lstm(graph: Graph, bundle: Bundle, x: str) -> tuple[str, list[Any], list[An
 
 
 # Kind of a bundle -> what builds its network; inputs and outputs besides observation and action.
-_BODIES: dict[str, Callable[[Graph, Bundle, str], tuple[str, list[Any], list[Any]]]] = {"mlp": _mlp, "lstm": _lstm}
+_BODIES: dict[str, Callable[[Graph, AgentFile, str], tuple[str, list[Any], list[Any]]]] = {"mlp": _mlp, "lstm": _lstm}
 
 
 def _matrix(name: str, columns: int) -> Any:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.policies.agent_file import Bundle, BundleError
+from agents.policies.agent_file import AgentFile, BundleError
 
 Array = NDArray[np.float32]
 
@@ -36,10 +36,10 @@ def load_policy(path: str | Path) -> Any:
     Raises:
         BundleError: If the file is none, or its kind is not known here.
     """
-    return policy_of(Bundle.load(path))
+    return policy_of(AgentFile.load(path))
 
 
-def policy_of(bundle: Bundle) -> Any:
+def policy_of(bundle: AgentFile) -> Any:
     """Return what a bundle's kind makes of it."""
     if bundle.kind not in KINDS:
         raise BundleError(f"an agent of kind {bundle.kind!r} needs a newer drive-env; this one has {', '.join(KINDS)}")
@@ -91,7 +91,7 @@ class Ends:
     (actions,). Settings: observation_clip (of the normalised observation; None for no normaliser), output (OUTPUTS).
     """
 
-    def __init__(self, bundle: Bundle) -> None:
+    def __init__(self, bundle: AgentFile) -> None:
         self.bundle = bundle
         arrays, settings = bundle.arrays, bundle.settings
         clip = settings.get("observation_clip")
@@ -124,7 +124,7 @@ class Ends:
         return action[0] if np.ndim(observation) == 1 else action
 
 
-def _layers(bundle: Bundle) -> list[tuple[Array, Array]]:
+def _layers(bundle: AgentFile) -> list[tuple[Array, Array]]:
     """Return weights (in, out) and biases of the layers, in order."""
     found: list[tuple[Array, Array]] = []
     while f"weight_{len(found)}" in bundle.arrays:
@@ -149,7 +149,7 @@ class MlpPolicy:
     each layer but the last.
     """
 
-    def __init__(self, bundle: Bundle) -> None:
+    def __init__(self, bundle: AgentFile) -> None:
         self.bundle = bundle
         self._ends = Ends(bundle)
         *self._hidden, self._last = _layers(bundle)
@@ -179,7 +179,7 @@ class LstmPolicy:
     cells), the gates in torch's order: input, forget, cell, output.
     """
 
-    def __init__(self, bundle: Bundle) -> None:
+    def __init__(self, bundle: AgentFile) -> None:
         self.bundle = bundle
         self._ends = Ends(bundle)
         *self._hidden, self._last = _layers(bundle)

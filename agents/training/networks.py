@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from agents.policies.agent_file import Bundle, BundleError, installed
+from agents.policies.agent_file import AgentFile, BundleError, installed
 from agents.policies.open_policy import ACTOR
 from agents.policies.policy import ACTIVATIONS
 
@@ -23,7 +23,7 @@ def bundle_of(
     environment: str,
     configuration: Mapping[str, Any],
     card: Mapping[str, Any],
-) -> Bundle:
+) -> AgentFile:
     """Return the actor of a model as a bundle.
 
     Args:
@@ -63,7 +63,7 @@ def bundle_of(
     }
     output = "tanh" if squashes else "clip"
     settings = {"activation": activation, "output": output, "observation_clip": clip}
-    bundle = Bundle(kind, arrays, settings, environment, configuration, card, installed(*PACKAGES))
+    bundle = AgentFile(kind, arrays, settings, environment, configuration, card, installed(*PACKAGES))
     entries = arrays["lstm_input" if lstm is not None else "weight_0"].shape[0]
     if entries != len(mean):
         raise BundleError(

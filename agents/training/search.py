@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from agents.training.hyperparameters import merge
-from agents.training.train import ALGORITHMS, DivergedError, Run, train
+from agents.training.train import ALGORITHMS, DivergedError, TrainingRun, train
 
 if TYPE_CHECKING:
     from tuning.runs.pools import Pool
@@ -29,7 +29,7 @@ ROUND = 5  # trials that are drawn from the same knowledge, and may run at a tim
 _ALONE = threading.Lock()
 
 
-class Row(NamedTuple):
+class SearchRow(NamedTuple):
     """A hyper-parameter that is searched: where it stands in the YAML, and its range or its choices."""
 
     key: str
@@ -41,29 +41,29 @@ class Row(NamedTuple):
 
 DISCOUNTS = (0.0, 0.95, 0.98, 0.99, 0.995, 1.0)  # 0: rewards that each step earns alone, as EachTrial's
 PPO = (
-    Row("learning_rate", 3e-5, 3e-3, log=True),
-    Row("gamma", choices=DISCOUNTS),
-    Row("gae_lambda", choices=(0.9, 0.95, 1.0)),
-    Row("clip_range", choices=(0.1, 0.2, 0.3)),
-    Row("n_epochs", choices=(3, 5, 10)),
-    Row("policy_kwargs.log_std_init", -3.0, 0.0),
-    Row("policy_kwargs.net_arch", choices=("32,32", "64,64", "128,128")),
+    SearchRow("learning_rate", 3e-5, 3e-3, log=True),
+    SearchRow("gamma", choices=DISCOUNTS),
+    SearchRow("gae_lambda", choices=(0.9, 0.95, 1.0)),
+    SearchRow("clip_range", choices=(0.1, 0.2, 0.3)),
+    SearchRow("n_epochs", choices=(3, 5, 10)),
+    SearchRow("policy_kwargs.log_std_init", -3.0, 0.0),
+    SearchRow("policy_kwargs.net_arch", choices=("32,32", "64,64", "128,128")),
 )
 # Algorithm -> what is searched. Networks are texts: Optuna keeps choices in its file as JSON.
-SPACES: dict[str, tuple[Row, ...]] = {
+SPACES: dict[str, tuple[SearchRow, ...]] = {
     "ppo": PPO,
-    "recurrent_ppo": (*PPO[:-1], Row("policy_kwargs.lstm_hidden_size", choices=(32, 64, 128))),
+    "recurrent_ppo": (*PPO[:-1], SearchRow("policy_kwargs.lstm_hidden_size", choices=(32, 64, 128))),
     "sac": (
-        Row("learning_rate", 3e-5, 3e-3, log=True),
-        Row("gamma", choices=DISCOUNTS),
-        Row("tau", choices=(0.005, 0.01, 0.02)),
-        Row("batch_size", choices=(128, 256, 512)),
-        Row("policy_kwargs.net_arch", choices=("64,64", "128,128", "256,256")),
+        SearchRow("learning_rate", 3e-5, 3e-3, log=True),
+        SearchRow("gamma", choices=DISCOUNTS),
+        SearchRow("tau", choices=(0.005, 0.01, 0.02)),
+        SearchRow("batch_size", choices=(128, 256, 512)),
+        SearchRow("policy_kwargs.net_arch", choices=("64,64", "128,128", "256,256")),
     ),
 }
 
 
-class Trial(NamedTuple):
+class SearchTrial(NamedTuple):
     """A trial that is over: its number, score (None if the training diverged), and what was drawn."""
 
     number: int
@@ -71,10 +71,10 @@ class Trial(NamedTuple):
     drawn: Mapping[str, Any]
 
 
-class _Task(NamedTuple):
+class _TrainingTask(NamedTuple):
     """A training and its score, for whatever process; without a folder its files come back with the score."""
 
-    run: Run
+    run: TrainingRun
     folder: Path | None
     episodes: int
 
@@ -95,7 +95,7 @@ def search(
     trials: int,
     seed: int = 0,
     episodes: int = 64,
-    told: Callable[[Trial, Trial | None], None] | None = None,
+    told: Callable[[SearchTrial, SearchTrial | None], None] | None = None,
     pool: Pool | None = None,
 ) -> dict[str, Any]:
     """Try hyper-parameters and return the best, RL-Zoo's way; the folder gets the study, and best.yaml, trial by trial.
@@ -123,12 +123,12 @@ def search(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # what failed is told, in a line
-    base = Run(environment, algorithm, hyperparameters)
+    base = TrainingRun(environment, algorithm, hyperparameters)
     storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
     study = optuna.create_study(storage=storage, study_name=f"{base.environment} {algorithm}", load_if_exists=True)
     states = optuna.trial.TrialState
 
-    def begun(known: Any) -> tuple[Any, _Task]:
+    def begun(known: Any) -> tuple[Any, _TrainingTask]:
         """Return a trial, drawn from what was known when its round began, and what is to be done."""
         study.sampler = optuna.samplers.RandomSampler()  # draws nothing yet
         trial = study.ask()
@@ -137,8 +137,8 @@ def search(
         study.sampler = _sampler(known, int(own))
         given = drawn(algorithm, hyperparameters, trial)
         here = pool is None or pool.shares_disk
-        run = Run(environment, algorithm, given, seed=seed, preset="search")
-        return trial, _Task(run, _folder_of(folder, trial.number) if here else None, episodes)
+        run = TrainingRun(environment, algorithm, given, seed=seed, preset="search")
+        return trial, _TrainingTask(run, _folder_of(folder, trial.number) if here else None, episodes)
 
     def over(trial: Any, scored: _Scored) -> None:
         for name, content in scored.files.items():
@@ -151,7 +151,9 @@ def search(
         if best is not None:
             _write(folder / BEST, base.environment, drawn(algorithm, hyperparameters, best), study, best)
         if told is not None:
-            last, first = (None if one is None else Trial(one.number, one.value, one.params) for one in (found, best))
+            last, first = (
+                None if one is None else SearchTrial(one.number, one.value, one.params) for one in (found, best)
+            )
             assert last is not None
             told(last, first)
 
@@ -193,7 +195,7 @@ def _sampler(known: Any, seed: int) -> Any:
     return FromTheRoundsBefore(seed=seed, multivariate=False)  # what is drawn jointly is so before the trial's seed
 
 
-def _trained(task: _Task) -> _Scored:
+def _trained(task: _TrainingTask) -> _Scored:
     """Do a task."""
     from agents.evaluation.evaluation import FIRST_SEED, evaluate
     from agents.policies.policy import policy_of

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from drive_env.envs.lanes import Lanes
 
 
-class Task(NamedTuple):
+class TrainingTask(NamedTuple):
     """An environment.
 
     short: Name of its files, and of its module in drive_env.envs.
@@ -23,11 +23,11 @@ class Task(NamedTuple):
 
 
 ENVIRONMENTS = {
-    "ServoDrive/GainTuning-v0": Task("gain_tuning", "GainTuning", lambda config: int(config.trials)),
-    "ServoDrive/GainScheduling-v0": Task(
+    "ServoDrive/GainTuning-v0": TrainingTask("gain_tuning", "GainTuning", lambda config: int(config.trials)),
+    "ServoDrive/GainScheduling-v0": TrainingTask(
         "gain_scheduling", "GainScheduling", lambda config: round(config.duration / config.step)
     ),
-    "ServoDrive/Tracking-v0": Task("tracking", "Tracking", lambda config: int(config.steps)),
+    "ServoDrive/Tracking-v0": TrainingTask("tracking", "Tracking", lambda config: int(config.steps)),
 }
 
 

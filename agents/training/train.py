@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.policies.agent_file import Bundle, plain
+from agents.policies.agent_file import AgentFile, plain
 from agents.training import checkpoint
 from agents.training.hyperparameters import RUN_KEYS, HyperparameterError, schedule
 from agents.training.learning_curve import draw_learning_curve
@@ -56,7 +56,7 @@ class MissingPackageError(ImportError):
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """What is trained.
 
     Attributes:
@@ -112,8 +112,8 @@ Report = Callable[[Progress], None]
 
 
 def train(
-    run: Run, folder: str | Path, *, report: Report | None = None, resume: bool = False, trust: bool = False
-) -> Bundle:
+    run: TrainingRun, folder: str | Path, *, report: Report | None = None, resume: bool = False, trust: bool = False
+) -> AgentFile:
     """Train an agent and return it.
 
     The folder gets agent.npz, checkpoint.zip, training.csv, its picture learning_curve.png, and TensorBoard's files.
@@ -190,7 +190,7 @@ def clear(folder: str | Path) -> None:
         folder.rmdir()
 
 
-def run_to_resume(folder: str | Path) -> Run:
+def run_to_resume(folder: str | Path) -> TrainingRun:
     """Return the run whose checkpoint a folder holds.
 
     Raises:
@@ -204,7 +204,7 @@ def run_to_resume(folder: str | Path) -> Run:
     return _run_of(checkpoint.read_run(path), path)
 
 
-def agent_of(model: Any, normaliser: Any, run: Run, configuration: Mapping[str, Any]) -> Bundle:
+def agent_of(model: Any, normaliser: Any, run: TrainingRun, configuration: Mapping[str, Any]) -> AgentFile:
     """Return a trained model as a bundle with what is known of the run on its card."""
     card = {
         "trained": f"{run.algorithm} of Stable-Baselines3, preset {run.preset}, {model.num_timesteps} steps",
@@ -217,7 +217,7 @@ def agent_of(model: Any, normaliser: Any, run: Run, configuration: Mapping[str, 
     return bundle_of(model, normaliser, environment=run.environment, configuration=configuration, card=card)
 
 
-def bundle_of_checkpoint(path: str | Path, *, trust: bool = False) -> Bundle:
+def bundle_of_checkpoint(path: str | Path, *, trust: bool = False) -> AgentFile:
     """Return the agent of a checkpoint.
 
     Raises:
@@ -228,21 +228,21 @@ def bundle_of_checkpoint(path: str | Path, *, trust: bool = False) -> Bundle:
     return agent_of(model, normaliser, _run_of(table, Path(path)), table["configuration"])
 
 
-def _run_of(table: Mapping[str, Any], path: Path) -> Run:
+def _run_of(table: Mapping[str, Any], path: Path) -> TrainingRun:
     """Return the run that a checkpoint tells of."""
     try:
-        return Run(**table["run"])
+        return TrainingRun(**table["run"])
     except TypeError as error:
         raise checkpoint.CheckpointError(f"{path} is no checkpoint of this drive-agent: {error}") from None
 
 
-def with_figures(bundle: Bundle, figures: Mapping[str, Any], seeds: Mapping[str, Any]) -> Bundle:
+def with_figures(bundle: AgentFile, figures: Mapping[str, Any], seeds: Mapping[str, Any]) -> AgentFile:
     """Return a bundle whose card has figures, and the seeds of the episodes that they come from."""
     card = {**bundle.card, "figures": plain(figures), "seeds": {**bundle.card.get("seeds", {}), **seeds}}
     return replace(bundle, card=card)
 
 
-def make_env(run: Run) -> tuple[CountedLanes, Any]:
+def make_env(run: TrainingRun) -> tuple[CountedLanes, Any]:
     """Return counted lanes, and the VecEnv of Stable-Baselines3 over them."""
     _need("stable_baselines3")
     from drive_env.envs.stable_baselines import LanesVecEnv
@@ -259,7 +259,7 @@ def make_env(run: Run) -> tuple[CountedLanes, Any]:
     return counted, env
 
 
-def make_model(run: Run, env: Any) -> tuple[Any, Any]:
+def make_model(run: TrainingRun, env: Any) -> tuple[Any, Any]:
     """Return a new model on the environment, and its normaliser, if the hyper-parameters want one."""
     from stable_baselines3.common.vec_env import VecNormalize
 
@@ -300,7 +300,7 @@ def algorithm_class(name: str) -> Any:
     return getattr(importlib.import_module(module), kind)
 
 
-def segment_length(run: Run, lanes: CountedLanes) -> int:
+def segment_length(run: TrainingRun, lanes: CountedLanes) -> int:
     """Return the steps of a segment: a share of the run, but some episodes of every lane, which else never ended."""
     episode: int = ENVIRONMENTS[run.environment].steps(lanes.config) * lanes.num_envs
     return max(int(run.total // run.segments), EPISODES_PER_SEGMENT * episode)
@@ -318,7 +318,7 @@ def _count_from(env: Any, steps: int) -> None:
     env._steps = steps
 
 
-def _imitate(run: Run, model: Any, lanes: CountedLanes, report: Report | None) -> None:
+def _imitate(run: TrainingRun, model: Any, lanes: CountedLanes, report: Report | None) -> None:
     """Have the model begin as the baseline that the hyper-parameters name."""
     from agents.policies.baselines import baseline
     from agents.training.imitation import imitate
@@ -407,7 +407,13 @@ def _segments_class() -> Any:
         """Writes checkpoints, begins segments, tells how far it is."""
 
         def __init__(
-            self, run: Run, folder: Path, lanes: CountedLanes, normaliser: Any, report: Report | None, resumed: bool
+            self,
+            run: TrainingRun,
+            folder: Path,
+            lanes: CountedLanes,
+            normaliser: Any,
+            report: Report | None,
+            resumed: bool,
         ) -> None:
             super().__init__()
             self._run, self._folder, self._lanes, self._normaliser = run, folder, lanes, normaliser

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agents.policies.agent_file import Bundle, BundleError
+from agents.policies.agent_file import AgentFile, BundleError
 from agents.policies.policy import PolicyError, sigmoid
 
 Array = NDArray[np.float32]
@@ -84,7 +84,7 @@ class Memory(NamedTuple):
     hidden: Mask
 
 
-class Network:
+class EnsembleMember:
     """One member of the ensemble; weights as (in, out), `nearness` is ln of s, (heads,)."""
 
     def __init__(self, weights: dict[str, Array]) -> None:
@@ -136,7 +136,7 @@ class SurrogatePolicy:
     the scale, for trials), caution (of it, for the answer).
     """
 
-    def __init__(self, bundle: Bundle) -> None:
+    def __init__(self, bundle: AgentFile) -> None:
         self.bundle = bundle
         try:
             self._normal = Normaliser(*(np.asarray(bundle.arrays[name], np.float32) for name in NORMALISER))
@@ -144,7 +144,7 @@ class SurrogatePolicy:
         except KeyError as error:
             raise BundleError(f"the agent has no array {error}; it is no surrogate") from None
         count = len(stacked["nearness"])
-        self._networks = [Network({name: array[k] for name, array in stacked.items()}) for k in range(count)]
+        self._networks = [EnsembleMember({name: array[k] for name, array in stacked.items()}) for k in range(count)]
         s = bundle.settings
         self._gains, self._step = int(s["gains"]), float(s["step"])
         self._low, self._high = (np.asarray(s[end], np.float32) for end in ("low", "high"))

@@ -15,14 +15,14 @@ from agents.tuner.tune_target import TrialShown, best_unstopped, tune_target
 
 if TYPE_CHECKING:
     from tuning.auto.result import Result
-    from tuning.auto.run import Run as AutoRun
+    from tuning.auto.run import AutoRun
     from tuning.certificate.certificate import Certificate
     from tuning.target import Target
 
 Integers = NDArray[np.int64]
 
 
-class Run(NamedTuple):
+class TunerRun(NamedTuple):
     """What became of a target: the result, its certificate, and the agent's trials."""
 
     result: Result
@@ -40,7 +40,7 @@ def run(
     show: Callable[[TrialShown], None] = lambda trial: None,
     say: Callable[[str], None] = lambda what: None,
     files: Callable[[Certificate], AbstractContextManager[object]] = nullcontext,
-) -> Run:
+) -> TunerRun:
     """Tune a target; gains that fail a check are rolled back, and the result says why.
 
     What raises leaves the drives with what they had, at rest and disabled.
@@ -83,7 +83,7 @@ def run(
         return files(certificates[0])
 
     result = prove_found(target, file, find, keep=keep, progress=told, budget=math.inf, files=written)
-    return Run(result, certificates[0], tuple(trials))
+    return TunerRun(result, certificates[0], tuple(trials))
 
 
 def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:

@@ -10,7 +10,7 @@ from drive_env.bus.wire import Transmission, Wire
 from drive_env.canopen.frames import IDENTIFIER, SYNC, Frame
 from drive_env.canopen.node import Node
 from drive_env.emulator.emulated_drives import EmulatedDrives
-from drive_env.node.axis import Port
+from drive_env.node.axis import ObjectPort
 
 CYCLE = 0.001  # s: the communication cycle
 SYNC_OBJECT = (0x1005, 0)
@@ -76,7 +76,7 @@ class World:
         self.before_cycle: list[Callable[[], None]] = []
         self.time = 0.0
         self.cycles = 0
-        self._sync_objects: list[Port] = []  # 1005h of each node
+        self._sync_objects: list[ObjectPort] = []  # 1005h of each node
         self._on: set[int] = set()
         self._overflowed: set[int] = set()
         self._off: dict[int, float] = {}  # node identifier -> when its controller is back [s]

@@ -18,7 +18,7 @@ from drive_env.dictionary.aborts import INCOMPATIBLE_PARAMETER, VALUE_RANGE, WRO
 from drive_env.dictionary.access import check_allowed, check_limits
 from drive_env.dictionary.entries import EdsText, Entry, ObjectDictionary
 from drive_env.node import mapping
-from drive_env.node.axis import Port
+from drive_env.node.axis import ObjectPort
 
 Key = tuple[int, int]
 
@@ -97,14 +97,14 @@ class ModuleObjects:
         """Return the number in the object that has a role."""
         return self.value(*self._device.canopen.objects[role])
 
-    def port(self, entry: Entry) -> Port:
+    def port(self, entry: Entry) -> ObjectPort:
         """Return the way to one of these objects."""
         key = (entry.index, entry.sub)
         values = self._values
         read: Callable[[], int | str] = self.readers.get(key) or (lambda: values[key])
         if key in self.commands:
             command = self.commands[key]
-            return Port(entry, read, lambda raw: check_limits(entry, raw), command)
+            return ObjectPort(entry, read, lambda raw: check_limits(entry, raw), command)
         check = _rule(entry.index)
 
         def write(raw: int) -> None:
@@ -119,7 +119,7 @@ class ModuleObjects:
             if check is not None:
                 check(self, entry, raw)
 
-        return Port(entry, read, checked, write)
+        return ObjectPort(entry, read, checked, write)
 
     def _fixed(self, entry: Entry) -> int:
         """Return the bits that are set whatever is written: bit 30 of a PDO's COB-ID, where the factory's has it."""

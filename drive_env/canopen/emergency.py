@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 
 from drive_env.canopen.frames import Frame
-from drive_env.devices import Emergency
+from drive_env.devices import EmergencyCode
 
 EPSILON = 1e-6  # s: times are sums of cycles
 QUEUE = 8
@@ -34,7 +34,7 @@ class EmergencyProducer:
         self._can_id = can_id
         self._inhibit = inhibit
 
-    def push(self, emergency: Emergency, error_register: int) -> None:
+    def push(self, emergency: EmergencyCode, error_register: int) -> None:
         """Queue a message; a full queue loses the newest, as a transmit buffer does."""
         if self._can_id is not None and len(self._waiting) < QUEUE:
             head = emergency.code.to_bytes(2, "little") + bytes((error_register,))

@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 
-class State(IntEnum):
+class NmtState(IntEnum):
     """NMT state; the number is what heartbeat and guarding send."""
 
     INITIALISING = 0
@@ -34,10 +34,10 @@ class Services(NamedTuple):
 
 
 SERVICES = {
-    State.INITIALISING: Services(sdo=False, pdo=False, emergency=False),
-    State.PRE_OPERATIONAL: Services(sdo=True, pdo=False, emergency=True),
-    State.OPERATIONAL: Services(sdo=True, pdo=True, emergency=True),
-    State.STOPPED: Services(sdo=False, pdo=False, emergency=False),
+    NmtState.INITIALISING: Services(sdo=False, pdo=False, emergency=False),
+    NmtState.PRE_OPERATIONAL: Services(sdo=True, pdo=False, emergency=True),
+    NmtState.OPERATIONAL: Services(sdo=True, pdo=True, emergency=True),
+    NmtState.STOPPED: Services(sdo=False, pdo=False, emergency=False),
 }
 
 _COMMANDS = {int(command): command for command in Command}

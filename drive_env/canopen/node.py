@@ -20,14 +20,14 @@ from drive_env.canopen.communication import ModuleObjects, known_bit_rate, signe
 from drive_env.canopen.emergency import EPSILON, EmergencyProducer
 from drive_env.canopen.error_control import HeartbeatConsumer, HeartbeatProducer, NodeGuarding, consumers
 from drive_env.canopen.frames import Frame
-from drive_env.canopen.nmt import Command, State
+from drive_env.canopen.nmt import Command, NmtState
 from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, HARDWARE_ERROR, VALUE_RANGE, ObjectAccessError
 from drive_env.dictionary.access import check_limits
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.firmware.protection import CAUSES, CUT, STOP
 from drive_env.node.axis import Axis, QueuedEmergency
-from drive_env.node.error_history import CONDITIONS, Condition, ErrorHistory
+from drive_env.node.error_history import CONDITIONS, ErrorCondition, ErrorHistory
 from drive_env.node.node_dictionary import NodeDictionary
 from drive_env.node.sdo_server import SdoServer
 from drive_env.node.store import PowerLostError, Section, Store
@@ -87,7 +87,7 @@ class Node:
             )
         self._bus_bit_rate = None if bit_rate is None else known_bit_rate(device, bit_rate)
         self.node_id = self._given_id = node_id
-        self.state = State.INITIALISING
+        self.state = NmtState.INITIALISING
         self.drives = drives
         self.first_axis = first_axis
         self._device = device
@@ -112,7 +112,7 @@ class Node:
 
         self._sdo = SdoServer(self.dictionary.port, device.canopen.sdo_timeout)
         self._emergency = EmergencyProducer(self._transmit)
-        self._conditions: dict[Hashable, Condition] = {}
+        self._conditions: dict[Hashable, ErrorCondition] = {}
         self._heartbeat = HeartbeatProducer()
         self._guarding = NodeGuarding()
         self._consumers: list[HeartbeatConsumer] = []
@@ -240,7 +240,7 @@ class Node:
     def bus_on(self, now: float) -> None:
         """Let the controller recover from bus-off; the node tells it as soon as its NMT state allows."""
         self._now = now
-        if self._is_online or self.state is State.INITIALISING:
+        if self._is_online or self.state is NmtState.INITIALISING:
             return
         self._is_online = True
         self._raise("bus_off_recovered", now)
@@ -282,7 +282,7 @@ class Node:
 
     def _reset_communication(self, now: float) -> None:
         """Bring the communication objects back, send the boot-up message and become pre-operational."""
-        self.state = State.INITIALISING
+        self.state = NmtState.INITIALISING
         self._leaves_for_bootloader = False
         self._received.clear()
         self._sdo.close()
@@ -299,9 +299,9 @@ class Node:
             communication.PRODUCER_HEARTBEAT,
         ):
             self._configure(index)
-        self._transmit(Frame(frames.ERROR_CONTROL + self.node_id, bytes((State.INITIALISING,))))
+        self._transmit(Frame(frames.ERROR_CONTROL + self.node_id, bytes((NmtState.INITIALISING,))))
         self._heartbeat.postpone(now)
-        self.state = State.PRE_OPERATIONAL
+        self.state = NmtState.PRE_OPERATIONAL
 
     def _configure(self, index: int) -> None:
         """Let the service behind a communication object take over what was written."""
@@ -345,11 +345,11 @@ class Node:
     def _on_nmt(self, data: bytes, now: float) -> None:
         command = nmt.parse_command(data, self.node_id)
         if command is Command.START:
-            self._enter(State.OPERATIONAL)
+            self._enter(NmtState.OPERATIONAL)
         elif command is Command.STOP:
-            self._enter(State.STOPPED, is_commanded=True)
+            self._enter(NmtState.STOPPED, is_commanded=True)
         elif command is Command.ENTER_PRE_OPERATIONAL:
-            self._enter(State.PRE_OPERATIONAL)
+            self._enter(NmtState.PRE_OPERATIONAL)
             self._flush(now)
         elif command is Command.RESET_NODE:
             self._objects.restart(self._mask)  # at once, however long it takes to boot: no firmware drives the motor
@@ -362,21 +362,21 @@ class Node:
         if self._boot_time == 0.0:
             boot(now)
             return
-        self.state = State.INITIALISING
+        self.state = NmtState.INITIALISING
         self._is_online = False
         self._received.clear()
         self._boots_at, self._boot = now + self._boot_time, boot
 
-    def _enter(self, state: State, *, is_commanded: bool = False) -> None:
+    def _enter(self, state: NmtState, *, is_commanded: bool = False) -> None:
         if state is self.state:
             return
         self.state = state
         for received in self._rpdos:
             received.forget()
-        if state is State.OPERATIONAL:
+        if state is NmtState.OPERATIONAL:
             for sent in self._tpdos:
                 sent.start()
-        elif state is State.STOPPED:
+        elif state is NmtState.STOPPED:
             self._sdo.close()
             # The one link between the two automata (manual, section 2.2). A stop after an error has been told already.
             tripped = [axis.trip() for axis in self._axes]
@@ -396,7 +396,7 @@ class Node:
         if self._leaves_for_bootloader:
             # The boot loader does not speak CANopen, and under it no firmware drives the motor: until power-on.
             self._is_online = False
-            self.state = State.INITIALISING
+            self.state = NmtState.INITIALISING
             self._objects.restart(self._mask)
 
     def _on_sync(self, data: bytes, now: float) -> None:
@@ -459,12 +459,12 @@ class Node:
 
     def _react(self, error_class: int) -> None:
         """Do what 1029h says of an error that is detected in operational."""
-        if self.state is not State.OPERATIONAL:
+        if self.state is not NmtState.OPERATIONAL:
             return
         raw = self._module.value(communication.ERROR_BEHAVIOUR, error_class)
         target = self._device.canopen.error_behaviour.get(raw, "stay")
         if target != "stay":
-            self._enter(State[target])
+            self._enter(NmtState[target])
 
     def _error_register(self, without: Axis | None = None) -> int:
         register = 0

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from drive_env.canopen import frames
 from drive_env.canopen.communication import TO_MAPPING, ModuleObjects
 from drive_env.node import mapping
-from drive_env.node.axis import Port
+from drive_env.node.axis import ObjectPort
 from drive_env.node.process_data import MappedObjects
 
 LAST_SYNCHRONOUS = 240  # transmission types 0...240; 254 and 255 are driven by events
@@ -23,7 +23,7 @@ class Pdo:
         port: Finds an object by index and sub-index.
     """
 
-    def __init__(self, index: int, objects: ModuleObjects, port: Callable[[int, int], Port]) -> None:
+    def __init__(self, index: int, objects: ModuleObjects, port: Callable[[int, int], ObjectPort]) -> None:
         self.index = index
         self._objects = objects
         self._port = port
@@ -91,7 +91,7 @@ class TransmitPdo(Pdo):
         self,
         index: int,
         objects: ModuleObjects,
-        port: Callable[[int, int], Port],
+        port: Callable[[int, int], ObjectPort],
         inhibit_unit: float,
         event_unit: float,
     ) -> None:

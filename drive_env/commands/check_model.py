@@ -13,7 +13,7 @@ from drive_env.commands.tables import print_lines
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectDictionary
-    from drive_env.trials.replay import Difference, Fit
+    from drive_env.trials.replay import LogDifference, LogFit
 
 LEAST = 16  # machines that a fit needs
 
@@ -93,7 +93,9 @@ def check_model(
             _print(report, dictionary, found, out)
 
 
-def _print(report: Mapping[Any, Difference], dictionary: ObjectDictionary, found: Fit | None, out: Path | None) -> None:
+def _print(
+    report: Mapping[Any, LogDifference], dictionary: ObjectDictionary, found: LogFit | None, out: Path | None
+) -> None:
     for key, row in report.items():
         late = float(row.shift[0]) * 1e3
         how = "in time" if abs(late) < 0.05 else f"{abs(late):.1f} ms {'late' if late > 0.0 else 'early'}"
@@ -115,7 +117,7 @@ def _print(report: Mapping[Any, Difference], dictionary: ObjectDictionary, found
 
 
 def _as_json(
-    report: Mapping[Any, Difference], dictionary: ObjectDictionary, found: Fit | None, out: Path | None
+    report: Mapping[Any, LogDifference], dictionary: ObjectDictionary, found: LogFit | None, out: Path | None
 ) -> dict[str, Any]:
     told: dict[str, Any] = {
         "differences": {

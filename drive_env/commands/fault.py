@@ -11,7 +11,7 @@ from drive_env.commands.options import Json, ending_by, fail, print_json
 from drive_env.commands.tables import print_lines
 
 if TYPE_CHECKING:
-    from drive_env.faults.table import Row
+    from drive_env.faults.table import FaultRow
 
 CONTROL_PORT = 29637  # of faults/control.py, whose import takes long
 
@@ -90,7 +90,7 @@ def _print_table(as_json: bool) -> None:
             print_lines([f"    {key}: {parameter.meaning} ({limits})"])
 
 
-def _row(row: Row) -> dict[str, Any]:
+def _row(row: FaultRow) -> dict[str, Any]:
     return vars(row) | {"parameters": {key: vars(parameter) for key, parameter in row.parameters.items()}}
 
 

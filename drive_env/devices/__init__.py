@@ -33,7 +33,7 @@ class StageParameter(NamedTuple):
     source: str
 
 
-class Emergency(NamedTuple):
+class EmergencyCode(NamedTuple):
     """Emergency code and the five additional bytes."""
 
     code: int
@@ -126,7 +126,7 @@ class Device(NamedTuple):
     allowed_values: dict[tuple[int, int], tuple[int, ...]]
     unsupported: frozenset[tuple[int, int]]
     refuses_same_mode: bool
-    emergencies: dict[str, Emergency]
+    emergencies: dict[str, EmergencyCode]
     stage: dict[str, StageParameter]
     presets: Path
     axis_offsets: tuple[AxisOffset, ...]
@@ -249,7 +249,7 @@ def find_device(name: str) -> Device:
         allowed_values=allowed_values(data),
         unsupported=frozenset(parse_key(text) for text in data["unsupported"]["objects"]),
         refuses_same_mode=data["quirks"]["refuses_same_mode"],
-        emergencies={n: Emergency(e["code"], tuple(e["bytes"])) for n, e in data["emergencies"].items()},
+        emergencies={n: EmergencyCode(e["code"], tuple(e["bytes"])) for n, e in data["emergencies"].items()},
         stage={n: StageParameter(**row) for n, row in data["stage"].items()},
         presets=folder / "presets",
         axis_offsets=tuple(AxisOffset(**row) for row in data["axis_offsets"]),

@@ -21,7 +21,7 @@ from drive_env.dictionary.codec import Code, code_of, decode, encode
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
-from drive_env.emulator.prepared_record import SCALES, PreparedRecord, Row
+from drive_env.emulator.prepared_record import SCALES, PreparedObject, PreparedRecord
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.firmware import cycle
 from drive_env.firmware.modes import MODES
@@ -159,10 +159,12 @@ class LiveDictionary:
         out_of = channels([(row.code.field, row.code.part) for row in rows])
         return PreparedRecord((into, sources), (out_of, rows), self._scale_changes)
 
-    def _row(self, entry: Entry) -> Row:
+    def _row(self, entry: Entry) -> PreparedObject:
         key = (entry.index, entry.sub)
         code = self.codes[key]
-        return Row(key, code, np.array(np.broadcast_to(code.factor(self._context()), (self.num_axes,)), float))
+        return PreparedObject(
+            key, code, np.array(np.broadcast_to(code.factor(self._context()), (self.num_axes,)), float)
+        )
 
     def recordable(self, entry: Entry) -> Code | None:
         """Return where the value of an entry is that changes by itself, None of one that only a write changes."""

@@ -33,7 +33,7 @@ Integers = NDArray[np.int64]
 SCALES = frozenset({"position_scaler"})
 
 
-class Row(NamedTuple):
+class PreparedObject(NamedTuple):
     """An object that is played or sampled: its factor of each axis [SI per drive unit], shape (num_axes,)."""
 
     key: tuple[int, int]
@@ -51,7 +51,10 @@ class PreparedRecord:
     """
 
     def __init__(
-        self, played: tuple[Channels, list[Row]], sampled: tuple[Channels, list[Row]], scale_changes: int
+        self,
+        played: tuple[Channels, list[PreparedObject]],
+        sampled: tuple[Channels, list[PreparedObject]],
+        scale_changes: int,
     ) -> None:
         self.played, self.inputs = played
         self.sampled, outputs = sampled

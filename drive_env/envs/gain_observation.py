@@ -19,7 +19,7 @@ LOG_MAX = math.log(RAW_MAX)
 RATIO_MAX = 100.0  # of a true parameter over its default
 
 
-class Row(NamedTuple):
+class ObservationRow(NamedTuple):
     """An entry of the observation: name, unit, bounds."""
 
     name: str
@@ -29,26 +29,26 @@ class Row(NamedTuple):
 
 
 IDENTIFIED = (
-    Row("ln of total inertia over three rotors", "1", -5.0, 7.0),
-    Row("dry friction", "rated current", 0.0, 5.0),
-    Row("viscous friction at rated speed", "rated current", 0.0, 5.0),
-    Row("constant load", "rated current", -5.0, 5.0),
+    ObservationRow("ln of total inertia over three rotors", "1", -5.0, 7.0),
+    ObservationRow("dry friction", "rated current", 0.0, 5.0),
+    ObservationRow("viscous friction at rated speed", "rated current", 0.0, 5.0),
+    ObservationRow("constant load", "rated current", -5.0, 5.0),
 )
 PHASE = (
-    Row("ln t_s/t_0", "1", 0.0, 5.0),
-    Row("ln(1 + n/3 %)", "1", 0.0, 7.0),
-    Row("overshoot", "the move", 0.0, 5.0),
-    Row("ln of the following error's integral over the rule's", "1", -10.0, 10.0),
-    Row("stopped: it oscillated or tripped", "1", 0.0, 1.0),
+    ObservationRow("ln t_s/t_0", "1", 0.0, 5.0),
+    ObservationRow("ln(1 + n/3 %)", "1", 0.0, 7.0),
+    ObservationRow("overshoot", "the move", 0.0, 5.0),
+    ObservationRow("ln of the following error's integral over the rule's", "1", -10.0, 10.0),
+    ObservationRow("stopped: it oscillated or tripped", "1", 0.0, 1.0),
 )
-COST = Row("ln J by measured terms, of the lane", "1", -10.0, 4.0)
+COST = ObservationRow("ln J by measured terms, of the lane", "1", -10.0, 4.0)
 TRIED = (*PHASE * len(PHASES), COST)
-LOG_GAIN = Row("ln of a gain over the rule's", "1", -LOG_MAX, LOG_MAX)
-WAVE = Row("error of the move", "the move", -5.0, 5.0)
-LEFT = Row("trials left", "those of an episode", 0.0, 1.0)
+LOG_GAIN = ObservationRow("ln of a gain over the rule's", "1", -LOG_MAX, LOG_MAX)
+WAVE = ObservationRow("error of the move", "the move", -5.0, 5.0)
+LEFT = ObservationRow("trials left", "those of an episode", 0.0, 1.0)
 
 
-def rows_of(axes: int, gains: int, waveform: int) -> list[Row]:
+def rows_of(axes: int, gains: int, waveform: int) -> list[ObservationRow]:
     """Return the entries of a lane: of each axis in turn, of the last trial before the incumbent's, then of the lane.
 
     Args:

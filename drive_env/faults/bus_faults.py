@@ -19,7 +19,7 @@ from drive_env.drives.arguments import whole_cycles
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.faults.machine_faults import axes_that_fulfil
 from drive_env.faults.schedule import NEVER, Condition, Order, cycles_of
-from drive_env.faults.table import Row, checked_parameters, find_fault
+from drive_env.faults.table import FaultRow, checked_parameters, find_fault
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ class BusFault(NamedTuple):
 
 
 @dataclass(eq=False)
-class _Scheduled:
+class _BusFault:
     """A fault and where it stands: cycles at which it begins and ends, None while its condition is waited for.
 
     `inner` is the number that the machine gave to a fault of its own.
@@ -54,7 +54,7 @@ class _Scheduled:
 
     number: int
     order: Order
-    row: Row
+    row: FaultRow
     given: Mapping[str, float]
     condition: Condition
     node: int | None
@@ -76,8 +76,8 @@ class BusFaults:
     def __init__(self, world: World) -> None:
         self._world = world
         self._lock = threading.RLock()
-        self._faults: list[_Scheduled] = []
-        self._ended: list[_Scheduled] = []  # called off, to be ended by the world's own thread
+        self._faults: list[_BusFault] = []
+        self._ended: list[_BusFault] = []  # called off, to be ended by the world's own thread
         self._next_number = 0
         world.before_cycle.append(self._act)
 
@@ -102,7 +102,7 @@ class BusFaults:
                 # Refused here if the machine refuses it; the world's own thread gives it to the machine.
                 self._drives_of(node)._faults.check(order)
             self._next_number += 1
-            fault = _Scheduled(self._next_number, order, row, given, condition, node, delay, length)
+            fault = _BusFault(self._next_number, order, row, given, condition, node, delay, length)
             self._faults.append(fault)
             if order.when == "" or self._is_of_machine(row):
                 fault.begins = self._world.cycles + (0 if self._is_of_machine(row) else delay)
@@ -125,7 +125,7 @@ class BusFaults:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     @staticmethod
-    def _is_of_machine(row: Row) -> bool:
+    def _is_of_machine(row: FaultRow) -> bool:
         return row.group not in ("bus", "node")
 
     def _node_of(self, order: Order) -> int:
@@ -146,7 +146,7 @@ class BusFaults:
     def _drives_of(self, node: int) -> EmulatedDrives:
         return self._emulated(node).drives
 
-    def _is_active(self, fault: _Scheduled) -> bool:
+    def _is_active(self, fault: _BusFault) -> bool:
         if fault.inner is not None and fault.node is not None:
             found = [one for one in self._drives_of(fault.node)._faults.listing() if one.number == fault.inner]
             return bool(found) and bool(found[0].active.any())
@@ -178,7 +178,7 @@ class BusFaults:
                 elif fault.ends is not None:
                     self._go_on(fault, now)
 
-    def _holds(self, fault: _Scheduled) -> bool:
+    def _holds(self, fault: _BusFault) -> bool:
         """Return whether an axis of the fault's node, or any on the bus, fulfils its condition."""
         if fault.node is None:
             return any(bool(axes_that_fulfil(fault.condition, drives).any()) for drives in self._world.drives)
@@ -186,14 +186,14 @@ class BusFaults:
         met = axes_that_fulfil(fault.condition, node.drives)
         return bool(met[node.first_axis : node.first_axis + node.drives.device.num_axes].any())
 
-    def _is_over(self, fault: _Scheduled, now: int) -> bool:
+    def _is_over(self, fault: _BusFault, now: int) -> bool:
         if fault.row.once:
             return True
         if fault.inner is not None and fault.node is not None:
             return not any(one.number == fault.inner for one in self._drives_of(fault.node)._faults.listing())
         return fault.ends is not None and fault.ends <= now
 
-    def _begin(self, fault: _Scheduled) -> None:
+    def _begin(self, fault: _BusFault) -> None:
         world, name, node = self._world, fault.row.name, fault.node
         if name in DISTURBANCES:
             fault.disturbance = DISTURBANCES[name](fault.given)
@@ -213,7 +213,7 @@ class BusFaults:
         elif self._is_of_machine(fault.row):
             fault.inner = self._give_to_machine(fault, node)
 
-    def _give_to_machine(self, fault: _Scheduled, number: int) -> int:
+    def _give_to_machine(self, fault: _BusFault, number: int) -> int:
         """Let the machine of a node have a fault; of sensors, motor and supply it is of the node's own axis."""
         node = self._emulated(number)
         drives, order = node.drives, fault.order
@@ -225,7 +225,7 @@ class BusFaults:
             axis=axis if of_axis else None, **order.parameters,
         )  # fmt: skip
 
-    def _go_on(self, fault: _Scheduled, now: int) -> None:
+    def _go_on(self, fault: _BusFault, now: int) -> None:
         wire, name, given = self._world.wire, fault.row.name, fault.given
         assert fault.begins is not None
         sender = (name, fault.number)
@@ -238,7 +238,7 @@ class BusFaults:
         elif name == "second_master" and (now - fault.begins) % max(round(given["period"] / CYCLE), 1) == 0:
             wire.send(Frame(NMT, bytes((int(given["command"]), fault.node or 0))), sender, self._world.time)
 
-    def _end(self, fault: _Scheduled) -> None:
+    def _end(self, fault: _BusFault) -> None:
         if fault.disturbance is not None:
             # By identity: two faults of the same numbers are two.
             injected = self._world.wire.injected

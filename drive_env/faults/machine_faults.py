@@ -24,7 +24,7 @@ from drive_env.faults.effects import (
     changes_of,
 )
 from drive_env.faults.schedule import ENABLED, NEVER, NO_CONDITION, Condition, Order, cycles_of
-from drive_env.faults.table import Row, checked_parameters, find_fault
+from drive_env.faults.table import FaultRow, checked_parameters, find_fault
 from drive_env.firmware.record import get_lanes, set_lanes
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class InjectedFault(NamedTuple):
 
 
 @dataclass(eq=False)
-class _Scheduled:
+class _MachineFault:
     """A fault with its state in each machine.
 
     `delay` and `length` are its times in cycles; `axes` those that it is of, (num_axes,). Of each machine, shape
@@ -64,7 +64,7 @@ class _Scheduled:
 
     number: int
     order: Order
-    row: Row
+    row: FaultRow
     given: Mapping[str, float]
     condition: Condition
     changes: tuple[Change, ...]
@@ -106,7 +106,7 @@ class MachineFaults:
     def __init__(self, drives: EmulatedDrives) -> None:
         self._drives = drives
         self._axes_per_machine = drives.load.num_axes
-        self._faults: list[_Scheduled] = []
+        self._faults: list[_MachineFault] = []
         self._next_number = 0
         self._base: dict[Quantity, Floats] = {}
         self._held: dict[Quantity, Mask] = {}
@@ -128,14 +128,14 @@ class MachineFaults:
         begins = np.full(drives.num_machines, drives._now + delay)
         state = np.where(machines, DUE if condition.quantity == NO_CONDITION else WAITING, ABSENT)
         self._faults.append(
-            _Scheduled(
+            _MachineFault(
                 self._next_number, order, row, given, condition, changes, delay, length, axes, state, begins,
                 np.full(drives.num_machines, NEVER),
             )
         )  # fmt: skip
         return self._next_number
 
-    def check(self, order: Order) -> tuple[Row, tuple[Change, ...]]:
+    def check(self, order: Order) -> tuple[FaultRow, tuple[Change, ...]]:
         """Return the row of a fault and what it changes.
 
         Raises:
@@ -232,7 +232,7 @@ class MachineFaults:
                 self._set(change.quantity, change.value(sound, given, self._drives.motor.rated_torque), axes)
                 self._set(change.quantity, sound, axes)
 
-    def _begin(self, fault: _Scheduled, machines: Mask, now: int) -> None:
+    def _begin(self, fault: _MachineFault, machines: Mask, now: int) -> None:
         axes = fault.axes & np.repeat(machines, self._axes_per_machine)
         if fault.row.name in MOMENTS:
             fault.state[machines] = OVER
@@ -248,7 +248,7 @@ class MachineFaults:
             set_lanes(self._drives._records, "encoder_random", np.floor(seeds), axes)
         self._refresh(fault)
 
-    def _end(self, fault: _Scheduled, machines: Mask) -> None:
+    def _end(self, fault: _MachineFault, machines: Mask) -> None:
         if not machines.any():
             return
         fault.state[machines] = OVER
@@ -260,7 +260,7 @@ class MachineFaults:
     def _forget(self) -> None:
         self._faults = [fault for fault in self._faults if not fault.is_over()]
 
-    def _holds(self, fault: _Scheduled) -> Mask:
+    def _holds(self, fault: _MachineFault) -> Mask:
         """Return which machines fulfil a fault's condition, on any of its axes."""
         return self._machines(axes_that_fulfil(fault.condition, self._drives) & fault.axes)
 
@@ -269,7 +269,7 @@ class MachineFaults:
         found: Mask = np.logical_or.reduce(axes.reshape(-1, self._axes_per_machine), axis=1)
         return found
 
-    def _refresh(self, fault: _Scheduled) -> None:
+    def _refresh(self, fault: _MachineFault) -> None:
         """Bring the quantities that a fault changes to what all faults that are there make of them."""
         for quantity in {change.quantity for change in fault.changes}:
             while not self._refresh_quantity(quantity):

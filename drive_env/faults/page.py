@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from drive_env.faults.table import FAULTS, GROUPS, Row, emergency_name
+from drive_env.faults.table import FAULTS, GROUPS, FaultRow, emergency_name
 
 HEADINGS = {
     "sensor": "Sensors", "motor": "Motor and stage", "supply": "Supply", "load": "Load", "bus": "Bus", "node": "Node",
@@ -71,14 +71,14 @@ def page() -> str:
     return "\n".join(parts)
 
 
-def _line(row: Row) -> str:
+def _line(row: FaultRow) -> str:
     if row.emergency is None or row.detection is None:
         return f"| [{row.name}](#{row.name}) | nothing | not by the drive |"
     said = f"{row.emergency:04X}h, {emergency_name(row.emergency).replace('_', ' ')}"
     return f"| [{row.name}](#{row.name}) | {said} | {row.detection * 1e3:g} ms |"
 
 
-def _section(row: Row) -> str:
+def _section(row: FaultRow) -> str:
     lines = [f"### {row.name}\n", f"{row.physics}\n"]
     if row.parameters:
         lines.append("| parameter | meaning | default | range | unit |\n| --- | --- | --- | --- | --- |")

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from drive_env.faults.table import Row
+from drive_env.faults.table import FaultRow
 
 QUANTITIES = {"position": "rad", "speed": "rad/s"}
 NO_CONDITION, ENABLED = "", "enabled"
@@ -67,7 +67,7 @@ class Order:
     parameters: dict[str, float] = field(default_factory=dict)
 
 
-def cycles_of(order: Order, row: Row, cycles: Callable[[float], int]) -> tuple[int, int]:
+def cycles_of(order: Order, row: FaultRow, cycles: Callable[[float], int]) -> tuple[int, int]:
     """Return delay and length of a fault in communication cycles; `cycles` counts them in a time [s].
 
     Raises:

@@ -16,7 +16,7 @@ DRIVE = "tmcm1636"  # whose reactions the table has
 
 
 @dataclass(frozen=True)
-class Parameter:
+class FaultParameter:
     """A number of a fault: default, lowest and highest value, unit, and what it means."""
 
     default: float
@@ -27,7 +27,7 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Row:
+class FaultRow:
     """A fault; table.toml says what each entry holds. `emergency` is None where nothing in the drive sees it."""
 
     name: str
@@ -41,13 +41,15 @@ class Row:
     emergency: int | None = None
     detection: float | None = None
     once: bool = False
-    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+    parameters: Mapping[str, FaultParameter] = field(default_factory=dict)
 
 
-def _rows() -> dict[str, Row]:
+def _rows() -> dict[str, FaultRow]:
     tables = tomllib.loads((Path(__file__).parent / "table.toml").read_text(encoding="utf-8"))
     return {
-        name: Row(name, **{**table, "parameters": {k: Parameter(**p) for k, p in table.get("parameters", {}).items()}})
+        name: FaultRow(
+            name, **{**table, "parameters": {k: FaultParameter(**p) for k, p in table.get("parameters", {}).items()}}
+        )
         for name, table in tables.items()
     }
 
@@ -55,7 +57,7 @@ def _rows() -> dict[str, Row]:
 FAULTS = _rows()
 
 
-def find_fault(name: str) -> Row:
+def find_fault(name: str) -> FaultRow:
     """Return the row of a fault.
 
     Raises:
@@ -82,7 +84,7 @@ def names_of(chosen: str) -> tuple[str, ...]:
     return (chosen,)
 
 
-def checked_parameters(row: Row, given: Mapping[str, float]) -> dict[str, float]:
+def checked_parameters(row: FaultRow, given: Mapping[str, float]) -> dict[str, float]:
     """Return all parameters of a fault, those that are not given at their defaults.
 
     Raises:

@@ -38,7 +38,7 @@ from mechanics import stepping
 from mechanics.bundle import Bundle, Cube, Matrix, Numbers, reader
 from mechanics.calls import call_hook, next_number
 from mechanics.compiled import cached, inlined, stage
-from mechanics.plant import Plant
+from mechanics.plant import PackedPlant
 
 # How a played or written value acts on a field.
 REAL, INTEGER, CONTROLWORD, MODE, SET_POINT = 0, 1, 2, 3, 4
@@ -80,7 +80,7 @@ class Machinery(Bundle):
     records: Records  # (blocks,)
     reals: Matrix
     integers: Integers
-    plant: Plant
+    plant: PackedPlant
     rates: Rates
     motion: Matrix  # scratch, (7, 8 blocks)
     first_axis: int  # number of the group's first axis in a call's rows

@@ -36,7 +36,7 @@ _NOW = 0
 
 
 @dataclass(eq=False)
-class Call:
+class RecordCall:
     """What `record` must know of its objects: found out once, for a policy makes the same call every millisecond.
 
     sampled: Entries to return.
@@ -81,9 +81,9 @@ class CycleRunner:
         self._description, self._num_axes = description, num_axes
         self._port, self._pace, self._process = port, pace, process
         self._start, self._catch_up, self._dry = start, catch_up, dry
-        self._calls: dict[object, Call] = {}
+        self._calls: dict[object, RecordCall] = {}
         self._running = threading.RLock()  # one user of SYNC at a time: the program, or its supervisor
-        self._nothing = Call((), ())
+        self._nothing = RecordCall((), ())
 
     def pass_time(self, cycles: int, envelope: Envelope | None) -> None:
         """Let cycles pass by the clock: where this computer was late, SYNCs are left out."""
@@ -127,7 +127,7 @@ class CycleRunner:
         envelope.observe(rows, epoch)
         return True
 
-    def call(self, objects: Sequence[ObjectName], play: Sequence[ObjectName]) -> Call:
+    def call(self, objects: Sequence[ObjectName], play: Sequence[ObjectName]) -> RecordCall:
         """Return what is known of a call.
 
         Raises:
@@ -150,10 +150,10 @@ class CycleRunner:
         check_mappable(self._description, played, INTO_DRIVE)
         if len(self._calls) >= MOST_CALLS:
             self._calls.clear()
-        made = self._calls[names] = Call(sampled, played)
+        made = self._calls[names] = RecordCall(sampled, played)
         return made
 
-    def rows(self, call: Call, given: Sequence[ArrayLike], cycles: int) -> dict[Entry, Integers]:
+    def rows(self, call: RecordCall, given: Sequence[ArrayLike], cycles: int) -> dict[Entry, Integers]:
         """Return what is played, each of shape (cycles, num_axes).
 
         Raises:
@@ -173,7 +173,7 @@ class CycleRunner:
         return played
 
     def record(
-        self, call: Call, played: Mapping[Entry, Integers], cycles: int, envelope: Envelope | None
+        self, call: RecordCall, played: Mapping[Entry, Integers], cycles: int, envelope: Envelope | None
     ) -> dict[Key, Integers]:
         """Let cycles pass and return what was sampled, each object of shape (cycles, num_axes)."""
         if envelope is not None:
@@ -189,7 +189,7 @@ class CycleRunner:
         return found
 
     # --- inside ---------------------------------------------------------------------------------------------------
-    def _map(self, call: Call, envelope: Envelope | None) -> None:
+    def _map(self, call: RecordCall, envelope: Envelope | None) -> None:
         """Have a call's objects mapped, and what the envelope watches if it fits besides, from now on."""
         watched = NOTHING if envelope is None else envelope.watched()
         if call.watched is not watched:

@@ -18,7 +18,7 @@ MAX_NODE = 127
 _EMCY_LAYOUT = struct.Struct("<HB5s")
 
 
-class Emergency(NamedTuple):
+class ReceivedEmergency(NamedTuple):
     """An emergency message of a node."""
 
     node: int
@@ -38,7 +38,7 @@ class Network:
     def __init__(self, port: Port, nodes: Sequence[int]) -> None:
         self._port = port
         self._nodes = tuple(nodes)
-        self._emergencies: list[Emergency] = []
+        self._emergencies: list[ReceivedEmergency] = []
         self._booted: set[int] = set()
         self._resets = False
         self.on_boot: Callable[[int], None] = lambda node: None
@@ -82,7 +82,7 @@ class Network:
                 "its reset; check its power, then look for it with `drive-env scan`"
             )
 
-    def take_emergencies(self) -> list[Emergency]:
+    def take_emergencies(self) -> list[ReceivedEmergency]:
         """Return and forget the emergencies that came, in their order."""
         self._port.drain()
         taken, self._emergencies[:] = list(self._emergencies), []
@@ -91,7 +91,7 @@ class Network:
     def _on_emergency(self, node: int, data: bytes) -> None:
         if len(data) == 8:
             code, register, extra = _EMCY_LAYOUT.unpack(data)
-            self._emergencies.append(Emergency(node, code, register, tuple(extra)))
+            self._emergencies.append(ReceivedEmergency(node, code, register, tuple(extra)))
 
     def _on_error_control(self, node: int, data: bytes) -> None:
         if self.on_error_control is not None:

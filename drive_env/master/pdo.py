@@ -43,7 +43,7 @@ class Member(NamedTuple):
     size: int
 
 
-class Pdo(NamedTuple):
+class RemotePdo(NamedTuple):
     """A PDO in use: its identifier, its length in bytes, its members."""
 
     label: str
@@ -142,7 +142,7 @@ class PdoConfiguration:
         self._silenced: dict[int, int] = {}  # TPDO -> its COB-ID as it was found
         self._quiet: set[int] = set()  # TPDOs that do not go with SYNC as they are
 
-    def configure(self, groups: Sequence[Sequence[Entry]], direction: Direction) -> list[Pdo]:
+    def configure(self, groups: Sequence[Sequence[Entry]], direction: Direction) -> list[RemotePdo]:
         """Map entries of all axes, each group to a PDO that goes with SYNC, and return these PDOs.
 
         PDOs of this direction that carried a mapping of ours and are not needed any more are put back. Other TPDOs that
@@ -201,7 +201,7 @@ class PdoConfiguration:
                 self._put(direction.communication + number, 1, cob_id | INVALID, 4, self._sdo.write)
                 self._silenced[number] = cob_id
 
-    def _map(self, direction: Direction, number: int, axis: int, group: Sequence[Entry]) -> Pdo:
+    def _map(self, direction: Direction, number: int, axis: int, group: Sequence[Entry]) -> RemotePdo:
         label = f"{direction.name} {number + 1} of node {self._node}"
         before = self._before.get((direction.name, number)) or self._look(direction, number)
         before = self._look_further(direction, before, len(group))
@@ -229,7 +229,7 @@ class PdoConfiguration:
         own = self._description.hints.rpdo_type
         kinds = dict.fromkeys((own, *SYNCHRONOUS)) if direction is INTO_DRIVE else (SYNC_EVERY,)
         self._write_all(direction, number, cob_id, (*kinds,), mapping, len(mapping), self._sdo.write)
-        return Pdo(label, can_id, start, tuple(members))
+        return RemotePdo(label, can_id, start, tuple(members))
 
     def _look(self, direction: Direction, number: int) -> _Before:
         communication, mapping = direction.communication + number, direction.mapping + number

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry
 from drive_env.master.description import Description, Key
-from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, Direction, Pdo, PdoConfiguration, plan, too_many
+from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, Direction, PdoConfiguration, RemotePdo, plan, too_many
 from drive_env.master.sampling import Bytes, Samples
 
 Integers = NDArray[np.int64]
@@ -32,7 +32,7 @@ class ProcessData:
         self._description = description
         self._configurations = configurations
         self._num_axes = len(configurations) * description.num_axes
-        self._mapped: dict[str, tuple[tuple[Entry, ...], list[list[Pdo]]]] = {}
+        self._mapped: dict[str, tuple[tuple[Entry, ...], list[list[RemotePdo]]]] = {}
         self._plans: dict[tuple[str, tuple[Entry, ...]], Groups | None] = {}
         self.mapping = 0
 
@@ -75,7 +75,7 @@ class ProcessData:
         pdos = [configuration.configure(groups, direction) for configuration in self._configurations]
         self._mapped[direction.name] = (entries, pdos)
 
-    def sampled(self) -> list[Pdo]:
+    def sampled(self) -> list[RemotePdo]:
         """Return the TPDOs that are mapped, node by node."""
         return [pdo for of_node in self._mapped.get(OUT_OF_DRIVE.name, ((), []))[1] for pdo in of_node]
 

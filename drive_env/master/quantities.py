@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from drive_env.master.can_drives import CanDrives
 
 
-class Unit(NamedTuple):
+class EnteredUnit(NamedTuple):
     """A unit: what it measures, and how many of the dimension's own unit it is (rev, rev/s, rev/s^2, A, V, s)."""
 
     dimension: str
@@ -29,25 +29,25 @@ class Unit(NamedTuple):
 
 
 UNITS = {
-    "rev": Unit("angle", 1.0),
-    "deg": Unit("angle", 1.0 / 360.0),
-    "rad": Unit("angle", 0.5 / math.pi),
-    "1/65536 rev": Unit("angle", 1.0 / 65536.0),
-    "rev/s": Unit("speed", 1.0),
-    "rpm": Unit("speed", 1.0 / 60.0),
-    "rad/s": Unit("speed", 0.5 / math.pi),
-    "deg/s": Unit("speed", 1.0 / 360.0),
-    "rev/s^2": Unit("acceleration", 1.0),
-    "rpm/s": Unit("acceleration", 1.0 / 60.0),
-    "rad/s^2": Unit("acceleration", 0.5 / math.pi),
-    "A": Unit("current", 1.0),
-    "mA": Unit("current", 1e-3),
-    "V": Unit("voltage", 1.0),
-    "0.1V": Unit("voltage", 0.1),
-    "s": Unit("time", 1.0),
-    "ms": Unit("time", 1e-3),
-    "100us": Unit("time", 1e-4),
-    "us": Unit("time", 1e-6),
+    "rev": EnteredUnit("angle", 1.0),
+    "deg": EnteredUnit("angle", 1.0 / 360.0),
+    "rad": EnteredUnit("angle", 0.5 / math.pi),
+    "1/65536 rev": EnteredUnit("angle", 1.0 / 65536.0),
+    "rev/s": EnteredUnit("speed", 1.0),
+    "rpm": EnteredUnit("speed", 1.0 / 60.0),
+    "rad/s": EnteredUnit("speed", 0.5 / math.pi),
+    "deg/s": EnteredUnit("speed", 1.0 / 360.0),
+    "rev/s^2": EnteredUnit("acceleration", 1.0),
+    "rpm/s": EnteredUnit("acceleration", 1.0 / 60.0),
+    "rad/s^2": EnteredUnit("acceleration", 0.5 / math.pi),
+    "A": EnteredUnit("current", 1.0),
+    "mA": EnteredUnit("current", 1e-3),
+    "V": EnteredUnit("voltage", 1.0),
+    "0.1V": EnteredUnit("voltage", 0.1),
+    "s": EnteredUnit("time", 1.0),
+    "ms": EnteredUnit("time", 1e-3),
+    "100us": EnteredUnit("time", 1e-4),
+    "us": EnteredUnit("time", 1e-6),
 }
 # Units that follow the increments of a revolution.
 INCREMENTAL = {"inc": "angle", "pps": "speed", "pps^2": "acceleration"}
@@ -55,10 +55,10 @@ SHOWN = {"angle": "rev", "speed": "rpm", "acceleration": "rev/s^2", "current": "
 _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*$")
 
 
-def find_unit(name: str, increments: float | None) -> Unit | None:
+def find_unit(name: str, increments: float | None) -> EnteredUnit | None:
     """Return a unit by name; `increments` per revolution, None where they are unknown."""
     if name in INCREMENTAL:
-        return None if not increments else Unit(INCREMENTAL[name], 1.0 / increments)
+        return None if not increments else EnteredUnit(INCREMENTAL[name], 1.0 / increments)
     return UNITS.get(name)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drive_env.canopen.frames import SYNC
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.pace import Pace
-from drive_env.master.pdo import Pdo
+from drive_env.master.pdo import RemotePdo
 from drive_env.master.port import Port
 
 Bytes = NDArray[np.uint8]
@@ -24,7 +24,7 @@ class Samples:
         pdos: What to collect.
     """
 
-    def __init__(self, port: Port, pdos: Sequence[Pdo]) -> None:
+    def __init__(self, port: Port, pdos: Sequence[RemotePdo]) -> None:
         self._port = port
         self._pdos = pdos
         port.drain()  # what an earlier run left behind belongs to its SYNCs

@@ -28,7 +28,7 @@ from drive_env.firmware import cycle, protection
 from drive_env.firmware.record import EMERGENCY_QUEUE, LANES, RECORD
 
 
-class Port(NamedTuple):
+class ObjectPort(NamedTuple):
     """The way to one object: what it is, its value, the check of a new value, the write of a checked one.
 
     `event` names what a write sets off, as in a binding.
@@ -74,7 +74,7 @@ class Axis:
         self._fresh = self._place("set_point_fresh")[1]
         self._scaler = self._place("position_scaler")[1]
         self._error_register = self._place("error_register")[1]
-        self._ports: dict[tuple[int, int], Port] = {}
+        self._ports: dict[tuple[int, int], ObjectPort] = {}
 
     @property
     def state(self) -> int:
@@ -86,7 +86,7 @@ class Axis:
         """The axis' share of 1001h."""
         return self._integers[self._error_register]
 
-    def port(self, entry: Entry) -> Port:
+    def port(self, entry: Entry) -> ObjectPort:
         """Return the way to an object; indices are those of axis 0."""
         key = (entry.index, entry.sub)
         if key not in self._ports:
@@ -114,12 +114,12 @@ class Axis:
         memory = self._reals if dtype.base.kind == "f" else self._integers
         return memory, start // dtype.base.itemsize + part * LANES + self._lane
 
-    def _make_port(self, entry: Entry) -> Port:
+    def _make_port(self, entry: Entry) -> ObjectPort:
         code = self._objects.codes.get((entry.index, entry.sub))
         check = self._checker(entry)
         if code is None:
-            return Port(entry, self._unbound_reader(entry), check, self._unbound_writer(entry))
-        return Port(entry, self._reader(code), check, self._writer(entry, code), code.event)
+            return ObjectPort(entry, self._unbound_reader(entry), check, self._unbound_writer(entry))
+        return ObjectPort(entry, self._reader(code), check, self._writer(entry, code), code.event)
 
     def _checker(self, entry: Entry) -> Callable[[int], None]:
         device, key = self._device, (entry.index, entry.sub)

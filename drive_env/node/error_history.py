@@ -10,7 +10,7 @@ from drive_env.dictionary.aborts import NO_DATA, VALUE_RANGE, ObjectAccessError
 GENERIC, COMMUNICATION, PROFILE = 0x01, 0x10, 0x20  # bits of 1001h
 
 
-class Condition(NamedTuple):
+class ErrorCondition(NamedTuple):
     """A row: name as in the device's emergency table, bits of 1001h, and whether it lasts or is over when told."""
 
     name: str
@@ -22,16 +22,16 @@ class Condition(NamedTuple):
 CONDITIONS = {
     row.name: row
     for row in (
-        Condition("communication_error", GENERIC | COMMUNICATION, False),
-        Condition("pdo_not_accepted", GENERIC | PROFILE, True),  # until a good one comes
-        Condition("pdo_too_short", GENERIC | COMMUNICATION, True),
-        Condition("pdo_too_long", GENERIC | COMMUNICATION, True),
-        Condition("heartbeat_lost", GENERIC | COMMUNICATION, True),  # until it comes again
-        Condition("error_passive", GENERIC | COMMUNICATION, False),
-        Condition("controller_overflow", GENERIC | COMMUNICATION, False),
-        Condition("transmit_overflow", GENERIC | COMMUNICATION, False),
-        Condition("receive_overflow", GENERIC | COMMUNICATION, False),
-        Condition("bus_off_recovered", GENERIC | COMMUNICATION, False),
+        ErrorCondition("communication_error", GENERIC | COMMUNICATION, False),
+        ErrorCondition("pdo_not_accepted", GENERIC | PROFILE, True),  # until a good one comes
+        ErrorCondition("pdo_too_short", GENERIC | COMMUNICATION, True),
+        ErrorCondition("pdo_too_long", GENERIC | COMMUNICATION, True),
+        ErrorCondition("heartbeat_lost", GENERIC | COMMUNICATION, True),  # until it comes again
+        ErrorCondition("error_passive", GENERIC | COMMUNICATION, False),
+        ErrorCondition("controller_overflow", GENERIC | COMMUNICATION, False),
+        ErrorCondition("transmit_overflow", GENERIC | COMMUNICATION, False),
+        ErrorCondition("receive_overflow", GENERIC | COMMUNICATION, False),
+        ErrorCondition("bus_off_recovered", GENERIC | COMMUNICATION, False),
     )
 }
 

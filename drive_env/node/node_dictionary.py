@@ -8,7 +8,7 @@ from drive_env import cia402
 from drive_env.canopen.communication import ModuleObjects
 from drive_env.devices import Device
 from drive_env.dictionary.entries import Entry, ObjectDictionary
-from drive_env.node.axis import Axis, Port
+from drive_env.node.axis import Axis, ObjectPort
 
 
 class NodeDictionary:
@@ -26,9 +26,9 @@ class NodeDictionary:
         self._device = device
         self._module = module
         self._axes = axes
-        self._ports: dict[tuple[int, int], Port] = {}
+        self._ports: dict[tuple[int, int], ObjectPort] = {}
 
-    def port(self, index: int, sub: int) -> Port:
+    def port(self, index: int, sub: int) -> ObjectPort:
         """Return the way to an object.
 
         Raises:
@@ -56,7 +56,7 @@ class NodeDictionary:
         axis, base = self._device.locate(entry.index)
         return "profile" if base in cia402.PROFILE_AREAS else f"motor {axis}"
 
-    def _make(self, entry: Entry) -> Port:
+    def _make(self, entry: Entry) -> ObjectPort:
         if self._module.owns(entry):
             return self._module.port(entry)
         axis, base = self._device.locate(entry.index)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.node import mapping
-from drive_env.node.axis import Port
+from drive_env.node.axis import ObjectPort
 
 # What is received takes effect as a whole: set-points first, then the mode, then the controlword, whatever their order
 # in it. A controlword that starts a move so finds the target of the same frame.
@@ -24,7 +24,7 @@ class MappedObjects:
         size: Length of their data [bytes].
     """
 
-    def __init__(self, ports: Sequence[Port]) -> None:
+    def __init__(self, ports: Sequence[ObjectPort]) -> None:
         letters = [mapping.LAYOUT[port.entry.bits or 0][port.entry.signed] for port in ports]
         self._layout = struct.Struct("<" + "".join(letters))
         self.size = self._layout.size

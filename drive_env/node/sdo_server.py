@@ -19,7 +19,7 @@ from drive_env.dictionary.aborts import (
 )
 from drive_env.dictionary.access import check_readable, check_writable
 from drive_env.dictionary.entries import Entry
-from drive_env.node.axis import Port
+from drive_env.node.axis import ObjectPort
 
 # Client command specifiers, bits 7...5 of the first byte.
 DOWNLOAD_SEGMENT, INITIATE_DOWNLOAD, INITIATE_UPLOAD, UPLOAD_SEGMENT, ABORT, BLOCK_UPLOAD, BLOCK_DOWNLOAD = range(7)
@@ -40,7 +40,7 @@ class Transfer:
     data: bytearray
     is_upload: bool
     last: float
-    port: Port | None = None
+    port: ObjectPort | None = None
     expected: int | None = None
     position: int = 0
     toggle: int = 0
@@ -54,7 +54,7 @@ class SdoServer:
         timeout: Time [s] after which an open transfer is given up.
     """
 
-    def __init__(self, port: Callable[[int, int], Port], timeout: float) -> None:
+    def __init__(self, port: Callable[[int, int], ObjectPort], timeout: float) -> None:
         self._port = port
         self._timeout = timeout
         self._open: Transfer | None = None
@@ -185,7 +185,7 @@ def _check_length(entry: Entry, size: int) -> None:
         raise ObjectAccessError(TOO_SHORT, f"{entry.label} has {_size(entry)} bytes, not {size}")
 
 
-def _store(port: Port, content: bytes) -> None:
+def _store(port: ObjectPort, content: bytes) -> None:
     raw = int.from_bytes(content, "little", signed=port.entry.signed)
     port.check(raw)
     port.write(raw)

@@ -66,7 +66,7 @@ class Log(NamedTuple):
         return max(1, round(float(self.t[1] - self.t[0]) / CYCLE))
 
 
-class Difference(NamedTuple):
+class LogDifference(NamedTuple):
     """How far one object of an emulated machine lies from the log, each of shape (num_machines,).
 
     nrmse: RMS of the difference over the log's range (greatest less least), samples by samples.
@@ -79,7 +79,7 @@ class Difference(NamedTuple):
     shifted: Floats
 
 
-class Fit(NamedTuple):
+class LogFit(NamedTuple):
     """Machines that fit a log.
 
     distributions: The laws given, those of fitted parameters replaced by the range of the accepted machines.
@@ -213,7 +213,7 @@ def command_of(log: Log) -> tuple[Key, str, Key]:
     raise ValueError(f"the log holds no command that changes step by step; record one of {known} with the response")
 
 
-def compare(log: Log, found: Mapping[Key, Integers], num_machines: int = 1) -> dict[Key, Difference]:
+def compare(log: Log, found: Mapping[Key, Integers], num_machines: int = 1) -> dict[Key, LogDifference]:
     """Return how far replayed objects lie from the log; of several axes the worst counts.
 
     Args:
@@ -221,7 +221,7 @@ def compare(log: Log, found: Mapping[Key, Integers], num_machines: int = 1) -> d
         found: As `replay` returns it.
         num_machines: Machines in it.
     """
-    report: dict[Key, Difference] = {}
+    report: dict[Key, LogDifference] = {}
     for key, values in found.items():
         axes = log.num_axes
         want = log.objects[key].astype(float)
@@ -229,7 +229,7 @@ def compare(log: Log, found: Mapping[Key, Integers], num_machines: int = 1) -> d
         span = np.maximum(np.ptp(want, axis=0), 1.0)
         plain = (_rms(have - want[:, None]) / span).max(axis=-1)
         shift, shifted = _best_shift(want, have, span, log.every * CYCLE)
-        report[key] = Difference(plain, shift, shifted)
+        report[key] = LogDifference(plain, shift, shifted)
     return report
 
 
@@ -249,7 +249,7 @@ def fit(
     accept: float = 0.1,
     slack: float = 1.2,
     seed: int = 0,
-) -> Fit:
+) -> LogFit:
     """Fit laws to a log: draw machines, keep those that respond like it, draw anew around them, and so on.
 
     A population Monte Carlo search without likelihood: every machine of `drives` is a candidate. The first round draws
@@ -349,7 +349,7 @@ def _result(
     shares: Floats,
     distances: Floats,
     base: float,
-) -> Fit:
+) -> LogFit:
     fitted = dict(laws.laws)
     accepted: dict[str, Floats] = {}
     narrowed: dict[str, float] = {}
@@ -364,7 +364,7 @@ def _result(
         ends = sorted(float(law.value(share, default[name]) / scale) for share in (low, high))
         log_law = law.law == "loguniform" and ends[0] > 0.0
         fitted[name] = Law("loguniform" if log_law else "uniform", law.relative, ends[0], ends[1])
-    return Fit(Distributions(fitted, laws.curriculum, laws.faults), accepted, distances, base, narrowed)
+    return LogFit(Distributions(fitted, laws.curriculum, laws.faults), accepted, distances, base, narrowed)
 
 
 def _best_shift(want: Floats, have: Floats, span: Floats, period: float) -> tuple[Floats, Floats]:

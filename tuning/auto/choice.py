@@ -14,14 +14,14 @@ from tuning.auto.run import MOVE_TIME
 from tuning.auto.twin import Twins, known_of
 
 if TYPE_CHECKING:
-    from tuning.auto.run import Run
+    from tuning.auto.run import AutoRun
 
 Mask = NDArray[np.bool_]
 
 CLEARLY = 0.98  # of hidden J on the twins: what is less than that is worth another move
 
 
-def choose(run: Run) -> None:
+def choose(run: AutoRun) -> None:
     """Take the rule's gains where they serve better on the twins, and the measured loop bears them.
 
     What was found is better on the twins before it is calmed; what is left of it afterwards need not be.
@@ -35,7 +35,7 @@ def choose(run: Run) -> None:
     show(run, better)
 
 
-def _rule_is_better(run: Run) -> Mask:
+def _rule_is_better(run: AutoRun) -> Mask:
     """Return the axes whose rule serves better than the gains they have, (num_axes,)."""
     target, response = run.target, run.response
     better = np.zeros(target.num_axes, bool)

@@ -23,7 +23,7 @@ from tuning.response.measured_loop import merged
 
 if TYPE_CHECKING:
     from tuning.auto.result import AxisRun
-    from tuning.auto.run import Run
+    from tuning.auto.run import AutoRun
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
 
 Integers = NDArray[np.int64]
@@ -48,7 +48,7 @@ ALONE = (
 FREE_WINDOW = 100  # turns of following error that trip a frequency response: it means nothing there
 
 
-def measure(run: Run) -> None:
+def measure(run: AutoRun) -> None:
     """Measure the velocity loop's response with the new gains; what comes too near to instability is calmed."""
     going = run.going
     # A move with the gains before matters more: without it nobody knows whether the new ones are better.
@@ -95,7 +95,7 @@ def measure(run: Run) -> None:
     _go_on_after_faults(run, faults)
 
 
-def _unclear(run: Run, response: MeasuredLoop, going: Mask) -> Mask:
+def _unclear(run: AutoRun, response: MeasuredLoop, going: Mask) -> Mask:
     """Return the axes of which too little was seen, and for which there is time to look longer, (num_axes,)."""
     left = run.affordable(LONGER * run.response_time + run.response_time + run.look_back_time)
     unclear = np.zeros(run.target.num_axes, bool)
@@ -110,7 +110,7 @@ def _seen(response: MeasuredLoop, k: int) -> int:
     return round(float(response.refined(k)[2].mean()) * len(response.f))
 
 
-def _calm(run: Run, k: int, response: MeasuredLoop) -> bool:
+def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
     """Lower the gains of an axis one of whose loops comes too near to instability; return whether it was so."""
     axis = run.axes[k]
     seen = _seen(response, k)
@@ -145,12 +145,12 @@ def _calm(run: Run, k: int, response: MeasuredLoop) -> bool:
     return True
 
 
-def _loops(run: Run) -> tuple[str, ...]:
+def _loops(run: AutoRun) -> tuple[str, ...]:
     """Return which loops a measured velocity loop shows; that of an axis alone, which never goes alone, only itself."""
     return ("velocity",) if run.target.linked else tuple(CALMED)
 
 
-def _margins(run: Run, response: MeasuredLoop, gains: Integers, k: int) -> dict[str, Margins]:
+def _margins(run: AutoRun, response: MeasuredLoop, gains: Integers, k: int) -> dict[str, Margins]:
     """Return the margins of both outer loops of an axis, by its measured velocity loop."""
     f, velocity, position, trusted = response.loops(gains, k, plant=run.axes[k].plant)
     found = {"velocity": margins(f, velocity, trusted), "position": margins(f, position, trusted)}
@@ -158,13 +158,13 @@ def _margins(run: Run, response: MeasuredLoop, gains: Integers, k: int) -> dict[
     return {loop: one if math.isfinite(one.gain_db) else one._replace(gain_db=math.nan) for loop, one in found.items()}
 
 
-def sensitivity(run: Run, response: MeasuredLoop, gains: Integers, k: int) -> float:
+def sensitivity(run: AutoRun, response: MeasuredLoop, gains: Integers, k: int) -> float:
     """Return Ms of the outer loops of an axis by its measured velocity loop, the greater."""
     found = _margins(run, response, gains, k)
     return max(found[loop].ms for loop in _loops(run))
 
 
-def judge(run: Run) -> None:
+def judge(run: AutoRun) -> None:
     """Say which margins the gains have that are to stay: as measured, or what they are at least."""
     response = run.response
     if response is None:
@@ -208,7 +208,7 @@ def _tell(axis: AxisRun, loop: str, found: Margins, least: AtLeast) -> None:
             )
 
 
-def _try_again(run: Run, calmed: Mask) -> None:
+def _try_again(run: AutoRun, calmed: Mask) -> None:
     """Try gains that were calmed, and record a move with them; without time for a trial, that move must do."""
     where = calmed & run.affordable(TRIAL_TIME + MOVE_TIME + run.look_back_time)
     run.reserve(calmed & ~where, "a move was the only trial of the calmed gains: the drive time was used up")
@@ -224,7 +224,7 @@ def _try_again(run: Run, calmed: Mask) -> None:
     show(run, calmed & run.going)
 
 
-def _go_on_after_faults(run: Run, faults: Mapping[int, str]) -> None:
+def _go_on_after_faults(run: AutoRun, faults: Mapping[int, str]) -> None:
     """Have axes move once more that were shaken into a fault: what the gains do by themselves was seen before."""
     where = np.isin(np.arange(run.target.num_axes), list(faults))
     if not where.any():
@@ -239,7 +239,7 @@ def _go_on_after_faults(run: Run, faults: Mapping[int, str]) -> None:
     show(run, where & run.going)
 
 
-def _without_response(run: Run, where: Mask, why: str) -> None:
+def _without_response(run: AutoRun, where: Mask, why: str) -> None:
     """Say why there is no frequency response, and what was verified instead."""
     run.unseen |= where
     run.reserve(where, f"no margins were measured: {why}; verified {BY_TRIAL} instead")

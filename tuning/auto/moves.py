@@ -15,7 +15,7 @@ from tuning.auto.run import MOVE_TIME, TRIAL_TIME
 from tuning.auto.trials import SCALED, faster
 
 if TYPE_CHECKING:
-    from tuning.auto.run import Run
+    from tuning.auto.run import AutoRun
     from tuning.target import Target
 
 Mask = NDArray[np.bool_]
@@ -29,7 +29,7 @@ OVERTIME = 2.5  # s beyond the budget for axes that still shake: so near to the 
 EASINGS, EASED_LEAST, EASED, EASED_TO, LIMIT_CYCLE = 3, 0.5, 0.8, 0.9, 0.2
 
 
-def show(run: Run, where: Mask | None = None) -> None:
+def show(run: AutoRun, where: Mask | None = None) -> None:
     """Record a move with the new gains, of all axes or some; one that fails is refused."""
     going = run.going if where is None else run.target.together(where)
     if not going.any():
@@ -76,7 +76,7 @@ def show(run: Run, where: Mask | None = None) -> None:
     run.drop_faults("it moved with the new gains")
 
 
-def _ease(run: Run, k: int, swing: float, why: str) -> None:
+def _ease(run: AutoRun, k: int, swing: float, why: str) -> None:
     """Take calmer gains for an axis that shook: the same, slowed by as much as it shook, or the fitted rule's.
 
     Args:
@@ -105,7 +105,7 @@ def _shook(swing: float, when: str) -> str:
     return f"its current swung by {100.0 * swing:.1f} % of the rated one (RMS) {when}, and {allowed}"
 
 
-def stand(run: Run, target: Target) -> None:
+def stand(run: AutoRun, target: Target) -> None:
     """Have axes stand still: what shakes at rest, on emulated machines after a load step too, is softened or refused.
 
     Args:
@@ -128,7 +128,7 @@ def stand(run: Run, target: Target) -> None:
         show(run, again & run.going)
 
 
-def _shaking(run: Run, target: Target) -> dict[int, tuple[float, str]]:
+def _shaking(run: AutoRun, target: Target) -> dict[int, tuple[float, str]]:
     """Return the axes that do not stand still: by how much their current swings over the rated one, and in words."""
     going, shown = run.going, run.shown
     if shown is None or not going.any():
@@ -153,7 +153,7 @@ def _shaking(run: Run, target: Target) -> dict[int, tuple[float, str]]:
     return found
 
 
-def look_back(run: Run) -> None:
+def look_back(run: AutoRun) -> None:
     """Record a move with the gains before, where they are safe by the model; keep them where they do better."""
     going = run.going
     late = going & ~run.affordable(run.look_back_time)
@@ -188,7 +188,7 @@ def look_back(run: Run) -> None:
     _keep_what_is_better(run, run.whole_machines(able & ~failed) & run.going)
 
 
-def _keep_what_is_better(run: Run, where: Mask) -> None:
+def _keep_what_is_better(run: AutoRun, where: Mask) -> None:
     """Keep the gains before on machines that moved better with them; one of several axes is as good as its worst."""
     assert run.shown is not None and run.earlier is not None, "both moves are recorded"
     lanes = run.target.axes_per_machine

@@ -18,7 +18,7 @@ import numpy as np
 from tuning.auto.choice import choose
 from tuning.auto.loop_margins import judge, measure
 from tuning.auto.moves import look_back, show, stand
-from tuning.auto.run import Run
+from tuning.auto.run import AutoRun
 from tuning.auto.search import compute, identify, prepare
 from tuning.auto.settings import begin, commission, write
 from tuning.auto.trials import prove
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
 Files = Callable[["Result"], AbstractContextManager[object]]
-Find = Callable[[Run, Progress], None]  # finds gains for the axes that go on, and has tried them on the drives
+Find = Callable[[AutoRun, Progress], None]  # finds gains for the axes that go on, and has tried them on the drives
 
 BUDGET = 10.0  # s of drive time
 
@@ -74,7 +74,7 @@ def auto(
     )  # fmt: skip
 
 
-def on_twins(run: Run, say: Progress) -> None:
+def on_twins(run: AutoRun, say: Progress) -> None:
     """Search gains on digital twins, and try the best few on the drives."""
     say("searching gains on digital twins", 0.3)
     compute(run)
@@ -110,7 +110,7 @@ def prove_found(
     """
     say = progress or (lambda what, share: None)
     with Transaction(target, file) as transaction, timed(target) as (watched, clock):
-        run = Run(watched, seed, clock, budget)
+        run = AutoRun(watched, seed, clock, budget)
         say("checking the drives", 0.0)
         begin(run)
         say("identifying", 0.05)
@@ -142,7 +142,7 @@ def prove_found(
     return result
 
 
-def tell_of_lateness(run: Run) -> None:
+def tell_of_lateness(run: AutoRun) -> None:
     """Say of a bus in real time whether its SYNCs were late: moves and responses are distorted by that."""
     drives = run.target.drives
     if drives.time_waits or drives.bus is None:

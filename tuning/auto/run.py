@@ -33,7 +33,7 @@ Mask = NDArray[np.bool_]
 RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, LOOK_BACK_TIME = 2.3, 0.85, 0.8, 1.3
 
 
-class Run:
+class AutoRun:
     """One run of auto; each stage takes out the axes that fail in it.
 
     Args:

@@ -21,7 +21,7 @@ from tuning.rules.rules_by_name import RULES, propose
 from tuning.target import Target
 
 if TYPE_CHECKING:
-    from tuning.auto.run import Run
+    from tuning.auto.run import AutoRun
     from tuning.identify.identification import Identification
 
 Floats = NDArray[np.float64]
@@ -38,7 +38,7 @@ SOFT = "margin_60"  # the rule that is tried when nothing faster passes: 60 degr
 CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4
 
 
-def identify(run: Run, experiments: Identify) -> None:
+def identify(run: AutoRun, experiments: Identify) -> None:
     """Check the wiring and identify."""
     target = run.target
     if not run.going.any():
@@ -67,7 +67,7 @@ def identify(run: Run, experiments: Identify) -> None:
         ]
 
 
-def prepare(run: Run) -> None:
+def prepare(run: AutoRun) -> None:
     """Find what gains are measured against, what stands by when they fail, and whether those before are safe."""
     target = run.target
     for axis in map(int, np.flatnonzero(run.going)):
@@ -81,7 +81,7 @@ def prepare(run: Run) -> None:
         run.reference[axis] = fitted
 
 
-def compute(run: Run) -> None:
+def compute(run: AutoRun) -> None:
     """Search gains on twins, from what the rules propose."""
     target = run.target
     chosen = np.flatnonzero(run.going)
@@ -113,7 +113,7 @@ def compute(run: Run) -> None:
         run.axes[axis].twin = float(hidden)
 
 
-def _search_apart(run: Run, known: Sequence[Known], starts: Integers, scaler: Floats) -> Optimum:
+def _search_apart(run: AutoRun, known: Sequence[Known], starts: Integers, scaler: Floats) -> Optimum:
     """Search several times side by side, and return what the luckiest search of each axis found.
 
     Of an elastic axis hidden J has several valleys, and a search stays in the one that it comes into first.

@@ -17,7 +17,7 @@ from tuning.identify.working_state import BOTH_ENDS
 from tuning.snapshot import Transaction, restore
 
 if TYPE_CHECKING:
-    from tuning.auto.run import Run
+    from tuning.auto.run import AutoRun
     from tuning.target import Target
 
 Mask = NDArray[np.bool_]
@@ -26,7 +26,7 @@ LEAST_WAY = 0.2  # rad between the ends of the travel: finding the poles alone t
 ENCODER_INIT = "ABN Encoder Settings.Encoder Init Mode"  # presets take the encoder's offset as known; here nobody knows
 
 
-def begin(run: Run) -> None:
+def begin(run: AutoRun) -> None:
     """Refuse what has no way to go, and disable what is enabled: identification begins at rest."""
     drives, way = run.target.drives, run.target.high - run.target.low
     for axis in np.flatnonzero(way < LEAST_WAY):
@@ -40,7 +40,7 @@ def begin(run: Run) -> None:
         motion.disable(drives, where=on)
 
 
-def commission(run: Run) -> None:
+def commission(run: AutoRun) -> None:
     """Tell a drive that is fresh from the factory which motor it has, and any how that is wired.
 
     Identification did so, too, but left drives as they were.
@@ -60,7 +60,7 @@ def commission(run: Run) -> None:
     run.note(run.fresh, f"fresh from the factory: commissioned for {target.motor.name} first")
 
 
-def _wire(run: Run) -> None:
+def _wire(run: AutoRun) -> None:
     """Write what the wiring needs: as it was seen, and where nothing was, as a fresh drive's motor is known to be."""
     target = run.target
     preset = _commissioning(target)
@@ -79,7 +79,7 @@ def _wire(run: Run) -> None:
     run.wire(wanted)
 
 
-def write(run: Run, transaction: Transaction) -> Mask:
+def write(run: AutoRun, transaction: Transaction) -> Mask:
     """Leave the accepted axes with their gains and everything else as it was; return which they are, (num_axes,)."""
     going = run.going
     run.stop(~going, "another axis of its machine was refused")

@@ -16,7 +16,7 @@ from tuning.auto.trial_order import Ladder, Rung
 
 if TYPE_CHECKING:
     from tuning.auto.proving import Proof
-    from tuning.auto.run import Run
+    from tuning.auto.run import AutoRun
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -27,7 +27,7 @@ SCALED = [Gains._fields.index(name) for name in ("velocity_p", "velocity_i", "po
 WINDOW = 10  # following error that trips a trial, over its move: a slow loop lags by the whole of it
 
 
-def prove(run: Run) -> None:
+def prove(run: AutoRun) -> None:
     """Try the twins' gains on the drives; slower ones until some pass, then others, the best is kept."""
     going = run.going
     if not going.any():
@@ -78,7 +78,7 @@ def prove(run: Run) -> None:
     run.gains = best
 
 
-def _to_blame(run: Run, proof: Proof, where: Mask) -> Mask:
+def _to_blame(run: AutoRun, proof: Proof, where: Mask) -> Mask:
     """Return which axes have stopped their machines: all of them, if none that was tried did or they are linked."""
     culprit = where & proof.culprit
     if run.target.linked:
@@ -87,7 +87,7 @@ def _to_blame(run: Run, proof: Proof, where: Mask) -> Mask:
     return culprit | ~np.repeat(known, run.target.axes_per_machine)
 
 
-def _meant(run: Run, axis: int, rung: Rung | None) -> Integers:
+def _meant(run: AutoRun, axis: int, rung: Rung | None) -> Integers:
     """Return the gains that a rung means for an axis; any, if nothing is to be tried on it."""
     if rung is None:
         return np.asarray(run.fallbacks[-1, axis])
@@ -98,7 +98,7 @@ def _meant(run: Run, axis: int, rung: Rung | None) -> Integers:
     return faster(run.gains[axis], rung.factor)
 
 
-def watch_following(run: Run, where: Mask) -> None:
+def watch_following(run: AutoRun, where: Mask) -> None:
     """Have a following error trip the drive that trials cannot have."""
     assert run.ground is not None, "proving makes it"
     drives = run.target.drives

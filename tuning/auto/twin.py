@@ -39,7 +39,7 @@ SLOWEST_FILTER = 50.0  # Hz
 UNKNOWN_FILTER = 0.5  # relative: how far a velocity filter may be off that was not identified
 
 
-class Friction(NamedTuple):
+class FrictionGuess(NamedTuple):
     """Friction at the rotor: dry [A], viscous [A*s/rad], as identified."""
 
     coulomb: float = 0.0
@@ -62,7 +62,7 @@ class Known(NamedTuple):
     """
 
     plant: Plant
-    friction: Friction
+    friction: FrictionGuess
     reach: float
     spread: Spread = Spread()
     offset: float = 0.0
@@ -83,7 +83,7 @@ def known_of(plant: Plant, identified: Identification, reach: float) -> Known:
         estimate = identified.estimates.get(name)
         if estimate is not None and estimate.is_known:
             widths[field] = 0.5 * (estimate.high - estimate.low) / estimate.value
-    return Known(plant, Friction(max(dry, 0.0), max(viscous, 0.0)), reach, Spread(**widths), offset)
+    return Known(plant, FrictionGuess(max(dry, 0.0), max(viscous, 0.0)), reach, Spread(**widths), offset)
 
 
 _INTERVALS = {
@@ -94,7 +94,7 @@ _INTERVALS = {
 }
 
 
-class World(NamedTuple):
+class MachineVariant(NamedTuple):
     """A guess at what no drive shows and no identification is sure of; a tuning must serve in all of them.
 
     inertia, anti_resonance, resonance, filter: How far each is from what was identified, relative; as far as its
@@ -114,10 +114,12 @@ class World(NamedTuple):
 
 
 WORLDS = (
-    World("as identified"),
+    MachineVariant("as identified"),
     # Dry friction holds a shaking axis still, and is what two short moves tell worst: drag and sticking pass for it.
-    World("rough", 0.05, -0.04, -0.03, -0.1, 0.7, friction=0.4, adc_noise=0.05, cogging=1.7, supply_resistance=0.15),
-    World("smooth", -0.05, 0.03, 0.04, 0.1, damping=1.5, adc_noise=0.01, cogging=0.5),
+    MachineVariant(
+        "rough", 0.05, -0.04, -0.03, -0.1, 0.7, friction=0.4, adc_noise=0.05, cogging=1.7, supply_resistance=0.15
+    ),
+    MachineVariant("smooth", -0.05, 0.03, 0.04, 0.1, damping=1.5, adc_noise=0.01, cogging=0.5),
 )
 # What the current may swing in a move, likewise of the rated one, and the power by which more than that counts.
 MOST_SWING, SWINGING = 0.8 * OSCILLATION, 2.0
@@ -129,7 +131,7 @@ def is_elastic(plant: Plant) -> bool:
     return plant.anti_resonance < plant.resonance < FASTEST_RESONANCE
 
 
-def twin_parameters(device: Device, motor: Motor, known: Known, world: World = WORLDS[0]) -> dict[str, float]:
+def twin_parameters(device: Device, motor: Motor, known: Known, world: MachineVariant = WORLDS[0]) -> dict[str, float]:
     """Return the true parameters of the emulated machine that shows what was identified, with an inertia or two masses.
 
     Torque constant is the data sheet's: inertia and friction are known over it only, and so it does not matter.
@@ -209,7 +211,7 @@ class Twins:
         scaler: Floats,
         lanes: int,
         num_threads: int | None = None,
-        worlds: Sequence[World] = WORLDS,
+        worlds: Sequence[MachineVariant] = WORLDS,
     ) -> None:
         self.lanes = lanes
         self.num_axes = len(known)
@@ -257,7 +259,7 @@ class _Part:
         scaler: Floats,
         lanes: int,
         num_threads: int | None,
-        worlds: Sequence[World],
+        worlds: Sequence[MachineVariant],
     ) -> None:
         self.axes = axes
         self._shape = (len(axes), lanes, len(worlds))

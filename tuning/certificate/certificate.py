@@ -97,7 +97,7 @@ class FrequencyResponse:
 
 
 @dataclass(frozen=True)
-class Parameter:
+class StatedParameter:
     """An identified value with its interval of 95 % confidence; refused: nan and the reason."""
 
     value: float
@@ -130,7 +130,7 @@ class AxisCertificate:
     accepted: bool
     reason: str
     reservations: tuple[str, ...]
-    identified: Mapping[str, Parameter]
+    identified: Mapping[str, StatedParameter]
     before: tuple[int, ...]
     after: tuple[int, ...]
     before_si: Mapping[str, float]
@@ -219,10 +219,10 @@ MARGIN_NAMES = {
 }
 
 
-def identified(identification: Identification) -> dict[str, Parameter]:
+def identified(identification: Identification) -> dict[str, StatedParameter]:
     """Return what was identified as a certificate has it: nothing that a tuner only guessed."""
     told = identification.estimates if identification.told is None else identification.told
-    return {name: Parameter(*estimate) for name, estimate in told.items()}
+    return {name: StatedParameter(*estimate) for name, estimate in told.items()}
 
 
 def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, float]:
@@ -371,7 +371,7 @@ def _value(kind: str, value: Any) -> Any:
     if kind == "Mapping[str, float]":
         return {name: _number(item) for name, item in value.items()}
     if kind == "Mapping[str, Parameter]":
-        return {name: _built(Parameter, item) for name, item in value.items()}
+        return {name: _built(StatedParameter, item) for name, item in value.items()}
     return tuple(value) if kind.startswith("tuple[") else value
 
 

@@ -81,7 +81,7 @@ def rules(
             plants = _identified(target)
             known = [plant for plant in plants if not isinstance(plant, str)]
             swung = _swing(target, known) if relay and len(known) == len(plants) else [""] * len(plants)
-            axes = [_Axis(plant) for plant in plants]
+            axes = [_AxisRules(plant) for plant in plants]
             for axis, measured in zip(axes, swung, strict=True):
                 if not isinstance(axis.plant, str):
                     axis.rows |= _propose(target, axis.plant, chosen)
@@ -104,7 +104,7 @@ def rules(
 
 
 @dataclass
-class _Axis:
+class _AxisRules:
     """What there is to show of an axis: its plant, or why it is not known, and what the rules say of it."""
 
     plant: Plant | str
@@ -172,7 +172,7 @@ def _margins(target: Target, plant: Plant, proposal: Proposal) -> Any:
     return margins(f, velocity_open_loop(target.device, plant, proposal.gains, f))
 
 
-def _as_json(target: Target, axis: _Axis) -> dict[str, Any]:
+def _as_json(target: Target, axis: _AxisRules) -> dict[str, Any]:
     from dataclasses import asdict
 
     plant, rows = axis.plant, axis.rows
@@ -192,7 +192,7 @@ def _as_json(target: Target, axis: _Axis) -> dict[str, Any]:
     } | ({"no_relay": axis.unswung} if axis.unswung else {})
 
 
-def _print(target: Target, shown: _Axis, axis: int | None) -> None:
+def _print(target: Target, shown: _AxisRules, axis: int | None) -> None:
     head, plant, rows = "" if axis is None else f"axis {axis}: ", shown.plant, shown.rows
     if isinstance(plant, str):
         print_lines([f"{head}{plant}"])

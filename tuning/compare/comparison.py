@@ -27,7 +27,7 @@ from drive_env.gains import Gains, rule_gains
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import HiddenScore
 from mechanics.untrusted import parse_json
-from tuning.compare.suite import Machine, groups, open_group
+from tuning.compare.suite import SuiteMachine, groups, open_group
 from tuning.compare.tuners import RuleTuner, find_tuner, identify_all
 from tuning.drive_audit import KINDS, DriveAudit
 from tuning.identify.moved_inertia import moved_inertia
@@ -112,7 +112,7 @@ class Comparison:
 
 
 def compare(
-    machines: Sequence[Machine],
+    machines: Sequence[SuiteMachine],
     tuners: Mapping[str, Tuner],
     *,
     seed: int = 0,
@@ -157,16 +157,16 @@ def compare(
     return Comparison(ordered, tuple(sorted(summaries, key=lambda row: (row.median, row.tuner))))
 
 
-class _Task(NamedTuple):
+class _GroupTask(NamedTuple):
     """A tuner on the machines of a group, for another process."""
 
-    group: list[Machine]
+    group: list[SuiteMachine]
     tuner: str
     trials: int | None
     seed: int
 
 
-def _run(task: _Task) -> str:
+def _run(task: _GroupTask) -> str:
     """Return what a tuner makes of the machines of a group, as text."""
     with closing(Yardstick(task.group, 1)) as yardstick:
         tuned = _Bench(task.group, task.seed, 1).tune(task.tuner, find_tuner(task.tuner, task.trials))
@@ -174,7 +174,7 @@ def _run(task: _Task) -> str:
 
 
 def _here(
-    machines: Sequence[Machine],
+    machines: Sequence[SuiteMachine],
     tuners: Mapping[str, Tuner],
     tasks: Sequence[tuple[Sequence[int], str]],
     left: Sequence[int],
@@ -198,7 +198,7 @@ def _here(
 
 
 def _elsewhere(
-    machines: Sequence[Machine],
+    machines: Sequence[SuiteMachine],
     tasks: Sequence[tuple[Sequence[int], str]],
     left: Sequence[int],
     seed: int,
@@ -207,7 +207,7 @@ def _elsewhere(
     say: Callable[[int], None],
 ) -> Iterator[tuple[int, list[MachineRow]]]:
     """Give the number and the rows of each task as it comes back."""
-    items = [_Task([machines[i] for i in tasks[k][0]], tasks[k][1], trials, seed) for k in left]
+    items = [_GroupTask([machines[i] for i in tasks[k][0]], tasks[k][1], trials, seed) for k in left]
     for place, text in pool.unordered(_run, items):
         say(left[place])
         yield left[place], _rows_of(text)
@@ -224,7 +224,7 @@ def _rows_of(text: str) -> list[MachineRow]:
 class Yardstick:
     """Hidden J of a group of machines, and that of the fitted rule with their true inertia."""
 
-    def __init__(self, group: Sequence[Machine], num_threads: int | None) -> None:
+    def __init__(self, group: Sequence[SuiteMachine], num_threads: int | None) -> None:
         device, load, motor, friction = group[0].kind
         self._hidden = HiddenScore(device, load, motor, len(group), num_threads=num_threads, friction=friction)
         with open_group(group, num_threads) as target:
@@ -273,7 +273,7 @@ class _Tuned(NamedTuple):
 class _Bench:
     """Has tuners tune the machines of a group, each time fresh from the box."""
 
-    def __init__(self, group: Sequence[Machine], seed: int, num_threads: int | None) -> None:
+    def __init__(self, group: Sequence[SuiteMachine], seed: int, num_threads: int | None) -> None:
         self._group, self._seed, self._num_threads = group, seed, num_threads
         self._identified: tuple[list[Identification], float, Integers, DriveAudit] | None = None
 
@@ -305,7 +305,7 @@ class _Bench:
         return tuner.propose(target, found, before, seconds), audit
 
 
-def _rows(name: str, group: Sequence[Machine], tuned: _Tuned, yardstick: Yardstick) -> list[MachineRow]:
+def _rows(name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Yardstick) -> list[MachineRow]:
     """Return what a tuner made of every machine of a group."""
     hidden, outcome, audit = yardstick.score(tuned.gains), tuned.outcome, tuned.audit
     per_machine = len(tuned.gains) // len(group)

@@ -40,7 +40,7 @@ _SUPPLY = "supply.voltage"  # the law's name in a set of distributions
 
 
 @dataclass(frozen=True)
-class Machine:
+class SuiteMachine:
     """A machine of a suite.
 
     Attributes:
@@ -73,7 +73,7 @@ def suite_names() -> list[str]:
 
 
 def load_suite(name_or_path: str | Path = "public", seed: int | None = None, count: int | None = None) -> tuple[
-    Machine, ...
+    SuiteMachine, ...
 ]:  # fmt: skip
     """Return the machines of a suite: its public part, and with a seed the part that is drawn for it.
 
@@ -95,7 +95,7 @@ def load_suite(name_or_path: str | Path = "public", seed: int | None = None, cou
     where = path.name
     check_keys(where, table, ["device", "group", "generated"], optional=("generated", "group"))
     device = as_value(f"{where}: device", table["device"], "str")
-    machines: list[Machine] = []
+    machines: list[SuiteMachine] = []
     for row in table.get("group", []):
         machines += _group(where, device, as_table(f"{where}: group", row))
     if seed is not None:
@@ -106,7 +106,7 @@ def load_suite(name_or_path: str | Path = "public", seed: int | None = None, cou
     return tuple(machines) if count is None else _spread(machines, count)
 
 
-def groups(machines: Sequence[Machine]) -> list[list[int]]:
+def groups(machines: Sequence[SuiteMachine]) -> list[list[int]]:
     """Return the indices of machines that can be lanes of one set of drives, in the order of their first."""
     found: dict[tuple[str, str, str, str], list[int]] = {}
     for k, machine in enumerate(machines):
@@ -114,7 +114,9 @@ def groups(machines: Sequence[Machine]) -> list[list[int]]:
     return list(found.values())
 
 
-def open_machines(machines: Sequence[Machine], num_threads: int | None = None) -> Iterator[tuple[Target, list[int]]]:
+def open_machines(
+    machines: Sequence[SuiteMachine], num_threads: int | None = None
+) -> Iterator[tuple[Target, list[int]]]:
     """Yield machines ready to be tuned, those of one load and motor as the lanes of one target, and their indices.
 
     The drives come up commissioned for their motor and at rest; they are closed when the next ones are asked for.
@@ -124,7 +126,7 @@ def open_machines(machines: Sequence[Machine], num_threads: int | None = None) -
             yield target, indices
 
 
-def open_group(machines: Sequence[Machine], num_threads: int | None = None) -> Target:
+def open_group(machines: Sequence[SuiteMachine], num_threads: int | None = None) -> Target:
     """Return machines of one kind as one target.
 
     Raises:
@@ -179,7 +181,7 @@ def _names() -> str:
     return ", ".join(suite_names())
 
 
-def _group(where: str, device: str, row: dict[str, Any]) -> list[Machine]:
+def _group(where: str, device: str, row: dict[str, Any]) -> list[SuiteMachine]:
     """Return the machines of a table whose columns they are."""
     check_keys(f"{where}: group", row, list(_GROUP), optional=("friction", "travel"))
     load, motor = (as_value(f"{where}: {key}", row[key], "str") for key in ("load", "motor"))
@@ -201,7 +203,7 @@ def _group(where: str, device: str, row: dict[str, Any]) -> list[Machine]:
                 f"{where}: supply {volts:g} V and travel {turns:g} rev of machine {k} must be above 0"
             )
     return [
-        Machine(
+        SuiteMachine(
             f"{stem}-{k}", device, load, motor, {name: values[k] for name, values in columns.items()}, supply[k],
             friction, travel[k],
         )
@@ -218,7 +220,7 @@ def _numbers(where: str, value: Any, count: int | None = None) -> list[float]:
     return [item if item == math.inf else as_value(where, item, "float") for item in value]
 
 
-def _check_names(where: str, machines: Sequence[Machine]) -> None:
+def _check_names(where: str, machines: Sequence[SuiteMachine]) -> None:
     seen: set[str] = set()
     for machine in machines:
         if machine.name in seen:
@@ -250,7 +252,7 @@ def _defaults(device: str, load: str, motor: str) -> dict[str, float]:
 _DEFAULTS: dict[tuple[str, str, str], dict[str, float]] = {}  # they never change, and take a load's compilation
 
 
-def _spread(machines: Sequence[Machine], count: int) -> tuple[Machine, ...]:
+def _spread(machines: Sequence[SuiteMachine], count: int) -> tuple[SuiteMachine, ...]:
     """Return so many machines, taken from the groups in turn, in the order they had."""
     if count < 1:
         raise ExperimentError(f"count must be 1 or more, not {count}")
@@ -261,13 +263,13 @@ def _spread(machines: Sequence[Machine], count: int) -> tuple[Machine, ...]:
 
 
 # --- drawing ----------------------------------------------------------------------------------------------------------
-def _generated(where: str, device: str, tables: Any, seed: int) -> list[Machine]:
+def _generated(where: str, device: str, tables: Any, seed: int) -> list[SuiteMachine]:
     """Return the machines that are drawn for a seed; one that its motor cannot move is drawn again."""
     if seed < 0:
         raise ExperimentError(f"seed must be 0 or more, not {seed}")
     if not isinstance(tables, list):
         raise ExperimentError(f"{where} is {kind_of(tables)}; write one table [[generated]] for machines of a kind")
-    machines: list[Machine] = []
+    machines: list[SuiteMachine] = []
     for table in tables:
         check_keys(where, as_table(where, table), ["count", "groups"])
         count = as_value(f"{where}: count", table["count"], "int")
@@ -282,7 +284,7 @@ def _generated(where: str, device: str, tables: Any, seed: int) -> list[Machine]
     return machines
 
 
-def _draw(where: str, device: str, load: str, motor: str, seed: int, number: int) -> Machine:
+def _draw(where: str, device: str, load: str, motor: str, seed: int, number: int) -> SuiteMachine:
     """Return machine `number` of a seed; it does not depend on how many others are drawn."""
     defaults = _checked_defaults(where, device, load, motor)
     if load not in shipped():
@@ -294,7 +296,7 @@ def _draw(where: str, device: str, load: str, motor: str, seed: int, number: int
         drawn = laws.draw(rng, known)
         supply = drawn.pop(_SUPPLY, known[_SUPPLY])
         if _sound(device, load, motor, drawn):
-            return Machine(f"seed{seed}-{number:02d}-{load}-{motor}", device, load, motor, drawn, supply)
+            return SuiteMachine(f"seed{seed}-{number:02d}-{load}-{motor}", device, load, motor, drawn, supply)
     raise ExperimentError(
         f"{where}: {_TRIES} draws of {load!r} gave no machine that {motor!r} can move; choose a stronger motor"
     )

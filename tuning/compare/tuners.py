@@ -31,7 +31,7 @@ Integers = NDArray[np.int64]
 ENTRY_POINTS = "drive_env.tuners"
 
 
-class Row(NamedTuple):
+class TunerKind(NamedTuple):
     """A tuner of the registry: what it is, in a line, and whether it thinks so long that it is asked for by name."""
 
     name: str
@@ -45,10 +45,10 @@ class MissingTunerError(ValueError):
     """A tuner that is none, or that lacks what it needs; the message has the remedy."""
 
 
-def tuner_rows() -> dict[str, Row]:
+def tuner_rows() -> dict[str, TunerKind]:
     """Return all tuners by name: those of this package, the rules, and those that others have registered."""
     rows = {row.name: row for row in _OWN}
-    rows |= {name: Row(name, f"rule {name}", partial(RuleTuner, name)) for name in _rule_names()}
+    rows |= {name: TunerKind(name, f"rule {name}", partial(RuleTuner, name)) for name in _rule_names()}
     rows |= {row.name: row for row in _AFTER}
     for entry in sorted(importlib.metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
         distribution = entry.dist.name if entry.dist else "an unknown package"
@@ -57,7 +57,7 @@ def tuner_rows() -> dict[str, Row]:
                 f"{distribution} registers a tuner {entry.name!r}, and there is one of that name; rename it or "
                 f"uninstall {distribution}"
             )
-        rows[entry.name] = Row(entry.name, f"from {distribution}", partial(_load, entry))
+        rows[entry.name] = TunerKind(entry.name, f"from {distribution}", partial(_load, entry))
     return rows
 
 
@@ -177,19 +177,21 @@ def _load(entry: importlib.metadata.EntryPoint) -> Tuner:
 
 
 _OWN = (
-    Row("factory", "the gains that the drive comes with for its motor", lambda: _factory),
-    Row("fitted", "the fitted rule, for the inertia that two moves show", lambda: _fitted),
+    TunerKind("factory", "the gains that the drive comes with for its motor", lambda: _factory),
+    TunerKind("fitted", "the fitted rule, for the inertia that two moves show", lambda: _fitted),
 )
 _AFTER = (
-    Row("auto", "one button: identify, compute, verify, refine", _auto),
-    Row("random", "20 trials drawn at random", partial(_search, "random", trials=20), searches=True),
-    Row("grid", "the fitted rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
-    Row("tpe", "20 trials by tree-structured Parzen estimators", partial(_search, "tpe", trials=20), searches=True),
-    Row("tpe-safe", "20 trials by TPE from safe gains, in small steps", partial(_search, "tpe", trials=20, safe=True),
+    TunerKind("auto", "one button: identify, compute, verify, refine", _auto),
+    TunerKind("random", "20 trials drawn at random", partial(_search, "random", trials=20), searches=True),
+    TunerKind("grid", "the fitted rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
+    TunerKind("tpe", "20 trials by tree-structured Parzen estimators",
+        partial(_search, "tpe", trials=20), searches=True),
+    TunerKind("tpe-safe", "20 trials by TPE from safe gains, in small steps",
+        partial(_search, "tpe", trials=20, safe=True),
         searches=True),
-    Row("cmaes", "20 trials by CMA-ES", partial(_search, "cmaes", trials=20), searches=True),
-    Row("gp", "12 trials by a Gaussian process", partial(_search, "gp", trials=12), slow=True, searches=True),
-    Row("gp-safe", "12 trials by a Gaussian process from safe gains, in small steps",
+    TunerKind("cmaes", "20 trials by CMA-ES", partial(_search, "cmaes", trials=20), searches=True),
+    TunerKind("gp", "12 trials by a Gaussian process", partial(_search, "gp", trials=12), slow=True, searches=True),
+    TunerKind("gp-safe", "12 trials by a Gaussian process from safe gains, in small steps",
         partial(_search, "gp", trials=12, safe=True), slow=True, searches=True),
 )  # fmt: skip
 

@@ -165,7 +165,7 @@ class _Window(NamedTuple):
     angle: Floats  # rad electrical
 
 
-class _Axis(NamedTuple):
+class _AxisWinding(NamedTuple):
     demand: Floats
     current: Floats
     angle: Floats
@@ -173,8 +173,10 @@ class _Axis(NamedTuple):
     block: NDArray[np.int64]
 
 
-def _of_axis(pulses: Pulses, k: int) -> _Axis:
-    return _Axis(pulses.demand[:, k], pulses.current[:, k], pulses.angle[:, k], pulses.duty_sum[:, k], pulses.block)
+def _of_axis(pulses: Pulses, k: int) -> _AxisWinding:
+    return _AxisWinding(
+        pulses.demand[:, k], pulses.current[:, k], pulses.angle[:, k], pulses.duty_sum[:, k], pulses.block
+    )
 
 
 def _levels(repeats: int) -> tuple[Floats, NDArray[np.int64]]:
@@ -188,7 +190,7 @@ def _levels(repeats: int) -> tuple[Floats, NDArray[np.int64]]:
     return np.array(levels), np.array(blocks)
 
 
-def _winding(working: Working, axis: _Axis, k: int, electrical: float, pole_pairs: float) -> Winding:
+def _winding(working: Working, axis: _AxisWinding, k: int, electrical: float, pole_pairs: float) -> Winding:
     target, motor = working.target, working.target.motor
     supply = float(target.supply[k])
     P_raw, I_raw = loop_gains(working)
@@ -215,8 +217,8 @@ def _winding(working: Working, axis: _Axis, k: int, electrical: float, pole_pair
 
 
 def _window(
-    working: Working, axis: _Axis, P: float, share: float, supply: float, R: float, L: float, emf: float, lost: float,
-    saturation: float, electrical: float, pole_pairs: float,
+    working: Working, axis: _AxisWinding, P: float, share: float, supply: float, R: float, L: float, emf: float,
+    lost: float, saturation: float, electrical: float, pole_pairs: float,
 ) -> _Window:  # fmt: skip
     device, motor = working.target.device, working.target.motor
     dt, ticks = 1.0 / device.current_rate, round(CYCLE * device.current_rate)
@@ -360,7 +362,7 @@ def _solve(
     return _Solved(b, spread, float(rest @ rest) + len(y) * floor, penalty)
 
 
-def _judge(working: Working, axis: _Axis, found: _Fit, window: _Window) -> Winding:
+def _judge(working: Working, axis: _AxisWinding, found: _Fit, window: _Window) -> Winding:
     """Return the estimates with their intervals, or why there are none."""
     target = working.target
     t = t_quantile(found.freedom)

@@ -24,7 +24,7 @@ RINGING_CURRENT = 0.2
 RECOVERY_BAND = 0.2
 
 
-class Recording(NamedTuple):
+class MoveRecording(NamedTuple):
     """One move of many machines: n samples of p points."""
 
     t: Floats  # s, shape (n,)
@@ -35,7 +35,7 @@ class Recording(NamedTuple):
     t_step: float  # s
     t_load: float  # s
 
-    def point(self, k: int) -> Recording:
+    def point(self, k: int) -> MoveRecording:
         """Return the recording of point k alone."""
         return self._replace(
             speed_rpm=self.speed_rpm[:, [k]].copy(),
@@ -47,7 +47,7 @@ class Recording(NamedTuple):
 class Figures(NamedTuple):
     """What response.py says of a recording; errors [rpm] are set-point less actual."""
 
-    recording: Recording
+    recording: MoveRecording
     step: response.StepMetrics
     disturbance: response.DisturbanceMetrics
     current: response.CurrentMetrics
@@ -64,7 +64,7 @@ class Metric(NamedTuple):
     function: Callable[[Figures], Floats]
 
 
-def figures(recording: Recording) -> Figures:
+def figures(recording: MoveRecording) -> Figures:
     """Return the figures of a recording: the step up to the load torque, the disturbance from there to the end."""
     t, speed = recording.t, recording.speed_rpm
     reference = np.broadcast_to(recording.reference_rpm[:, None], speed.shape)

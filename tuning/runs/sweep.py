@@ -26,7 +26,7 @@ from mechanics.model import COPIES_PER_MODEL
 from tuning.runs import metrics, provenance
 from tuning.runs.experiment import Experiment, Resolved, label, resolve
 from tuning.runs.experiment import load_experiment as load_experiment
-from tuning.runs.metrics import Recording
+from tuning.runs.metrics import MoveRecording
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
 
@@ -59,7 +59,7 @@ class SweepResult:
     names: tuple[str, ...]
     columns: dict[str, NDArray[Any]]
     order: NDArray[np.int64]
-    response: Recording
+    response: MoveRecording
     simulated: float
     wall: float
 
@@ -260,12 +260,12 @@ def _column_names() -> list[str]:
     return ["score", *metrics.METRICS, *FLAGS]
 
 
-def _best(found: list[Arrays], experiment: Experiment) -> Recording:
+def _best(found: list[Arrays], experiment: Experiment) -> MoveRecording:
     """Return the recording of the best point; of equals that of the first shard."""
     shard = found[int(np.argmin([_score(arrays).min() for arrays in found]))]
     recorded = {name: shard[f"best.{name}"] for name in _RECORDED}
     excitation = experiment.excitation
-    return Recording(**recorded, t_step=excitation.velocity_time, t_load=excitation.load_time)
+    return MoveRecording(**recorded, t_step=excitation.velocity_time, t_load=excitation.load_time)
 
 
 def _compile(experiment: Experiment) -> None:
@@ -293,7 +293,7 @@ def _record(
     resolved: Resolved,
     points: NDArray[np.int64],
     report: Callable[[float], None],
-) -> tuple[Recording, NDArray[np.bool_]]:
+) -> tuple[MoveRecording, NDArray[np.bool_]]:
     """Return the recording of every point, and which ended in fault."""
     excitation = experiment.excitation
     # Enabled with the preset's gains, which are stable, so that the point's gains meet every axis in the same state.
@@ -319,7 +319,7 @@ def _record(
     velocity_unit = resolved.device.bindings[cia402.VELOCITY_ACTUAL, 0].unit
     rpm = 60.0 / resolved.position_scaler / per_increment_of(velocity_unit, resolved.position_scaler)
     ramp = np.clip((t - excitation.velocity_time) * resolved.acceleration, 0.0, abs(resolved.velocity))
-    recording = Recording(
+    recording = MoveRecording(
         t=t,
         reference_rpm=np.sign(resolved.velocity) * ramp * rpm,
         speed_rpm=np.concatenate([trace[cia402.VELOCITY_ACTUAL] for trace in traces]) * rpm,
@@ -348,7 +348,7 @@ def _pieces(step: float, load: float, end: float, piece: float, period: float) -
     return pieces
 
 
-def _evaluate(experiment: Experiment, recording: Recording) -> dict[str, NDArray[Any]]:
+def _evaluate(experiment: Experiment, recording: MoveRecording) -> dict[str, NDArray[Any]]:
     """Return the score before the flags count, every metric, and the flags but the fault's."""
     found = metrics.figures(recording)
     choice = experiment.metric
@@ -370,7 +370,7 @@ def _ranked(
     experiment: Experiment,
     resolved: Resolved,
     found: dict[str, NDArray[Any]],
-    best: Recording,
+    best: MoveRecording,
     simulated: float,
     wall: float,
 ) -> SweepResult:

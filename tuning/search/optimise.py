@@ -69,7 +69,7 @@ class Settings:
             raise ValueError(f"width must lie above 0 and up to {math.log(RAW_MAX):.1f}, not {self.width:g}")
 
 
-class Row(NamedTuple):
+class TrialRow(NamedTuple):
     """A trial that was made.
 
     search, number: Which search, and the trial's number in it.
@@ -112,14 +112,14 @@ class Optimised:
     gains: Integers
     rule: Integers
     cost: Floats
-    rows: tuple[Row, ...]
+    rows: tuple[TrialRow, ...]
     drive_seconds: float
     moves: Integers
     aborts: Integers
     notes: tuple[str, ...]
     t_0: float
 
-    def front(self, objectives: Sequence[str], search: int = 0) -> list[Row]:
+    def front(self, objectives: Sequence[str], search: int = 0) -> list[TrialRow]:
         """Return the accepted trials of a search that no other of them beats in every objective."""
         return pareto([row for row in self.rows if row.search == search and row.accepted], objectives)
 
@@ -172,7 +172,7 @@ class _Search:
 
     def __init__(self, bench: TrialBench, settings: Settings, shared: bool, trials: TrialBench | LoggedTrials) -> None:
         machines, axes = bench.num_machines, bench.target.axes_per_machine
-        self.rows: list[Row] = []
+        self.rows: list[TrialRow] = []
         self.notes = [""] * machines
         self._bench, self._trials, self._settings, self._axes = bench, trials, settings, axes
         self._columns = np.array([Gains._fields.index(name) for name in settings.gains])
@@ -224,11 +224,11 @@ class _Search:
                     gains[self._axes_of(machine)], cost[machine] = row.gains, row.cost
         return gains, cost
 
-    def judged(self) -> tuple[Row, ...]:
+    def judged(self) -> tuple[TrialRow, ...]:
         """Return every trial, those marked whose gains were found fragile later."""
         return tuple(row._replace(fragile=row.gains.tobytes() in self._fragile[row.search]) for row in self.rows)
 
-    def _best_row(self, k: int) -> Row | None:
+    def _best_row(self, k: int) -> TrialRow | None:
         unstopped = self._unstopped(k)
         if not unstopped:
             rows = [row for row in self.rows if row.search == k]
@@ -252,7 +252,7 @@ class _Search:
         values, facts = [], []
         for place, (point, own) in enumerate(zip(asked, held, strict=True)):
             machine = int(self._members[k][place])
-            row = Row(
+            row = TrialRow(
                 k,
                 self._proposers[k].told + place,
                 gains[self._axes_of(machine)].copy(),
@@ -277,7 +277,7 @@ class _Search:
                 self._least[machine] = np.inf if left is None else left.cost
                 self._note(k, "gains of a good trial went on shaking once something else had shaken the axis: not kept")
 
-    def _unstopped(self, k: int) -> list[Row]:
+    def _unstopped(self, k: int) -> list[TrialRow]:
         """Return a search's trials that were not stopped, and whose gains have not been found fragile since."""
         return [
             row
@@ -285,7 +285,7 @@ class _Search:
             if row.search == k and not row.aborted and row.gains.tobytes() not in self._fragile[k]
         ]
 
-    def _take(self, k: int, point: Floats, row: Row) -> None:
+    def _take(self, k: int, point: Floats, row: TrialRow) -> None:
         """Remember a trial; what is better than all before and was not stopped is what the next ones go back to."""
         self.rows.append(row)
         (self._refuted if row.aborted else self._proved)[k].append(point)
@@ -369,7 +369,7 @@ class _Search:
             self.notes[machine] = text
 
 
-def pareto(rows: Sequence[Row], objectives: Sequence[str]) -> list[Row]:
+def pareto(rows: Sequence[TrialRow], objectives: Sequence[str]) -> list[TrialRow]:
     """Return the trials that no other is better than in every objective, ordered by the first one."""
     values = np.array([objective_values(row, objectives) for row in rows]).reshape(len(rows), -1)
     best = [
@@ -378,14 +378,14 @@ def pareto(rows: Sequence[Row], objectives: Sequence[str]) -> list[Row]:
     return sorted((rows[k] for k in best), key=lambda row: objective_values(row, objectives))
 
 
-def objective_values(row: Row, objectives: Sequence[str]) -> tuple[float, ...]:
+def objective_values(row: TrialRow, objectives: Sequence[str]) -> tuple[float, ...]:
     """Return what a trial is worth in each objective, less is better."""
     return tuple(row.cost if name == COST else row.objectives[OBJECTIVES.index(name)] for name in objectives)
 
 
-def _row(search: int, fact: Mapping[str, Any]) -> Row:
+def _row(search: int, fact: Mapping[str, Any]) -> TrialRow:
     """Return a trial that a journal remembers."""
-    return Row(
+    return TrialRow(
         search,
         int(fact["number"]),
         np.array(fact["gains"], np.int64),

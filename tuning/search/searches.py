@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tuning.runs.pools import Pool
 from tuning.runs.shard_log import Arrays, ShardLog
 from tuning.runs.unfinished import part_log, part_path
-from tuning.search.optimise import Optimised, Row, Settings, optimise
+from tuning.search.optimise import Optimised, Settings, TrialRow, optimise
 from tuning.target import emulated
 from tuning.toml_tables import toml
 
@@ -31,7 +31,7 @@ class Search(NamedTuple):
     settings: Settings
 
 
-class _Task(NamedTuple):
+class _SearchTask(NamedTuple):
     """A search to be run, and the file from which it goes on with its key; None if there is none."""
 
     search: Search
@@ -80,7 +80,8 @@ def run(
     # A journal remembers by itself; a cluster's workers do not see this machine's files.
     here = shards[0].settings.journal is None and (pool is None or pool.shares_disk)
     tasks = [
-        _Task(shard, part_path(log, k) if here else None, f"{log.key}search {k}") for k, shard in enumerate(shards)
+        _SearchTask(shard, part_path(log, k) if here else None, f"{log.key}search {k}")
+        for k, shard in enumerate(shards)
     ]
     for k, arrays in _done(tasks, left, pool, progress):
         found[k] = arrays
@@ -90,7 +91,7 @@ def run(
 
 
 def _done(
-    tasks: list[_Task], left: list[int], pool: Pool | None, progress: Callable[[float], None]
+    tasks: list[_SearchTask], left: list[int], pool: Pool | None, progress: Callable[[float], None]
 ) -> Iterator[tuple[int, Arrays]]:
     """Give the number and the result of each search as it is done."""
     before = len(tasks) - len(left)
@@ -122,7 +123,7 @@ def joined(found: list[Optimised]) -> Optimised:
     )
 
 
-def _run(task: _Task, progress: Callable[[float], None] = lambda share: None) -> Arrays:
+def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: None) -> Arrays:
     """Return what a search found, of the machine that its lanes are, as arrays."""
     search = task.search
     kept = nullcontext() if task.path is None else part_log(task.path, task.key)
@@ -150,7 +151,7 @@ def _run(task: _Task, progress: Callable[[float], None] = lambda share: None) ->
 
 def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
     rows = tuple(
-        Row(search, int(number), gains, float(cost), tuple(objectives.tolist()), bool(aborted), bool(fragile))
+        TrialRow(search, int(number), gains, float(cost), tuple(objectives.tolist()), bool(aborted), bool(fragile))
         for number, gains, cost, objectives, aborted, fragile in zip(
             *(arrays[name] for name in ("number", "tried", "costs", "objectives", "aborted", "fragile")), strict=True
         )

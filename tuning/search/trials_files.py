@@ -15,7 +15,7 @@ import numpy as np
 from drive_env.gains import Gains
 from drive_env.whole_file import write_whole
 from mechanics.untrusted import read_toml
-from tuning.search.optimise import COST, Optimised, Row, Settings, objective_values, pareto
+from tuning.search.optimise import COST, Optimised, Settings, TrialRow, objective_values, pareto
 from tuning.search.trial_bench import OBJECTIVES
 from tuning.toml_tables import check_keys, toml
 
@@ -75,7 +75,7 @@ def save(
     write_whole(folder / "trials.png", picture.getvalue())
 
 
-def figures(row: Row, objectives: Sequence[str], t_0: float) -> list[float]:
+def figures(row: TrialRow, objectives: Sequence[str], t_0: float) -> list[float]:
     """Return what a trial reached in each objective, in the units of `TITLES`; `t_0` is that of the search [s]."""
     scales = {COST: 1.0, "speed": 1e3 * t_0, "robustness": 1.0}
     values = zip(objectives, objective_values(row, objectives), strict=True)
@@ -172,7 +172,7 @@ def _scale(axis: Any, set_scale: Any, name: str) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _draw_best(axes: Any, rows: list[Row], values: list[float], label: str | None) -> None:
+def _draw_best(axes: Any, rows: list[TrialRow], values: list[float], label: str | None) -> None:
     """Draw what a search had found by each of its trials, of those that were accepted."""
     accepted = [value if row.accepted else np.inf for row, value in zip(rows, values, strict=True)]
     best = np.minimum.accumulate(accepted)

@@ -12,8 +12,7 @@ from functools import cache
 from typing import NamedTuple
 
 from drive_env import cia402
-from drive_env.canopen.nmt import SERVICES, Command
-from drive_env.canopen.nmt import State as Nmt
+from drive_env.canopen.nmt import SERVICES, Command, NmtState
 from drive_env.cia402 import State
 from drive_env.firmware.fsa import AUTOMATIC_TRANSITIONS, TRANSITIONS
 
@@ -46,7 +45,7 @@ class Drive(NamedTuple):
     turns: bool = False
     ramps: bool = False
     word: int = 0
-    nmt: Nmt = Nmt.PRE_OPERATIONAL
+    nmt: NmtState = NmtState.PRE_OPERATIONAL
     consumer: int = NOBODY
     heard: bool = False
     latched: int | None = None
@@ -103,25 +102,25 @@ def trip(drive: Drive) -> Drive:
 def take_nmt(drive: Drive, command: Command) -> Drive:
     """Return the drive after an NMT command."""
     if command in (Command.RESET_NODE, Command.RESET_COMMUNICATION):
-        drive = drive._replace(nmt=Nmt.PRE_OPERATIONAL, consumer=NOBODY, heard=False, latched=None)
+        drive = drive._replace(nmt=NmtState.PRE_OPERATIONAL, consumer=NOBODY, heard=False, latched=None)
         if command is Command.RESET_NODE:
             # Not ready to switch on is passed before the boot-up message, after which frames can come.
             drive = drive._replace(fsa=State.SWITCH_ON_DISABLED, ramps=False, word=0)
         return drive
     target = {
-        Command.START: Nmt.OPERATIONAL,
-        Command.STOP: Nmt.STOPPED,
-        Command.ENTER_PRE_OPERATIONAL: Nmt.PRE_OPERATIONAL,
+        Command.START: NmtState.OPERATIONAL,
+        Command.STOP: NmtState.STOPPED,
+        Command.ENTER_PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
     }[command]
     return _enter(drive, target)
 
 
-def _enter(drive: Drive, nmt: Nmt) -> Drive:
+def _enter(drive: Drive, nmt: NmtState) -> Drive:
     """Enter an NMT state; entering Stopped is the one link to the axis' automaton."""
     if nmt is drive.nmt:
         return drive
     drive = drive._replace(nmt=nmt, latched=None)
-    return trip(drive) if nmt is Nmt.STOPPED else drive
+    return trip(drive) if nmt is NmtState.STOPPED else drive
 
 
 def write_consumer(drive: Drive, node: int) -> Drive:
@@ -160,7 +159,7 @@ def tick(drive: Drive, beating: frozenset[int]) -> Drive:
         return drive
     drive = drive._replace(heard=False)
     # 1029h is looked at in operational alone: a loss in pre-operational is told and changes nothing.
-    return _by_itself(_enter(drive, Nmt.STOPPED)) if drive.nmt is Nmt.OPERATIONAL else drive
+    return _by_itself(_enter(drive, NmtState.STOPPED)) if drive.nmt is NmtState.OPERATIONAL else drive
 
 
 def _by_itself(drive: Drive) -> Drive:

@@ -6,11 +6,22 @@ import time
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-from drive_env.canopen.nmt import State as Nmt
+from drive_env.canopen.nmt import NmtState
 from drive_env.cia402 import State as Fsa
 from drive_env.safety.model.drive import NOBODY, tick
 from drive_env.safety.model.rules import Assumptions, Rules
-from drive_env.safety.model.situation import DRIVE, GONE, LIBRARY, At, Hand, Situation, Step, Stop, beating, beginnings
+from drive_env.safety.model.situation import (
+    DRIVE,
+    GONE,
+    LIBRARY,
+    At,
+    Hand,
+    Situation,
+    Step,
+    StopStage,
+    beating,
+    beginnings,
+)
 from drive_env.safety.model.steps import attended, left_alone, steps
 
 RUNS_ON = "runs on: nobody watches, and no watchdog ends it"
@@ -28,7 +39,7 @@ def verdicts(before: Situation, step: Step, rules: Rules) -> Iterable[str]:
     live = after.drive.live
     if live and ours and before.drive.consumer != NOBODY == after.drive.consumer and before.at in _RESTORING:
         yield GIVEN_UP
-    if live and ours and (after.at in GONE or after.stop is Stop.UNPROVEN) and _runs_on_alone(after, rules):
+    if live and ours and (after.at in GONE or after.stop is StopStage.UNPROVEN) and _runs_on_alone(after, rules):
         yield RUNS_ON
     if live and ours and after.at is At.STALLED and _runs_on_beside_a_stalled_program(after, rules):
         yield RUNS_ON
@@ -36,11 +47,11 @@ def verdicts(before: Situation, step: Step, rules: Rules) -> Iterable[str]:
         if step.kind in ("INT", "TERM") and live and ours and after.at is At.DEAD:
             yield LEFT
         return
-    if live and ours and not after.armed and after.stop is not Stop.UNPROVEN:
+    if live and ours and not after.armed and after.stop is not StopStage.UNPROVEN:
         yield UNWATCHED
     if live and ours and after.armed and not after.believed and after.at is At.PROGRAM and not attended(after, rules):
         yield TAKEN_FOR_OFF
-    cuts = before.stop is Stop.CUT and before.drive.fsa is Fsa.OPERATION_ENABLED and before.drive.turns
+    cuts = before.stop is StopStage.CUT and before.drive.fsa is Fsa.OPERATION_ENABLED and before.drive.turns
     if cuts and not live and not before.ramped:
         yield UNRAMPED
 
@@ -92,7 +103,7 @@ def described(s: Situation) -> str:
     turning = ", turns" if drive.turns else ""
     watchdog = "no watchdog" if drive.consumer == NOBODY else f"watches {drive.consumer}"
     begun = "" if drive.consumer == NOBODY or drive.heard else ", not begun"
-    idle = " without effect" if drive.heard and drive.nmt is not Nmt.OPERATIONAL else ""
+    idle = " without effect" if drive.heard and drive.nmt is not NmtState.OPERATIONAL else ""
     fsa, nmt = drive.fsa.name.lower().replace("_", " "), drive.nmt.name.lower().replace("_", "-")
     return f"{fsa}{turning}; {nmt}; {watchdog}{begun}{idle}"
 

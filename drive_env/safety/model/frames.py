@@ -27,7 +27,7 @@ def deliver(s: Situation, frame: Held) -> Situation:
     return after._replace(held=tuple(held))
 
 
-class Transfer(NamedTuple):
+class ModelTransfer(NamedTuple):
     """How an SDO transfer may end: what happened to it, and the answer that its client takes for its own."""
 
     kind: str
@@ -36,14 +36,14 @@ class Transfer(NamedTuple):
     answer: object  # None: none came
 
 
-def transfers(s: Situation, index: int, value: int | None, assumptions: Assumptions) -> Iterator[Transfer]:
+def transfers(s: Situation, index: int, value: int | None, assumptions: Assumptions) -> Iterator[ModelTransfer]:
     """Return how a transfer may end: a write of `value` to 6040h or 1016h, or a read of 6041h."""
     if assumptions.keeps_order:
         while (earlier := next((frame for frame in s.held if frame.kind == "request"), None)) is not None:
             s = deliver(s, earlier)
     if not has_sdo(s):
         for answer, after in _answered(s, index, None, assumptions):
-            yield Transfer(LIBRARY, "the node answers no SDO in its NMT state", after, answer)
+            yield ModelTransfer(LIBRARY, "the node answers no SDO in its NMT state", after, answer)
         return
     done, content = s, object()
     if index == cia402.CONTROLWORD:
@@ -77,7 +77,9 @@ def transfers(s: Situation, index: int, value: int | None, assumptions: Assumpti
         for answer, then in _answered(after._replace(troubles=troubles), index, own, assumptions):
             is_stale = answer is not None and answer is not own
             stale = f"an earlier answer is taken for its own: {named(answer)}" if is_stale else ""
-            yield Transfer(kind, ", ".join(filter(None, (text, stale))), then._replace(held=then.held + more), answer)
+            yield ModelTransfer(
+                kind, ", ".join(filter(None, (text, stale))), then._replace(held=then.held + more), answer
+            )
 
 
 def _answered(s: Situation, index: int, own: object, assumptions: Assumptions) -> Iterator[tuple[object, Situation]]:

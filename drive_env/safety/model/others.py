@@ -14,7 +14,7 @@ from drive_env.safety.model.situation import (
     Situation,
     Step,
     Steps,
-    Stop,
+    StopStage,
     begun,
     ended,
     has_sdo,
@@ -38,7 +38,7 @@ def signal_steps(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
         if name not in rules.handles:
             yield Step(name, f"SIG{name} ends the process", ended(s, At.DEAD))
         elif rules.stops_in == "supervisor":
-            if s.armed and s.stop in (Stop.NONE, Stop.PROVEN) and s.at not in (At.RESTORE, At.RESTORE_AGAIN):
+            if s.armed and s.stop in (StopStage.NONE, StopStage.PROVEN) and s.at not in (At.RESTORE, At.RESTORE_AGAIN):
                 yield Step(name, f"SIG{name}: the supervisor begins to stop the axis", begun(s, rules))
         elif s.at in (At.RESTORE, At.RESTORE_AGAIN):
             yield Step(name, f"SIG{name} breaks off the putting back, and the process ends", ended(s, At.CLOSED))
@@ -46,7 +46,7 @@ def signal_steps(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
             yield Step(name, f"SIG{name} raises in the program, which leaves", left(s, rules))
         elif s.stop in IN_A_STOP:
             text = f"SIG{name} breaks off the stop; at the interpreter's end the drives are closed"
-            yield Step(name, text, s._replace(at=At.RESTORE, stop=Stop.PROVEN, ramped=False, acknowledged=False))
+            yield Step(name, text, s._replace(at=At.RESTORE, stop=StopStage.PROVEN, ramped=False, acknowledged=False))
 
 
 _FOREIGN = {

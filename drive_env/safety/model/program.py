@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from drive_env import cia402
-from drive_env.canopen.nmt import SERVICES, Command
-from drive_env.canopen.nmt import State as Nmt
+from drive_env.canopen.nmt import SERVICES, Command, NmtState
 from drive_env.firmware.fsa import ENABLE_OPERATION
 from drive_env.safety.model.drive import NOBODY, hear, latch, sync, take_nmt
 from drive_env.safety.model.frames import deliver, transfers
@@ -28,7 +27,7 @@ from drive_env.safety.model.situation import (
     Situation,
     Step,
     Steps,
-    Stop,
+    StopStage,
     begun,
     ended,
     has_sdo,
@@ -82,15 +81,15 @@ def _calls(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
 
 def _check(s: Situation, rules: Rules, kind: str, text: str, rows: tuple[int, ...]) -> Steps:
     """Return the step in which the envelope lets a call pass, after which the call goes on; or none: it is refused."""
-    if rules.watches and (s.stop in IN_A_STOP or s.stop is Stop.UNPROVEN):
+    if rules.watches and (s.stop in IN_A_STOP or s.stop is StopStage.UNPROVEN):
         return
     checked = s._replace(at=At.SEND, rows=rows, by_pdo=kind == "play")
     if rules.arms_for & frozenset(rows):
         if rules.live_from == "statusword":
             checked = checked._replace(believed=True)
         checked = checked._replace(at=At.ARM if rules.arms == "each time" or not s.armed else At.ARMED)
-    if rules.watches and rows != (SET_POINT,) and s.stop is Stop.PROVEN:
-        checked = checked._replace(stop=Stop.NONE)
+    if rules.watches and rows != (SET_POINT,) and s.stop is StopStage.PROVEN:
+        checked = checked._replace(stop=StopStage.NONE)
     yield Step(kind, text, checked)
 
 
@@ -101,7 +100,7 @@ def _arm(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
         return
     started = moved(s, take_nmt(s.drive, Command.START), Hand.NOBODY)
     yield from _configure(started, rules, assumptions, LIBRARY, "the library sends NMT start")
-    if s.troubles and s.drive.nmt is not Nmt.OPERATIONAL:
+    if s.troubles and s.drive.nmt is not NmtState.OPERATIONAL:
         lost = s._replace(troubles=s.troubles - 1)
         what = "the library sends NMT start, which is lost"
         if rules.operational == "seen":
@@ -191,12 +190,12 @@ def _leave(s: Situation, rules: Rules) -> Steps:
     """Begin the stop, wait for it, or go on after it."""
     if s.stop in IN_A_STOP:
         return
-    if s.stop is Stop.NONE and s.armed and (rules.watches or s.believed):
+    if s.stop is StopStage.NONE and s.armed and (rules.watches or s.believed):
         stop = begun(s, rules)
         if not s.believed:  # no controlword is sent to an axis that is off already
-            stop = stop._replace(stop=Stop.PROVE, acknowledged=True)
+            stop = stop._replace(stop=StopStage.PROVE, acknowledged=True)
         yield Step(LIBRARY, "the library begins to stop the axis", stop)
-    elif s.stop is Stop.UNPROVEN:
+    elif s.stop is StopStage.UNPROVEN:
         yield Step(LIBRARY, "the library leaves 1016h as it is and closes", ended(s, At.CLOSED))
     elif s.armed:
         yield Step(LIBRARY, "the library goes on to put 1016h back", s._replace(at=At.RESTORE))

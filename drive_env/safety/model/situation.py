@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from enum import Enum
 from typing import Literal, NamedTuple
 
-from drive_env.canopen.nmt import SERVICES
-from drive_env.canopen.nmt import State as Nmt
+from drive_env.canopen.nmt import SERVICES, NmtState
 from drive_env.cia402 import State as Fsa
 from drive_env.safety.model.drive import NOBODY, Drive
 from drive_env.safety.model.rules import ENABLE, FIXED_ID, OWN_ID, Assumptions, Rules
@@ -34,7 +33,7 @@ class At(_Place):
     DEAD = "dead"
 
 
-class Stop(_Place):
+class StopStage(_Place):
     """How far a stop is."""
 
     NONE = "none"
@@ -75,7 +74,7 @@ class Situation(NamedTuple):
     believed: bool = False  # the envelope takes the axis for live
     armed: bool = False  # the supervisor runs, and sends heartbeats
     lockstep: bool = False  # as the program chose; the bus is one of real time all the same
-    stop: Stop = Stop.NONE
+    stop: StopStage = StopStage.NONE
     ramped: bool = False  # this stop has sent its quick stop
     acknowledged: bool = False  # this stop's last controlword was answered
     interfered: bool = False  # another master acted, and what follows of it is not done yet
@@ -95,13 +94,13 @@ class Step(NamedTuple):
 
 LIBRARY, DRIVE = "library", "drive"  # kinds of steps that happen by themselves
 GONE = (At.CLOSED, At.DEAD)
-IN_A_STOP = (Stop.QUICK, Stop.RAMP, Stop.CUT, Stop.PROVE)
+IN_A_STOP = (StopStage.QUICK, StopStage.RAMP, StopStage.CUT, StopStage.PROVE)
 Steps = Iterator[Step]
 
 
 def beginnings(rules: Rules, assumptions: Assumptions) -> Iterator[Situation]:
     """Return the situations in which a session may begin: the axis off, or enabled by another master and turning."""
-    found = Drive(fsa=Fsa.OPERATION_ENABLED, turns=True, word=ENABLE, nmt=Nmt.OPERATIONAL)
+    found = Drive(fsa=Fsa.OPERATION_ENABLED, turns=True, word=ENABLE, nmt=NmtState.OPERATIONAL)
     for lockstep in (False,) if rules.arms_in_lockstep else (False, True):  # then it makes no difference
         for drive, hand in ((Drive(), Hand.NOBODY), (found, Hand.OTHER)):
             yield Situation(drive, lockstep=lockstep, hand=hand, troubles=assumptions.troubles)
@@ -136,8 +135,8 @@ def refused(s: Situation) -> Situation:
 
 def left(s: Situation, rules: Rules) -> Situation:
     """Return the situation in which the program has begun to leave."""
-    proven = s.stop is Stop.PROVEN and not rules.proves_anew
-    stop = s.stop if s.stop in IN_A_STOP or s.stop is Stop.UNPROVEN or proven else Stop.NONE
+    proven = s.stop is StopStage.PROVEN and not rules.proves_anew
+    stop = s.stop if s.stop in IN_A_STOP or s.stop is StopStage.UNPROVEN or proven else StopStage.NONE
     return s._replace(at=At.LEAVING, rows=(), by_pdo=False, cancelled=False, stop=stop)
 
 
@@ -149,7 +148,7 @@ def ended(s: Situation, at: At) -> Situation:
 
 def begun(s: Situation, rules: Rules) -> Situation:
     """Return the situation with a stop begun."""
-    stop = Stop.QUICK if rules.ramps_first else Stop.CUT
+    stop = StopStage.QUICK if rules.ramps_first else StopStage.CUT
     believed = rules.live_from == "statusword"  # TODAY forgets what it stops before it has stopped
     cancelled = s.at in (At.ARM, At.ARMED, At.SEND)
     return s._replace(stop=stop, ramped=False, acknowledged=False, believed=believed, cancelled=cancelled)

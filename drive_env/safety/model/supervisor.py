@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drive_env import cia402
-from drive_env.canopen.nmt import State as Nmt
+from drive_env.canopen.nmt import NmtState
 from drive_env.cia402 import State as Fsa
 from drive_env.safety.model.frames import named, transfers
 from drive_env.safety.model.rules import DISABLE_VOLTAGE, QUICK_STOP, Assumptions, Rules
@@ -15,7 +15,7 @@ from drive_env.safety.model.situation import (
     Situation,
     Step,
     Steps,
-    Stop,
+    StopStage,
     begun,
     has_sdo,
     joined,
@@ -32,14 +32,14 @@ def supervisor_steps(s: Situation, rules: Rules, assumptions: Assumptions) -> St
     elif s.armed and s.at not in (At.RESTORE, At.RESTORE_AGAIN):
         if rules.watches:
             yield from _look(s, rules)
-        elif s.at is At.STALLED and s.believed and not s.lockstep and s.stop is Stop.NONE:
+        elif s.at is At.STALLED and s.believed and not s.lockstep and s.stop is StopStage.NONE:
             what = "the lifeline sends a quick stop, and waits for no answer"
             for kind, text, after, _ in transfers(s, cia402.CONTROLWORD, QUICK_STOP, assumptions):
-                yield Step(kind, joined(what, text), after._replace(stop=Stop.PROVEN))
+                yield Step(kind, joined(what, text), after._replace(stop=StopStage.PROVEN))
 
 
 def _watchdog_is_there(s: Situation, rules: Rules) -> bool:
-    return s.drive.nmt is Nmt.OPERATIONAL and s.drive.consumer == master_id(rules)
+    return s.drive.nmt is NmtState.OPERATIONAL and s.drive.consumer == master_id(rules)
 
 
 def _look(s: Situation, rules: Rules) -> Steps:
@@ -53,7 +53,7 @@ def _look(s: Situation, rules: Rules) -> Steps:
     believed = s.drive.fsa not in rules.off or (s.believed and s.at not in (At.PROGRAM, At.STALLED))
     lost = s.drive.live and (shared or gone)
     may_be_lost = believed and (shared or (gone and s.at is not At.ARM))
-    if lost or may_be_lost or (s.drive.live and (s.at is At.STALLED or s.stop is Stop.PROVEN)):
+    if lost or may_be_lost or (s.drive.live and (s.at is At.STALLED or s.stop is StopStage.PROVEN)):
         after = begun(s, rules)
     else:
         # What was checked before the watchdog went is checked anew.
@@ -66,38 +66,38 @@ def _look(s: Situation, rules: Rules) -> Steps:
 
 
 def _stop(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
-    if s.stop is Stop.QUICK:
+    if s.stop is StopStage.QUICK:
         for kind, text, after, answer in transfers(s, cia402.CONTROLWORD, QUICK_STOP, assumptions):
             # Once in quick stop active it needs nobody any more: a controlword that comes late changes nothing.
             stops = answer is not None and after.drive.fsa is not Fsa.OPERATION_ENABLED
-            sent = after._replace(stop=Stop.RAMP, ramped=True, acknowledged=answer is not None)
+            sent = after._replace(stop=StopStage.RAMP, ramped=True, acknowledged=answer is not None)
             sent = sent._replace(interfered=s.interfered and not stops)
             yield Step(kind, joined("the stop sends 6040h = 02h", text), sent)
-    elif s.stop is Stop.RAMP:
+    elif s.stop is StopStage.RAMP:
         # A quick stop that comes while operation is being disabled waits for that ramp, if it came; we wait as long as
         # somebody else watches, too.
         guarded = _watchdog_is_there(s, rules) and s.twin != master_id(rules)
         waits = s.drive.fsa is not Fsa.OPERATION_ENABLED or (s.drive.ramps and s.acknowledged and guarded)
         if not (s.drive.live and s.drive.turns and waits and has_sdo(s)):
             how = "is not on its ramp" if s.drive.live and s.drive.turns else "stands, or is off"
-            yield Step(LIBRARY, f"the stop sees that the axis {how}", s._replace(stop=Stop.CUT))
-    elif s.stop is Stop.CUT:
+            yield Step(LIBRARY, f"the stop sees that the axis {how}", s._replace(stop=StopStage.CUT))
+    elif s.stop is StopStage.CUT:
         for kind, text, after, answer in transfers(s, cia402.CONTROLWORD, DISABLE_VOLTAGE, assumptions):
-            then = Stop.PROVEN if rules.gives_up == "always" else Stop.PROVE
+            then = StopStage.PROVEN if rules.gives_up == "always" else StopStage.PROVE
             unanswered = answer is None
             done = after._replace(stop=then, acknowledged=not unanswered, interfered=s.interfered and unanswered)
             yield Step(kind, joined("the stop sends 6040h = 00h", text), done)
-    elif s.stop is Stop.PROVE:
+    elif s.stop is StopStage.PROVE:
         for kind, text, after, answer in transfers(s, cia402.STATUSWORD, None, assumptions):
             what = "the stop reads 6041h" if answer is None else f"the stop reads 6041h: {named(answer)}"
             enough = rules.proof == "read" or s.acknowledged
             if answer in rules.off and enough:
-                proven = after._replace(stop=Stop.PROVEN, believed=False, ramped=False, acknowledged=False)
+                proven = after._replace(stop=StopStage.PROVEN, believed=False, ramped=False, acknowledged=False)
                 yield Step(kind, joined(what, text), proven)
             else:
                 if not s.ramped:
                     yield Step(kind, joined(f"{what}; so it stops", text), begun(after, rules))
                     continue
-                gives_up = after._replace(stop=Stop.UNPROVEN, armed=False, ramped=False, acknowledged=False)
+                gives_up = after._replace(stop=StopStage.UNPROVEN, armed=False, ramped=False, acknowledged=False)
                 yield Step(kind, joined(f"{what}; no proof, so the heartbeats end", text), gives_up)
-                yield Step(kind, joined(f"{what}; no proof, so once more", text), after._replace(stop=Stop.CUT))
+                yield Step(kind, joined(f"{what}; no proof, so once more", text), after._replace(stop=StopStage.CUT))
