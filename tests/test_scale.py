@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import re
@@ -418,6 +419,15 @@ def test_the_hash_of_the_sources_covers_every_file_that_decides_a_digit(tmp_path
     (package / "new.json").rename(package / "other.json")
     seen.add(provenance.hash_of_sources([package]))
     assert len(seen) == 5
+
+
+def test_the_hash_of_the_sources_is_that_of_the_packages_that_are_loaded():
+    packages = [
+        Path(importlib.import_module(name).__file__).parent for name in ("drive_env", "mechanics", "tuning", "agents")
+    ]
+    assert provenance.hash_of_sources(packages) == provenance.SOURCES
+    for package in packages:
+        assert provenance.hash_of_sources(one for one in packages if one != package) != provenance.SOURCES
 
 
 def test_worker_processes_of_other_sources_are_refused_with_both_hashes(monkeypatch):

@@ -12,12 +12,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from drive_env.own_packages import ROOT
 from drive_env.whole_file import keep_names
 
 HEADER = "# The whole experiment of this run. It repeats from this file: drive-tune sweep --config settings.toml\n"
 _PACKAGES = ("drive-env", "numpy", "numba", "llvmlite", "mujoco")
-_ROOT = Path(__file__).parent.parent
-_OURS = tuple(_ROOT / name for name in ("drive_env", "mechanics", "tuning", "agents"))
+_OURS = tuple(ROOT / name for name in ("drive_env", "mechanics", "tuning", "agents"))
 
 
 def hash_of_sources(folders: Iterable[Path] = _OURS) -> str:
