@@ -53,7 +53,7 @@ def join(parts: Sequence[TrialData]) -> TrialData:
 
 
 class SurrogateNetwork(nn.Module):  # type: ignore[misc]
-    """What `surrogate.Network` is, for normalised inputs."""
+    """What `surrogate.EnsembleMember` is, for normalised inputs."""
 
     def __init__(self, gains: int) -> None:
         super().__init__()
