@@ -1,0 +1,134 @@
+"""The house of docs/architecture.md, as far as a program can look: imports one way, no circles, one name per class."""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+# From below to above: whoever stands later may import whoever stands earlier.
+PACKAGES = ("mechanics", "drive_env", "tuning", "agents", "research")
+MOST_LINES, MOST_ARGUMENTS = 60, 10
+# What was longer when the rule came; a row goes when its function is split, none is added.
+LONG = {
+    "agents/commands/evaluate.py evaluate", "agents/commands/tune.py tune", "agents/evaluation/evaluation.py evaluate",
+    "agents/training/search.py search", "agents/training/train.py _segments_class",
+    "agents/tuner/tune_target.py tune_target", "drive_env/canopen/node.py __init__",
+    "drive_env/commands/check_model.py check_model", "drive_env/commands/jog.py jog",
+    "drive_env/commands/scope.py _record", "drive_env/commands/serve.py serve",
+    "drive_env/emulator/emulated_drives.py __init__", "drive_env/firmware/cycle.py power_on",
+    "drive_env/firmware/modes/hm.py generate", "drive_env/firmware/power_stage.py power_stage",
+    "drive_env/firmware/power_stage.py refresh_winding", "mechanics/packed.py _new_plant",
+    "mechanics/stepping.py drive", "mechanics/stepping.py report", "mechanics/stepping.py rub",
+    "tuning/commands/optimise.py optimise", "tuning/commands/rank.py _compare",
+}  # fmt: skip
+# A command line's options are its arguments; these have more than ten.
+MANY = {
+    "agents/commands/evaluate.py evaluate", "agents/commands/search.py search", "agents/commands/train.py train",
+    "agents/commands/tune.py tune", "agents/evaluation/evaluation.py evaluate",
+    "drive_env/commands/check_model.py check_model", "drive_env/commands/fault.py fault",
+    "drive_env/commands/get.py set_object", "drive_env/commands/jog.py jog", "drive_env/commands/monitor.py monitor",
+    "drive_env/commands/parameters.py commission", "drive_env/commands/parameters.py diff",
+    "drive_env/commands/parameters.py restore", "drive_env/commands/scope.py scope",
+    "drive_env/commands/serve.py serve", "drive_env/emulator/emulated_drives.py __init__",
+    "drive_env/master/can_drives.py __init__", "mechanics/friction.py bristle_torque",
+    "mechanics/packed.py __init__", "tuning/commands/optimise.py optimise", "tuning/commands/options.py open_target",
+    "tuning/commands/rank.py _compare", "tuning/commands/rank.py rank", "tuning/commands/sweep.py sweep",
+    "tuning/identify/winding.py _simulate", "tuning/identify/winding.py _window",
+    "tuning/response/frequency_response.py measure", "tuning/target.py emulated",
+}  # fmt: skip
+
+
+@cache
+def modules() -> dict[str, ast.Module]:
+    """Every module of ours by its dotted name."""
+    found = {}
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+            found[name] = ast.parse(path.read_text(encoding="utf-8"))
+    return found
+
+
+def loaded_by(tree: ast.Module) -> set[str]:
+    """What a module imports when it is loaded: not in functions, and not where types alone are checked."""
+    names: set[str] = set()
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            waiting += node.orelse
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                names.add(whole if whole in modules() else node.module)
+        elif isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            waiting += ast.iter_child_nodes(node)
+    return names & modules().keys()
+
+
+def test_no_module_imports_itself_through_others():
+    imports = {name: loaded_by(tree) - {name} for name, tree in modules().items()}
+    circles, below = [], {}
+
+    def depth(name: str, above: tuple[str, ...]) -> int:
+        if name in above:
+            circles.append(" -> ".join((*above[above.index(name) :], name)))
+            return 0
+        if name not in below:
+            below[name] = 1 + max((depth(one, (*above, name)) for one in sorted(imports[name])), default=0)
+        return below[name]
+
+    for name in imports:
+        depth(name, ())
+    assert not circles
+    assert max(below.values()) > 5  # there was something to see
+
+
+def test_imports_point_one_way():
+    floors = {package: floor for floor, package in enumerate(PACKAGES)}
+    for name, tree in modules().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in floors:
+                assert floors[node.module.split(".")[0]] <= floors[name.split(".")[0]], (name, node.module)
+
+
+def test_a_class_has_its_name_alone():
+    homes = defaultdict(list)
+    for name, tree in modules().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                homes[node.name].append(name)
+    assert {name: where for name, where in homes.items() if len(where) > 1} == {}
+
+
+@pytest.mark.parametrize(("measure", "most", "known"), [
+    ("lines", MOST_LINES, LONG), ("arguments", MOST_ARGUMENTS, MANY),
+])  # fmt: skip
+def test_functions_are_short(measure, most, known):
+    found = set()
+    for name, tree in modules().items():
+        folder = ROOT / Path(*name.split("."))
+        path = (folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")).relative_to(ROOT)
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef) and size(node)[measure] > most:
+                found.add(f"{path.as_posix()} {node.name}")
+    assert found <= known, f"of more than {most} {measure}: split them"
+    assert known <= found, "short now: take them from the list"
+
+
+def size(node: ast.FunctionDef) -> dict[str, int]:
+    """A function's lines without its docstring, and its arguments without self."""
+    first, given = node.body[0], node.args
+    docstring = first.end_lineno - first.lineno + 1 if ast.get_docstring(node, clean=False) else 0
+    names = [one.arg for one in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+    return {
+        "lines": node.end_lineno - node.lineno + 1 - docstring,
+        "arguments": len(names) - (names[:1] in (["self"], ["cls"])),
+    }
