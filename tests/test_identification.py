@@ -512,7 +512,7 @@ def test_of_axes_that_pull_at_one_thing_a_brief_response_says_nothing_of_the_own
     ("winder", "faulhaber_3863", 6),
 ])  # fmt: skip
 def test_over_the_bus_in_lockstep_the_same_comes_out(load, motor, seed):
-    """R and L within 10 % over the bus; all else as in-process, since the integers are the same."""
+    """R and L within 10 % over the bus; all else as in-process, of brushed motors by their intervals."""
     with served("calls", load=load, motor=motor, seed=seed) as drives:
         own = emulated("tmcm1636", load, motor, seed=seed, num_threads=1)
         target = Target(drives, own.device, own.motor, own.supply, own.low, own.high, own.speed, own.current)
@@ -524,7 +524,10 @@ def test_over_the_bus_in_lockstep_the_same_comes_out(load, motor, seed):
     for name in NAMES:
         a, b = on_bus.estimates[name], here.estimates[name]
         assert a.is_known == b.is_known, name
-        assert a.value == pytest.approx(b.value, rel=0.02, nan_ok=True), name
+        if target.motor.kind == "dc":  # a push of milliseconds comes first, and where it ends hangs on the bus's time
+            assert not a.is_known or (a.low <= b.value <= a.high and b.low <= a.value <= b.high), name
+        else:
+            assert a.value == pytest.approx(b.value, rel=0.02, nan_ok=True), name
 
 
 class Late:
