@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -356,31 +356,24 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _built(kind: type, data: Mapping[str, Any]) -> Any:
+def _built(kind: Any, data: Mapping[str, Any]) -> Any:
     """Return a dataclass from what `_plain` made of it."""
-    return kind(**{f.name: _value(str(f.type), data[f.name]) for f in fields(kind)})
+    kinds = get_type_hints(kind)
+    return kind(**{f.name: _value(kinds[f.name], data[f.name]) for f in fields(kind)})
 
 
-def _value(kind: str, value: Any) -> Any:
-    if kind in _NESTED:
-        return tuple(_built(_NESTED[kind], item) for item in value)
-    if kind == "Floats":
-        return np.array([_number(item) for item in value], float)
-    if kind == "float":
-        return _number(value)
-    if kind == "Mapping[str, float]":
-        return {name: _number(item) for name, item in value.items()}
-    if kind == "Mapping[str, Parameter]":
-        return {name: _built(StatedParameter, item) for name, item in value.items()}
-    return tuple(value) if kind.startswith("tuple[") else value
+def _value(kind: Any, value: Any) -> Any:
+    if get_origin(kind) is tuple:
+        item = get_args(kind)[0]
+        return tuple(_built(item, one) for one in value) if is_dataclass(item) else tuple(value)
+    if get_origin(kind) is Mapping and is_dataclass(item := get_args(kind)[1]):
+        return {name: _built(item, one) for name, one in value.items()}
+    if kind == Mapping[str, float]:
+        return {name: _number(one) for name, one in value.items()}
+    if kind == Floats:
+        return np.array([_number(one) for one in value], float)
+    return _number(value) if kind is float else value
 
 
 def _number(value: Any) -> float:
     return math.nan if value is None else float(value)
-
-
-_NESTED: dict[str, type] = {
-    "tuple[AxisCertificate, ...]": AxisCertificate,
-    "tuple[StepResponse, ...]": StepResponse,
-    "tuple[FrequencyResponse, ...]": FrequencyResponse,
-}
