@@ -111,7 +111,7 @@ class GainSet:
         changed[:, column] = np.clip(np.rint(raw[:, column] * np.asarray(factor, float)), 1, self.rows[column].highest)
         return changed
 
-    def softened(self, raw: Integers, divisor: ArrayLike, *loops: str) -> Integers:
+    def softened(self, raw: Integers, divisor: Integers | int, *loops: str) -> Integers:
         """Return gains of shape (n, count) with those of loops over a whole number, shape (n,) or one; 1 at least."""
         softer = raw.copy()
         for column in self.columns_of(*loops):
