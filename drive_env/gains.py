@@ -6,7 +6,9 @@ the integration time and k_v the position gain [1/s], the raw integers are
     P_T = 25600 2 pi f L / V     I_T = 65536 dt_c R / L     P_V = 8784 w_v J / K_t     I_V = 65536 dt_v / T_i
     P_P = 3.75 k_v
 
-for a current loop of full scale 100 A; the functions take the scale from the device's data.
+for a current loop of full scale 100 A; the functions take the scale from the device's data. A device names the cascade
+in its `gains.toml` (`cascade = "pi"`); it may have some of these gains only, the others fixed, and count them in other
+units than the chip, which its bindings name.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.devices import Device
-from drive_env.dictionary.units import RPM
+from drive_env.dictionary.units import RPM, UNITS, Context
 from drive_env.drives.interface import Drives, device_of
 from drive_env.motors import Motor
 
@@ -96,7 +98,31 @@ def gains_from_bandwidths(
         integration: Integration time of the velocity loop as a multiple of 1/w_v.
 
     Raises:
-        ValueError: If a gain leaves 1...32767.
+        ValueError: If a gain leaves its range, or the drive has no linear model of its loops.
+    """
+    check_linear_model(device)
+    raw = bandwidth_gains(
+        device, motor, inertia, current_hz=current_hz, velocity_hz=velocity_hz, position_hz=position_hz,
+        supply=supply, integration=integration,
+    )  # fmt: skip
+    return Gains(*raw.tolist())
+
+
+def bandwidth_gains(
+    device: Device,
+    motor: Motor,
+    inertia: float,
+    *,
+    current_hz: float,
+    velocity_hz: float,
+    position_hz: float,
+    supply: float | None = None,
+    integration: float = DEFAULT_INTEGRATION,
+) -> NDArray[np.int64]:
+    """Return the device's gains for the bandwidths wanted, shape (count,); arguments as `gains_from_bandwidths` has.
+
+    Raises:
+        ValueError: If a gain leaves its range, or the device names no cascade.
     """
     w_v = 2.0 * math.pi * velocity_hz
     raw = (
@@ -106,10 +132,11 @@ def gains_from_bandwidths(
         65536.0 / device.velocity_rate * w_v / integration,
         _POSITION_P_SCALE * 2.0 * math.pi * position_hz,
     )
-    for name, value in zip(device.gains.titles, raw, strict=True):
-        if not 0.5 <= value < RAW_MAX + 0.5:
-            raise ValueError(f"{name} would be {value:.0f}, outside 1...{RAW_MAX}; choose another bandwidth")
-    return Gains(*(round(value) for value in raw))
+    own = _of_device(device, np.array(raw)).tolist()
+    for gain, value in zip(device.gains.rows, own, strict=True):
+        if not 0.5 <= value < gain.highest + 0.5:
+            raise ValueError(f"{gain.title} would be {value:.0f}, outside 1...{gain.highest}; choose another bandwidth")
+    return np.array([round(value) for value in own], np.int64)
 
 
 def bandwidths_from_gains(
@@ -155,7 +182,7 @@ FITTED_RULE = Rule(current_hz=1000.0, speed=0.19, inertia=0.432, integration=1.3
 def rule_gains(
     device: Device, motor: Motor, inertia: ArrayLike, rule: Rule = FITTED_RULE, *, supply: float | None = None
 ) -> NDArray[np.int64]:
-    """Return a rule's raw gains, shape (n, 5) in the order of `Gains`; what leaves 1...32767 is cut off there.
+    """Return a rule's raw gains, shape (n, count) in the order of the device's set; what leaves its range is cut off.
 
     Args:
         device: The drive.
@@ -165,6 +192,9 @@ def rule_gains(
             constant is another.
         rule: The rule's constants.
         supply: Supply voltage [V]; the motor's own by default.
+
+    Raises:
+        ValueError: If the device names no cascade.
     """
     J = np.atleast_1d(np.asarray(inertia, float))
     small = float(small_time_constants(device, device.stage["velocity_filter"].default, rule.current_hz))
@@ -179,7 +209,7 @@ def rule_gains(
         ],
         axis=-1,
     )
-    return scaled(raw, 1.0)
+    return device.gains.clipped(_of_device(device, raw))
 
 
 def small_time_constants(device: Device, velocity_filter: ArrayLike, current_hz: float = 1000.0) -> NDArray[np.float64]:
@@ -203,6 +233,57 @@ def small_time_constants(device: Device, velocity_filter: ArrayLike, current_hz:
 def scaled(raw: NDArray[Any], factor: ArrayLike) -> NDArray[np.int64]:
     """Return raw gains times a factor as integers, cut off at 1 and 32767."""
     return np.asarray(np.clip(np.rint(raw * np.asarray(factor, float)), 1, RAW_MAX), np.int64)
+
+
+# --- other devices' gains ---------------------------------------------------------------------------------------------
+PI = "pi"  # the cascade, as a device names it
+# The chip's gains in the order of `Gains`: loop and part, and the unit that it counts them in.
+_CHIP = {
+    ("current", "P"): "current P",
+    ("current", "I"): "I",
+    ("velocity", "P"): "velocity P",
+    ("velocity", "I"): "I",
+    ("position", "P"): "position P",
+}
+
+
+def has_linear_model(device: Device) -> bool:
+    """Return whether the loops of a device are those of the linear model: the whole cascade, in the chip's units."""
+    rows = device.gains.rows
+    parts = {(row.loop, row.part): device.bindings[row.key].unit for row in rows}
+    return device.gains.cascade == PI and list(parts.items()) == list(_CHIP.items()) and len(rows) == len(parts)
+
+
+def check_linear_model(device: Device) -> None:
+    """Raise ValueError unless a device's loops are those of the linear model."""
+    if not has_linear_model(device):
+        raise ValueError(
+            f"{device.name}: this drive has no linear model of its loops; drive-tune sweep and optimise need none, and "
+            "find gains by trials"
+        )
+
+
+def _of_device(device: Device, raw: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return raw gains of the chip, shape (..., 5), as those of a device, (..., count), in its units."""
+    known = device.gains
+    if known.cascade != PI:
+        raise ValueError(
+            f"{device.name} names no cascade of its loops, so that no gains follow from its motor; give its gains.toml "
+            f'cascade = "{PI}" if its loops are that one, or set gains by hand and use drive-tune sweep'
+        )
+    context, order = Context(65536.0, device.current_full_scale / 32768.0), list(_CHIP)
+    columns, ratios = [], []
+    for row in known.rows:
+        part = row.loop, row.part
+        if part not in _CHIP:
+            raise ValueError(
+                f"{device.name}: gains.toml: {row.name} is {row.part} of the {row.loop} loop, which the cascade "
+                f'"{PI}" does not have; it has {", ".join(f"{p} of {loop}" for loop, p in order)}'
+            )
+        columns.append(order.index(part))
+        chips, own = (float(UNITS[name].factor(context)) for name in (_CHIP[part], device.bindings[row.key].unit))
+        ratios.append(chips / own)
+    return np.asarray(raw[..., columns] * np.array(ratios))
 
 
 def write_gains(drives: Drives, gains: NDArray[np.int64], where: NDArray[np.bool_] | None = None) -> None:

@@ -22,6 +22,8 @@ import pytest
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import device_names, find_device
+from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.inertia_check import MAX_INERTIA_RATIO, MisfitWarning
 from drive_env.firmware.modes import MODES
@@ -96,7 +98,7 @@ def build(device, load, motor, num_machines, **options):
 class Life:
     """A life of a set of drives: fixed times, so that sets of any size live alike; `seen` is what a bus shows."""
 
-    OBJECTS = (0x6041, 0x6061, 0x6064, 0x606C, 0x6062, 0x6077, 0x2101, 0x60FD)
+    OBJECTS = (0x6041, 0x6061, 0x6064, 0x606C, 0x6062, 0x6077, Role.MOTOR_FLAGS, 0x60FD)
 
     def __init__(self, device, load, motor, num_machines):
         row, per_radian, self.swings = life_of(load)
@@ -292,7 +294,12 @@ class Life:
             stations = {"no": self.no_mode, "pp": self.pp, "pv": self.pv, "hm": self.hm}
             stations |= {"csp": self.csp, "csv": self.csv, "cst": self.cst}
             # Zero last: it is the mode that stops.
+            taken = drives.device.allowed_values.get((0x6060, 0))
             for mode in sorted(MODES, key=lambda mode: mode.number == 0):
+                if taken is not None and mode.number not in taken:
+                    with pytest.raises(ObjectAccessError):
+                        drives.write(0x6060, mode.number)
+                    continue
                 stations[mode.abbreviation]()
                 assert self.in_state(ENABLED), mode
                 assert drives.emergencies() == [], mode

@@ -64,7 +64,9 @@ def test_a_trial_costs_what_the_environments_trials_cost(rigid):
     trials.recover(everywhere)
     by_hand = trials.run(bench.rule, bench.safe, bench.move, bench._origin, np.ones(4, int), everywhere)
     assert not by_hand.aborted.any()
-    expected = measured_cost(by_hand.costs(softness(bench.rule) / softness(bench.rule)))
+    expected = measured_cost(
+        by_hand.costs(softness(rigid.device.gains, bench.rule) / softness(rigid.device.gains, bench.rule))
+    )
     assert np.all(expected < 30.0)
     np.testing.assert_allclose(np.exp(tried.cost), expected, rtol=1e-12)
     np.testing.assert_allclose(tried.objectives[:, 0], np.log(by_hand.terms.settling[:2].max(axis=0)))
@@ -551,8 +553,6 @@ def test_what_an_emulated_search_keeps_in_its_journal_is_told(tmp_path, monkeypa
     ("settings", "message"),
     [
         ({"sampler": "luck"}, r"no sampler is named 'luck'; there are random, grid, tpe, cmaes, gp"),
-        ({"gains": ("velocity_d",)}, r"no gain is named 'velocity_d'; there are torque_p"),
-        ({"gains": ("velocity_p", "velocity_p")}, r"give different ones of gain"),
         ({"objectives": ("beauty",)}, r"no objective is named 'beauty'; there are cost, speed, robustness, current"),
         ({"objectives": ()}, r"give different ones of objective: .*, not none"),
         ({"trials": 0}, r"trials must be 1 or more, not 0"),
@@ -562,6 +562,21 @@ def test_what_an_emulated_search_keeps_in_its_journal_is_told(tmp_path, monkeypa
 def test_mistakes_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         Settings(**settings)
+
+
+@pytest.mark.parametrize(
+    ("gains", "message"),
+    [
+        (("velocity_d",), r"no gain is named 'velocity_d'; there are torque_p"),
+        (("velocity_p", "velocity_p"), r"give different ones of gain"),
+        ((), r"give different ones of gain: .*, not none"),
+    ],
+)
+def test_gains_that_the_drive_does_not_have_are_refused_before_anything_moves(rigid, gains, message):
+    gains_before = rigid.device.gains.read(rigid.drives)
+    with pytest.raises(ValueError, match=message):
+        optimise(rigid, Settings(gains=gains))
+    np.testing.assert_array_equal(rigid.device.gains.read(rigid.drives), gains_before)
 
 
 def test_the_first_gains_are_those_of_the_commissioning_preset(rigid):

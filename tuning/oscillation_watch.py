@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
-from drive_env.drives.interface import Drives
+from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.observed import Observer
 from drive_env.drives.trace import Trace
 from drive_env.gains import write_gains
@@ -26,7 +26,6 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-VELOCITY_P, VELOCITY_I = 2, 3  # of raw gains
 CLEAR = 3.0
 SOFTER = 4  # by what the velocity gains of an axis are divided that oscillates with gains of our own
 
@@ -92,15 +91,13 @@ class OscillationWatch(Observer):
         Args:
             drives: The drives, as they are watched.
             where: Which, shape (num_axes,).
-            gains: Raw gains of all axes, shape (num_axes, 5).
+            gains: Raw gains of all axes, shape (num_axes, count).
             mode: "csv" or "csp".
 
         Returns:
             The gains, softer where the mask is true.
         """
-        softer = gains.copy()
-        for k in (VELOCITY_P, VELOCITY_I):
-            softer[where, k] = np.maximum(gains[where, k] // SOFTER, 1)
+        softer = np.where(where[:, None], device_of(drives).gains.softened(gains, SOFTER, "velocity"), gains)
         write_gains(drives, softer, where)
         self.swung &= ~where
         drives.write(cia402.TARGET_VELOCITY, 0, where=where)

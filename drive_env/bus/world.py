@@ -102,7 +102,7 @@ class World:
             )
         nodes: list[Node] = []
         for k, node_id in enumerate(node_ids):
-            path = None if store is None else store / f"node-{node_id}-{drives.device.name}.json"
+            path = None if store is None else store / f"node-{node_id}-{Path(drives.device.name).stem}.json"
 
             def make(send: Callable[[Frame], None], k: int = k, path: Path | None = path) -> Node:
                 bit_rate = round(self.wire.bit_rate)

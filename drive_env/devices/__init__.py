@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from drive_env import cia402
 from drive_env.devices.gain_set import GainSet, load_gain_set
+from drive_env.devices.own_folder import BINDINGS, is_own_folder, naming, own_bindings, own_data
 from drive_env.devices.variants import compose_eds, converted_preset, merged, own_variant, parse_key, variant_bindings
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
@@ -154,13 +155,18 @@ class Device(NamedTuple):
         The one that is written for a motor of the catalogue, else what the device's rule makes of the motor's data.
 
         Raises:
-            ValueError: For a motor that the drive cannot turn.
+            ValueError: For a motor that the drive cannot turn, or for which a device of one's own has no preset.
         """
         path = self.presets / f"{motor.name}.toml"
         written_for = find_device(self.variant_of or self.name)
         preset: dict[str, int]
         if path.exists() and MOTORS.get(motor.name) == motor and self._scales_gains_as(written_for):
             preset = dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
+        elif self.presets.parent.parent != FOLDER:
+            raise ValueError(
+                f"{self.name} has no preset for a {motor.name}; write {path} with [objects], name = integer, or take a "
+                f"motor that it has one for: {', '.join(sorted(one.stem for one in self.presets.glob('*.toml')))}"
+            )
         else:
             rule = importlib.import_module(f"drive_env.devices.{self.presets.parent.name}.commissioning")
             preset = rule.preset(self, motor)
@@ -200,12 +206,14 @@ def device_of(kind: int, vendor: int | None, product: int | None) -> str | None:
 
 @cache
 def find_device(name: str) -> Device:
-    """Return a device by its name, or a variant of one's own by the path of its TOML file.
+    """Return a device by its name, or one of one's own by a path: a variant by its TOML file, a device by its folder.
 
     Raises:
-        ValueError: For a name that none has, with those there are, or a file that describes no variant.
+        ValueError: For a name that none has, with those there are, or a file or folder that describes none.
     """
     folder = FOLDER / name
+    if name not in device_names() and is_own_folder(name):
+        return _own_device(Path(name))
     if name.endswith(".toml"):
         own = own_variant(Path(name), {known: _read(FOLDER / known) for known in device_names()})
     elif name in device_names():
@@ -214,7 +222,7 @@ def find_device(name: str) -> Device:
         near = did_you_mean(name, device_names())
         raise ValueError(
             f"no device is named {name!r}; there are {', '.join(device_names())}{near}; or give the path of a "
-            "variant's .toml file"
+            "variant's .toml file, or of a folder with a device of your own"
         )
     data = own
     if "variant_of" in own:
@@ -226,6 +234,39 @@ def find_device(name: str) -> Device:
     else:
         rows: tuple[Binding, ...] = importlib.import_module(f"drive_env.devices.{name}.bindings").BINDINGS
         eds, bindings = folder / data["eds"], {(row.index, row.sub): row for row in rows}
+    return _device(data, folder, eds, bindings, _roles(folder), load_gain_set(folder / "gains.toml"))
+
+
+def _own_device(folder: Path) -> Device:
+    """Return the device in a folder of one's own; ValueError names the file that is wrong, and what is wrong in it."""
+    with naming(folder / "device.toml"):
+        data = own_data(folder)
+        eds = folder / data["eds"]
+    with naming(folder / BINDINGS):
+        bindings = own_bindings(folder)
+    with naming(folder / "roles.toml"):
+        roles = _roles(folder)
+    with naming(folder / "gains.toml"):
+        gains = load_gain_set(folder / "gains.toml")
+        if missing := [f"{index:04X}h:{sub:02X}" for index, sub in gains.keys if (index, sub) not in bindings]:
+            raise ValueError(f"{', '.join(missing)} is no gain: {BINDINGS} binds it to nothing")
+    with naming(folder / "device.toml"):
+        device = _device(data, folder, eds, bindings, roles, gains)
+    with naming(eds):
+        dictionary = device.new_dictionary()
+        for key in bindings:
+            dictionary.find(key)
+    return device
+
+
+def _device(
+    data: Mapping[str, Any],
+    folder: Path,
+    eds: Path | EdsText,
+    bindings: dict[tuple[int, int], Binding],
+    roles: dict[Role, tuple[int, int]],
+    gains: GainSet,
+) -> Device:
     return Device(
         name=data["name"],
         title=data["title"],
@@ -255,8 +296,8 @@ def find_device(name: str) -> Device:
         axis_offsets=tuple(AxisOffset(**row) for row in data["axis_offsets"]),
         canopen=_canopen(data["canopen"]),
         master=_master(data["master"]),
-        roles=_roles(folder),
-        gains=load_gain_set(folder / "gains.toml"),
+        roles=roles,
+        gains=gains,
         variant_of=data.get("variant_of", ""),
     )
 
@@ -270,7 +311,7 @@ def _roles(folder: Path) -> dict[Role, tuple[int, int]]:
     return {Role[name.upper()]: parse_key(text) for name, text in rows.items()}
 
 
-def allowed_values(data: dict[str, Any]) -> dict[tuple[int, int], tuple[int, ...]]:
+def allowed_values(data: Mapping[str, Any]) -> dict[tuple[int, int], tuple[int, ...]]:
     """Return the few values of each object that knows a few only, from a device's data."""
     rows: dict[str, list[int | str]] = dict(data["values"])
     if data["quirks"]["strict_transmission_types"]:

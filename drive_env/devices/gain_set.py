@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -31,9 +32,14 @@ class Gain(NamedTuple):
 
 @dataclass(frozen=True)
 class GainSet:
-    """The gains of a device, in its order; raw integers have shape (..., len(set))."""
+    """The gains of a device, in its order; raw integers have shape (..., count).
+
+    cascade: Structure of the loops that they are gains of, one of those of `drive_env/gains.py`, from which their
+    rule comes; "" for loops that nothing is known of.
+    """
 
     rows: tuple[Gain, ...]
+    cascade: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -63,10 +69,54 @@ class GainSet:
         """Return which gains belong to loops."""
         return [k for k, row in enumerate(self.rows) if row.loop in loops]
 
+    @property
+    def outer(self) -> tuple[str, ...]:
+        """Names of those of the velocity and the position loop, which machines differ in."""
+        return tuple(self.names[k] for k in self.columns_of("velocity", "position"))
+
+    @property
+    def highest(self) -> Integers:
+        """The greatest integers, shape (count,)."""
+        return np.array([row.highest for row in self.rows], np.int64)
+
+    def columns(self, names: Sequence[str]) -> Integers:
+        """Return which gains have names.
+
+        Raises:
+            ValueError: For a name that none has, naming those there are, and unless they are different ones.
+        """
+        for name in names:
+            if name not in self.names:
+                raise ValueError(f"no gain is named {name!r}; there are {', '.join(self.names)}")
+        if not names or len(set(names)) != len(names):
+            raise ValueError(f"give different ones of gain: {', '.join(self.names)}, not {', '.join(names) or 'none'}")
+        return np.array([self.names.index(name) for name in names])
+
     def clipped(self, raw: ArrayLike) -> Integers:
         """Return gains as integers within what the device takes, 1 at least: 0 opens a loop."""
-        most = np.array([row.highest for row in self.rows], float)
-        return np.asarray(np.clip(np.rint(np.asarray(raw, float)), 1.0, most), np.int64)
+        return np.asarray(np.clip(np.rint(np.asarray(raw, float)), 1, self.highest), np.int64)
+
+    def with_velocity_p(self, raw: Integers, factor: ArrayLike) -> Integers:
+        """Return gains of shape (n, count) with velocity P times a factor, within its range.
+
+        Raises:
+            ValueError: If the device has no such gain.
+        """
+        column = self.column("velocity", "P")
+        if column is None:
+            raise ValueError(
+                "this drive has no velocity P, by which trials tell how far its gains are from oscillation"
+            )
+        changed = raw.copy()
+        changed[:, column] = np.clip(np.rint(raw[:, column] * np.asarray(factor, float)), 1, self.rows[column].highest)
+        return changed
+
+    def softened(self, raw: Integers, divisor: Integers | int, *loops: str) -> Integers:
+        """Return gains of shape (n, count) with those of loops over a whole number, shape (n,) or one; 1 at least."""
+        softer = raw.copy()
+        for column in self.columns_of(*loops):
+            softer[:, column] = np.maximum(raw[:, column] // divisor, 1)
+        return softer
 
     def read(self, drives: BasicDrives) -> Integers:
         """Return the gains that drives have, shape (num_axes, len(set))."""
@@ -87,4 +137,4 @@ def load_gain_set(path: Path) -> GainSet:
         rows.append(
             Gain(row["name"], row["title"], (int(index, 16), int(sub)), row["highest"], row["loop"], row["part"])
         )
-    return GainSet(tuple(rows))
+    return GainSet(tuple(rows), data.get("cascade", ""))

@@ -25,12 +25,13 @@ from drive_env.emulator.prepared_record import SCALES, PreparedObject, PreparedR
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.firmware import cycle
 from drive_env.firmware.modes import MODES
-from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.firmware.record import PARAMETERS, get_lanes, set_lanes
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+_PARAMETERS = frozenset(field.name for field in PARAMETERS)
 _EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
 MODE_OF_OPERATION = (cia402.MODE, 0)
@@ -209,7 +210,10 @@ class LiveDictionary:
                 self._values[entry.index, entry.sub] = entry.default
             else:
                 stored[entry.index, entry.sub] = np.array([entry.default], np.int64)
-        modes = sum(1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None)
+        taken = allowed_values(self.device, self.entries.find(MODE_OF_OPERATION)) or ()
+        modes = sum(
+            1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None and mode.number in taken
+        )
         stored[cia402.SUPPORTED_MODES, 0] = np.array([modes], np.int64)
         for name, value in preset.items():
             entry = self.entries.find(name)
@@ -224,14 +228,17 @@ class LiveDictionary:
     def _stored_snapshot(self) -> RecordSnapshot:
         """Return the fields that a restart sets from what is stored, converted by the scales that are stored.
 
-        A read-only field that the firmware computes is none of them.
+        What the firmware computes, and nobody can write, is none of them; a parameter that nobody can write is fixed.
         """
         length = max(map(len, self._stored.values()))
         context = self._context()
         if self.scale_key is not None:
             context = context._replace(position_scaler=self._stored[self.scale_key].astype(float))
         bound = [
-            key for key in self._stored if key in self.codes and self.entries.find(key).access not in ("ro", "const")
+            key
+            for key in self._stored
+            if key in self.codes
+            and (self.entries.find(key).access not in ("ro", "const") or self.codes[key].field in _PARAMETERS)
         ]
         values = [self._from_od(self.codes[key], self._stored[key], context) for key in bound]
         fields = [(self.codes[key].field, self.codes[key].part) for key in bound]
@@ -330,7 +337,8 @@ def check_supported(device: Device, entry: Entry) -> None:
 def allowed_values(device: Device, entry: Entry) -> tuple[int, ...] | None:
     """Return the few values that an object knows, None if it takes its whole range."""
     if (entry.index, entry.sub) == MODE_OF_OPERATION:
-        return tuple(mode.number for mode in MODES)
+        known = device.allowed_values.get(MODE_OF_OPERATION)
+        return tuple(mode.number for mode in MODES if known is None or mode.number in known)
     return device.allowed_values.get((entry.index, entry.sub))
 
 

@@ -9,13 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import RAW_MAX
 from drive_env.motors import Motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial
 
 Floats = NDArray[np.float64]
 
-LOG_MAX = math.log(RAW_MAX)
 RATIO_MAX = 100.0  # of a true parameter over its default
 
 
@@ -43,20 +41,21 @@ PHASE = (
 )
 COST = ObservationRow("ln J by measured terms, of the lane", "1", -10.0, 4.0)
 TRIED = (*PHASE * len(PHASES), COST)
-LOG_GAIN = ObservationRow("ln of a gain over the rule's", "1", -LOG_MAX, LOG_MAX)
 WAVE = ObservationRow("error of the move", "the move", -5.0, 5.0)
 LEFT = ObservationRow("trials left", "those of an episode", 0.0, 1.0)
 
 
-def rows_of(axes: int, gains: int, waveform: int) -> list[ObservationRow]:
+def rows_of(axes: int, gains: int, waveform: int, highest: int) -> list[ObservationRow]:
     """Return the entries of a lane: of each axis in turn, of the last trial before the incumbent's, then of the lane.
 
     Args:
         axes: Of the lane.
         gains: How many the action changes.
         waveform: Points of the last move's error.
+        highest: The greatest integer of any gain.
     """
-    axis = [*IDENTIFIED, *[LOG_GAIN] * (2 * gains), *TRIED, *TRIED, *[WAVE] * waveform]
+    log_gain = ObservationRow("ln of a gain over the rule's", "1", -math.log(highest), math.log(highest))
+    axis = [*IDENTIFIED, *[log_gain] * (2 * gains), *TRIED, *TRIED, *[WAVE] * waveform]
     return [*axis * axes, LEFT]
 
 

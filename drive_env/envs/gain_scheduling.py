@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
@@ -24,7 +25,7 @@ from drive_env.envs.lanes import Info, Lanes, Reward, Stepped, check_choice
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
-from drive_env.gains import FITTED_RULE, RAW_MAX, read_gains, rule_gains, small_time_constants, write_gains
+from drive_env.gains import FITTED_RULE, read_gains, rule_gains, small_time_constants, write_gains
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
@@ -39,8 +40,6 @@ Mask = NDArray[np.bool_]
 CYCLE = 0.001  # s, communication cycle
 STEPS = (0.005, 0.020)  # s, shortest and longest time between two sets of gains
 MODES = ("csp", "csv")
-# What can be scheduled: the integers of 2041h are computed from R and L, and are no part of it.
-GAINS = ("velocity_p", "velocity_i", "position_p")  # those of the outer loops, which payloads change
 BASES = ("rule", "present")
 ROUGH = 0.03  # increment of current from sample to sample, of rated: DESIGN's score counts it so
 
@@ -81,7 +80,8 @@ class GainSchedulingConfig:
     excitation: The programme: "moves" from point to point, or "sine".
     step: Time between two sets of gains [s], 5 to 20 ms, whole milliseconds.
     duration: Of an episode [s].
-    gains: Which gains the agent sets: velocity_p, velocity_i, position_p.
+    gains: Which gains the agent sets, of the velocity and the position loop; all of those by default: velocity_p,
+        velocity_i, position_p of the TMCM-1636.
     base: What an action of 0 means: "rule", the fitted rule's gains for the nominal machine, or "present", those that
         the drives hold when the environment is made; on a bus it is always these.
     span: ln of the largest factor on a gain.
@@ -103,7 +103,7 @@ class GainSchedulingConfig:
     excitation: str = "moves"
     step: float = 0.010
     duration: float = 2.0
-    gains: tuple[str, ...] = GAINS
+    gains: tuple[str, ...] | None = None
     base: str = "rule"
     span: float = 1.0
     payload: str = "auto"
@@ -119,11 +119,15 @@ class GainSchedulingConfig:
         check_choice("mode", self.mode, MODES)
         check_choice("excitation", self.excitation, EXCITATIONS)
         check_choice("base", self.base, BASES)
-        if isinstance(self.gains, str) or not self.gains or len(set(self.gains)) != len(self.gains):
-            raise ValueError(f"gains must be different ones of {', '.join(GAINS)}, not {self.gains!r}")
-        object.__setattr__(self, "gains", tuple(self.gains))
-        for name in self.gains:
-            check_choice("a gain", name, GAINS)
+        # What payloads change: the gains of a current loop are computed from R and L, and are no part of it.
+        outer = find_device(self.device).gains.outer
+        if self.gains is not None and (
+            isinstance(self.gains, str) or not self.gains or len(set(self.gains)) != len(self.gains)
+        ):
+            raise ValueError(f"gains must be different ones of {', '.join(outer)}, not {self.gains!r}")
+        object.__setattr__(self, "gains", outer if self.gains is None else tuple(self.gains))
+        for name in self.chosen:
+            check_choice("a gain", name, outer)
         for name in self.weights:
             check_choice("a weight's name", name, tuple(WEIGHTS))
         object.__setattr__(self, "weights", {**WEIGHTS, **self.weights})
@@ -137,6 +141,11 @@ class GainSchedulingConfig:
             raise ValueError(f"duration must be at least one step of {self.step:g} s, not {self.duration:g} s")
         if not 0.0 <= self.stage <= 1.0:
             raise ValueError(f"stage of the curriculum must lie in 0...1, not {self.stage:g}")
+
+    @property
+    def chosen(self) -> tuple[str, ...]:
+        """The gains that the agent sets."""
+        return self.gains or ()
 
 
 class GainScheduling(Lanes):
@@ -203,7 +212,7 @@ class GainScheduling(Lanes):
         self.config = configured(GainSchedulingConfig, config, options)
         row = find_load(self.config.load)
         self._axes = row.num_axes
-        width = len(self.config.gains)
+        width = len(self.config.chosen)
         bounds = [[entry[k] for entry in ENTRIES] + [sign] * width for k, sign in ((2, -1.0), (3, 1.0))]
         self._low, self._high = (np.tile(np.array(bound, np.float32), self._axes) for bound in bounds)
         super().__init__(
@@ -310,7 +319,7 @@ class GainScheduling(Lanes):
         self._bus, self._gain_bus = BusDelays(n), BusDelays(n)
         self._now = np.zeros(n, np.int64)  # steps since the lane's reset
         self._origin = np.zeros(axes, np.int64)
-        self._action = np.zeros((axes, len(self.config.gains)))
+        self._action = np.zeros((axes, len(self.config.chosen)))
         self._acting = np.zeros((n, self._axes), np.int64)
 
     def _prepare_scales(self, load: Load) -> None:
@@ -351,7 +360,7 @@ class GainScheduling(Lanes):
         self._payload_changes = PayloadChanges(self._payload, machine, self.num_envs, self._steps, changes)
 
     def _prepare_gains(self) -> None:
-        """Keep the five raw gains of every axis that an action of 0 means, shape (num_axes, 5)."""
+        """Keep the raw gains of every axis that an action of 0 means, shape (num_axes, count)."""
         drives = self.drives
         if drives.machine is None or self.config.base == "present":
             self.base_gains = read_gains(drives)
@@ -359,16 +368,15 @@ class GainScheduling(Lanes):
             motor = find_motor(self.config.motor)
             self.base_gains = np.tile(rule_gains(device_of(drives), motor, self._nominal_inertia), (self.num_envs, 1))
         known = device_of(drives).gains
-        columns = [known.names.index(name) for name in self.config.gains]
+        columns = known.columns(self.config.chosen)
         self._gain_objects = [known.keys[column] for column in columns]
-        self._scheduled = self.base_gains[:, columns]
-        self._gain_objects = [known.keys[column] for column in columns]
+        self._scheduled, self._highest = self.base_gains[:, columns], known.highest[columns]
 
     # --- a step ---------------------------------------------------------------------------------------------------
     def _gains_of(self, action: Floats) -> Integers:
         """Return raw gains, shape (num_axes, gains)."""
         raw = np.rint(self._scheduled * np.exp(self.config.span * action))
-        return np.asarray(np.clip(raw, 1, RAW_MAX), np.int64)
+        return np.asarray(np.clip(raw, 1, self._highest), np.int64)
 
     def _set_points(self, cycles: Integers) -> Integers:
         """Return set-points [drive units] of cycles from the lanes' present step on, (cycles, num_envs, axes)."""

@@ -29,7 +29,7 @@ from drive_env.envs.gain_observation import (
 from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Reward, Stepped, check_choice
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
-from drive_env.gains import RAW_MAX, Gains, read_gains, rule_gains, small_time_constants
+from drive_env.gains import read_gains, rule_gains, small_time_constants
 from drive_env.motors import find_motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
 from drive_env.trials.positioning import TRIAL, plan_move, power_up, reach
@@ -37,15 +37,14 @@ from drive_env.trials.score import HiddenScore
 
 Integers = NDArray[np.int64]
 
-ALL_GAINS = Gains._fields
-
 
 @dataclass(frozen=True)
 class GainTuningConfig:
     """Configuration of GainTuning.
 
     load, device, motor, friction: As `EmulatedDrives` takes them.
-    gains: Which gains the action changes: torque_p, torque_i, velocity_p, velocity_i, position_p.
+    gains: Which gains the action changes, of the device's: those of the TMCM-1636 are torque_p, torque_i, velocity_p,
+        velocity_i, position_p. None is those of the velocity and the position loop.
     trials: Of an episode.
     step: Largest change of a gain's logarithm; the reach of gains, 10.4, is the most that makes sense.
     distributions: The machines, as `randomisation.Distributions` takes them; None is the load's shipped set,
@@ -62,7 +61,7 @@ class GainTuningConfig:
     device: str = "tmcm1636"
     motor: str = "qbl4208"
     friction: str = "stribeck"
-    gains: tuple[str, ...] = ("velocity_p", "velocity_i", "position_p")
+    gains: tuple[str, ...] | None = None
     trials: int = 10
     step: float = 0.7
     distributions: Any = None
@@ -74,11 +73,12 @@ class GainTuningConfig:
     num_threads: int | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "gains", tuple(self.gains))
-        for name in self.gains:
-            check_choice("a gain", name, ALL_GAINS)
-        if not self.gains or len(set(self.gains)) != len(self.gains):
-            raise ValueError(f"gains must be different ones of {', '.join(ALL_GAINS)}, not {self.gains}")
+        known = find_device(self.device).gains
+        object.__setattr__(self, "gains", known.outer if self.gains is None else tuple(self.gains))
+        for name in self.chosen:
+            check_choice("a gain", name, known.names)
+        if not self.chosen or len(set(self.chosen)) != len(self.chosen):
+            raise ValueError(f"gains must be different ones of {', '.join(known.names)}, not {self.gains}")
         if self.trials < 1:
             raise ValueError(f"trials must be 1 or more, not {self.trials}")
         if not 0.0 < self.step < math.inf:
@@ -91,6 +91,11 @@ class GainTuningConfig:
             raise ValueError(f"abort_cost must be 0 or more, not {self.abort_cost:g}")
         if self.travel is not None and not 0.0 < abs(self.travel) < math.inf:
             raise ValueError(f"travel must be finite and not 0, not {self.travel:g} rev")
+
+    @property
+    def chosen(self) -> tuple[str, ...]:
+        """The gains that the action changes."""
+        return self.gains or ()
 
 
 class GainTuning(Lanes):
@@ -105,7 +110,7 @@ class GainTuning(Lanes):
     included. The pole of the inverted pendulum falls meanwhile, and shakes its cart.
 
     Action, float32, for each axis of the machine, with G gains of the configuration; gains are rounded and stay within
-    1...32767; the bounds are the configuration's `step`:
+    the device's range; the bounds are the configuration's `step`:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
@@ -153,11 +158,11 @@ class GainTuning(Lanes):
     less `abort_cost` for a trial that was stopped. On given drives there is no hidden J; it is that of ln J by measured
     terms. The episode is `truncated` when its trials are used up, `terminated` if a given drive cannot be cleared.
 
-    `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (lanes, axes, 5) raw integers in the order of
-    `Gains`; "measured", its J by measured terms, and "hidden", hidden J; "trial_hidden", that of this step's trial;
-    "trial_gains" and "trial_measured" too; "aborted", whether it was stopped, of the rule's trial at the begin as well;
-    "faults", names of the trial's emergencies, tuples; "parameters", the true machine. Of given drives there is nothing
-    hidden.
+    `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (lanes, axes, count) raw integers in the order
+    of the device's set; "measured", its J by measured terms, and "hidden", hidden J; "trial_hidden", that of this
+    step's trial; "trial_gains" and "trial_measured" too; "aborted", whether it was stopped, of the rule's trial at the
+    begin as well; "faults", names of the trial's emergencies, tuples; "parameters", the true machine. Of given drives
+    there is nothing hidden.
 
     Args:
         num_envs: Lanes.
@@ -235,27 +240,29 @@ class GainTuning(Lanes):
 
     def _spaces(self) -> tuple[gymnasium.Space[Any], Box]:
         c = self.config
-        rows = rows_of(self._axes, len(c.gains), c.waveform)
+        rows = rows_of(self._axes, len(c.chosen), c.waveform, int(self._device.gains.highest.max()))
         low, high = (np.array([getattr(row, end) for row in rows], np.float32) for end in ("low", "high"))
         self._low, self._high = low, high
         observation: gymnasium.Space[Any] = Box(low, high, dtype=np.float32)
         if c.privileged:
             true = Box(-RATIO_MAX, RATIO_MAX, (len(self._defaults),), np.float32)
             observation = gymnasium.spaces.Dict({"observation": observation, "privileged": true})
-        return observation, Box(-c.step, c.step, (self._axes * len(c.gains),), np.float32)
+        return observation, Box(-c.step, c.step, (self._axes * len(c.chosen),), np.float32)
 
     def _prepare(self, given_reach: ArrayLike | None) -> None:
         c, n, axes = self.config, self.num_envs, self.drives.num_axes
         t_0 = 4.0 * float(small_time_constants(self._device, self._device.stage["velocity_filter"].default))
         self._trials = Trials(self.drives, self.motor, self._axes, t_0)
-        self._columns = np.array([ALL_GAINS.index(name) for name in c.gains])
+        self._columns = self._device.gains.columns(c.chosen)
         one = reach(c.load) if c.travel is None else np.full(self._axes, c.travel * 2.0 * math.pi)
         self._reach = np.tile(one, n) if given_reach is None else np.broadcast_to(np.asarray(given_reach, float), axes)
         zero = np.zeros(axes)
         self._identified = Identified(zero, zero, zero, zero)
         self._move = plan_move(self.motor, zero + self.motor.inertia, 1.0, zero)
         self._origin, self._direction = np.zeros(axes, np.int64), np.ones(axes, np.int64)
-        self._safe, self._rule, self._best, self._last = (np.ones((axes, len(ALL_GAINS)), np.int64) for _ in range(4))
+        self._safe, self._rule, self._best, self._last = (
+            np.ones((axes, self._device.gains.count), np.int64) for _ in range(4)
+        )
         self._best_is_stable = np.ones(axes, bool)
         self._following = np.ones((len(PHASES), axes))  # the rule's
         blank = np.zeros((axes, len(TRIED)))
@@ -338,7 +345,7 @@ class GainTuning(Lanes):
         return self._observe(), terms["tuning"] + terms["abort"], dead, self._left <= 0, info
 
     def gains_of(self, action: ArrayLike) -> Integers:
-        """Return the gains that an action means now, without trying them: (lanes, axes, 5), as `info["gains"]`."""
+        """Return the gains that an action means now, without trying them: (lanes, axes, count), as `info["gains"]`."""
         return self._changed(action).reshape(self.num_envs, self._axes, -1)
 
     def _changed(self, action: ArrayLike) -> Integers:
@@ -346,7 +353,7 @@ class GainTuning(Lanes):
         change = np.nan_to_num(np.clip(np.asarray(action, float), -step, step)).reshape(-1, len(self._columns))
         gains: Integers = self._best.copy()
         chosen = gains[:, self._columns] * np.exp(change)
-        gains[:, self._columns] = np.clip(np.rint(chosen), 1, RAW_MAX).astype(np.int64)
+        gains[:, self._columns] = np.clip(np.rint(chosen), 1, self._device.gains.highest[self._columns])
         return gains
 
     # --- a trial --------------------------------------------------------------------------------------------------
@@ -386,7 +393,8 @@ class GainTuning(Lanes):
 
     def _measure(self, gains: Integers, tried: Trial) -> Floats:
         """Return J by measured terms of the lanes: that of the worst axis."""
-        costs = measured_cost(tried.costs(softness(gains) / softness(self._rule)))
+        known = self._device.gains
+        costs = measured_cost(tried.costs(softness(known, gains) / softness(known, self._rule)))
         return np.asarray(costs.reshape(self.num_envs, -1).max(axis=1))
 
     def _stopped(self, tried: Trial) -> Mask:

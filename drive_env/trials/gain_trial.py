@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402, motion
+from drive_env.devices.gain_set import GainSet
 from drive_env.dictionary.roles import Role
-from drive_env.drives.interface import Drives
+from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
-from drive_env.gains import Gains, scaled, write_gains
+from drive_env.gains import write_gains
 from drive_env.motors import Motor
 from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
 from drive_env.trials.score import Terms, cost
@@ -27,8 +28,6 @@ Mask = NDArray[np.bool_]
 
 PHASES = ("move", "reversal", "probe")
 PROBE = 1.5  # velocity P of the probe over that of the trial
-ALL = Gains._fields
-VELOCITY_P = ALL.index("velocity_p")
 
 # The watch looks every 25 ms at what has passed since its last look: what oscillates is stopped within 50 ms.
 # RMS change of the current from millisecond to millisecond, over the rated current. The edges of a profile make 0.1 on
@@ -74,13 +73,13 @@ class Trial(NamedTuple):
         return cost(self.terms._replace(disturbance=disturbance, tripped=self.aborted))
 
 
-def softness(gains: Integers) -> Floats:
+def softness(known: GainSet, gains: Integers) -> Floats:
     """Return what the integral of the error after a load step is proportional to, (num_axes,).
 
     No load step exists on a bus; but the integrators of a P-PI cascade leave it no choice: for a current i that the
     load takes, the integral of the position error is i T_i / (P k_v), as long as the error keeps its sign.
     """
-    cascade = [ALL.index(name) for name in ("velocity_p", "velocity_i", "position_p")]
+    cascade = known.columns_of("velocity", "position")
     return np.asarray(1.0 / np.prod(gains[:, cascade].astype(float), axis=1))
 
 
@@ -135,7 +134,7 @@ class Trials:
     def run(
         self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
     ) -> Trial:
-        """Try gains, raw integers of shape (num_axes, 5), in a move from the origin [inc], back, and there again.
+        """Try gains, raw integers of shape (num_axes, count), in a move from the origin [inc], back, and there again.
 
         Where an axis oscillates or trips, its lane gets the incumbent back at once, is cleared, and goes on with it.
 
@@ -156,8 +155,7 @@ class Trials:
         settling, noise, overshoot, following = (np.zeros(shape) for _ in range(4))
         first_error = np.zeros((TRIAL, count))
         write_profile(drives, move, where)
-        probe = gains.copy()
-        probe[:, VELOCITY_P] = scaled(gains[:, VELOCITY_P], PROBE)
+        probe = device_of(drives).gains.with_velocity_p(gains, PROBE)
         for phase, (target, tried) in enumerate(((away, gains), (origin, gains), (away, probe))):
             write_gains(drives, np.where(stopped[:, None], incumbent, tried), where)
             position, demand, current, stopped, new = self._phase(target, incumbent, stopped, where)

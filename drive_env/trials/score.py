@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.parameters import WIRING
-from drive_env.gains import Gains, scaled, small_time_constants, write_gains
+from drive_env.gains import small_time_constants, write_gains
 from drive_env.trials.positioning import (
     CYCLE,
     SETTLED,
@@ -57,7 +57,6 @@ NOISE, OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.03, 0.02, 0.1
 LOAD_SHARE = 0.3  # of the rated torque
 
 _INERTIA = ("body_inertia", "body_mass", "density")  # fields of load parameters that are the load's inertia
-VELOCITY_P = Gains._fields.index("velocity_p")
 _STIFFNESS = ("jnt_stiffness", "contact_stiffness")
 
 
@@ -232,7 +231,7 @@ class HiddenScore:
         return self._scores(*measured)
 
     def score(self, gains: Integers) -> Scores:
-        """Return the scores of gains, raw integers of shape (num_machines * axes, 5) in the order of `Gains`."""
+        """Return the scores of gains, raw integers of shape (num_machines * axes, count) in the device's order."""
         return self._scores(*self._run(gains))
 
     def close(self) -> None:
@@ -251,9 +250,9 @@ class HiddenScore:
         drives, move = self._drives, self._move
         drives.machine.load_torque = self._constant
         drives.machine.reset()
-        raw = self._spread(np.asarray(gains, np.int64)).copy()
-        raw[:, VELOCITY_P] = scaled(raw[:, VELOCITY_P], self._factors)
-        write_gains(drives, raw)
+        write_gains(
+            drives, drives.device.gains.with_velocity_p(self._spread(np.asarray(gains, np.int64)), self._factors)
+        )
         write_profile(drives, move)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drive_env.gains import check_linear_model
 from tuning.auto.choice import choose
 from tuning.auto.loop_margins import judge, measure
 from tuning.auto.moves import look_back, show, stand
@@ -107,7 +108,11 @@ def prove_found(
         experiments: What identifies.
         budget: Most time that may pass on the drives for each axis of a machine [s].
         files: As `auto` takes it.
+
+    Raises:
+        ValueError: For a drive without a linear model of its loops, before anything is done.
     """
+    check_linear_model(target.device)
     say = progress or (lambda what, share: None)
     with Transaction(target, file) as transaction, timed(target) as (watched, clock):
         run = AutoRun(watched, seed, clock, budget)

@@ -228,7 +228,8 @@ class ProvingGround:
             position.astype(float), current * 1e-3, self.move, self._t_0, rated, away, way
         )
         # Of axes that take no part the gains may be none.
-        soft = softness(np.where(where[:, None], gains, self._reference)) / softness(self._reference)
+        known = self.target.device.gains
+        soft = softness(known, np.where(where[:, None], gains, self._reference)) / softness(known, self._reference)
         costs = cost(Terms(settling, soft, noise, overshoot, stopped))
         self.aborts[stopped] += 1
         self._shaken |= stopped
@@ -382,7 +383,8 @@ class ProvingGround:
 
     def _proof(self, gains: Integers, tried: Trial, where: Mask) -> Proof:
         terms: Terms = tried.terms
-        costs = measured_cost(tried.costs(softness(gains) / softness(self._reference)))
+        known = self.target.device.gains
+        costs = measured_cost(tried.costs(softness(known, gains) / softness(known, self._reference)))
         stopped: Mask = np.asarray(tried.aborted.any(axis=0))
         self.aborts[where & stopped] += 1
         self._shaken |= where & stopped

@@ -68,7 +68,7 @@ def optimise(
         typer.Option(
             "--gain",
             help="Gain that is searched, again for another.",
-            show_default="velocity_p, velocity_i, position_p",
+            show_default="those of the velocity and position loop",
         ),
     ] = None,
     width: Annotated[
@@ -119,6 +119,7 @@ def optimise(
                 "--searches, --workers, --cluster and --resume are of emulated machines; a search on a bus goes on "
                 "from its --journal"
             )
+        from drive_env.devices import find_device
         from tuning.runs import provenance, unfinished
         from tuning.search.optimise import Settings
         from tuning.snapshot import file_before
@@ -127,7 +128,9 @@ def optimise(
         if resume:
             _check_unfinished(folder, journal)
         provenance.check_folder(folder)
-        chosen: dict[str, Any] = {"gains": tuple(gains)} if gains else {}
+        known = find_device(drive.device).gains
+        chosen: dict[str, Any] = {"gains": tuple(gains) if gains else known.outer}
+        known.columns(chosen["gains"])  # before anything moves
         if width is not None:
             chosen["width"] = width
         settings = Settings(
@@ -273,13 +276,13 @@ def _report(
             }
         )  # fmt: skip
         return
-    _print(found, settings, folder, before, where)
+    _print(found, settings, folder, before, where, options["device"])
 
 
-def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: str) -> None:
+def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: str, device: str) -> None:
     import numpy as np
 
-    from drive_env.gains import Gains
+    from drive_env.devices import find_device
     from tuning.search.optimise import COST
     from tuning.search.trials_files import TITLES
 
@@ -288,7 +291,9 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
     kind = "Axis" if before is not None else "Search"
     several = settings.objectives != (COST,)
     shown = (COST, *(name for name in settings.objectives if name != COST))
-    titles = [name.replace("_", "\n") for name in Gains._fields] + [_on_two_lines(TITLES[name]) for name in shown]
+    titles = [name.replace("_", "\n") for name in find_device(device).gains.names] + [
+        _on_two_lines(TITLES[name]) for name in shown
+    ]
     columns = [Column("", "name"), *map(Column, titles)]
     for search in searches:
         own = [row for row in found.rows if row.search == search]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import gains_from_bandwidths, write_gains
+from drive_env.gains import check_linear_model, gains_from_bandwidths, write_gains
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders
 from tuning.identify.identification import NAMES, Estimate, Identification, Progress, refused
@@ -67,6 +67,7 @@ class Experiments:
     corrects = False  # drives that somebody set up go on with what their wiring needs, too
 
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
+        check_linear_model(target.device)  # what is moved with here comes from it
         self.target, self.where, self.progress = target, where, progress
         self._at_rest: list[Estimate] = []  # resistances, where they are looked for
         self._under_way: tuple[str, tuple[str, ...]] = ("", NAMES)

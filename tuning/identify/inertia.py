@@ -25,7 +25,7 @@ from drive_env.gains import write_gains
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.identification import Estimate, refused
 from tuning.identify.working_state import CYCLE, GUESS, Working, cautious_gains, go_back, still_enabled
-from tuning.oscillation_watch import SOFTER, VELOCITY_I, VELOCITY_P, OscillationError, watch_of
+from tuning.oscillation_watch import SOFTER, OscillationError, watch_of
 from tuning.stop_causes import stop_causes
 from tuning.target import Target
 
@@ -268,8 +268,7 @@ def _moved(
     """Move, once more with softer gains if an axis oscillates; return plan, what `move` returns, and the gains."""
     drives = working.target.drives
     watch = watch_of(drives)
-    for column in (VELOCITY_P, VELOCITY_I):
-        gains[:, column] = np.maximum(gains[:, column] // softness, 1)
+    gains = working.target.device.gains.softened(gains, softness, "velocity")
     write_gains(drives, gains, working.where)
     for again in (True, False):
         go_back(working, "csv")

@@ -14,7 +14,7 @@ All angles are the rotor's; f is in Hz throughout.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.dictionary.units import UNITS, Context
-from drive_env.gains import Gains
+from drive_env.gains import Gains, check_linear_model
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -150,7 +150,7 @@ def current_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLik
         gains: Raw integers in the order of `Gains`.
         f: Frequencies [Hz], shape (n,).
     """
-    raw, at = Gains(*gains), _below(f, device.current_rate)
+    raw, at = _raw(device, gains), _below(f, device.current_rate)
     A, B = _machine(plant)
     T = 1.0 / device.current_rate
     Phi, Gamma, _, _ = _held(A, B, T)
@@ -168,7 +168,7 @@ def velocity_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLi
         gains: Raw integers in the order of `Gains`.
         f: Frequencies [Hz], shape (n,).
     """
-    raw, at = Gains(*gains), _below(f, device.velocity_rate)
+    raw, at = _raw(device, gains), _below(f, device.velocity_rate)
     z = np.exp(2j * math.pi * at / device.velocity_rate)
     return np.asarray(controllers(device, raw).velocity(z) * velocity_plant(device, plant, raw, at))
 
@@ -179,7 +179,8 @@ def velocity_plant(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) 
     Of the gains, those of the current loop matter.
     """
     at = _below(f, device.velocity_rate)
-    return np.asarray(mean_velocity(device, plant, Gains(*gains), at) * velocity_filter_response(device, plant, at))
+    velocity = mean_velocity(device, plant, _raw(device, gains), at)
+    return np.asarray(velocity * velocity_filter_response(device, plant, at))
 
 
 def position_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) -> Complex:
@@ -191,7 +192,7 @@ def position_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLi
         gains: Raw integers in the order of `Gains`.
         f: Frequencies [Hz], shape (n,).
     """
-    raw, at = Gains(*gains), _below(f, device.velocity_rate)
+    raw, at = _raw(device, gains), _below(f, device.velocity_rate)
     z = np.exp(2j * math.pi * at / device.velocity_rate)
     regulator = controllers(device, raw)
     # What the position loop reads is the angle itself: the differences, added up.
@@ -240,10 +241,16 @@ class Controllers(NamedTuple):
 
 def controllers(device: Device, gains: RawGains) -> Controllers:
     """Return raw gains in SI."""
-    raw = Gains(*(int(gain) for gain in gains))
+    raw = _raw(device, (int(gain) for gain in gains))
     context = Context(65536.0, device.current_full_scale / 32768.0)
     names = ("current P", "I", "velocity P", "I", "position P")
     return Controllers(*(value * float(UNITS[name].factor(context)) for value, name in zip(raw, names, strict=True)))
+
+
+def _raw(device: Device, gains: Iterable[int]) -> Gains:
+    """Return raw gains by their names; ValueError for a device whose loops are others than those of this model."""
+    check_linear_model(device)
+    return Gains(*gains)
 
 
 def velocity_filter_response(device: Device, plant: Plant, f: ArrayLike) -> Complex:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from drive_env.gains import check_linear_model
 from tuning.rules.cascade_chain import chain_rule
 from tuning.rules.internal_model import imc_rule, simc_rule
 from tuning.rules.margin_targets import TARGETS, margin_rule
@@ -52,8 +53,9 @@ def propose(name: str, device: Device, motor: Motor, plant: Plant) -> Proposal:
     """Return what a rule proposes.
 
     Raises:
-        ValueError: For an unknown rule, naming those there are.
+        ValueError: For an unknown rule, naming those there are, or a drive without a linear model of its loops.
     """
+    check_linear_model(device)
     if name not in RULES:
         raise ValueError(f"no rule is named {name!r}; there are {', '.join(RULES)}")
     return RULES[name](device, motor, plant)

@@ -31,7 +31,6 @@ DEFAULT = Path(__file__).parent / "sweep.toml"
 MAX_POINTS = 262_144
 MAX_DURATION = 60.0  # s
 MIN_SAMPLES = 20  # in each of the two windows; fewer say nothing about ringing
-GAIN_UNITS = frozenset({"current P", "velocity P", "position P", "I"})  # of dictionary/units.py
 TARGET_VELOCITY, ACCELERATION = (cia402.TARGET_VELOCITY, 0), (cia402.PROFILE_ACCELERATION, 0)
 _INDEX = re.compile(r"(?:0x)?([0-9a-f]{4})h?:(?:0x)?([0-9a-f]{1,2})h?", re.IGNORECASE)
 _SPACINGS = ("lin", "log")
@@ -207,9 +206,7 @@ def gain_objects(device: Device, dictionary: ObjectDictionary) -> list[Entry]:
     return [
         entry
         for entry in dictionary
-        if entry.access not in ("ro", "const")
-        and (entry.index, entry.sub) in device.bindings
-        and device.bindings[entry.index, entry.sub].unit in GAIN_UNITS
+        if entry.access not in ("ro", "const") and (entry.index, entry.sub) in device.gains.keys
     ]
 
 

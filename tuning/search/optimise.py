@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import RAW_MAX, Gains
+from drive_env.gains import RAW_MAX
 from tuning.runs.shard_log import ShardLog
 from tuning.search.samplers import SAMPLERS, Proposer, new_proposer
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
@@ -43,7 +43,8 @@ class Settings:
         sampler: One of `samplers.SAMPLERS`.
         trials: Of every search, the first ones included.
         objectives: ("cost",), or several of "speed", "robustness" and "current" (trial_bench.py).
-        gains: Names of those that are searched; the others are the rule's.
+        gains: Names of those that are searched, of the device's; the others are the rule's. None is those of the
+            velocity and the position loop.
         width: How far the search reaches, as the logarithm of a factor of the rule's gains.
         safe: Start from safe gains and go on from what was proved.
         seed: Of everything random.
@@ -53,7 +54,7 @@ class Settings:
     sampler: str = "tpe"
     trials: int = 30
     objectives: tuple[str, ...] = (COST,)
-    gains: tuple[str, ...] = ("velocity_p", "velocity_i", "position_p")
+    gains: tuple[str, ...] | None = None
     width: float = WIDTH
     safe: bool = False
     seed: int = 0
@@ -61,7 +62,6 @@ class Settings:
 
     def __post_init__(self) -> None:
         _check("sampler", [self.sampler], SAMPLERS)
-        _check("gain", self.gains, Gains._fields)
         _check("objective", self.objectives, (COST, *OBJECTIVES))
         if self.trials < 1:
             raise ValueError(f"trials must be 1 or more, not {self.trials}")
@@ -73,7 +73,7 @@ class TrialRow(NamedTuple):
     """A trial that was made.
 
     search, number: Which search, and the trial's number in it.
-    gains: Of the machine's axes, raw integers, (axes_per_machine, 5).
+    gains: Of the machine's axes, raw integers, (axes_per_machine, count).
     cost: ln J by measured terms.
     objectives: In the order of `OBJECTIVES`.
     aborted: Stopped, for it oscillated or tripped.
@@ -99,8 +99,8 @@ class Optimised:
     """What a search found.
 
     Attributes:
-        gains: The best of every machine, raw integers, (num_axes, 5); that of the safe search was never stopped.
-        rule: The fitted rule's, from what was identified, (num_axes, 5).
+        gains: The best of every machine, raw integers, (num_axes, count); that of the safe search was never stopped.
+        rule: The fitted rule's, from what was identified, (num_axes, count).
         cost: ln J by measured terms of the best, (num_machines,).
         rows: Every trial, in the order in which they were told.
         drive_seconds: Time that passed on the drives [s].
@@ -144,15 +144,18 @@ def optimise(
         progress: Called with the share that is done.
 
     Raises:
-        ValueError: For a sampler that lacks a package or does not take several objectives.
+        ValueError: For a gain that the device does not have, or a sampler that lacks a package or does not take several
+            objectives.
         ShardLogError: If the log is of another search.
     """
     if log is not None and (not anew or settings.journal is not None):
         raise ValueError("a search goes on from its log if every trial begins anew, and if it has no journal besides")
+    chosen = target.device.gains.outer if settings.gains is None else settings.gains
+    columns = target.device.gains.columns(chosen)  # before anything moves
     with timed(target) as (watched, clock):
         bench = TrialBench(watched, anew=anew)
         bench.identify()
-        search = _Search(bench, settings, shared, bench if log is None else LoggedTrials(bench, clock, log))
+        search = _Search(bench, settings, columns, shared, bench if log is None else LoggedTrials(bench, clock, log))
         while search.generation():
             progress(search.share())
         gains, cost = search.best()
@@ -170,12 +173,19 @@ class _Search:
     of three numbers finds something in twenty trials where one of eighteen does not.
     """
 
-    def __init__(self, bench: TrialBench, settings: Settings, shared: bool, trials: TrialBench | LoggedTrials) -> None:
+    def __init__(
+        self,
+        bench: TrialBench,
+        settings: Settings,
+        columns: Integers,
+        shared: bool,
+        trials: TrialBench | LoggedTrials,
+    ) -> None:
         machines, axes = bench.num_machines, bench.target.axes_per_machine
         self.rows: list[TrialRow] = []
         self.notes = [""] * machines
         self._bench, self._trials, self._settings, self._axes = bench, trials, settings, axes
-        self._columns = np.array([Gains._fields.index(name) for name in settings.gains])
+        self._columns, self._highest = columns, bench.target.device.gains.highest[columns]
         # Machines of a search: they are its generation.
         self._members = [np.arange(machines)] if shared else [np.array([k]) for k in range(machines)]
         self._start = self._points(bench.safe if settings.safe else bench.rule)
@@ -213,7 +223,7 @@ class _Search:
         return min(told) / self._settings.trials if told else 1.0
 
     def best(self) -> tuple[Integers, Floats]:
-        """Return the best gains of every machine, (num_axes, 5), and what they cost, (num_machines,)."""
+        """Return the best gains of every machine, (num_axes, count), and what they cost, (num_machines,)."""
         bench = self._bench
         gains = (bench.safe if self._settings.safe else bench.rule).copy()
         cost = np.full(bench.num_machines, np.nan)
@@ -356,9 +366,9 @@ class _Search:
         return np.asarray(logs.reshape(self._bench.num_machines, self._axes, -1).mean(axis=1))
 
     def _gains(self, machine: int, point: Floats) -> Integers:
-        """Return the gains of a machine's axes at a point, (axes_per_machine, 5)."""
+        """Return the gains of a machine's axes at a point, (axes_per_machine, count)."""
         gains = self._bench.rule[self._axes_of(machine)].copy()
-        gains[:, self._columns] = np.clip(np.rint(gains[:, self._columns] * np.exp(point)), 1, RAW_MAX)
+        gains[:, self._columns] = np.clip(np.rint(gains[:, self._columns] * np.exp(point)), 1, self._highest)
         return gains
 
     def _axes_of(self, machine: int) -> slice:

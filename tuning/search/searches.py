@@ -109,7 +109,7 @@ def _done(
 
 
 def joined(found: list[Optimised]) -> Optimised:
-    """Return searches as one: gains (searches * axes, 5) and cost (searches,) of each, the counts of all lanes."""
+    """Return searches as one: gains (searches * axes, count) and cost (searches,) of each, the counts of all lanes."""
     return Optimised(
         np.concatenate([one.gains for one in found]),
         np.concatenate([one.rule for one in found]),
@@ -136,7 +136,7 @@ def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: No
         "rule": found.rule[:axes],
         "cost": found.cost[:1],
         "number": np.array([row.number for row in rows], np.int64),
-        "tried": np.array([row.gains for row in rows], np.int64).reshape(len(rows), axes, 5),
+        "tried": np.array([row.gains for row in rows], np.int64).reshape(len(rows), axes, found.gains.shape[1]),
         "costs": np.array([row.cost for row in rows], float),
         "objectives": np.array([row.objectives for row in rows], float).reshape(len(rows), -1),
         "aborted": np.array([row.aborted for row in rows], bool),

@@ -20,7 +20,7 @@ from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import (
     FITTED_RULE,
     Rule,
-    gains_from_bandwidths,
+    bandwidth_gains,
     rule_gains,
     small_time_constants,
     write_gains,
@@ -30,7 +30,7 @@ from drive_env.trials.gain_trial import Identified, Trial, Trials, measured_cost
 from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, plan_move, start, wrapped, write_profile
 from drive_env.trials.score import TRIP, cost
 from tuning.auto.fallback_gains import FallbackGains
-from tuning.oscillation_watch import SOFTER, VELOCITY_P, OscillationError, OscillationWatch
+from tuning.oscillation_watch import SOFTER, OscillationError, OscillationWatch
 from tuning.target import Target
 
 Floats = NDArray[np.float64]
@@ -144,7 +144,8 @@ class TrialBench:
                 found = trials.identify(self._reach, self._where)
             if not watch.swung.any():
                 return found
-            gains[watch.swung, VELOCITY_P:] = np.maximum(gains[watch.swung, VELOCITY_P:] // SOFTER, 1)
+            softer = target.device.gains.softened(gains, SOFTER, "velocity", "position")
+            gains = np.where(watch.swung[:, None], softer, gains)
             write_gains(drives, gains, watch.swung)
             self._trials.recover(self._where)
             drives.advance(CALM)
@@ -159,7 +160,7 @@ class TrialBench:
         """Try gains in a move, its reversal and the gain probe; what is stopped gets the incumbent back.
 
         Args:
-            gains: Raw integers, shape (num_axes, 5) in the order of `Gains`.
+            gains: Raw integers, shape (num_axes, count) in the order of the device's set.
             where: Machines that take part, (num_machines,); the others' figures mean nothing.
         """
         target = self.target
@@ -212,7 +213,8 @@ class TrialBench:
 
     def _cost(self, gains: Integers, tried: Trial) -> Floats:
         """Return the cost of every axis, (num_axes,): what is slow beyond J's end is still told from what is slower."""
-        relative = softness(gains) / softness(self.rule)
+        known = self.target.device.gains
+        relative = softness(known, gains) / softness(known, self.rule)
         # J is cut off at 30; with less of E_d, which enters as a factor, it is not.
         uncut = tried.costs(relative * _UNCUT) * _UNCUT**-E_D_EXPONENT
         worth = np.log(measured_cost(np.where(tried.aborted, TRIP, uncut)))
@@ -264,11 +266,11 @@ class TrialBench:
 
 
 def first_gains(target: Target) -> Integers:
-    """Return gains from the data sheet alone, for a total inertia of three rotors, shape (num_axes, 5)."""
+    """Return gains from the data sheet alone, for a total inertia of three rotors, shape (num_axes, count)."""
     motor = target.motor
     return np.array(
         [
-            gains_from_bandwidths(target.device, motor, 3.0 * motor.inertia, supply=float(volts), **FIRST_HZ)
+            bandwidth_gains(target.device, motor, 3.0 * motor.inertia, supply=float(volts), **FIRST_HZ)
             for volts in target.supply
         ],
         np.int64,
@@ -276,7 +278,7 @@ def first_gains(target: Target) -> Integers:
 
 
 def read_gains(target: Target) -> Integers:
-    """Return the gains that the drives have, shape (num_axes, 5)."""
+    """Return the gains that the drives have, shape (num_axes, count)."""
     return target.device.gains.read(target.drives)
 
 

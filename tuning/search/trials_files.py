@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drive_env.gains import Gains
+from drive_env.devices import find_device
 from drive_env.whole_file import write_whole
 from mechanics.untrusted import read_toml
 from tuning.search.optimise import COST, Optimised, Settings, TrialRow, objective_values, pareto
@@ -55,9 +55,9 @@ def save(
     """
     table = io.StringIO()
     writer = csv.writer(table)
-    names = (COST, *OBJECTIVES)
+    names, gains_there_are = (COST, *OBJECTIVES), find_device(machine["device"]).gains.names
     writer.writerow(
-        ["search", "trial", "axis", *Gains._fields, *(TITLES[name] for name in names), "stopped", "fragile"]
+        ["search", "trial", "axis", *gains_there_are, *(TITLES[name] for name in names), "stopped", "fragile"]
     )
     for row in found.rows:
         values = [f"{value:.6g}" for value in figures(row, names, found.t_0)]

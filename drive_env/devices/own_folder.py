@@ -1,0 +1,79 @@
+"""A device in a folder of one's own: the same files as of those that ship, and all of them data.
+
+    device.toml     rates, limits, causes, what it does on a bus: as drive_env/devices/tmcm1636/device.toml has them
+    *.eds           its dictionary; device.toml names it
+    bindings.toml   "index:sub" = { field, unit, part, event }: which object is which field of the drive record
+    roles.toml      which object plays which part
+    gains.toml      its gains, and the cascade that they belong to
+    presets/        <motor>.toml for each motor that it is commissioned for
+
+Nothing in the folder is executed.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from drive_env.devices.variants import Key, parse_key
+from drive_env.dictionary.bindings import Binding
+from drive_env.dictionary.units import UNITS
+from mechanics.near_names import did_you_mean
+from mechanics.untrusted import read_toml
+
+BINDINGS = "bindings.toml"
+
+
+def is_own_folder(name: str) -> bool:
+    """Return whether a name is the path of a device's folder."""
+    return (Path(name) / "device.toml").is_file()
+
+
+def own_data(folder: Path) -> dict[str, Any]:
+    """Return the data of a device in a folder; its name is the folder's path.
+
+    Raises:
+        ValueError: If it cannot be read, or is a variant of another device.
+    """
+    data = read_toml(folder / "device.toml")
+    if "variant_of" in data:
+        raise ValueError(
+            f"variant_of = {data['variant_of']!r} is for a file alone: give the path of this file as the device"
+        )
+    return data | {"name": str(folder)}
+
+
+def own_bindings(folder: Path) -> dict[Key, Binding]:
+    """Return the bindings in a folder's `bindings.toml`.
+
+    Raises:
+        ValueError: For a unit that there is not, with a near one.
+    """
+    rows: Mapping[str, Mapping[str, Any]] = read_toml(folder / BINDINGS)
+    bindings = {}
+    for text, row in rows.items():
+        bindings[parse_key(text)] = binding = Binding(*parse_key(text), **row)
+        if binding.unit not in UNITS:
+            raise ValueError(f"{text} has no unit {binding.unit!r}{did_you_mean(binding.unit, UNITS)}")
+    return bindings
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Turn whatever is wrong in a device's file into a ValueError that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror or error}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no TOML file: {error}") from None
+    except KeyError as error:
+        raise ValueError(
+            f"{path} lacks or does not know {error}; every key is explained where the TMCM-1636 has it, in "
+            f"drive_env/devices/tmcm1636/{path.name}"
+        ) from None
+    except (TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from None

@@ -1,0 +1,195 @@
+"""A device that nothing in the repository knows: a folder of data, opened by its path, goes wherever a drive goes.
+
+tests/invented_drive has two axes a node, three gains of other names, objects and units, a current loop that is fixed,
+speeds in rpm, no cst, and fewer methods of homing.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_contract import Life
+from test_parity import WorldBus
+from typer.testing import CliRunner
+
+from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env.bus.world import World
+from drive_env.devices import find_device
+from drive_env.dictionary.access import ObjectAccessError
+from drive_env.dictionary.roles import Role
+from drive_env.dictionary.units import UNITS, Context
+from drive_env.envs.gain_scheduling import GainScheduling
+from drive_env.envs.gain_tuning import GainTuning
+from drive_env.envs.tracking import Tracking
+from drive_env.gains import has_linear_model, rule_gains
+from drive_env.motors import find_motor
+from tuning.auto.one_button import auto
+from tuning.commands.cli import app
+from tuning.identify.identification import identify
+from tuning.rules.rules_by_name import propose
+from tuning.runs import sweep
+from tuning.runs.experiment import ExperimentError, SweptObject, load_experiment, resolve
+from tuning.search.optimise import Settings, optimise
+from tuning.target import emulated
+
+FOLDER = Path(__file__).parent / "invented_drive"
+INVENTED = str(FOLDER)
+NAMES = ("speed_gain", "speed_integrator", "position_gain")
+SPEED_GAIN, SPEED_INTEGRATOR = "3200h:01", "3200h:02"
+
+
+def si(device, raw):
+    """Return raw gains in the units of the drive record."""
+    context = Context(65536.0, device.current_full_scale / 32768.0)
+    units = [device.bindings[key].unit for key in device.gains.keys]
+    return raw * np.array([float(UNITS[unit].factor(context)) for unit in units])
+
+
+# --- its gains --------------------------------------------------------------------------------------------------------
+def test_the_rule_says_the_same_of_it_as_of_a_drive_with_other_units():
+    own, known, motor = find_device(INVENTED), find_device("tmcm1636"), find_motor("qbl4208")
+    inertia = np.geomspace(1.0, 30.0, 7) * motor.inertia
+    theirs = si(known, rule_gains(known, motor, inertia))[:, 2:]
+    np.testing.assert_allclose(si(own, rule_gains(own, motor, inertia)), theirs, rtol=0.02)  # by whole numbers
+
+
+def test_a_sweep_goes_over_its_objects():
+    swept = (SweptObject(SPEED_GAIN, 20, 200, 3, "log"), SweptObject(SPEED_INTEGRATOR, 100, 800, 2, "log"))
+    found = sweep.run(replace(load_experiment(), device=INVENTED, load="inertia", sweep=swept))
+    assert len(found.order) == 6
+    assert found.objects == (SPEED_GAIN, SPEED_INTEGRATOR)
+
+
+@pytest.mark.parametrize("name", ["2042h:01", "3041h:01"])  # another drive's; its own current loop, which is fixed
+def test_a_sweep_refuses_what_is_no_gain_of_it(name):
+    with pytest.raises(ExperimentError):
+        resolve(replace(load_experiment(), device=INVENTED, sweep=(SweptObject(name, 20, 200, 3, "log"),)))
+
+
+def test_a_search_finds_gains_within_its_ranges():
+    with emulated(INVENTED, "inertia", num_machines=2) as target:
+        found = optimise(target, Settings(sampler="random", trials=6), shared=True, anew=True)
+        assert found.gains.shape == found.rule.shape == (2, 3)
+        assert np.isfinite(found.cost).all()
+        np.testing.assert_array_equal(target.device.gains.read(target.drives), found.gains)
+        with pytest.raises(ValueError, match="no gain is named 'velocity_p'; there are speed_gain"):
+            optimise(target, Settings(gains=("velocity_p",)))
+
+
+def test_the_command_writes_them_by_their_names(tmp_path):
+    line = ["optimise", "--device", INVENTED, "--load", "inertia", "--sampler", "random", "--trials", "2",
+            "--lanes", "2", "--out", str(tmp_path / "found")]  # fmt: skip
+    done = CliRunner().invoke(app, line)
+    assert done.exit_code == 0, done.output
+    head = (tmp_path / "found" / "trials.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert head.startswith("search,trial,axis,speed_gain,speed_integrator,position_gain,")
+
+
+def test_an_agent_tunes_them_as_an_episode():
+    env = GainTuning(2, device=INVENTED, load="inertia", trials=2, num_threads=1)
+    assert env.config.gains == NAMES
+    _, info = env.reset(seed=1)
+    assert info["gains"].shape == (2, 1, 3)
+    _, reward, *_, info = env.step(np.full((2, 3), 0.2, np.float32))
+    assert np.isfinite(reward).all() and np.isfinite(info["trial_hidden"]).all()
+    assert (info["trial_gains"] > 1).all()
+    env.close()
+    with pytest.raises(ValueError, match=r"speed_gain.*position_gain"):
+        GainTuning(1, device=INVENTED, gains=("torque_p",))
+
+
+def test_what_needs_a_linear_model_says_that_it_has_none(tmp_path):
+    device, motor = find_device(INVENTED), find_motor("qbl4208")
+    assert not has_linear_model(device)
+    says = "this drive has no linear model of its loops"
+    with emulated(INVENTED, "inertia") as target:
+        with pytest.raises(ValueError, match=says):
+            auto(target, tmp_path / "before.toml")
+        with pytest.raises(ValueError, match=says):
+            identify(target)
+        with pytest.raises(ValueError, match=says):
+            propose("simc", device, motor, None)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- the rest of a drive's life ---------------------------------------------------------------------------------------
+@pytest.mark.parametrize("load", ["inertia", "two_mass"])
+def test_it_keeps_the_contract(load):
+    assert Life(INVENTED, load, "qbl4208", 2).whole().size
+
+
+def test_it_has_its_own_modes_and_methods_of_homing():
+    with EmulatedDrives(INVENTED, "inertia", num_threads=1) as drives:
+        assert drives.read(0x6502)[0] == 0x1A5  # without bit 9, cst
+        for name, value in ((0x6060, 10), (0x6098, 21), ((0x3041, 1), 7)):
+            with pytest.raises(ObjectAccessError):
+                drives.write(name, value)
+        assert drives.read((0x3041, 1))[0] == 4021  # the current loop is what it is
+        assert Role.CURRENT_P not in drives.device.roles
+
+
+def moved(drives):
+    """Return what a move of both axes shows."""
+    objects = (0x6041, 0x6064, 0x606C, 0x6077)
+    motion.enable(drives, mode="pp")
+    motion.start_move(drives, [20_000, -30_000])
+    trace = drives.record(objects, 0.3)
+    motion.disable(drives)
+    return np.stack([trace[name] for name in objects])
+
+
+def test_on_a_bus_both_axes_of_a_node_show_the_same_integers():
+    machine = {"load": "inertia", "num_machines": 2, "num_threads": 1, "seed": 4}
+    with EmulatedDrives(INVENTED, **machine) as inside:
+        expected = moved(inside)
+    world = World(lockstep=True)
+    world.add(EmulatedDrives(INVENTED, **machine), [1])
+    bus = WorldBus(world)
+    with CanDrives(INVENTED, bus=bus, nodes=(1,), pace="lockstep") as drives:
+        assert drives.num_axes == 2
+        found = moved(drives)
+    bus.shutdown()
+    world.close()
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(("kind", "options"), [(Tracking, {"mode": "csv"}), (GainScheduling, {"gains": NAMES})])
+def test_the_other_environments_run_on_it(kind, options):
+    env = kind(2, device=INVENTED, load="inertia", num_threads=1, **options)
+    env.reset(seed=0)
+    for _ in range(3):
+        observation, *_ = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert np.isfinite(observation).all()
+    env.close()
+
+
+# --- a folder that is none --------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("device.toml", "undervoltage", "undervolts", r"device.toml lacks or does not know 'undervoltage'"),
+        ("device.toml", "axes = 2", "axes = ", "device.toml is no TOML file"),
+        ("device.toml", "axes = 2", 'axes = 2\nvariant_of = "tmcm1636"', "give the path of this file as the device"),
+        ("bindings.toml", '"1/1000"', '"1/100"', "bindings.toml: .* has no unit '1/100'"),
+        ("bindings.toml", '"3200:3"', '"3200:9"', "gains.toml: 3200h:03 is no gain"),
+        ("roles.toml", "outputs =", "out_puts =", "roles.toml lacks or does not know 'OUT_PUTS'"),
+        ("gains.toml", "highest", "most", "gains.toml lacks or does not know 'highest'"),
+        ("device.toml", "invented.eds", "none.eds", "none.eds"),
+    ],
+)
+def test_a_file_that_is_wrong_is_named_with_what_is_wrong(tmp_path, file, old, new, message):
+    folder = tmp_path / "own"
+    shutil.copytree(FOLDER, folder)
+    path = folder / file
+    path.write_text(path.read_text(encoding="utf-8").replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        find_device(str(folder))
+
+
+def test_a_motor_without_a_preset_is_told_with_the_remedy():
+    with pytest.raises(ValueError, match=r"no preset for a re_40; write .*re_40.toml .* one for: qbl4208"):
+        find_device(INVENTED).preset(find_motor("re_40"))
