@@ -28,7 +28,6 @@ from rich.table import Table
 from benchmarks import bus, environments, gain_tuning, sweeps, training
 from drive_env import EmulatedDrives, motion
 from drive_env.emulator.emulated_drives import MOST_MACHINES
-from drive_env.firmware import cycle
 from mechanics.loads import LOADS
 
 SIZES = (1, 8, 64, 1024, 16384)
@@ -64,7 +63,7 @@ def ticks() -> dict[str, float]:
     for name, machines in (("1 lane", 1), ("8 lanes", 8)):
         drives = running_drives(machines, 1)
         group = drives._groups[0]
-        seconds = best_time(lambda g=group, d=drives: cycle.run_drives_alone(d._records, g._rates, cycles))
+        seconds = best_time(lambda g=group, d=drives: d.device.firmware.run_drives_alone(d._records, g._rates, cycles))
         result[name] = seconds / (cycles * group._rates.windows * group._rates.ticks * machines) * 1e9
     return result
 
@@ -75,7 +74,7 @@ def bound(load: str = LOAD, machines: int = 64) -> dict[str, float]:
     The parts are measured in turn, so that a slower moment of the machine slows all of them.
     """
     drives = running_drives(machines, 1, load, SLOW_PPS)
-    groups, cycles = drives._groups, 40
+    groups, cycles, run_alone = drives._groups, 40, drives.device.firmware.run_drives_alone
     moving = [(group.load.data.qpos.copy(), group.load.data.qvel.copy()) for group in groups]
 
     def physics() -> None:
@@ -85,7 +84,10 @@ def bound(load: str = LOAD, machines: int = 64) -> dict[str, float]:
     whole = alone = steps = float("inf")
     for _ in range(8):
         whole = min(whole, best_time(lambda: drives.advance(cycles * 1e-3), 1))
-        alone = min(alone, best_time(lambda: cycle.run_drives_alone(drives._records, groups[0]._rates, cycles), 1))
+        alone = min(
+            alone,
+            best_time(lambda: run_alone(drives._records, groups[0]._rates, cycles), 1),
+        )
         kept = [(group.load.data.qpos.copy(), group.load.data.qvel.copy()) for group in groups]
         for group, (qpos, qvel) in zip(groups, moving, strict=True):
             # Forces of the last step would drive it away, and springs are not MuJoCo's.

@@ -88,16 +88,17 @@ def source_hash(files: Mapping[str, Path]) -> str:
     return digest.hexdigest()[:16]
 
 
-def cached(*, allocates: bool = True) -> Callable[[Function], Function]:
+def cached(*, allocates: bool = True, source: str | None = None) -> Callable[[Function], Function]:
     """Return a decorator that compiles an entry point and keeps its machine code on disk, keyed by its sources.
 
     Args:
         allocates: Whether it makes arrays; if not, it counts no references, see `stage`.
+        source: Name of the module that tells what it is composed of, if not that in which it is written.
     """
     options = OPTIONS if allocates else OPTIONS | UNCOUNTED
 
     def decorate(function: Function) -> Function:
-        stamp = source_hash(sources(sys.modules[function.__module__]))
+        stamp = source_hash(sources(sys.modules[source or function.__module__]))
         folder = user_cache_folder() / stamp
         try:
             folder.mkdir(parents=True, exist_ok=True)

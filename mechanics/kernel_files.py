@@ -13,6 +13,7 @@ import hashlib
 import logging
 import os
 import pickle
+import re
 import uuid
 from contextlib import suppress
 from functools import cache
@@ -42,7 +43,13 @@ class KernelCache(FunctionCache):  # type: ignore[misc]  # Numba has no types
     def __init__(self, function: Any, folder: Path, stamp: str) -> None:
         super().__init__(function)
         self._cache_path = str(folder)
-        self._cache_file = KernelFiles(folder, self._impl.filename_base, stamp)
+        # Without the function that composes it: its name is the module's and its own.
+        name = re.sub(r"\w+\.locals\.", "", self._impl.filename_base)
+        self._cache_file = KernelFiles(folder, name, stamp)
+
+    def _index_key(self, signature: Any, codegen: Any) -> Any:
+        # What a composed kernel closes over are stages, whose pickles are others in each process; the stamp knows them.
+        return signature, codegen.magic_tuple(), hashlib.sha256(self._py_func.__code__.co_code).hexdigest()
 
     def _save_overload(self, signature: Any, kernel: Any) -> None:
         # Numba's own makes a folder besides, named after where the source lies.

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from drive_env.firmware.cycle import mechanics_window, meet, start_window, supervise, tick
+from drive_env.firmware.cycle import mechanics_window, meet
 from drive_env.firmware.record import LANES
+from drive_env.firmware.servo.stages import FIRMWARE
 from mechanics.compiled import cached
+
+start_window, supervise, tick = FIRMWARE.start_window, FIRMWARE.supervise, FIRMWARE.tick
 
 BRIDGE, COPPER, SHAFT, SOURCE, CHOPPER, IDLE, OFF_CURRENT, LEAP, SPEED = range(9)
 

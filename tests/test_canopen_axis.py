@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.canopen.frames import Frame
 from drive_env.devices import AxisOffset, find_device
-from drive_env.firmware.record import FIELDS, set_lanes
+from drive_env.firmware.record import set_lanes
+from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.node.axis import Axis
 
 DEVICE = find_device("tmcm1636")
@@ -50,7 +51,7 @@ def test_every_bound_object_reads_alike_whatever_is_in_the_record(shared, data):
     """Also what no healthy axis has: infinities, no number, positions beyond the counter."""
     entry = data.draw(st.sampled_from([e for e in ENTRIES if (e.index, e.sub) in DEVICE.bindings]))
     binding = DEVICE.bindings[entry.index, entry.sub]
-    field = next(f for f in FIELDS if f.name == binding.field)
+    field = next(f for f in FIRMWARE.layout.fields if f.name == binding.field)
     if field.name == "position_scaler":
         return
     if field.kind == "f8":
@@ -91,7 +92,7 @@ def test_every_write_does_what_the_dictionary_of_all_axes_does(drives, entry):
         assert refused == code, (entry.label, raw)
         assert drives.read(key)[8] == drives.read(key)[9] == port.read()
         assert drives.read(key)[7] == drives.read(key)[0]
-    for field in FIELDS:
+    for field in FIRMWARE.layout.fields:
         if field.name != "random":  # each axis has its own noise
             block = drives._records[field.name].reshape(2, -1, 8)[1]
             assert np.array_equal(block[:, 0], block[:, 1], equal_nan=True), field.name

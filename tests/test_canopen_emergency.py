@@ -11,8 +11,8 @@ from drive_env.canopen.emergency import QUEUE
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.nmt import NmtState
 from drive_env.devices import find_device
-from drive_env.firmware import fsa
-from drive_env.firmware.protection import CAUSES
+from drive_env.firmware.common import fsa
+from drive_env.firmware.servo.causes import CAUSES
 from drive_env.node.error_history import CONDITIONS
 
 

@@ -10,7 +10,7 @@ from canopen_wire import Wire
 from drive_env import EmulatedDrives
 from drive_env.canopen.error_control import consumers
 from drive_env.canopen.nmt import NmtState
-from drive_env.firmware import fsa
+from drive_env.firmware.common import fsa
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.nmt import NmtState
 from drive_env.canopen.node import Node
-from drive_env.firmware import fsa
+from drive_env.firmware.common import fsa
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from drive_env.firmware import alignment
 from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.firmware.servo import alignment
 from drive_env.motors import MOTORS
 
 MOTOR = MOTORS["qbl4208"]

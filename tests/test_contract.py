@@ -26,7 +26,7 @@ from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.inertia_check import MAX_INERTIA_RATIO, MisfitWarning
-from drive_env.firmware.modes import MODES
+from drive_env.firmware.common.modes import MODES
 from drive_env.firmware.record import get_lanes
 from drive_env.motors import MOTORS
 from mechanics.loads import LOADS, find_load

@@ -10,6 +10,7 @@ import pytest
 from drive_env import EmulatedDrives, motion
 from drive_env.firmware import cycle
 from drive_env.firmware.record import LANES, get_lanes
+from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.trials import response
 from mechanics import stepping
 from mechanics.compiled import cached
@@ -258,6 +259,9 @@ def test_halving_the_physics_step_changes_no_verdict(load):
     assert recovery <= 1e-3
 
 
+window = FIRMWARE.window
+
+
 # --- prediction within a window ---------------------------------------------------------------------------------------
 @cached()
 def windows(records, plant, rates, scratch, count):
@@ -265,7 +269,7 @@ def windows(records, plant, rates, scratch, count):
     out = np.zeros((count, 4))
     for n in range(count):
         for block in range(records.shape[0]):
-            cycle.window(records[block], rates)
+            window(records[block], rates)
         out[n, 0] = records[0].theta_m[0]
         out[n, 1] = records[0].omega_m[0]
         cycle.mechanics_window(records, plant, rates, scratch)

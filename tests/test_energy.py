@@ -16,11 +16,14 @@ from numba import njit
 
 from drive_env import EmulatedDrives, motion
 from drive_env.emulator.group import rates_of
-from drive_env.firmware.cycle import mechanics_window, start_window, supervise, tick
-from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
-from drive_env.firmware.thermal import warm
+from drive_env.firmware.cycle import mechanics_window
+from drive_env.firmware.record import LANES, get_lanes, set_lanes
+from drive_env.firmware.servo.stages import FIRMWARE
+from drive_env.firmware.servo.thermal import warm
 from drive_env.motors import MOTORS
 from mechanics.compiled import OPTIONS
+
+start_window, supervise, tick = FIRMWARE.start_window, FIRMWARE.supervise, FIRMWARE.tick
 
 FREE = {"load.coulomb": 0.0, "load.breakaway": 0.0, "load.viscous": 0.0}
 COPPER = 0.00393  # 1/K at 25 degC
@@ -203,7 +206,7 @@ def run_warm(drive, dt, steps):
 
 
 def new_winding(motor, **fields):
-    records = new_records(LANES)
+    records = FIRMWARE.layout.new_records(LANES)
     values = {
         "is_dc": motor.kind == "dc", "phase_factor": 1.0 if motor.kind == "dc" else 1.5, "R_s": motor.R_s,
         "R_nominal": motor.R_s, "psi_m": motor.psi_m, "psi_nominal": motor.psi_m, "overload_time": 10.0,

@@ -20,9 +20,9 @@ LONG = {
     "agents/tuner/tune_target.py tune_target", "drive_env/canopen/node.py __init__",
     "drive_env/commands/check_model.py check_model", "drive_env/commands/jog.py jog",
     "drive_env/commands/scope.py _record", "drive_env/commands/serve.py serve",
-    "drive_env/emulator/emulated_drives.py __init__", "drive_env/firmware/cycle.py power_on",
-    "drive_env/firmware/modes/hm.py generate", "drive_env/firmware/power_stage.py power_stage",
-    "drive_env/firmware/power_stage.py refresh_winding", "mechanics/packed.py _new_plant",
+    "drive_env/emulator/emulated_drives.py __init__",
+    "drive_env/firmware/common/modes/hm.py generate", "drive_env/firmware/servo/power_stage.py power_stage",
+    "drive_env/firmware/servo/power_stage.py refresh_winding", "mechanics/packed.py _new_plant",
     "mechanics/stepping.py drive", "mechanics/stepping.py report", "mechanics/stepping.py rub",
     "tuning/commands/optimise.py optimise", "tuning/commands/rank.py _compare",
 }  # fmt: skip

@@ -15,7 +15,8 @@ from drive_env import EmulatedDrives
 from drive_env.emulator import cyclic_control, prepared_record
 from drive_env.emulator.prepared_record import from_od
 from drive_env.envs import bus_delays, tracking_cycle
-from drive_env.firmware import cycle, protection
+from drive_env.firmware.servo import stages
+from drive_env.firmware.servo.stages import FIRMWARE
 from mechanics import kernel_files
 from mechanics.compiled import source_hash, sources, user_cache_folder
 from mechanics.kernel_files import KernelFiles
@@ -25,7 +26,7 @@ ROOT = Path(kernel_files.__file__).parent.parent
 SMALL = """
 import logging, numpy as np
 logging.basicConfig(format="%(message)s")
-from drive_env.firmware import cycle
+from drive_env.firmware.servo import stages
 from drive_env.emulator.prepared_record import from_od
 values = np.empty((2, 1, 1))
 code = np.array([-10, 10, 0.0, *[np.nan] * 4])
@@ -65,7 +66,7 @@ def cache(tmp_path_factory) -> Path:
     with EmulatedDrives() as drives:
         drives.advance(0.001)
     copy = tmp_path_factory.mktemp("cache")
-    for kernel in (from_od, cycle.run):
+    for kernel in (from_od, FIRMWARE.run):
         folder = Path(kernel._cache.cache_path).relative_to(user_cache_folder()).parts[0]
         shutil.copytree(user_cache_folder() / folder, copy / folder, dirs_exist_ok=True)
     return copy
@@ -179,10 +180,10 @@ def compiled_from(function: object) -> set[str]:
 
 KERNELS = [
     (kernel, module)
-    for module in (cycle, protection, cyclic_control, prepared_record, tracking_cycle, bus_delays)
+    for module in (cyclic_control, prepared_record, tracking_cycle, bus_delays)
     for kernel in vars(module).values()
     if hasattr(kernel, "py_func") and kernel.py_func.__module__ == module.__name__ and hasattr(kernel._cache, "flush")
-]
+] + [(kernel, stages) for kernel in FIRMWARE if hasattr(kernel, "py_func") and hasattr(kernel._cache, "flush")]
 
 
 @pytest.mark.parametrize(("kernel", "module"), KERNELS, ids=[kernel.__name__ for kernel, _ in KERNELS])
@@ -193,22 +194,22 @@ def test_a_kernel_is_keyed_by_every_file_that_it_calls_and_by_no_command(kernel,
 
 
 def test_cyclic_control_is_keyed_by_prepared_records_and_the_firmware_by_no_python_around_it():
-    assert {"drive_env.emulator.prepared_record", "drive_env.firmware.loops", "mechanics.stepping"} <= sources(
+    assert {"drive_env.emulator.prepared_record", "drive_env.firmware.servo.loops", "mechanics.stepping"} <= sources(
         cyclic_control
     ).keys()
     assert (
         not {"drive_env.emulator.emulated_drives", "drive_env.emulator.prepared_record", "mechanics.packed"}
-        & sources(cycle).keys()
+        & sources(stages).keys()
     )
 
 
 def test_the_key_is_that_of_names_and_contents_wherever_they_lie(tmp_path):
-    files = sources(cycle)
+    files = sources(stages)
     elsewhere = {name: tmp_path / f"{k}.py" for k, name in enumerate(files)}
     for name, path in files.items():
         shutil.copyfile(path, elsewhere[name])
     assert source_hash(elsewhere) == source_hash(files)
-    edited = elsewhere["drive_env.firmware.loops"]
+    edited = elsewhere["drive_env.firmware.servo.loops"]
     edited.write_text(edited.read_text() + "# another\n")
     assert source_hash(elsewhere) != source_hash(files)
 

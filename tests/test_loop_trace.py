@@ -5,9 +5,9 @@ import pytest
 
 from drive_env import EmulatedDrives, motion
 from drive_env.emulator.loop_trace import SIGNALS, trace_loops
-from drive_env.firmware.record import RECORD
+from drive_env.firmware.servo.stages import FIRMWARE
 
-FIELDS = [name for name in RECORD.names if name != "padding"]
+FIELDS = [name for name in FIRMWARE.layout.dtype.names if name != "padding"]
 
 
 def set_points(cycles):

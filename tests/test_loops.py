@@ -20,15 +20,18 @@ from numba import njit, typeof
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.emulator.group import rates_of
-from drive_env.firmware.cycle import mechanics_window, window
-from drive_env.firmware.derived import derive
-from drive_env.firmware.loops import current_loop, motion_loops
-from drive_env.firmware.power_stage import convert_energy, power_stage, refresh_winding
-from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
-from drive_env.firmware.sensors import measure_angle, measure_currents, measure_motion
+from drive_env.firmware.cycle import mechanics_window
+from drive_env.firmware.record import LANES, get_lanes, set_lanes
+from drive_env.firmware.servo.derived import derive
+from drive_env.firmware.servo.loops import current_loop, motion_loops
+from drive_env.firmware.servo.power_stage import convert_energy, power_stage, refresh_winding
+from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_motion
+from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.gains import gains_from_bandwidths
 from drive_env.motors import MOTORS
 from mechanics.compiled import OPTIONS
+
+window = FIRMWARE.window
 
 TWO_PI = 2.0 * math.pi
 RPM = TWO_PI / 60.0
@@ -674,13 +677,13 @@ def count_arithmetic(kernel, records, rates):
 )  # fmt: skip
 def test_compiled_stages_hold_packed_arithmetic(stage, least):
     kernel = njit(**OPTIONS)(stage)
-    packed, scalar = count_arithmetic(kernel, new_records(LANES), rates_of(find_device("tmcm1636"), 1))
+    packed, scalar = count_arithmetic(kernel, FIRMWARE.layout.new_records(LANES), rates_of(find_device("tmcm1636"), 1))
     assert packed >= least
     assert packed > 10 * scalar
 
 
 def test_compiled_window_of_all_stages_together_holds_packed_arithmetic():
-    packed, scalar = count_arithmetic(window, new_records(LANES), rates_of(find_device("tmcm1636"), 1))
+    packed, scalar = count_arithmetic(window, FIRMWARE.layout.new_records(LANES), rates_of(find_device("tmcm1636"), 1))
     assert packed >= 200
     assert packed > 10 * scalar
 
@@ -691,5 +694,5 @@ def test_code_that_cannot_be_packed_is_counted_as_scalar():
         for lane in range(1, LANES):
             drive.i_d[lane] = drive.i_d[lane - 1] * drive.i_q[lane] + rates.tick
 
-    packed, scalar = count_arithmetic(chain, new_records(LANES), rates_of(find_device("tmcm1636"), 1))
+    packed, scalar = count_arithmetic(chain, FIRMWARE.layout.new_records(LANES), rates_of(find_device("tmcm1636"), 1))
     assert scalar > packed

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
-from drive_env.firmware.modes import MODES
+from drive_env.firmware.common.modes import MODES
 
 ACKNOWLEDGED, REACHED, LIMITED = 0x1000, 0x0400, 0x0800  # statusword bits 12, 10, 11
 TURN = 65536  # increments

@@ -11,9 +11,10 @@ from numba import njit
 from scipy.integrate import solve_ivp
 
 from drive_env import EmulatedDrives, motion
-from drive_env.firmware.derived import derive
-from drive_env.firmware.power_stage import convert_energy, power_stage, refresh_winding
-from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
+from drive_env.firmware.record import LANES, get_lanes, set_lanes
+from drive_env.firmware.servo.derived import derive
+from drive_env.firmware.servo.power_stage import convert_energy, power_stage, refresh_winding
+from drive_env.firmware.servo.stages import FIRMWARE
 from mechanics.compiled import OPTIONS
 
 DT = 40e-6  # s, current loop
@@ -48,7 +49,7 @@ def run_stage(drive, dt, window, duty, trace):
 
 def new_stage(**fields):
     """Return records of 8 ideal stages that drive motors whose rotors keep their speed."""
-    records = new_records(LANES)
+    records = FIRMWARE.layout.new_records(LANES)
     values = {
         "R_s": R, "L_d": L, "L_q": L, "psi_m": PSI, "n_p": N_P, "supply_voltage": SUPPLY, "u_dc": SUPPLY,
         "J_rotor": LOCKED, "stage_on": 1.0, "supply_sinks": 1.0, "dc_capacitance": 1e-9, "dead_time_current": 0.3,

@@ -13,7 +13,7 @@ from numba import njit
 from scipy.optimize import brentq
 
 from drive_env import EmulatedDrives, motion
-from drive_env.firmware import profiles
+from drive_env.firmware.common import profiles
 
 DT = 1e-3
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from drive_env.firmware.record import RECORD, STATE
+from drive_env.firmware.servo.stages import FIRMWARE
 
 POSITION_SCALER = (0x2058, 0)
 
@@ -28,7 +28,7 @@ def used():
 
 
 def fields(drives):
-    return {name: drives._records[name].copy() for name in RECORD.names if name != "padding"}
+    return {name: drives._records[name].copy() for name in FIRMWARE.layout.dtype.names if name != "padding"}
 
 
 def test_a_restart_restores_what_single_writes_would(used):
@@ -46,9 +46,7 @@ def test_a_restart_restores_what_single_writes_would(used):
             objects._set_value(entry, raw, mask)
         elif entry.access not in ("ro", "const"):  # what is read only the firmware computes
             objects._set_field(entry, raw, mask)
-    from drive_env.firmware import cycle
-
-    cycle.power_on(used._records, mask)
+    FIRMWARE.power_on(used._records, mask)
     for name, expected in fields(used).items():
         assert np.array_equal(expected, found[name], equal_nan=True), name
     for key in values:
@@ -70,7 +68,7 @@ def test_a_reset_sets_the_state_of_the_masked_machines_alone(used):
     used.machine.reset(mask)
     after = fields(used)
     others = np.flatnonzero(np.arange(16) != 9)
-    for field in STATE:
+    for field in FIRMWARE.layout.state:
         if field.name.startswith("block_"):
             continue
         old, new = (each[field.name].reshape(2, -1, 8) for each in (before, after))

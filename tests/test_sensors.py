@@ -11,9 +11,10 @@ from scipy import signal, stats
 
 from drive_env import EmulatedDrives, motion
 from drive_env.emulator.parameters import velocity_filter
-from drive_env.firmware.derived import derive
-from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
-from drive_env.firmware.sensors import measure_angle, measure_currents, measure_motion
+from drive_env.firmware.record import LANES, get_lanes, set_lanes
+from drive_env.firmware.servo.derived import derive
+from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_motion
+from drive_env.firmware.servo.stages import FIRMWARE
 from mechanics.compiled import OPTIONS
 
 TWO_PI = 2.0 * math.pi
@@ -57,7 +58,7 @@ def run_adc(drive, i_d, i_q, raw, current):
 
 def new_sensors(**fields):
     b, a1, a2 = velocity_filter(np.full(LANES, 400.0), 5000.0)
-    records = new_records(LANES)
+    records = FIRMWARE.layout.new_records(LANES)
     values = {
         "encoder_counts": COUNTS, "encoder_steps": COUNTS, "pole_pairs": 4.0, "n_p": 4.0,
         "velocity_filter_b": b, "angle_source": 3.0, "adc_step": STEP, "adc_step_lsb": 16.0, **fields,

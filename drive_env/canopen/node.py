@@ -25,7 +25,7 @@ from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, HARDWARE_ERROR, VALUE_RANGE, ObjectAccessError
 from drive_env.dictionary.access import check_limits
 from drive_env.emulator.emulated_drives import EmulatedDrives
-from drive_env.firmware.protection import CAUSES, CUT, STOP
+from drive_env.firmware.common.protection import CUT, STOP
 from drive_env.node.axis import Axis, QueuedEmergency
 from drive_env.node.error_history import CONDITIONS, ErrorCondition, ErrorHistory
 from drive_env.node.node_dictionary import NodeDictionary
@@ -35,7 +35,7 @@ from drive_env.node.store import PowerLostError, Section, Store
 logger = logging.getLogger(__name__)
 
 COMMUNICATION_ERROR, APPLICATION_ERROR = 1, 2  # sub-indices of 1029h
-FAULT_RESET = 0  # row of CAUSES
+FAULT_RESET = 0  # row of the firmware's causes
 
 
 class Node:
@@ -203,7 +203,7 @@ class Node:
                 self._tell_of(axis, emergency, now)
         if self._emergency.told and not self._error_register():
             # CiA 301: whoever was told of an error is told when there is none any more, however it ended.
-            self._emergency.push(self._device.emergencies[CAUSES[FAULT_RESET].name], 0)
+            self._emergency.push(self._device.emergencies[self._device.firmware.causes[FAULT_RESET].name], 0)
         self._flush(now)
         if nmt.SERVICES[self.state].pdo:
             for pdo in self._event_tpdos:
@@ -446,7 +446,7 @@ class Node:
 
     def _tell_of(self, axis: Axis, queued: QueuedEmergency, now: float) -> None:
         """Pass an axis' emergency on, with the error register of its moment, and react to a fault."""
-        cause = CAUSES[queued.row]
+        cause = self._device.firmware.causes[queued.row]
         if queued.row == FAULT_RESET:
             self._conditions.clear()
         register = queued.error_register | self._error_register(without=axis)

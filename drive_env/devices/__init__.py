@@ -8,17 +8,29 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from drive_env import cia402
 from drive_env.devices.gain_set import GainSet, load_gain_set
 from drive_env.devices.own_folder import BINDINGS, is_own_folder, naming, own_bindings, own_data
-from drive_env.devices.variants import compose_eds, converted_preset, merged, own_variant, parse_key, variant_bindings
+from drive_env.devices.variants import (
+    check_rates,
+    compose_eds,
+    converted_preset,
+    merged,
+    own_variant,
+    parse_key,
+    variant_bindings,
+)
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from drive_env.dictionary.roles import Role
+from drive_env.firmware import checked_firmware, find_firmware
 from drive_env.motors import MOTORS, Motor
 from mechanics.near_names import did_you_mean
+
+if TYPE_CHECKING:
+    from drive_env.firmware.cycle import Firmware
 
 FOLDER = Path(__file__).parent
 
@@ -112,7 +124,8 @@ class Device(NamedTuple):
     bindings: dict[tuple[int, int], Binding]
     current_rate: float
     velocity_rate: float
-    profile_rate: float
+    supervision_rate: float
+    communication_rate: float
     current_full_scale: float
     duty_limit: float
     overcurrent: float
@@ -135,7 +148,13 @@ class Device(NamedTuple):
     master: MasterHints
     roles: dict[Role, tuple[int, int]]
     gains: GainSet
+    firmware_name: str
     variant_of: str = ""
+
+    @property
+    def firmware(self) -> Firmware:
+        """What runs in the drive; it is composed at the first look, and compiled at its first use."""
+        return find_firmware(self.firmware_name)
 
     def new_dictionary(self, node_id: int = 1) -> ObjectDictionary:
         """Return the object dictionary of a node of this device."""
@@ -267,6 +286,7 @@ def _device(
     roles: dict[Role, tuple[int, int]],
     gains: GainSet,
 ) -> Device:
+    check_rates(data["rates"])
     return Device(
         name=data["name"],
         title=data["title"],
@@ -275,7 +295,8 @@ def _device(
         bindings=bindings,
         current_rate=data["rates"]["current"],
         velocity_rate=data["rates"]["velocity"],
-        profile_rate=data["rates"]["profile"],
+        supervision_rate=data["rates"]["supervision"],
+        communication_rate=data["rates"]["communication"],
         current_full_scale=data["current"]["full_scale"],
         duty_limit=data["current"]["duty_limit"],
         overcurrent=data["current"]["overcurrent"],
@@ -298,6 +319,7 @@ def _device(
         master=_master(data["master"]),
         roles=roles,
         gains=gains,
+        firmware_name=checked_firmware(data["firmware"]),
         variant_of=data.get("variant_of", ""),
     )
 

@@ -93,10 +93,21 @@ def own_variant(path: Path, devices: Mapping[str, Mapping[str, Any]]) -> dict[st
             f"full_scale = {current['full_scale']:g} A must come in this order: what flows for ever, what trips, what "
             "can be measured"
         )
-    rates = [whole["rates"][name] for name in ("current", "velocity", "profile")]
-    if any(fast % slow for fast, slow in itertools.pairwise(rates)):
-        raise ValueError(f"{path}: rates = {rates} Hz; each must be a whole multiple of the next")
+    try:
+        check_rates(whole["rates"])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     return {"title": f"{base['title']}, {path.stem}", "objects": {}, "groups": {}} | own | {"name": str(path)}
+
+
+def check_rates(rates: Mapping[str, float]) -> None:
+    """Raise ValueError for rates [Hz] that are no whole multiples of each other, from the fastest to the slowest."""
+    chain = [rates[name] for name in ("current", "velocity", "supervision", "communication")]
+    if any(slow <= 0 or fast % slow for fast, slow in itertools.pairwise(chain)):
+        raise ValueError(
+            f"rates = {chain} Hz of current loop, velocity loop, supervision and communication; each must be a whole "
+            "multiple of the next"
+        )
 
 
 def _check_like(where: str, value: Any, known: Any, base: Mapping[str, Any]) -> None:

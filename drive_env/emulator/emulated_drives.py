@@ -37,8 +37,7 @@ from drive_env.emulator.prepared_record import PreparedRecord
 from drive_env.faults.machine_faults import MachineFaults
 from drive_env.firmware import cycle
 from drive_env.firmware.cycle import Call
-from drive_env.firmware.protection import CAUSES
-from drive_env.firmware.record import LANES, get_lanes, new_records, set_lanes
+from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.master.quantities import integers, is_quantity
 from drive_env.motors import Motor, find_motor
 from mechanics.load import Load
@@ -123,7 +122,8 @@ class EmulatedDrives:
         self.num_machines = num_machines
         self.num_axes = num_machines * self.load.num_axes
         volts = checked_supply(self.motor.voltage if supply is None else supply, 1)
-        self._records = new_records(self.num_axes)
+        self._firmware = self.device.firmware
+        self._records = self._firmware.layout.new_records(self.num_axes)
         self._threads = max(1, num_threads if num_threads is not None else usable_cores())
         self._executor: ThreadPoolExecutor | None = None
         self._reported = np.zeros(num_machines, bool)
@@ -240,7 +240,7 @@ class EmulatedDrives:
         entries = [known.find(name) for name in objects]
         codes = {(e.index, e.sub): self._objects.recordable(e) for e in entries}
         live = {key: code for key, code in codes.items() if code is not None}
-        sampled = channels([(b.field, b.part) for b in live.values()]) if live else NOTHING
+        sampled = channels(self._firmware.layout, [(b.field, b.part) for b in live.values()]) if live else NOTHING
         values, played = self._objects.plan_play(play, cycles)
         rows = -(-cycles // every)
         samples = np.empty((rows, len(live), self.num_axes))
@@ -268,7 +268,7 @@ class EmulatedDrives:
         for axis in np.flatnonzero(counts):
             for k in range(int(counts[axis])):
                 queued = int(get_lanes(self._records, "emergency", self.num_axes, k)[axis])
-                cause = CAUSES[(queued & 0xFF) - 1]
+                cause = self._firmware.causes[(queued & 0xFF) - 1]
                 emergency = self.device.emergencies[cause.name]
                 messages.append(EmergencyMessage(int(axis), emergency.code, queued >> 8, emergency.extra, cause.name))
         set_lanes(self._records, "emergency_count", np.zeros(self.num_axes, np.int32))
@@ -331,7 +331,7 @@ class EmulatedDrives:
         for load in loads:
             machines = slice(first, first + load.copies)
             block, blocks = first * self.load.num_axes // LANES, -(-load.copies * self.load.num_axes // LANES)
-            groups.append(Group(machines, load, self._records[block : block + blocks], rates))
+            groups.append(Group(machines, load, self._records[block : block + blocks], rates, self._firmware))
             first = machines.stop
         return groups
 
@@ -426,7 +426,7 @@ class EmulatedDrives:
     # --- time -----------------------------------------------------------------------------------------------------
     @property
     def _cycle(self) -> float:
-        return 1.0 / self.device.profile_rate
+        return 1.0 / self.device.communication_rate
 
     def _cycles(self, duration: float) -> int:
         return whole_cycles(duration, self._cycle)
@@ -451,11 +451,11 @@ class EmulatedDrives:
         given = self._fleet.address, call.address, start, end, first, last
         helpers = min(self._threads, len(self._groups)) - 1
         if not helpers:
-            return bool(cycle.run(*given))
+            return bool(self._firmware.run(*given))
         if self._executor is None:
             self._executor = ThreadPoolExecutor(self._threads - 1, thread_name_prefix="drives")
-        jobs = [self._executor.submit(cycle.run, *given) for _ in range(helpers)]
-        found = bool(cycle.run(*given))
+        jobs = [self._executor.submit(self._firmware.run, *given) for _ in range(helpers)]
+        found = bool(self._firmware.run(*given))
         return sum(job.result() for job in jobs) > 0 or found
 
     def _report_divergence(self) -> None:

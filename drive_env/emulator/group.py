@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from drive_env.devices import Device
 from drive_env.firmware import cycle
-from drive_env.firmware.record import LANES, RECORD
+from drive_env.firmware.cycle import Firmware
+from drive_env.firmware.record import LANES, RecordLayout
 from mechanics.packed import PackedLoad
 
 
@@ -20,15 +21,13 @@ class Channels(NamedTuple):
     offsets: NDArray[np.int64]
 
 
-def channels(fields: list[tuple[str, int]], kinds: list[int] | None = None) -> Channels:
+def channels(layout: RecordLayout, fields: list[tuple[str, int]], kinds: list[int] | None = None) -> Channels:
     """Return the channels of (field, part) pairs; `kinds` overrides what the field's type says."""
     found = []
     offsets = []
     for k, (name, part) in enumerate(fields):
-        dtype, start = RECORD.fields[name][:2]  # type: ignore[index]
-        size = dtype.base.itemsize
-        real = dtype.base.kind == "f"
-        offsets.append(start // size + part * LANES)
+        real, place = layout.place(name, part)
+        offsets.append(place)
         found.append((cycle.REAL if real else cycle.INTEGER) if kinds is None or kinds[k] < 0 else kinds[k])
     return Channels(np.array(found, np.int64), np.array(offsets, np.int64))
 
@@ -58,9 +57,10 @@ def rates_of(device: Device, physics_steps: int) -> cycle.Rates:
     return cycle.Rates(
         tick=1.0 / device.current_rate,
         window=1.0 / device.velocity_rate,
-        period=1.0 / device.profile_rate,
+        period=1.0 / device.supervision_rate,
         ticks=ticks,
-        windows=round(device.velocity_rate / device.profile_rate),
+        windows=round(device.velocity_rate / device.supervision_rate),
+        periods=round(device.supervision_rate / device.communication_rate),
         substeps=physics_steps,
         weights=np.ascontiguousarray(weights),
         moments=np.ascontiguousarray(weights * late),
@@ -70,16 +70,18 @@ def rates_of(device: Device, physics_steps: int) -> cycle.Rates:
 class Group:
     """Machines `machines` of a set, their mechanics and their records."""
 
-    def __init__(self, machines: slice, load: PackedLoad, records: NDArray[np.void], rates: cycle.Rates) -> None:
+    def __init__(
+        self, machines: slice, load: PackedLoad, records: NDArray[np.void], rates: cycle.Rates, firmware: Firmware
+    ) -> None:
         self.machines = machines
         self.load = load
         self._records = records
         self._rates = rates
         num_axes = load.copies * load.num_axes
         self.axes = slice(machines.start * load.num_axes, machines.start * load.num_axes + num_axes)
-        memory = records.view(np.uint8).reshape(len(records), RECORD.itemsize)
+        memory = records.view(np.uint8).reshape(len(records), firmware.layout.dtype.itemsize)
         self._motion = np.zeros((7, len(records) * LANES))
-        self.machinery = cycle.Machinery(
+        self.machinery = firmware.machinery(
             records=records,
             reals=memory.view(np.float64),
             integers=memory.view(np.int32),

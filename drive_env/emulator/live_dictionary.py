@@ -24,14 +24,13 @@ from drive_env.emulator.group import Channels, channels
 from drive_env.emulator.prepared_record import SCALES, PreparedObject, PreparedRecord
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.firmware import cycle
-from drive_env.firmware.modes import MODES
-from drive_env.firmware.record import PARAMETERS, get_lanes, set_lanes
+from drive_env.firmware.common.modes import MODES
+from drive_env.firmware.record import get_lanes, set_lanes
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_PARAMETERS = frozenset(field.name for field in PARAMETERS)
 _EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
 MODE_OF_OPERATION = (cia402.MODE, 0)
@@ -53,6 +52,8 @@ class LiveDictionary:
         self.entries: ObjectDictionary = device.new_dictionary()
         self.scale_key = device.roles.get(Role.POSITION_SCALE)  # whose write gives positions another scale
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
+        self._layout = device.firmware.layout
+        self._parameters = frozenset(field.name for field in self._layout.parameters)
         self._records = records
         self.num_axes = num_axes
         self._scale_changes = 0
@@ -104,7 +105,7 @@ class LiveDictionary:
         after = self._context()
         if np.any(before.position_scaler != after.position_scaler):
             self._scale_changes += 1
-        cycle.power_on(self._records, axes)
+        self.device.firmware.power_on(self._records, axes)
 
     @property
     def records(self) -> NDArray[np.void]:
@@ -155,9 +156,11 @@ class LiveDictionary:
         if any(row.code.field in SCALES for row in sources):
             return None
         into = channels(
-            [(row.code.field, row.code.part) for row in sources], [_EVENTS[row.code.event] for row in sources]
+            self._layout,
+            [(row.code.field, row.code.part) for row in sources],
+            [_EVENTS[row.code.event] for row in sources],
         )
-        out_of = channels([(row.code.field, row.code.part) for row in rows])
+        out_of = channels(self._layout, [(row.code.field, row.code.part) for row in rows])
         return PreparedRecord((into, sources), (out_of, rows), self._scale_changes)
 
     def _row(self, entry: Entry) -> PreparedObject:
@@ -199,7 +202,7 @@ class LiveDictionary:
             values[:, k] = self._from_od(code, raw if raw.ndim == 2 else raw[:, None])
             fields.append((code.field, code.part))
             kinds.append(_EVENTS[code.event])
-        return values, channels(fields, kinds) if fields else NOTHING
+        return values, channels(self._layout, fields, kinds) if fields else NOTHING
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _commission(self, preset: Mapping[str, int]) -> dict[tuple[int, int], Integers]:
@@ -238,11 +241,13 @@ class LiveDictionary:
             key
             for key in self._stored
             if key in self.codes
-            and (self.entries.find(key).access not in ("ro", "const") or self.codes[key].field in _PARAMETERS)
+            and (self.entries.find(key).access not in ("ro", "const") or self.codes[key].field in self._parameters)
         ]
         values = [self._from_od(self.codes[key], self._stored[key], context) for key in bound]
         fields = [(self.codes[key].field, self.codes[key].part) for key in bound]
-        return RecordSnapshot(self._records, fields, np.array([np.broadcast_to(value, (length,)) for value in values]))
+        return RecordSnapshot(
+            self._layout, self._records, fields, np.array([np.broadcast_to(value, (length,)) for value in values])
+        )
 
     def _is_bound(self, entry: Entry) -> bool:
         return (entry.index, entry.sub) in self.codes
@@ -296,7 +301,7 @@ class LiveDictionary:
             self._set_field(entry, raw, where)
             set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
         elif event >= 0:
-            cycle.write_events(self._records, event, raw, where)
+            self.device.firmware.write_events(self._records, event, raw, where)
         elif key == self.scale_key:
             self._rescale(entry, raw, where)
         else:

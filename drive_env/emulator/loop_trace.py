@@ -72,40 +72,43 @@ def trace_loops(
             raise ValueError(f"no signal is named {name!r}; there are {', '.join(SIGNALS)}")
     cycles = emulated._cycles(duration)
     values, played = emulated._objects.plan_play(play or {}, cycles)
-    sampled = channels([(name, 0) for name in signals])
-    windows = round(emulated.device.velocity_rate / emulated.device.profile_rate)
-    samples = np.empty((cycles, windows, len(signals), emulated.num_axes))
+    sampled = channels(emulated.device.firmware.layout, [(name, 0) for name in signals])
+    windows = round(emulated.device.velocity_rate / emulated.device.supervision_rate)
+    periods = round(emulated.device.supervision_rate / emulated.device.communication_rate)
+    samples = np.empty((cycles, periods, windows, len(signals), emulated.num_axes))
     live = get_lanes(emulated._records, "live", emulated.num_axes).astype(np.int32)
     rates = {id(group.machinery.rates): group.machinery.rates for group in emulated._groups}.values()
-    period = 1.0 / emulated.device.profile_rate
+    period = 1.0 / emulated.device.supervision_rate
+    nothing = np.empty((windows, 0, emulated.num_axes))
     begin, diverged = emulated._now, False
     try:
         # Each window as if it were a cycle.
         for one in rates:
-            one.replace(windows=1)
+            one.replace(windows=1, periods=1)
         for k in range(cycles):
             while emulated._schedule and emulated._schedule[0][0] <= begin + k:
                 _, name, row, where = emulated._schedule.pop(0)
                 emulated.machine.set(name, row, where)
-            first = call_of(np.ascontiguousarray(values[k : k + 1]), played, samples[k, :1], sampled, 1)
-            diverged |= emulated._run_groups(first, 0, 1, True, True)
-            # A lane that is not alive is computed as ever, and left out of what happens once a cycle.
-            set_lanes(emulated._records, "live", np.zeros(emulated.num_axes, np.int32))
-            for one in rates:
-                one.replace(period=0.0)
-            nothing = np.empty((windows - 1, 0, emulated.num_axes))
-            others = call_of(nothing, NOTHING, samples[k, 1:], sampled, 1)
-            diverged |= emulated._run_groups(others, 0, windows - 1, True, True)
-            set_lanes(emulated._records, "live", live)
-            for one in rates:
-                one.replace(period=period)
+            for p in range(periods):
+                first = (np.ascontiguousarray(values[k : k + 1]), played) if p == 0 else (nothing, NOTHING)
+                call = call_of(*first, samples[k, p, :1], sampled, 1)
+                diverged |= emulated._run_groups(call, 0, 1, True, True)
+                # A lane that is not alive is computed as ever, and left out of what happens once a period.
+                set_lanes(emulated._records, "live", np.zeros(emulated.num_axes, np.int32))
+                for one in rates:
+                    one.replace(period=0.0)
+                others = call_of(nothing, NOTHING, samples[k, p, 1:], sampled, 1)
+                diverged |= emulated._run_groups(others, 0, windows - 1, True, True)
+                set_lanes(emulated._records, "live", live)
+                for one in rates:
+                    one.replace(period=period)
             emulated._now = begin + k + 1
     finally:
         set_lanes(emulated._records, "live", live)
         for one in rates:
-            one.replace(windows=windows, period=period)
+            one.replace(windows=windows, periods=periods, period=period)
     if diverged:
         emulated._report_divergence()
-    rows = samples.reshape(cycles * windows, len(signals), emulated.num_axes)
+    rows = samples.reshape(cycles * periods * windows, len(signals), emulated.num_axes)
     t = np.arange(len(rows)) / emulated.device.velocity_rate
     return LoopTrace(t, {name: rows[:, k].copy() for k, name in enumerate(signals)})

@@ -17,7 +17,7 @@ from drive_env.emulator.parameters import check_known, check_parameter
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.faults.machine_faults import InjectedFault
 from drive_env.faults.schedule import Order
-from drive_env.firmware.record import STATE, get_lanes, set_lanes
+from drive_env.firmware.record import get_lanes, set_lanes
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -343,9 +343,10 @@ class Machines:
             group.load.reset(mask[group.machines])
         axes = np.repeat(mask, drives.num_axes // drives.num_machines)
         if self._rest is None:
-            parts = [(field, part) for field in STATE for part in range(field.depth)]
+            layout = drives.device.firmware.layout
+            parts = [(field, part) for field in layout.state for part in range(field.depth)]
             initial = np.array([[field.initial] for field, _ in parts])
-            self._rest = RecordSnapshot(drives._records, [(field.name, part) for field, part in parts], initial)
+            self._rest = RecordSnapshot(layout, drives._records, [(field.name, part) for field, part in parts], initial)
         self._rest.restore(axes)
         set_lanes(drives._records, "random", drives._noise_seeds, axes)
         for live, nominal in (("R_s", "R_nominal"), ("psi_m", "psi_nominal")):

@@ -12,7 +12,7 @@ from drive_env import motors
 from drive_env.devices import Device
 from drive_env.emulator.machine_numbers import machine_numbers
 from drive_env.firmware.record import get_lanes, set_lanes
-from drive_env.firmware.sensors import encoder_count
+from drive_env.firmware.servo.sensors import encoder_count
 from drive_env.motors import Motor
 from mechanics.load import Load
 from mechanics.near_names import did_you_mean

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drive_env.emulator.group import channels
 from drive_env.firmware import cycle
-from drive_env.firmware.record import LANES, RECORD
+from drive_env.firmware.record import LANES, RecordLayout
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -21,14 +21,17 @@ class RecordSnapshot:
     """Fields and the values that they get.
 
     Args:
+        layout: Of the records.
         records: Whose fields they are, contiguous.
         fields: Pairs of field and part.
         values: One row per field, of one value for all axes or one per axis.
     """
 
-    def __init__(self, records: NDArray[np.void], fields: Sequence[tuple[str, int]], values: Floats) -> None:
-        memory = records.view(np.uint8).reshape(len(records), RECORD.itemsize)
-        kinds, offsets = channels(list(fields))
+    def __init__(
+        self, layout: RecordLayout, records: NDArray[np.void], fields: Sequence[tuple[str, int]], values: Floats
+    ) -> None:
+        memory = records.view(np.uint8).reshape(len(records), layout.dtype.itemsize)
+        kinds, offsets = channels(layout, list(fields))
         real = kinds == cycle.REAL
         self._reals, self._integers = memory.view(np.float64), memory.view(np.int32)
         self._real_offsets, self._integer_offsets = offsets[real], offsets[~real]

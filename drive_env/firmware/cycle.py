@@ -1,39 +1,25 @@
-"""The drive's cycle: one call per stage, in the order in which the data flows.
+"""A drive's cycle, composed of the stages that its firmware names, in the order in which the data flows.
 
-Per millisecond: protection, automaton, mode and profile, statusword. Per window (the velocity loop's period): encoder,
-position and velocity loops, winding matrices; then the current ticks; then one step of the load's mechanics.
+Per supervision period: protection, automaton, mode and profile, statusword. Per window (the velocity loop's period):
+sensors, position and velocity loops, then the current loop's ticks; then one step of the load's mechanics. A
+communication cycle is one supervision period or several.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, make_dataclass
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numba import from_dtype, types
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.firmware import alignment, fsa, inputs, modes, protection, thermal
-from drive_env.firmware.arithmetic import TWO_PI, sine_cosine
-from drive_env.firmware.derived import derive
-from drive_env.firmware.loops import current_loop, motion_loops
-from drive_env.firmware.modes import hm, pp
-from drive_env.firmware.power_stage import (
-    convert_energy,
-    open_phases,
-    power_stage,
-    refresh_winding,
-)
-from drive_env.firmware.record import LANES, RECORD
-from drive_env.firmware.sensors import (
-    encoder_count,
-    measure_angle,
-    measure_currents,
-    measure_halls,
-    measure_motion,
-    shake_encoders,
-)
+from drive_env.firmware.common import fields, fsa, inputs, modes, protection, start_up
+from drive_env.firmware.common.modes import hm, pp
+from drive_env.firmware.common.protection import Cause, protection_of, row_of
+from drive_env.firmware.record import LANES, Field, RecordLayout
 from mechanics import stepping
 from mechanics.bundle import Bundle, Cube, Matrix, Numbers, reader
 from mechanics.calls import call_hook, next_number
@@ -49,6 +35,9 @@ BRAKE_OPEN, BRAKE_CLOSED, BRAKE_WITH_STAGE = 0, 1, 2
 # Time constant of the speed that decides whether the motor rotates [s]: encoder noise must not light bit 14.
 ACTIVITY_TIME = 0.02
 
+Stage = Callable[..., Any]
+Integers = Annotated[NDArray[np.int32], types.int32[:, ::1]]
+
 
 @dataclass(eq=False)
 class Rates(Bundle):
@@ -56,35 +45,15 @@ class Rates(Bundle):
 
     tick: float  # current loop
     window: float  # velocity and position loop
-    period: float  # profile, automaton, protection: the communication cycle
+    period: float  # supervision: profile, automaton, protection
     ticks: int  # per window
     windows: int  # per period
+    periods: int  # per communication cycle
     substeps: int  # physics steps per window
     # Share of each tick's torque in the mean of each physics step, shape (substeps, ticks).
     weights: Matrix
     # The same times the time from the step's middle to the tick's [s].
     moments: Matrix
-
-
-Records = Annotated[NDArray[np.void], types.Array(from_dtype(RECORD), 1, "C")]
-Integers = Annotated[NDArray[np.int32], types.int32[:, ::1]]
-
-
-@dataclass(eq=False)
-class Machinery(Bundle):
-    """What a run knows of a group of machines.
-
-    `reals` and `integers` are the records' memory, shape (blocks, numbers per record).
-    """
-
-    records: Records  # (blocks,)
-    reals: Matrix
-    integers: Integers
-    plant: PackedPlant
-    rates: Rates
-    motion: Matrix  # scratch, (7, 8 blocks)
-    first_axis: int  # number of the group's first axis in a call's rows
-    num_axes: int
 
 
 @dataclass(eq=False)
@@ -115,134 +84,121 @@ class Fleet(Bundle):
     turn: Numbers  # (1,)
 
 
-machinery_at, call_at, fleet_at = reader(Machinery), reader(Call), reader(Fleet)
+call_at, fleet_at = reader(Call), reader(Fleet)
 
 
-@inlined
-def collect_torque(drive, s, weight, moment):
-    """Add this tick's share to mean and first moment of the torque of physics step s of the window."""
-    for lane in range(LANES):
-        drive.tau_window[s, lane] += weight * drive.tau_m[lane]
-    for lane in range(LANES):
-        drive.moment_window[s, lane] += moment * drive.tau_m[lane]
+@dataclass(frozen=True)
+class FirmwareStages:
+    """What a drive's firmware is made of, beside what all drives share; a stage is a compiled function.
+
+    Attributes:
+        name: Of the list; no two may have the same.
+        parameters, state: Fields that its stages have in the record beside those of `common/fields.py`.
+        causes: What it watches, see `protection_of`.
+        begin_period: Stages (drive, rates) at the beginning of a supervision period.
+        measure: Stages (drive, lane, dt) before protection looks at its causes.
+        switch: Stages (drive, lane, dt) between automaton and mode: start-up, commutation, what switches the power
+            stage.
+        tell: Stages (drive, lane) after the mode: status objects of the device's own.
+        end_period: Stages (drive, rates) at the end of a supervision period.
+        window: Stages (drive, rates): sensors and outer loops, once per window.
+        tick: Stages (drive, rates, k): current loop and power stage, in tick k of a window.
+        power_on: Stages (drive, lane) that begin anew what belongs to its own fields.
+        halt: Stages (drive, lane) that take its own fields of a machine that left physics back to finite numbers.
+    """
+
+    name: str
+    parameters: Sequence[Field]
+    state: Sequence[Field]
+    causes: Sequence[Cause]
+    begin_period: Sequence[Stage]
+    measure: Sequence[Stage]
+    switch: Sequence[Stage]
+    tell: Sequence[Stage]
+    end_period: Sequence[Stage]
+    window: Sequence[Stage]
+    tick: Sequence[Stage]
+    power_on: Sequence[Stage]
+    halt: Sequence[Stage]
 
 
-@stage
-def tick(drive, rates, k):
-    """Run one period of the current loop, tick k of its window."""
-    if drive.block_uses_halls[0]:
-        measure_halls(drive, rates.tick)
-    measure_angle(drive, rates.tick)
-    measure_currents(drive)
-    current_loop(drive)
-    power_stage(drive)
-    if drive.block_has_open_phase[0]:
-        open_phases(drive)
-    convert_energy(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
-    collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
-    for s in range(1, rates.substeps):
-        collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+class Firmware(NamedTuple):
+    """A drive's firmware, composed and ready to be compiled at its first use.
+
+    Attributes:
+        layout: Of its records.
+        causes: What it watches; an emergency in a record's queue is a row of it, plus 1.
+        machinery: Makes the bundle of what a run knows of a group of machines: records, reals and integers (the
+            records' memory, shape (blocks, numbers per record)), plant, rates, motion (scratch, (7, 8 blocks)),
+            first_axis (number of the group's first axis in a call's rows), num_axes.
+        run: (fleet address, call address, start, cycles, first, last) -> whether a machine has left physics. Runs
+            groups for whole communication cycles from `start` up to `cycles`, taking turns with other threads; `first`
+            and `last` say whether the call's hooks are due.
+        run_drives_alone: (records, rates, periods): runs the drives without mechanics, rotors driven by their predicted
+            torque balance; the benchmark's bound.
+        write_events: (records, kind, values, where): processes writes of the controlword or the mode for the axes where
+            the mask is true.
+        power_on: (records, where): starts the firmware anew on the axes where the mask is true: transitions 0 and 1,
+            encoder at zero.
+        trip: (records, first axis, number of axes, row) -> how many axes that were in operation are in fault now, with
+            the reaction of a cause that is outside of them. Whoever knows the cause tells it: no emergency is queued.
+        communication_lost: The row of the cause that a node's network gives.
+        supervise, start_window, tick, window: The parts of a cycle, for tests that look between them.
+    """
+
+    layout: RecordLayout
+    causes: tuple[Cause, ...]
+    machinery: Callable[..., Any]
+    run: Any
+    run_drives_alone: Any
+    write_events: Any
+    power_on: Any
+    trip: Any
+    communication_lost: int
+    supervise: Any
+    start_window: Any
+    tick: Any
+    window: Any
 
 
-@stage
-def start_window(drive, rates):
-    """Read the encoder, close position and velocity loop, and prepare the winding for the ticks of this window."""
-    if not drive.block_uses_halls[0]:
-        measure_halls(drive, rates.window)
-    if drive.block_has_noisy_encoder[0]:
-        shake_encoders(drive)
-    measure_motion(drive, rates.window)
-    motion_loops(drive)
-    for lane in range(LANES):
-        s, _ = sine_cosine(drive.cogging_order[lane] * drive.theta_m[lane] + drive.cogging_phase[lane])
-        drive.tau_cogging[lane] = drive.cogging_torque[lane] * s
-    for s in range(rates.substeps):
-        for lane in range(LANES):
-            drive.tau_window[s, lane] = drive.tau_cogging[lane]
-            drive.moment_window[s, lane] = 0.0
-    refresh_winding(drive, rates.tick, rates.window)
+def _after(first: Stage, second: Stage) -> Stage:
+    """Return the stage that runs one stage of two arguments and then another, with the same."""
+
+    @stage
+    def both(drive, of):
+        first(drive, of)
+        second(drive, of)
+
+    return both
 
 
-@stage
-def window(drive, rates):
-    """Run the drive through one window."""
-    start_window(drive, rates)
-    for k in range(rates.ticks):
-        tick(drive, rates, k)
+def _after_of_three(first: Stage, second: Stage) -> Stage:
+    """Return the stage that runs one stage of three arguments and then another, with the same."""
 
+    @stage
+    def both(drive, of, more):
+        first(drive, of, more)
+        second(drive, of, more)
 
-@stage
-def supervise(drive, rates):
-    """Run what the drive does once per millisecond."""
-    thermal.warm(drive, rates.period)
-    derive(drive, rates.tick)
-    for lane in range(LANES):
-        if drive.live[lane] == 0 or drive.diverged[lane] == 1:
-            continue
-        drive.omega_slow[lane] += (drive.omega_meas[lane] - drive.omega_slow[lane]) * (rates.period / ACTIVITY_TIME)
-        inputs.read_inputs(drive, lane)
-        protection.protect(drive, lane, rates.period)
-        fsa.automatic_transitions(drive, lane, rates.period)
-        alignment.commutate(drive, lane, rates.period)
-        modes.generate_demand(drive, lane, rates.period)
-        fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane))
-        drive.status_flags[lane] = modes.status_flags(drive, lane) | protection.fault_flags(drive, lane)
-    # What few drives need is left out of the ticks of a block where none does.
-    drive.block_uses_halls[0] = 0
-    drive.block_has_open_phase[0] = 0
-    drive.block_has_noisy_encoder[0] = 0
-    for lane in range(LANES):
-        if drive.angle_source[lane] == alignment.HALL or drive.velocity_sensor[lane] == alignment.VELOCITY_BY_HALL:
-            drive.block_uses_halls[0] = 1
-        if drive.open_a[lane] > 0.0 or drive.open_b[lane] > 0.0 or drive.open_c[lane] > 0.0:
-            drive.block_has_open_phase[0] = 1
-        # Once more after the noise has ended, so that none of it is left in the angle.
-        if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
-            drive.block_has_noisy_encoder[0] = 1
-
-
-@stage
-def write_controlword(drive, lane, word):
-    """Process a write of 6040h completely: fault reset edge, state commands, new set-point, statusword."""
-    before = drive.controlword[lane]
-    drive.controlword[lane] = word
-    if word & cia402.FAULT_RESET and not before & cia402.FAULT_RESET:
-        fsa.reset_fault(drive, lane, protection.causes_gone(drive, lane))
-    fsa.command(drive, lane)
-    if drive.mode_display[lane] == modes.PP:
-        pp.new_set_point(drive, lane, before)
-    elif drive.mode_display[lane] == modes.HM:
-        hm.start_or_stop(drive, lane, before)
-    fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane))
-
-
-@stage
-def write_mode(drive, lane, mode):
-    """Process a write of 6060h: the mode changes at once."""
-    drive.mode[lane] = mode
-    if mode != drive.mode_display[lane]:
-        modes.change_mode(drive, lane)
-    fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane))
+    return both
 
 
 @stage
-def play_row(records, reals, integers, values, kinds, offsets, row, first_axis, num_axes):
-    """Write one row of played values to the axes of this group."""
-    for k in range(kinds.shape[0]):
-        for axis in range(num_axes):
-            block, lane = axis // LANES, axis % LANES
-            value = values[row, k, first_axis + axis]
-            if kinds[k] == REAL:
-                reals[block, offsets[k] + lane] = value
-            elif kinds[k] == SET_POINT:
-                reals[block, offsets[k] + lane] = value
-                records[block].set_point_fresh[lane] = 1
-            elif kinds[k] == INTEGER:
-                integers[block, offsets[k] + lane] = int(value)
-            elif kinds[k] == CONTROLWORD:
-                write_controlword(records[block], lane, int(value))
-            else:
-                write_mode(records[block], lane, int(value))
+def _nothing(drive, of):
+    pass
+
+
+@stage
+def _nothing_of_three(drive, of, more):
+    pass
+
+
+def in_turn(stages: Sequence[Stage], arguments: int) -> Stage:
+    """Return one stage that runs several, each with the same two or three arguments."""
+    found: Stage = _nothing if arguments == 2 else _nothing_of_three
+    for k, one in enumerate(stages):
+        found = one if k == 0 else (_after if arguments == 2 else _after_of_three)(found, one)
+    return found
 
 
 @stage
@@ -290,12 +246,6 @@ def mechanics_window(records, plant, rates, motion):
             drive.tau_reaction_before[lane] = drive.tau_reaction[lane]
         for lane in range(LANES):
             drive.tau_reaction[lane] = total[first + lane] / rates.substeps
-    axes_per_copy = plant.axis_motion.shape[0]
-    for copy in range(plant.diverged.shape[0]):
-        if plant.diverged[copy] == 1:
-            for axis in range(copy * axes_per_copy, (copy + 1) * axes_per_copy):
-                if records[axis // LANES].diverged[axis % LANES] == 0:
-                    halt_diverged(records[axis // LANES], axis % LANES)
 
 
 @stage
@@ -315,175 +265,338 @@ def meet(records, plant):
 
 
 @stage
-def halt_diverged(drive, lane):
-    """Take a lane out of the world: its machine left physics; its numbers must not reach anything."""
-    drive.diverged[lane] = 1
-    # Seen from the bus the axis is in fault and stands.
-    drive.fsa[lane] = fsa.FAULTED
-    drive.error_register[lane] |= protection.GENERIC_ERROR
+def reset_shared_state(drive, lane):
+    """Begin anew what all drives share; the encoder is at zero."""
+    drive.fsa[lane] = fsa.NOT_READY
+    drive.transition_pending[lane] = 0
+    drive.fault[lane] = 0
+    drive.error_register[lane] = 0
+    drive.emergency_count[lane] = 0
+    drive.internal_limit[lane] = 0
+    drive.stopping[lane] = 0
+    drive.set_point_valid[lane] = 0
+    drive.set_point_acknowledged[lane] = 0
+    drive.target_reached[lane] = 0
     drive.drive_function[lane] = 0.0
     drive.stage_on[lane] = 0.0
-    drive.omega_slow[lane] = 0.0
-    drive.omega_meas[lane] = 0.0
-    drive.velocity_filter_z[0, lane] = 0.0
-    drive.velocity_filter_z[1, lane] = 0.0
-    drive.velocity_sum[lane] = 0.0
-    drive.current_sum_d[lane] = 0.0
-    drive.current_sum_q[lane] = 0.0
-    drive.velocity_demand[lane] = 0.0
-    drive.position_demand[lane] = drive.theta_meas[lane]
-    drive.i_d[lane] = 0.0
-    drive.i_q[lane] = 0.0
+    drive.active[lane] = 0
+    drive.present[lane] = 0
+    drive.blocked[lane] = 0
+    drive.warning[lane] = 0
+    drive.init_state[lane] = start_up.NEEDED
+    drive.home_shift[lane] = 0.0
+    drive.home_count[lane] = 0.0
+    drive.homing_state[lane] = hm.IDLE
+    drive.homing_attained[lane] = 0
+    drive.loop_level[lane] = 0
+    drive.mode_display[lane] = drive.mode[lane]
     drive.tau_m[lane] = 0.0
+    drive.velocity_sum[lane] = 0.0
+    drive.omega_meas[lane] = 0.0
+    drive.omega_slow[lane] = 0.0
     drive.u_dc[lane] = drive.supply_voltage[lane]
-    drive.tau_reaction[lane] = 0.0
-    drive.tau_reaction_before[lane] = 0.0
-    fsa.update_statusword(drive, lane, 0)
+    drive.theta_meas[lane] = 0.0
+    drive.position_demand[lane] = 0.0
+    drive.velocity_demand[lane] = 0.0
+    drive.torque_demand[lane] = 0.0
+    drive.cause_flags[lane] = 0
 
 
-@inlined
-def run_group(group, call, start, cycles):
-    """Run one group; cycle k: play row k, record row k (every `every` cycles), simulate one period."""
-    records, reals, integers, plant, rates = group.records, group.reals, group.integers, group.plant, group.rates
-    for cycle in range(start, cycles):
-        play_row(
-            records, reals, integers, call.values, call.kinds, call.offsets, cycle, group.first_axis, group.num_axes
-        )
-        if cycle % call.every == 0:
-            sample_row(
-                reals, integers, call.samples, call.sample_kinds, call.sample_offsets, cycle // call.every,
-                group.first_axis, group.num_axes,
-            )  # fmt: skip
-        for block in range(records.shape[0]):
-            supervise(records[block], rates)
-        meet(records, plant)
-        for _ in range(rates.windows):
-            for block in range(records.shape[0]):
-                window(records[block], rates)
-            mechanics_window(records, plant, rates, group.motion)
+class _Events(NamedTuple):
+    """Stages that process what comes from outside: see `compose`."""
+
+    tell_state: Stage
+    write_controlword: Stage
+    write_mode: Stage
 
 
-@cached(allocates=False)
-def run(fleet_address, call_address, start, cycles, first, last):
-    """Run groups for whole communication cycles from `start` up to `cycles`, taking turns with other threads.
+def _events(causes_gone: Stage, cause_bits: Stage) -> _Events:
+    @stage
+    def tell_state(drive, lane):
+        """Write the statusword."""
+        fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane) | cause_bits(drive, lane))
 
-    `first` and `last` say whether the call's hooks are due. Returns whether a machine has left physics.
-    """
-    fleet, call = fleet_at(fleet_address), call_at(call_address)
-    groups, turn = fleet.groups, fleet.turn
-    some = False
-    k = next_number(turn)
-    while k < groups.shape[0]:
-        group = machinery_at(groups[k])
-        if not first or call.before == 0 or call_hook(call.before, call.data, group.first_axis, group.num_axes) != 0:
-            run_group(group, call, start, cycles)
-            if last and call.after != 0:
-                call_hook(call.after, call.data, group.first_axis, group.num_axes)
-        diverged = group.plant.diverged
-        for copy in range(diverged.shape[0]):
-            some |= diverged[copy] != 0
-        k = next_number(turn)
-    return some
+    @stage
+    def write_controlword(drive, lane, word):
+        """Process a write of 6040h completely: fault reset edge, state commands, new set-point, statusword."""
+        before = drive.controlword[lane]
+        drive.controlword[lane] = word
+        if word & cia402.FAULT_RESET and not before & cia402.FAULT_RESET:
+            fsa.reset_fault(drive, lane, causes_gone(drive, lane))
+        fsa.command(drive, lane)
+        if drive.mode_display[lane] == modes.PP:
+            pp.new_set_point(drive, lane, before)
+        elif drive.mode_display[lane] == modes.HM:
+            hm.start_or_stop(drive, lane, before)
+        tell_state(drive, lane)
 
+    @stage
+    def write_mode(drive, lane, mode):
+        """Process a write of 6060h: the mode changes at once."""
+        drive.mode[lane] = mode
+        if mode != drive.mode_display[lane]:
+            modes.change_mode(drive, lane)
+        tell_state(drive, lane)
 
-@cached(allocates=False)
-def run_drives_alone(records, rates, cycles):
-    """Run the drives without mechanics, rotors driven by their predicted torque balance; the benchmark's bound."""
-    for _ in range(cycles):
-        for block in range(records.shape[0]):
-            supervise(records[block], rates)
-        for _ in range(rates.windows):
-            for block in range(records.shape[0]):
-                window(records[block], rates)
+    return _Events(tell_state, write_controlword, write_mode)
 
 
-@cached(allocates=False)
-def write_events(records, kind, values, where):
-    """Process writes of the controlword or the mode for the axes where the mask is true."""
-    for axis in range(values.shape[0]):
-        if where[axis]:
-            drive = records[axis // LANES]
-            if kind == CONTROLWORD:
-                write_controlword(drive, axis % LANES, values[axis])
-            else:
-                write_mode(drive, axis % LANES, values[axis])
+def _window(start_window: Stage, tick: Stage) -> Stage:
+    @stage
+    def window(drive, rates):
+        """Run the drive through one window."""
+        start_window(drive, rates)
+        for k in range(rates.ticks):
+            tick(drive, rates, k)
+
+    return window
 
 
-@cached(allocates=False)
-def power_on(records, where):
-    """Start the drive's firmware anew on the axes where the mask is true: transitions 0 and 1, encoder at zero.
+def _supervise(stages: FirmwareStages, protect: Stage, tell_state: Stage) -> Stage:
+    begin_period, end_period = in_turn(stages.begin_period, 2), in_turn(stages.end_period, 2)
+    measure, switch, tell = in_turn(stages.measure, 3), in_turn(stages.switch, 3), in_turn(stages.tell, 2)
 
-    The commutation is aligned: the angle at which the rotor stands is known up to the commutation offset.
-    """
-    for axis in range(where.shape[0]):
-        if not where[axis]:
-            continue
-        drive = records[axis // LANES]
-        lane = axis % LANES
-        drive.fsa[lane] = fsa.NOT_READY
-        drive.transition_pending[lane] = 0
-        drive.fault[lane] = 0
-        drive.error_register[lane] = 0
-        drive.emergency_count[lane] = 0
-        drive.internal_limit[lane] = 0
-        drive.stopping[lane] = 0
-        drive.set_point_valid[lane] = 0
-        drive.set_point_acknowledged[lane] = 0
-        drive.target_reached[lane] = 0
+    @stage
+    def supervise(drive, rates):
+        """Run what the drive does once per supervision period."""
+        begin_period(drive, rates)
+        for lane in range(LANES):
+            if drive.live[lane] == 0 or drive.diverged[lane] == 1:
+                continue
+            drive.omega_slow[lane] += (drive.omega_meas[lane] - drive.omega_slow[lane]) * (rates.period / ACTIVITY_TIME)
+            inputs.read_inputs(drive, lane)
+            measure(drive, lane, rates.period)
+            protect(drive, lane)
+            fsa.automatic_transitions(drive, lane, rates.period)
+            switch(drive, lane, rates.period)
+            modes.generate_demand(drive, lane, rates.period)
+            tell_state(drive, lane)
+            tell(drive, lane)
+        end_period(drive, rates)
+
+    return supervise
+
+
+def _play_row(events: _Events) -> Stage:
+    write_controlword, write_mode = events.write_controlword, events.write_mode
+
+    @stage
+    def play_row(records, reals, integers, values, kinds, offsets, row, first_axis, num_axes):
+        """Write one row of played values to the axes of this group."""
+        for k in range(kinds.shape[0]):
+            for axis in range(num_axes):
+                block, lane = axis // LANES, axis % LANES
+                value = values[row, k, first_axis + axis]
+                if kinds[k] == REAL:
+                    reals[block, offsets[k] + lane] = value
+                elif kinds[k] == SET_POINT:
+                    reals[block, offsets[k] + lane] = value
+                    records[block].set_point_fresh[lane] = 1
+                elif kinds[k] == INTEGER:
+                    integers[block, offsets[k] + lane] = int(value)
+                elif kinds[k] == CONTROLWORD:
+                    write_controlword(records[block], lane, int(value))
+                else:
+                    write_mode(records[block], lane, int(value))
+
+    return play_row
+
+
+def _leave_diverged(halt: Stage) -> Stage:
+    @stage
+    def halt_diverged(drive, lane):
+        """Take a lane out of the world: its machine left physics; its numbers must not reach anything."""
+        drive.diverged[lane] = 1
+        # Seen from the bus the axis is in fault and stands.
+        drive.fsa[lane] = fsa.FAULTED
+        drive.error_register[lane] |= protection.GENERIC_ERROR
         drive.drive_function[lane] = 0.0
         drive.stage_on[lane] = 0.0
-        drive.active[lane] = 0
-        drive.present[lane] = 0
-        drive.blocked[lane] = 0
-        drive.warning[lane] = 0
-        drive.overload[lane] = 0.0
-        drive.init_state[lane] = alignment.NEEDED
-        drive.home_shift[lane] = 0.0
-        drive.home_count[lane] = 0.0
-        drive.homing_state[lane] = hm.IDLE
-        drive.homing_attained[lane] = 0
-        drive.loop_level[lane] = 0
-        drive.mode_display[lane] = drive.mode[lane]
-        drive.i_d[lane] = 0.0
-        drive.i_q[lane] = 0.0
-        drive.tau_m[lane] = 0.0
-        drive.duty_alpha[lane] = 0.0
-        drive.duty_beta[lane] = 0.0
-        drive.duty_next_alpha[lane] = 0.0
-        drive.duty_next_beta[lane] = 0.0
-        drive.current_sum_d[lane] = 0.0
-        drive.current_sum_q[lane] = 0.0
-        drive.velocity_sum[lane] = 0.0
-        drive.i_q_ref[lane] = 0.0
-        drive.omega_meas[lane] = 0.0
         drive.omega_slow[lane] = 0.0
-        drive.velocity_filter_z[0, lane] = 0.0
-        drive.velocity_filter_z[1, lane] = 0.0
-        drive.u_dc[lane] = drive.supply_voltage[lane]
-        s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
-        drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
-        count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI)
-        gain = drive.encoder_gain[lane]
-        told = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI * gain
-        drive.count[lane] = encoder_count(told, drive.encoder_true_direction[lane])
-        drive.count_zero[lane] = drive.count[lane]
-        drive.angle_zero[lane] = (
-            drive.n_p[lane] * (count + 0.5) * TWO_PI / drive.encoder_counts[lane] + drive.commutation_offset[lane]
-        )
-        sector = np.floor((drive.n_p[lane] * drive.theta_m[lane] + drive.hall_true_offset[lane]) * (6.0 / TWO_PI))
-        reverse = abs(drive.hall_true_direction[lane] - drive.hall_direction[lane])
-        sector += reverse * (-1.0 - 2.0 * sector)
-        sector += 3.0 * abs(drive.hall_true_polarity[lane] - drive.hall_polarity[lane])
-        drive.hall_sector[lane] = sector
-        drive.hall_zero[lane] = sector
-        drive.hall_time[lane] = 1.0
-        drive.hall_period[lane] = 1.0
-        drive.angle_hall[lane] = (sector + 0.5) * (TWO_PI / 6.0) - drive.hall_offset[lane]
-        drive.theta_meas[lane] = 0.0
-        drive.position_demand[lane] = 0.0
+        drive.omega_meas[lane] = 0.0
+        drive.velocity_sum[lane] = 0.0
         drive.velocity_demand[lane] = 0.0
-        drive.torque_demand[lane] = 0.0
-        inputs.read_inputs(drive, lane)
-        fsa.automatic_transitions(drive, lane, 0.0)
-        fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane))
-        drive.status_flags[lane] = modes.status_flags(drive, lane)
+        drive.position_demand[lane] = drive.theta_meas[lane]
+        drive.tau_m[lane] = 0.0
+        drive.u_dc[lane] = drive.supply_voltage[lane]
+        drive.tau_reaction[lane] = 0.0
+        drive.tau_reaction_before[lane] = 0.0
+        halt(drive, lane)
+        fsa.update_statusword(drive, lane, 0)
+
+    @stage
+    def leave_diverged(records, plant):
+        """Take the axes of machines that have left physics out of the world."""
+        axes_per_copy = plant.axis_motion.shape[0]
+        for copy in range(plant.diverged.shape[0]):
+            if plant.diverged[copy] == 1:
+                for axis in range(copy * axes_per_copy, (copy + 1) * axes_per_copy):
+                    if records[axis // LANES].diverged[axis % LANES] == 0:
+                        halt_diverged(records[axis // LANES], axis % LANES)
+
+    return leave_diverged
+
+
+def _run_group(play_row: Stage, supervise: Stage, window: Stage, leave_diverged: Stage) -> Stage:
+    @inlined
+    def run_group(group, call, start, cycles):
+        """Run one group; cycle k: play row k, record row k (every `every` cycles), simulate one cycle."""
+        records, reals, integers, plant, rates = group.records, group.reals, group.integers, group.plant, group.rates
+        for cycle in range(start, cycles):
+            play_row(
+                records, reals, integers, call.values, call.kinds, call.offsets, cycle, group.first_axis, group.num_axes
+            )
+            if cycle % call.every == 0:
+                sample_row(
+                    reals, integers, call.samples, call.sample_kinds, call.sample_offsets, cycle // call.every,
+                    group.first_axis, group.num_axes,
+                )  # fmt: skip
+            for _ in range(rates.periods):
+                for block in range(records.shape[0]):
+                    supervise(records[block], rates)
+                meet(records, plant)
+                for _ in range(rates.windows):
+                    for block in range(records.shape[0]):
+                        window(records[block], rates)
+                    mechanics_window(records, plant, rates, group.motion)
+                    leave_diverged(records, plant)
+
+    return run_group
+
+
+def _run(source: str, machinery_at: Any, run_group: Stage) -> Any:
+    @cached(allocates=False, source=source)
+    def run(fleet_address, call_address, start, cycles, first, last):
+        fleet, call = fleet_at(fleet_address), call_at(call_address)
+        groups, turn = fleet.groups, fleet.turn
+        some = False
+        k = next_number(turn)
+        while k < groups.shape[0]:
+            group = machinery_at(groups[k])
+            if (
+                not first
+                or call.before == 0
+                or call_hook(call.before, call.data, group.first_axis, group.num_axes) != 0
+            ):
+                run_group(group, call, start, cycles)
+                if last and call.after != 0:
+                    call_hook(call.after, call.data, group.first_axis, group.num_axes)
+            diverged = group.plant.diverged
+            for copy in range(diverged.shape[0]):
+                some |= diverged[copy] != 0
+            k = next_number(turn)
+        return some
+
+    return run
+
+
+def _run_drives_alone(source: str, supervise: Stage, window: Stage) -> Any:
+    @cached(allocates=False, source=source)
+    def run_drives_alone(records, rates, periods):
+        for _ in range(periods):
+            for block in range(records.shape[0]):
+                supervise(records[block], rates)
+            for _ in range(rates.windows):
+                for block in range(records.shape[0]):
+                    window(records[block], rates)
+
+    return run_drives_alone
+
+
+def _write_events(source: str, events: _Events) -> Any:
+    write_controlword, write_mode = events.write_controlword, events.write_mode
+
+    @cached(allocates=False, source=source)
+    def write_events(records, kind, values, where):
+        for axis in range(values.shape[0]):
+            if where[axis]:
+                drive = records[axis // LANES]
+                if kind == CONTROLWORD:
+                    write_controlword(drive, axis % LANES, values[axis])
+                else:
+                    write_mode(drive, axis % LANES, values[axis])
+
+    return write_events
+
+
+def _power_on(source: str, stages: FirmwareStages, tell_state: Stage) -> Any:
+    begin_anew, tell = in_turn(stages.power_on, 2), in_turn(stages.tell, 2)
+
+    @cached(allocates=False, source=source)
+    def power_on(records, where):
+        for axis in range(where.shape[0]):
+            if not where[axis]:
+                continue
+            drive = records[axis // LANES]
+            lane = axis % LANES
+            reset_shared_state(drive, lane)
+            begin_anew(drive, lane)
+            inputs.read_inputs(drive, lane)
+            fsa.automatic_transitions(drive, lane, 0.0)
+            tell_state(drive, lane)
+            tell(drive, lane)
+
+    return power_on
+
+
+def _trip(source: str, take_into_fault: Stage) -> Any:
+    @cached(source=source)
+    def trip(records, first_axis, num_axes, cause):
+        taken = 0
+        for axis in range(first_axis, first_axis + num_axes):
+            drive = records[axis // LANES]
+            lane = axis % LANES
+            if drive.fsa[lane] != fsa.ENABLED:
+                continue
+            take_into_fault(drive, lane, cause)
+            taken += 1
+        return taken
+
+    return trip
+
+
+def _machinery(name: str, layout: RecordLayout, source: str) -> Any:
+    """Return the bundle's class; its name tells compiled code which records it has."""
+    columns = [
+        ("records", Annotated[NDArray[np.void], types.Array(from_dtype(layout.dtype), 1, "C")]),
+        ("reals", Matrix),
+        ("integers", Integers),
+        ("plant", PackedPlant),
+        ("rates", Rates),
+        ("motion", Matrix),
+        ("first_axis", int),
+        ("num_axes", int),
+    ]
+    return make_dataclass(f"Machinery_{name}", columns, bases=(Bundle,), eq=False, namespace={"__module__": source})
+
+
+def compose(stages: FirmwareStages, source: str) -> Firmware:
+    """Return the firmware of a list of stages.
+
+    Args:
+        stages: The list.
+        source: Name of the module that has it: compiled kernels are kept by its sources and all that it imports.
+    """
+    layout = RecordLayout((*fields.PARAMETERS, *stages.parameters), (*fields.STATE, *stages.state))
+    machinery = _machinery(stages.name, layout, source)
+    guard = protection_of(stages.causes)
+    events = _events(guard.causes_gone, guard.statusword_bits)
+    supervise = _supervise(stages, guard.protect, events.tell_state)
+    start_window, tick = in_turn(stages.window, 2), in_turn(stages.tick, 3)
+    window = _window(start_window, tick)
+    leave_diverged = _leave_diverged(in_turn(stages.halt, 2))
+    return Firmware(
+        layout=layout,
+        causes=tuple(stages.causes),
+        machinery=machinery,
+        run=_run(source, reader(machinery), _run_group(_play_row(events), supervise, window, leave_diverged)),
+        run_drives_alone=_run_drives_alone(source, supervise, window),
+        write_events=_write_events(source, events),
+        power_on=_power_on(source, stages, events.tell_state),
+        trip=_trip(source, guard.trip),
+        communication_lost=row_of(stages.causes, protection.COMMUNICATION),
+        supervise=supervise,
+        start_window=start_window,
+        tick=tick,
+        window=window,
+    )

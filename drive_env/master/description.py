@@ -177,7 +177,7 @@ def describe(device: str | None, eds: str | Path | None) -> Description:
             known.num_axes,
             known,
             known.master,
-            cycle=1.0 / known.profile_rate,
+            cycle=1.0 / known.communication_rate,
             _types=_read_types(known.eds),
         )
     path = Path(eds)

@@ -24,8 +24,8 @@ from drive_env.emulator.live_dictionary import (
     check_supported,
     refuse_same_mode,
 )
-from drive_env.firmware import cycle, protection
-from drive_env.firmware.record import EMERGENCY_QUEUE, LANES, RECORD
+from drive_env.firmware import cycle
+from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
 
 
 class ObjectPort(NamedTuple):
@@ -42,7 +42,7 @@ class ObjectPort(NamedTuple):
 
 
 class QueuedEmergency(NamedTuple):
-    """An emergency that an axis queued: row of `protection.CAUSES` and the error register of that moment."""
+    """An emergency that an axis queued: row of the firmware's causes and the error register of that moment."""
 
     row: int
     error_register: int
@@ -104,15 +104,14 @@ class Axis:
 
     def trip(self) -> bool:
         """Take the axis from operation enabled into fault because its network is lost; return whether it was there."""
-        taken = protection.trip(self._records, self._lane, 1, protection.COMMUNICATION)  # type: ignore[no-untyped-call]
-        return bool(taken)
+        firmware = self._device.firmware
+        return bool(firmware.trip(self._records, self._lane, 1, firmware.communication_lost))
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _place(self, field: str, part: int = 0) -> tuple[Any, int]:
         """Return the memory that a field is in, and its index there."""
-        dtype, start = RECORD.fields[field][:2]  # type: ignore[index]
-        memory = self._reals if dtype.base.kind == "f" else self._integers
-        return memory, start // dtype.base.itemsize + part * LANES + self._lane
+        real, place = self._device.firmware.layout.place(field, part)
+        return self._reals if real else self._integers, place + self._lane
 
     def _make_port(self, entry: Entry) -> ObjectPort:
         code = self._objects.codes.get((entry.index, entry.sub))
@@ -196,4 +195,4 @@ class Axis:
 
     def _write_event(self, kind: int, raw: int) -> None:
         self._word[self._lane] = raw
-        cycle.write_events(self._records, kind, self._word, self._here)  # type: ignore[no-untyped-call]
+        self._device.firmware.write_events(self._records, kind, self._word, self._here)

@@ -18,7 +18,7 @@ class ErrorCondition(NamedTuple):
     lasts: bool
 
 
-# Of the node, beside the causes of its axes (firmware/protection.py).
+# Of the node, beside the causes of its axes (firmware/servo/causes.py).
 CONDITIONS = {
     row.name: row
     for row in (

@@ -34,7 +34,7 @@ def seen_by_bus(device: Device, f: Floats, closed_loop: Response) -> Complex:
 
 def split(device: Device, f: Floats, closed_loop: Response) -> tuple[Complex, Complex]:
     """Return the share of T_bus that is T at f itself, and the share of its images."""
-    at = f + device.profile_rate * np.arange(windows(device))[:, None]
+    at = f + device.communication_rate * np.arange(windows(device))[:, None]
     # A sampled loop's answer repeats with its rate, and is conjugate above half of it.
     above = at > 0.5 * device.velocity_rate
     answer = closed_loop(np.where(above, device.velocity_rate - at, at).reshape(-1)).reshape(at.shape)
@@ -49,7 +49,7 @@ def unhold(device: Device, f: Floats, seen: Complex, images: Complex) -> Complex
 
 def windows(device: Device) -> int:
     """Return the windows of the velocity loop in a communication cycle."""
-    return round(device.velocity_rate / device.profile_rate)
+    return round(device.velocity_rate / device.communication_rate)
 
 
 def _hold(device: Device, f: Floats) -> Complex:

@@ -179,7 +179,7 @@ def resolve(experiment: Experiment) -> Resolved:
     entries = tuple(_swept_entry(device, dictionary, k, swept) for k, swept in enumerate(experiment.sweep, 1))
     _check_grid(experiment, entries)
     _check_metric(experiment.metric)
-    _check_times(experiment.excitation, 1.0 / device.profile_rate)
+    _check_times(experiment.excitation, 1.0 / device.communication_rate)
     scaler = int(dictionary.find(Role.POSITION_SCALE).default)
     scaler = {dictionary.find(name).label: value for name, value in preset.items()}.get(
         dictionary.find(Role.POSITION_SCALE).label, scaler

@@ -1,10 +1,9 @@
 """One axis and its node as the safety model sees them: explicit states, moved by the tables that the emulator runs by.
 
-The automaton is `firmware/fsa.py`'s TRANSITIONS, what lives in which NMT state is `canopen/nmt.py`'s SERVICES, and the
-heartbeat consumer's rule is that of `canopen/error_control.py`: watching begins with the first heartbeat, and a loss
-is told once. Time is counted in ticks. A tick is longer than the silence that the consumer allows and longer than any
-ramp, so that what a drive does by itself is done within one.
-"""
+The automaton is TRANSITIONS of `firmware/common/fsa.py`, what lives in which NMT state is SERVICES of `canopen/nmt.py`,
+and the heartbeat consumer's rule is that of `canopen/error_control.py`: watching begins with the first heartbeat, and a
+loss is told once. Time is counted in ticks. A tick is longer than the silence that the consumer allows and longer than
+any ramp, so that what a drive does by itself is done within one."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ from typing import NamedTuple
 from drive_env import cia402
 from drive_env.canopen.nmt import SERVICES, Command, NmtState
 from drive_env.cia402 import State
-from drive_env.firmware.fsa import AUTOMATIC_TRANSITIONS, TRANSITIONS
+from drive_env.firmware.common.fsa import AUTOMATIC_TRANSITIONS, TRANSITIONS
 
 NOBODY = 0  # node-ID in 1016h: no node is watched
 LIVE = frozenset({State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drive_env import cia402
 from drive_env.canopen.nmt import SERVICES, Command, NmtState
-from drive_env.firmware.fsa import ENABLE_OPERATION
+from drive_env.firmware.common.fsa import ENABLE_OPERATION
 from drive_env.safety.model.drive import NOBODY, hear, latch, sync, take_nmt
 from drive_env.safety.model.frames import deliver, transfers
 from drive_env.safety.model.rules import (

@@ -11,7 +11,7 @@ matrices change with speed only and are refreshed once per window. A DC motor is
 
 from __future__ import annotations
 
-from drive_env.firmware.arithmetic import clip, cosine_series, exponential, sine_series
+from drive_env.firmware.common.arithmetic import clip, cosine_series, exponential, sine_series
 from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined
 

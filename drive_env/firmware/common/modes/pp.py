@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from drive_env import cia402
-from drive_env.firmware import fsa, profiles
-from drive_env.firmware.protection import ROUNDING, corrected_maximum, corrected_minimum
+from drive_env.firmware.common import fsa, profiles
+from drive_env.firmware.common.limits import ROUNDING, corrected_maximum, corrected_minimum
 from mechanics.compiled import stage
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drive_env.firmware.arithmetic import TWO_PI, sine_cosine
+from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined, stage
 
@@ -199,8 +199,7 @@ ADC_CENTRE = 33500.0
 
 
 @stage
-def counts_per_turn(drive, lane):
-    """Return the counts of a revolution of the sensor that tells the position: the halls, or the encoder."""
-    if drive.angle_source[lane] == 2.0 and drive.always_use_encoder[lane] == 0.0:
-        return 6.0 * drive.pole_pairs[lane]
-    return drive.encoder_steps[lane]
+def tell_counts(drive, lane):
+    """Write the counts of a revolution of the sensor that tells the position: the halls, or the encoder."""
+    by_hall = drive.angle_source[lane] == 2.0 and drive.always_use_encoder[lane] == 0.0
+    drive.counts_per_turn[lane] = 6.0 * drive.pole_pairs[lane] if by_hall else drive.encoder_steps[lane]

@@ -12,6 +12,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.cia402 import STATE_CODING, Pattern, State
+from drive_env.firmware.common import start_up
 from drive_env.firmware.record import EMERGENCY_QUEUE
 from mechanics.compiled import stage
 
@@ -73,7 +74,6 @@ STOPPING = int(State.QUICK_STOP_ACTIVE)
 REACTING = int(State.FAULT_REACTION_ACTIVE)
 FAULTED = int(State.FAULT)
 
-INITIALIZATION_FAILED = 4  # state of alignment.py
 WARNING_BIT = cia402.WARNING.value
 
 # Rows of every device's emergency table that the automaton itself sends.
@@ -126,8 +126,8 @@ def _enter(drive, lane, number, end):
         drive.fault[lane] = 0
         drive.error_register[lane] = 0
         push_emergency(drive, lane, EMERGENCY_RESET)
-    if number == 3 and drive.init_state[lane] == INITIALIZATION_FAILED:
-        drive.init_state[lane] = 0  # tried again
+    if number == 3 and drive.init_state[lane] == start_up.FAILED:
+        drive.init_state[lane] = start_up.NEEDED  # tried again
     drive.drive_function[lane] = 1.0 if has_drive_function(end) else 0.0
     if not has_drive_function(end):
         drive.stopping[lane] = 0

@@ -14,8 +14,8 @@ edge as the methods have them:
 from __future__ import annotations
 
 from drive_env import cia402
-from drive_env.firmware import fsa, inputs, profiles, sensors
-from drive_env.firmware.arithmetic import TWO_PI
+from drive_env.firmware.common import fsa, inputs, profiles
+from drive_env.firmware.common.arithmetic import TWO_PI
 from mechanics.compiled import stage
 
 LEFT, RIGHT, HOME = 0, 1, 2
@@ -78,7 +78,7 @@ def forget(drive, lane):
 @stage
 def set_home(drive, lane, position, value):
     """Give `position` [rad] the value `value` [rad]; demand and measurement move together, so nothing jumps."""
-    drive.home_count[lane] = (position + drive.home_shift[lane]) * sensors.counts_per_turn(drive, lane) / TWO_PI
+    drive.home_count[lane] = (position + drive.home_shift[lane]) * drive.counts_per_turn[lane] / TWO_PI
     shift = position - value
     drive.home_shift[lane] += shift
     drive.theta_meas[lane] -= shift

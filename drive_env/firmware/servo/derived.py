@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drive_env.firmware.arithmetic import TWO_PI
+from drive_env.firmware.common.arithmetic import TWO_PI
 from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined
 

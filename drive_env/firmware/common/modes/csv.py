@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drive_env.firmware.modes import cyclic
+from drive_env.firmware.common.modes import cyclic
 from mechanics.compiled import stage
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drive_env.firmware import profiles
-from drive_env.firmware.modes import cyclic
-from drive_env.firmware.protection import ROUNDING, corrected_maximum, corrected_minimum
+from drive_env.firmware.common import profiles
+from drive_env.firmware.common.limits import ROUNDING, corrected_maximum, corrected_minimum
+from drive_env.firmware.common.modes import cyclic
 from mechanics.compiled import stage
 
 

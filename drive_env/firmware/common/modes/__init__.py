@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from drive_env import cia402
-from drive_env.firmware import alignment, fsa, profiles, protection
-from drive_env.firmware.modes import csp, cst, csv, cyclic, hm, idle, pp, pv
+from drive_env.firmware.common import fsa, profiles, protection, start_up
+from drive_env.firmware.common.modes import csp, cst, csv, cyclic, hm, idle, pp, pv
 from mechanics.compiled import stage
 
 
@@ -170,7 +170,7 @@ def generate_demand(drive, lane, dt):
         drive.braking[lane] = 0
         cyclic.forget(drive, lane)
         return
-    if alignment.is_busy(drive, lane):
+    if start_up.is_busy(drive, lane):
         drive.position_demand[lane] = drive.theta_meas[lane]
         drive.velocity_demand[lane] = 0.0
         drive.velocity_sum[lane] = 0.0
@@ -200,55 +200,22 @@ def generate_demand(drive, lane, dt):
 
 @stage
 def mode_bits(drive, lane):
-    """Return bits 12 and 13 of the statusword as the present mode documents them (tables 148, 217, 237, 263, 283).
-
-    And bit 11 of an axis that is past a software limit, beside that of a target that is.
-    """
+    """Return bit 12 of the statusword as the present mode documents it (tables 148, 217, 237, 263, 283)."""
     mode = drive.mode_display[lane]
-    bits = protection.limit_bit(drive, lane)
+    bits = 0
     if mode == PP:
         if drive.set_point_acknowledged[lane] == 1:
             bits |= 0x1000
     elif mode == HM:
         if drive.homing_attained[lane] == 1:
             bits |= 0x1000
-    elif mode in (CSP, CSV, CST):
+    elif (
         # 1 while the target is the input of the control loop.
-        if (
-            drive.fsa[lane] == fsa.ENABLED
-            and drive.stopping[lane] == 0
-            and (drive.controlword[lane] & cia402.HALT) == 0
-            and not is_blocked(drive, lane)
-        ):
-            bits |= 0x1000
-        if mode == CSP and drive.fault[lane] == protection.FOLLOWING_ERROR + 1:
-            bits |= 0x2000
+        mode in (CSP, CSV, CST)
+        and drive.fsa[lane] == fsa.ENABLED
+        and drive.stopping[lane] == 0
+        and (drive.controlword[lane] & cia402.HALT) == 0
+        and not is_blocked(drive, lane)
+    ):
+        bits |= 0x1000
     return bits
-
-
-# Bits of 2101h (table 85); those of the faults are the protection's.
-FLAG_HALTED, FLAG_STOP, FLAG_VELOCITY, FLAG_POSITION, FLAG_TORQUE = 1 << 4, 1 << 8, 1 << 9, 1 << 10, 1 << 11
-FLAG_POSITION_END, FLAG_INITIALIZED, FLAG_BRAKE = 1 << 14, 1 << 15, 1 << 18
-
-
-@stage
-def status_flags(drive, lane):
-    """Return the bits of 2101h that tell what the motor does."""
-    flags = FLAG_INITIALIZED if drive.fsa[lane] != fsa.NOT_READY else 0
-    if abs(drive.omega_slow[lane]) <= drive.standstill[lane]:
-        flags |= FLAG_HALTED
-    stops = drive.drive_function[lane] == 0.0 or drive.stopping[lane] == 1 or drive.braking[lane] == 1
-    # While the encoder is aligned the motor is in none of its modes.
-    if stops or alignment.is_busy(drive, lane):
-        flags |= FLAG_STOP
-    elif drive.loop_level[lane] == 2.0:
-        flags |= FLAG_POSITION
-    elif drive.loop_level[lane] == 1.0:
-        flags |= FLAG_VELOCITY
-    else:
-        flags |= FLAG_TORQUE
-    if drive.mode_display[lane] == PP and drive.target_reached[lane] == 1:
-        flags |= FLAG_POSITION_END
-    if drive.chopper[lane] > 0.0:
-        flags |= FLAG_BRAKE
-    return flags

@@ -7,7 +7,7 @@ offset knows the alignment from before.
 
 from __future__ import annotations
 
-from drive_env.firmware import fsa
+from drive_env.firmware.common.start_up import DONE, FAILED, FIRST_ANGLE, NEEDED, SECOND_ANGLE, is_busy
 from mechanics.compiled import stage
 
 TWO_PI = 6.283185307179586
@@ -18,9 +18,6 @@ DISABLED, OPEN_LOOP, HALL, ENCODER = 0.0, 1.0, 2.0, 3.0
 FORCED, DC_FRAME = 4.0, 5.0
 ESTIMATE, USE_OFFSET, USE_HALL = 0, 1, 2
 VELOCITY_BY_HALL = 1.0  # 2042h:05
-
-# States of the initialisation.
-NEEDED, FIRST_ANGLE, SECOND_ANGLE, DONE, FAILED = 0, 1, 2, 3, 4
 
 HOLD_TIME = 0.4  # s at each angle: the rotor swings in
 LONGEST_HOLD = 3.0  # s after which the angle is taken even if it still swings
@@ -38,12 +35,6 @@ def _encoder_turn(drive, lane):
 def has_come_to_rest(drive, lane):
     """Return whether the held rotor stands, or has had time enough."""
     return abs(drive.omega_slow[lane]) <= 0.25 * drive.standstill[lane] or drive.init_time[lane] > LONGEST_HOLD
-
-
-@stage
-def is_busy(drive, lane):
-    """Return whether an initialisation turns the motor, so that the mode has to wait."""
-    return drive.init_state[lane] == FIRST_ANGLE or drive.init_state[lane] == SECOND_ANGLE
 
 
 @stage
@@ -118,9 +109,3 @@ def needs_halls(drive, lane):
         or drive.velocity_sensor[lane] == VELOCITY_BY_HALL
         or (drive.angle_source[lane] == ENCODER and drive.encoder_init_mode[lane] == USE_HALL)
     )
-
-
-@stage
-def has_failed(drive, lane):
-    """Return whether the encoder's initialisation failed."""
-    return drive.init_state[lane] == FAILED and drive.fsa[lane] >= fsa.SWITCHED

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drive_env.firmware import profiles
+from drive_env.firmware.common import profiles
 from mechanics.compiled import stage
 
 

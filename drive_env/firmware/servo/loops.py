@@ -6,7 +6,7 @@ x = clip(x + P I e), out = clip(P e + x), both at the output's limit, without ba
 
 from __future__ import annotations
 
-from drive_env.firmware.arithmetic import clip
+from drive_env.firmware.common.arithmetic import clip
 from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined
 

@@ -1,0 +1,261 @@
+"""Protection: the causes that a drive watches, once per supervision period, and what each does.
+
+A cause is a physical condition of the axis, and a row of the table that a device's firmware names. Its emergency code
+and bytes are the device's data, by name; which cause has which reaction stands in its row: what endangers the stage
+cuts it, what endangers the machine stops it with the fault reaction of 605Eh, a limit of travel stops the axis and
+stays enabled, a warning only tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from drive_env import cia402
+from drive_env.firmware.common import fsa, limits
+from mechanics.compiled import stage
+
+CUT, STOP, LIMIT, WARN = 0, 1, 2, 3
+BLOCKS_NEGATIVE, BLOCKS_POSITIVE = 1, 2
+GENERIC_ERROR = 0x01  # bit 0 of 1001h is set with every error
+LIMIT_REGISTER = 0x20  # of 1001h, of an axis at a limit
+# Names that the core itself asks for.
+FAULT_RESET, COMMUNICATION, FOLLOWING_ERROR = "fault_reset", "communication_error", "following_error"
+
+
+class Cause(NamedTuple):
+    """A row.
+
+    Attributes:
+        name: As in the device's emergency table.
+        reaction: CUT, STOP, LIMIT or WARN.
+        error_register: Bits of 1001h.
+        status_flag: Bits of the device's status flags, where it has them.
+        condition: Stage (drive, lane, whether it was there at the last look) -> whether it is there; None of what
+            comes from outside the axis, or is told by the automaton.
+        blocks: BLOCKS_NEGATIVE or BLOCKS_POSITIVE, of a limit.
+        software: Whether it is a software limit, from which a demand within the limits leads back.
+        held: Whether it is over as soon as the stage is off, so that its flag stays until the reset.
+        tried_again: Whether a reset is allowed although it holds: the next enabling tries again.
+        unless: Name of a cause whose fault hides this one, which then follows from it.
+    """
+
+    name: str
+    reaction: int
+    error_register: int
+    status_flag: int
+    condition: Callable[..., Any] | None = None
+    blocks: int = 0
+    software: bool = False
+    held: bool = False
+    tried_again: bool = False
+    unless: str = ""
+
+
+class Protection(NamedTuple):
+    """Stages of a table of causes.
+
+    Attributes:
+        protect: (drive, lane): looks at every cause, once per supervision period.
+        causes_gone: (drive, lane) -> whether no cause that takes the drive into fault holds any more.
+        statusword_bits: (drive, lane) -> bits 11 and 13 of the statusword that causes set.
+        trip: (drive, lane, row): takes an axis that is in operation into fault.
+    """
+
+    protect: Any
+    causes_gone: Any
+    statusword_bits: Any
+    trip: Any
+
+
+def _mask(causes: Sequence[Cause], chosen: Callable[[Cause], bool]) -> int:
+    return sum(1 << row for row, cause in enumerate(causes) if row and chosen(cause))
+
+
+def row_of(causes: Sequence[Cause], name: str) -> int:
+    """Return the first row of a cause, -1 where the table has none of that name."""
+    return next((row for row, cause in enumerate(causes) if cause.name == name), -1)
+
+
+def _conditions(causes: Sequence[Cause]) -> Any:
+    """Return the stage (drive, lane) -> the causes whose condition holds now, as bits 1 << row."""
+
+    @stage
+    def none(drive, lane):
+        return 0
+
+    def also(before: Any, condition: Any, bit: int, hiding_fault: int) -> Any:
+        @stage
+        def conditions(drive, lane):
+            bits = before(drive, lane)
+            if drive.fault[lane] != hiding_fault and condition(drive, lane, (drive.active[lane] & bit) != 0):
+                bits |= bit
+            return bits
+
+        return conditions
+
+    found: Any = none
+    for row, cause in enumerate(causes):
+        if cause.condition is not None:
+            hiding = row_of(causes, cause.unless) + 1 if cause.unless else -1
+            found = also(found, cause.condition, 1 << row, hiding)
+    return found
+
+
+class _Masks(NamedTuple):
+    """Rows of a table as bits 1 << row, by what they do."""
+
+    cuts: int
+    stops: int
+    at_limits: int
+    warns: int
+    positive: int
+    negative: int
+    software: int
+    held: int
+    tried_again: int
+
+    @property
+    def faults(self) -> int:
+        """What takes the drive into fault."""
+        return self.cuts | self.stops
+
+
+def _masks(causes: Sequence[Cause]) -> _Masks:
+    return _Masks(
+        cuts=_mask(causes, lambda cause: cause.reaction == CUT),
+        stops=_mask(causes, lambda cause: cause.reaction == STOP),
+        at_limits=_mask(causes, lambda cause: cause.reaction == LIMIT),
+        warns=_mask(causes, lambda cause: cause.reaction == WARN),
+        positive=_mask(causes, lambda cause: cause.blocks == BLOCKS_POSITIVE),
+        negative=_mask(causes, lambda cause: cause.blocks == BLOCKS_NEGATIVE),
+        software=_mask(causes, lambda cause: cause.software),
+        held=_mask(causes, lambda cause: cause.held),
+        tried_again=_mask(causes, lambda cause: cause.tried_again),
+    )
+
+
+def _look(masks: _Masks, conditions: Any, told_when_left: int) -> Any:
+    """Return the stage (drive, lane) -> the causes that have appeared."""
+    faults, stops, at_limits, warns = masks.faults, masks.stops, masks.at_limits, masks.warns
+    positive, negative, software = masks.positive, masks.negative, masks.software
+    software_positive, software_negative = positive & software, negative & software
+
+    @stage
+    def demand_beyond(drive, lane):
+        """Return the software limits that the position demand is past."""
+        return (software_positive if limits.demand_above(drive, lane) else 0) | (
+            software_negative if limits.demand_below(drive, lane) else 0
+        )
+
+    @stage
+    def look(drive, lane):
+        present = conditions(drive, lane)
+        drive.present[lane] = present
+        if drive.fsa[lane] < fsa.SWITCHED or drive.fsa[lane] == fsa.FAULTED:
+            # A drive whose supply or enable is missing is in no fault before anybody switches it on.
+            present &= ~faults
+        appeared = present & ~drive.active[lane]
+        # Until the fault reaction has ended, what began it is no new occurrence when it goes and comes again.
+        told = drive.active[lane] & stops if drive.fsa[lane] == fsa.REACTING else 0
+        drive.active[lane] = present | told
+        drive.warning[lane] = 1 if present & warns else 0
+        # A position demand that is within the limits leads an axis back that was pushed past them.
+        blocking = present & ~software | demand_beyond(drive, lane) if drive.loop_level[lane] == 2 else present
+        drive.blocked[lane] = (BLOCKS_POSITIVE if blocking & positive else 0) | (
+            BLOCKS_NEGATIVE if blocking & negative else 0
+        )
+        # A limit shows in 1001h while it lasts; what made a fault stays there until the reset.
+        if present & at_limits:
+            drive.error_register[lane] |= GENERIC_ERROR | LIMIT_REGISTER
+        elif drive.fault[lane] == 0 and drive.error_register[lane] != 0:
+            drive.error_register[lane] = 0
+            fsa.push_emergency(drive, lane, told_when_left)
+        return appeared
+
+    return look
+
+
+def _react(masks: _Masks, register: tuple[int, ...]) -> Any:
+    """Return the stage (drive, lane, causes that have appeared): emergencies and reactions."""
+    faults, cuts, rows = masks.faults, masks.cuts, len(register)
+
+    @stage
+    def react(drive, lane, appeared):
+        for cause in range(1, rows):
+            if not appeared & (1 << cause):
+                continue
+            push_emergency = True
+            if faults & (1 << cause):
+                cut = cuts & (1 << cause) != 0
+                # The stage that is cut has answered: what else it sees in the same moment follows from it.
+                push_emergency = drive.fsa[lane] != fsa.FAULTED
+                if push_emergency:
+                    drive.fault[lane] = cause + 1
+                    drive.error_register[lane] |= GENERIC_ERROR | register[cause]
+                    fsa.fault(drive, lane, cut)
+            if push_emergency:
+                fsa.push_emergency(drive, lane, cause)
+
+    return react
+
+
+def _cause_flags(held: int, flags: tuple[int, ...]) -> Any:
+    """Return the stage (drive, lane) -> status flags."""
+    rows = len(flags)
+
+    @stage
+    def cause_flags(drive, lane):
+        """Return the status flags of what is wrong now, in whatever state the drive is."""
+        shown = drive.present[lane]
+        if drive.fault[lane] > 0:
+            shown |= 1 << (drive.fault[lane] - 1) & held
+        found = 0
+        for cause in range(1, rows):
+            if shown & 1 << cause:
+                found |= flags[cause]
+        return found
+
+    return cause_flags
+
+
+def protection_of(causes: Sequence[Cause]) -> Protection:
+    """Return the stages of a table of causes.
+
+    Args:
+        causes: Row 0 is the answer to a fault reset; the last one tells that the axis has left its limits. Causes that
+            appear together are told, and act, in the order of the rows.
+    """
+    masks = _masks(causes)
+    register = tuple(cause.error_register for cause in causes)
+    conditions = _conditions(causes)
+    look, react = _look(masks, conditions, len(causes) - 1), _react(masks, register)
+    cause_flags = _cause_flags(masks.held, tuple(cause.status_flag for cause in causes))
+    faults, cuts, software, tried_again = masks.faults, masks.cuts, masks.software, masks.tried_again
+    following_fault, csp = row_of(causes, FOLLOWING_ERROR) + 1, cia402.CSP
+
+    @stage
+    def causes_gone(drive, lane):
+        return conditions(drive, lane) & faults & ~tried_again == 0
+
+    @stage
+    def protect(drive, lane):
+        appeared = look(drive, lane)
+        if appeared != 0:
+            react(drive, lane, appeared)
+        drive.cause_flags[lane] = cause_flags(drive, lane)
+
+    @stage
+    def statusword_bits(drive, lane):
+        bits = 0x0800 if drive.active[lane] & software else 0
+        if drive.mode_display[lane] == csp and drive.fault[lane] == following_fault:
+            bits |= 0x2000
+        return bits
+
+    @stage
+    def trip(drive, lane, cause):
+        drive.fault[lane] = cause + 1
+        drive.error_register[lane] |= GENERIC_ERROR | register[cause]
+        fsa.fault(drive, lane, cuts & (1 << cause) != 0)
+
+    return Protection(protect, causes_gone, statusword_bits, trip)

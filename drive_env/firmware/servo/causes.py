@@ -1,0 +1,135 @@
+"""What servo drives watch: the shared causes, and those of bridge, phases, halls and the encoder's start-up."""
+
+from __future__ import annotations
+
+from drive_env.firmware.common import causes, fsa, start_up
+from drive_env.firmware.common.protection import (
+    BLOCKS_NEGATIVE,
+    BLOCKS_POSITIVE,
+    COMMUNICATION,
+    CUT,
+    FAULT_RESET,
+    FOLLOWING_ERROR,
+    LIMIT,
+    LIMIT_REGISTER,
+    STOP,
+    WARN,
+    Cause,
+)
+from drive_env.firmware.servo import alignment
+from mechanics.compiled import stage
+
+OPEN_LOAD_TIME = 0.05  # s for which a phase must stay without the current that is asked for
+OPEN_LOAD_DEMAND = 1.0  # A of phase current that must be asked for
+OPEN_LOAD_CURRENT = 0.3  # A below which there is none
+SQRT3 = 3.0**0.5
+
+
+@stage
+def watch_phases(drive, lane, dt):
+    """Measure for how long a phase carries no current although the loop asks for it."""
+    # What each phase should carry now; a rotor at rest may well ask nothing of one of them.
+    q = drive.i_q_ref[lane] * drive.torque_share[lane] * (1.0 - 2.0 * drive.shaft_direction[lane])
+    d = drive.i_d_ref[lane]
+    alpha = drive.cos_meas[lane] * d - drive.sin_meas[lane] * q
+    beta = drive.sin_meas[lane] * d + drive.cos_meas[lane] * q
+    asked_a = abs(alpha)
+    asked_b = asked_a if drive.is_dc[lane] == 1.0 else abs(0.5 * (SQRT3 * beta - alpha))
+    # Near no-load speed no current flows for want of voltage: the other phase, or standstill, must show that it could.
+    stands = abs(drive.omega_slow[lane]) <= drive.standstill[lane]
+    on = drive.stage_on[lane] > 0.0
+    could_a = on and asked_a > OPEN_LOAD_DEMAND and (stands or drive.peak_b[lane] >= OPEN_LOAD_CURRENT)
+    could_b = on and asked_b > OPEN_LOAD_DEMAND and (stands or drive.peak_a[lane] >= OPEN_LOAD_CURRENT)
+    if could_a and drive.peak_a[lane] < OPEN_LOAD_CURRENT:
+        drive.open_load_time_a[lane] += dt
+    elif not on or drive.peak_a[lane] >= OPEN_LOAD_CURRENT:
+        drive.open_load_time_a[lane] = 0.0
+    if could_b and drive.peak_b[lane] < OPEN_LOAD_CURRENT:
+        drive.open_load_time_b[lane] += dt
+    elif not on or drive.peak_b[lane] >= OPEN_LOAD_CURRENT:
+        drive.open_load_time_b[lane] = 0.0
+
+
+@stage
+def forget_peaks(drive, lane, dt):
+    """Begin the next period's largest currents, after protection has looked at this one's."""
+    drive.peak_a[lane] = 0.0
+    drive.peak_b[lane] = 0.0
+
+
+@stage
+def overcurrent_high_side(drive, lane, told):
+    """Return whether a short circuit across the DC link draws too much."""
+    return drive.u_dc[lane] * drive.short_conductance[lane] > drive.overcurrent[lane]
+
+
+@stage
+def overcurrent_a(drive, lane, told):
+    """Return whether phase A had too large a current."""
+    return drive.peak_a[lane] > drive.overcurrent[lane]
+
+
+@stage
+def overcurrent_b(drive, lane, told):
+    """Return whether phase B had too large a current."""
+    return drive.peak_b[lane] > drive.overcurrent[lane]
+
+
+@stage
+def hall_error(drive, lane, told):
+    """Return whether halls are needed that tell nothing: all three lines alike is a pattern that no rotor gives."""
+    # A brushed motor has none.
+    return (drive.hall_broken[lane] > 0.0 or drive.is_dc[lane] == 1.0) and alignment.needs_halls(drive, lane)
+
+
+@stage
+def initialization_failed(drive, lane, told):
+    """Return whether the encoder's initialisation failed."""
+    return drive.init_state[lane] == start_up.FAILED and drive.fsa[lane] >= fsa.SWITCHED
+
+
+@stage
+def open_load_a(drive, lane, told):
+    """Return whether phase A has carried no current for long, although it should."""
+    return drive.open_load_time_a[lane] > OPEN_LOAD_TIME
+
+
+@stage
+def open_load_b(drive, lane, told):
+    """Return whether phase B has carried no current for long, although it should."""
+    return drive.open_load_time_b[lane] > OPEN_LOAD_TIME
+
+
+@stage
+def overload(drive, lane, told):
+    """Return whether the stage's I2t budget is used up."""
+    return drive.overload[lane] > 1.0
+
+
+# Status flags are those of 2101h (table 85).
+CAUSES = (
+    Cause(FAULT_RESET, WARN, 0x00, 0x0),
+    Cause("overcurrent_high_side", CUT, 0x02, 0x1, overcurrent_high_side, held=True),
+    Cause("overcurrent_bridge_a", CUT, 0x02, 0x1, overcurrent_a, held=True),
+    Cause("overcurrent_bridge_b", CUT, 0x02, 0x1, overcurrent_b, held=True),
+    Cause("undervoltage", CUT, 0x04, 0x2, causes.undervoltage),
+    Cause("overvoltage", CUT, 0x04, 0x4, causes.overvoltage),
+    Cause("overtemperature", CUT, 0x08, 0x8, causes.overtemperature),
+    Cause("hall_error", CUT, 0x20, 0x20, hall_error),
+    Cause("shutdown_switch", CUT, 0x80, 0x1000, causes.shutdown_switch),
+    Cause("encoder_initialization", CUT, 0x20, 0x80, initialization_failed, tried_again=True),
+    # With one phase open the other lacks current too while the rotor stands across it: that follows from the first.
+    Cause("open_load_a", STOP, 0x80, 0x40, open_load_a, held=True, unless="open_load_b"),
+    Cause("open_load_b", STOP, 0x80, 0x40, open_load_b, held=True, unless="open_load_a"),
+    Cause(FOLLOWING_ERROR, STOP, 0x20, 0x0, causes.following_error),
+    Cause("overload", STOP, 0x02, 0x20000, overload, held=True),
+    Cause("overtemperature_warning", WARN, 0x08, 0x0, causes.warm),
+    Cause("positive_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.above_limit, BLOCKS_POSITIVE, software=True),
+    Cause("negative_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.below_limit, BLOCKS_NEGATIVE, software=True),
+    Cause("positive_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, causes.positive_switch, BLOCKS_POSITIVE),
+    Cause("negative_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, causes.negative_switch, BLOCKS_NEGATIVE),
+    # From outside the axis: its network was stopped or lost.
+    Cause(COMMUNICATION, STOP, 0x10, 0x0),
+    # The axis has left its limits: 0000h too, as CiA 301 has it, but no command, and nothing else ends with it.
+    Cause(FAULT_RESET, WARN, 0x00, 0x0),
+)

@@ -1,0 +1,194 @@
+"""The firmware of servo drives: which stages run when."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
+from drive_env.firmware.cycle import FirmwareStages, compose
+from drive_env.firmware.record import LANES
+from drive_env.firmware.servo import alignment, causes, fields, thermal
+from drive_env.firmware.servo.derived import derive
+from drive_env.firmware.servo.loops import current_loop, motion_loops
+from drive_env.firmware.servo.power_stage import convert_energy, open_phases, power_stage, refresh_winding
+from drive_env.firmware.servo.sensors import (
+    encoder_count,
+    measure_angle,
+    measure_currents,
+    measure_halls,
+    measure_motion,
+    shake_encoders,
+    tell_counts,
+)
+from drive_env.firmware.servo.status_flags import tell_status
+from mechanics.compiled import inlined, stage
+
+
+@inlined
+def collect_torque(drive, s, weight, moment):
+    """Add this tick's share to mean and first moment of the torque of physics step s of the window."""
+    for lane in range(LANES):
+        drive.tau_window[s, lane] += weight * drive.tau_m[lane]
+    for lane in range(LANES):
+        drive.moment_window[s, lane] += moment * drive.tau_m[lane]
+
+
+@stage
+def read_sensors(drive, rates, k):
+    """Measure the rotor's electrical angle and the phase currents."""
+    if drive.block_uses_halls[0]:
+        measure_halls(drive, rates.tick)
+    measure_angle(drive, rates.tick)
+    measure_currents(drive)
+
+
+@stage
+def regulate_current(drive, rates, k):
+    """Run the current loop."""
+    current_loop(drive)
+
+
+@stage
+def drive_winding(drive, rates, k):
+    """Apply the bridge's voltage to the winding."""
+    power_stage(drive)
+    if drive.block_has_open_phase[0]:
+        open_phases(drive)
+
+
+@stage
+def make_torque(drive, rates, k):
+    """Turn currents into torque and supply current, and add the torque to what the load's next steps get."""
+    convert_energy(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
+    collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
+    for s in range(1, rates.substeps):
+        collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+
+
+@stage
+def read_motion(drive, rates):
+    """Read encoder, and halls where they are needed no more often."""
+    if not drive.block_uses_halls[0]:
+        measure_halls(drive, rates.window)
+    if drive.block_has_noisy_encoder[0]:
+        shake_encoders(drive)
+    measure_motion(drive, rates.window)
+
+
+@stage
+def regulate_motion(drive, rates):
+    """Run position and velocity loop."""
+    motion_loops(drive)
+
+
+@stage
+def prepare_winding(drive, rates):
+    """Find this window's cogging torque, and the winding's matrices for its ticks."""
+    for lane in range(LANES):
+        s, _ = sine_cosine(drive.cogging_order[lane] * drive.theta_m[lane] + drive.cogging_phase[lane])
+        drive.tau_cogging[lane] = drive.cogging_torque[lane] * s
+    for s in range(rates.substeps):
+        for lane in range(LANES):
+            drive.tau_window[s, lane] = drive.tau_cogging[lane]
+            drive.moment_window[s, lane] = 0.0
+    refresh_winding(drive, rates.tick, rates.window)
+
+
+@stage
+def warm(drive, rates):
+    """Move temperatures on."""
+    thermal.warm(drive, rates.period)
+
+
+@stage
+def prepare_quotients(drive, rates):
+    """Compute what the ticks need as quotients."""
+    derive(drive, rates.tick)
+
+
+@stage
+def find_what_is_needed(drive, rates):
+    """Leave what few drives need out of the ticks of a block where none does."""
+    drive.block_uses_halls[0] = 0
+    drive.block_has_open_phase[0] = 0
+    drive.block_has_noisy_encoder[0] = 0
+    for lane in range(LANES):
+        if drive.angle_source[lane] == alignment.HALL or drive.velocity_sensor[lane] == alignment.VELOCITY_BY_HALL:
+            drive.block_uses_halls[0] = 1
+        if drive.open_a[lane] > 0.0 or drive.open_b[lane] > 0.0 or drive.open_c[lane] > 0.0:
+            drive.block_has_open_phase[0] = 1
+        # Once more after the noise has ended, so that none of it is left in the angle.
+        if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
+            drive.block_has_noisy_encoder[0] = 1
+
+
+@stage
+def tell_sensor(drive, lane, dt):
+    """Write the counts of the sensor in use."""
+    tell_counts(drive, lane)
+
+
+@stage
+def halt(drive, lane):
+    """Leave no number behind that is none."""
+    drive.velocity_filter_z[0, lane] = 0.0
+    drive.velocity_filter_z[1, lane] = 0.0
+    drive.current_sum_d[lane] = 0.0
+    drive.current_sum_q[lane] = 0.0
+    drive.i_d[lane] = 0.0
+    drive.i_q[lane] = 0.0
+
+
+@stage
+def power_on(drive, lane):
+    """Begin loops and sensors anew: the angle at which the rotor stands is known up to the commutation offset."""
+    drive.overload[lane] = 0.0
+    drive.i_d[lane] = 0.0
+    drive.i_q[lane] = 0.0
+    drive.duty_alpha[lane] = 0.0
+    drive.duty_beta[lane] = 0.0
+    drive.duty_next_alpha[lane] = 0.0
+    drive.duty_next_beta[lane] = 0.0
+    drive.current_sum_d[lane] = 0.0
+    drive.current_sum_q[lane] = 0.0
+    drive.i_q_ref[lane] = 0.0
+    drive.velocity_filter_z[0, lane] = 0.0
+    drive.velocity_filter_z[1, lane] = 0.0
+    s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
+    drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
+    count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI)
+    gain = drive.encoder_gain[lane]
+    told = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI * gain
+    drive.count[lane] = encoder_count(told, drive.encoder_true_direction[lane])
+    drive.count_zero[lane] = drive.count[lane]
+    drive.angle_zero[lane] = (
+        drive.n_p[lane] * (count + 0.5) * TWO_PI / drive.encoder_counts[lane] + drive.commutation_offset[lane]
+    )
+    sector = np.floor((drive.n_p[lane] * drive.theta_m[lane] + drive.hall_true_offset[lane]) * (6.0 / TWO_PI))
+    reverse = abs(drive.hall_true_direction[lane] - drive.hall_direction[lane])
+    sector += reverse * (-1.0 - 2.0 * sector)
+    sector += 3.0 * abs(drive.hall_true_polarity[lane] - drive.hall_polarity[lane])
+    drive.hall_sector[lane] = sector
+    drive.hall_zero[lane] = sector
+    drive.hall_time[lane] = 1.0
+    drive.hall_period[lane] = 1.0
+    drive.angle_hall[lane] = (sector + 0.5) * (TWO_PI / 6.0) - drive.hall_offset[lane]
+
+
+STAGES = FirmwareStages(
+    name="servo",
+    parameters=fields.PARAMETERS,
+    state=fields.STATE,
+    causes=causes.CAUSES,
+    begin_period=(warm, prepare_quotients),
+    measure=(causes.watch_phases,),
+    switch=(causes.forget_peaks, alignment.commutate, tell_sensor),
+    tell=(tell_status,),
+    end_period=(find_what_is_needed,),
+    window=(read_motion, regulate_motion, prepare_winding),
+    tick=(read_sensors, regulate_current, drive_winding, make_torque),
+    power_on=(power_on, tell_counts),
+    halt=(halt,),
+)
+
+FIRMWARE = compose(STAGES, __name__)
