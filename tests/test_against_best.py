@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from tuning.compare.against_best import against_the_best, all_rivals
-from tuning.compare.comparison import Comparison, MachineRow, TunerRow, save
+from tuning.compare.comparison import Comparison, MachineRow, TunerRow
+from tuning.compare.comparison_files import save
 from tuning.compare.tuners import find_tuner
 from tuning.search.optimise import Settings
 

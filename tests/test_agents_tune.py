@@ -22,7 +22,7 @@ from drive_env.cia402 import OPERATION_ENABLED
 from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
 from drive_env.trials.gain_trial import Trials
-from tuning.certificate.certificate import load_certificate
+from tuning.certificate.certificate_files import load_certificate
 from tuning.drive_audit import KINDS, DriveAudit
 from tuning.snapshot import load_snapshot
 from tuning.target import emulated

@@ -29,6 +29,7 @@ from tuning.auto.proving import ProvingGround
 from tuning.compare.suite import load_suite, open_machines
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.identify.quick_identification import identify_briefly
+from tuning.identify.true_plant import true_plant
 from tuning.response.linear_model import Plant, position_open_loop
 from tuning.response.margins import margins
 from tuning.rules.rules_by_name import propose
@@ -86,7 +87,7 @@ def test_a_drive_is_tuned_whatever_gains_it_had(five, axis):
     assert result.drive_seconds[axis] < FIVE_BUDGET + (OVERTIME if found.eased else 0.0)
     drives = target.drives
     hidden = HiddenScore("tmcm1636", "inertia", "qbl4208", 1)
-    J = np.array([Plant.from_machine(drives, axis).inertia])
+    J = np.array([true_plant(drives, axis).inertia])
     hidden.set_machines({k: v[[axis]] for k, v in drives.machine.parameters.items()}, drives.machine.supply[[axis]])
     hidden.set_moves(plan_move(drives.motor, J, drives.read((0x2058, 0))[[axis]], np.array([np.inf])))
     rule = hidden.set_reference(rule_gains(drives.device, drives.motor, J)).hidden[0]
@@ -204,11 +205,11 @@ def test_gains_are_lowered_until_the_outer_loops_are_sound_by_the_model(position
 # --- rolling back -----------------------------------------------------------------------------------------------------
 def standing_in(target, where=None):
     """Return the identification of drives whose truth is known: what the search needs, at no cost."""
-    from tuning.identify.identification import Estimate, Identification, refused
+    from tuning.identify.estimate import Estimate, Identification, refused
 
     found = []
     for axis in range(target.num_axes):
-        plant = Plant.from_machine(target.drives, axis)
+        plant = true_plant(target.drives, axis)
         values = {
             "resistance": plant.R, "inductance": plant.L, "inertia": plant.inertia, "coulomb": 0.1, "viscous": 1e-4,
             "offset": 0.0, "velocity_filter": plant.velocity_filter, "pole_pairs": 4.0, "encoder_direction": 1.0,
@@ -408,7 +409,7 @@ def test_one_shaking_axis_of_a_bus_does_not_fail_its_neighbour():
 
 def test_when_the_envelope_stops_all_axes_it_is_found_out_which_one_it_was(monkeypatch):
     with emulated(load="inertia", num_machines=3, num_threads=1) as target:
-        plants = [Plant.from_machine(target.drives, axis) for axis in range(3)]
+        plants = [true_plant(target.drives, axis) for axis in range(3)]
         safe = np.array([propose("margin_55", target.device, target.motor, plants[0]).gains] * 3)
         ground = ProvingGround(target, plants, (target.low, target.high), safe, safe)
         run = ground._trials.run
@@ -427,7 +428,7 @@ def test_when_the_envelope_stops_all_axes_it_is_found_out_which_one_it_was(monke
 
 def test_an_axis_alone_that_the_envelope_stops_is_refused_in_its_words(monkeypatch):
     with emulated(load="inertia", num_threads=1) as target:
-        plant = Plant.from_machine(target.drives)
+        plant = true_plant(target.drives)
         safe = np.array([propose("margin_55", target.device, target.motor, plant).gains])
         ground = ProvingGround(target, [plant], (target.low, target.high), safe, safe)
 
@@ -443,7 +444,7 @@ def test_an_axis_alone_that_the_envelope_stops_is_refused_in_its_words(monkeypat
 
 def test_a_slow_axis_passes_and_a_probe_that_shakes_is_told_from_a_move_that_does():
     with emulated(load="inertia", num_machines=3, num_threads=1) as target:
-        plants = [Plant.from_machine(target.drives, axis) for axis in range(3)]
+        plants = [true_plant(target.drives, axis) for axis in range(3)]
         slow = propose("margin_55", target.device, target.motor, plants[0]).gains
         safe = np.array([slow] * 3)
         ground = ProvingGround(target, plants, (target.low, target.high), safe, safe)
@@ -521,7 +522,7 @@ def test_on_the_public_machines_it_is_far_better_than_the_fitted_rule_and_stays_
 def test_brief_identification_is_right_and_quick():
     with emulated(load="two_mass", num_machines=2, num_threads=2) as target:
         found = identify_briefly(target)
-        true = Plant.from_machine(target.drives)
+        true = true_plant(target.drives)
     for one in found:
         assert one.drive_time < 5.0
         for name, value in (("resistance", true.R), ("inductance", true.L), ("inertia", true.inertia),

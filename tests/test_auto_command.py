@@ -11,7 +11,7 @@ from drive_env.gains import RAW_MAX
 from tuning.auto import search as auto_search
 from tuning.auto import settings as auto_settings
 from tuning.auto.moves import OVERTIME
-from tuning.certificate.certificate import is_unchanged
+from tuning.certificate.certificate_files import is_unchanged
 from tuning.commands.cli import app
 from tuning.snapshot import load_snapshot
 

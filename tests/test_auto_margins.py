@@ -13,8 +13,9 @@ from drive_env.gains import Gains, write_gains
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.result import AxisRun
 from tuning.auto.run import AutoRun
+from tuning.identify.true_plant import true_plant
 from tuning.response import frequency_response
-from tuning.response.linear_model import OPEN_LOOPS, Plant
+from tuning.response.linear_model import OPEN_LOOPS
 from tuning.response.margins import Margins, margins
 from tuning.response.measured_loop import AtLeast
 from tuning.target import emulated, timed
@@ -56,7 +57,7 @@ def measured():
     """A measured velocity loop of two masses on a spring, and the plant that it truly is."""
     with emulated(load="two_mass", num_threads=1) as target:
         write_gains(target.drives, GAINS[None])
-        yield frequency_response.measure(target), Plant.from_machine(target.drives), target.device
+        yield frequency_response.measure(target), true_plant(target.drives), target.device
 
 
 def true_margins(device, plant, gains):

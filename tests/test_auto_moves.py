@@ -26,8 +26,9 @@ from tuning.auto.run import AutoRun
 from tuning.auto.search import calm_gains
 from tuning.auto.trials import faster
 from tuning.auto.twin import Optimum
-from tuning.identify.identification import Estimate, Identification, refused
+from tuning.identify.estimate import Estimate, Identification, refused
 from tuning.identify.moved_inertia import moved_inertia
+from tuning.identify.true_plant import true_plant
 from tuning.response.linear_model import Plant
 from tuning.rules.rules_by_name import propose
 from tuning.target import emulated
@@ -47,7 +48,7 @@ def finds(monkeypatch, wanted):
 def axes():
     """Two like axes, and good gains for them."""
     with emulated(load="inertia", num_machines=2, num_threads=1) as target:
-        plant = Plant.from_machine(target.drives)
+        plant = true_plant(target.drives)
         yield target, np.array(propose("margin_55", target.device, target.motor, plant).gains)
 
 
@@ -258,7 +259,7 @@ def test_an_axis_that_still_turns_is_stopped_before_gains_are_judged_on_it():
     """Switched off at 1,500 rpm, as after a frequency response; what follows must be what it is from rest."""
     with emulated(load="inertia", num_machines=2, num_threads=1) as target:
         drives = target.drives
-        plants = [Plant.from_machine(drives, axis) for axis in range(2)]
+        plants = [true_plant(drives, axis) for axis in range(2)]
         good = np.array([propose("margin_45", target.device, target.motor, plants[0]).gains] * 2)
         turning = np.array([True, False])
         drives.write(0x6083, 10_000_000)
@@ -284,7 +285,7 @@ def test_a_move_for_the_record_begins_at_rest_with_its_own_gains(gains_then, kic
     everyone = np.ones(1, bool)
     with emulated(load="two_mass", num_threads=1) as target:
         drives, stiff = target.drives, np.array([STIFF])
-        ground = ProvingGround(target, [Plant.from_machine(drives)], (target.low, target.high), stiff, stiff)
+        ground = ProvingGround(target, [true_plant(drives)], (target.low, target.high), stiff, stiff)
         ground.show(stiff, everyone)
         # It turns and swings, as a frequency response may leave it, and its integrator works against that.
         motion.select_mode(drives, "csv")
@@ -303,9 +304,9 @@ def test_a_move_for_the_record_begins_at_rest_with_its_own_gains(gains_then, kic
 def test_what_shakes_before_a_move_for_the_record_is_stopped():
     everyone, wild = np.ones(1, bool), np.array([[4021, 1573, 30_000, 3000, 30_000]])
     with emulated(load="inertia", num_threads=1) as target:
-        good = np.array([propose("margin_55", target.device, target.motor, Plant.from_machine(target.drives)).gains])
+        good = np.array([propose("margin_55", target.device, target.motor, true_plant(target.drives)).gains])
         watched = CurrentsSeen(target.drives)
-        ground = ProvingGround(replace(target, drives=watched), [Plant.from_machine(target.drives)],
+        ground = ProvingGround(replace(target, drives=watched), [true_plant(target.drives)],
                                (target.low, target.high), good, good)  # fmt: skip
         ground.show(good, everyone)
         write_gains(target.drives, wild)
@@ -337,7 +338,7 @@ RINGING = (11883, 382, 1437, 1007, 1370)  # of a belt: good while it moves, and 
 
 def test_a_move_tells_whether_its_axis_shakes_at_rest():
     with emulated(load="belt", num_machines=2, num_threads=1) as target:
-        plant = Plant.from_machine(target.drives)
+        plant = true_plant(target.drives)
         calm = np.array(propose("margin_60", target.device, target.motor, plant).gains)
         room = (target.low, target.high)
         ground = ProvingGround(target, [plant] * 2, room, np.stack([calm] * 2), np.stack([calm] * 2))
@@ -347,7 +348,7 @@ def test_a_move_tells_whether_its_axis_shakes_at_rest():
 
 def test_gains_that_are_too_slow_to_arrive_do_not_pass():
     with emulated(load="inertia", num_machines=2, num_threads=1) as target:
-        plant = Plant.from_machine(target.drives)
+        plant = true_plant(target.drives)
         good = np.array(propose("margin_55", target.device, target.motor, plant).gains)
         slow = good.copy()
         slow[Gains._fields.index("position_p")] = max(good[-1] // 40, 1)

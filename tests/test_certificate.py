@@ -28,14 +28,13 @@ from tuning.certificate.certificate import (
     StepResponse,
     frequency_response,
     identified,
-    is_unchanged,
-    load_certificate,
     si_gains,
 )
+from tuning.certificate.certificate_files import is_unchanged, load_certificate, save_certificate
 from tuning.certificate.certificate_pictures import AFTER, BEFORE, DOUBTFUL, bode_picture, step_picture
 from tuning.certificate.report import to_html
 from tuning.commands.cli import app
-from tuning.identify.identification import Estimate, Identification, refused
+from tuning.identify.estimate import Estimate, Identification, refused
 from tuning.response.margins import Margins, margins
 from tuning.response.measured_loop import AtLeast
 
@@ -89,7 +88,7 @@ def certificate():
 
 # --- the file -----------------------------------------------------------------------------------------------------
 def test_a_certificate_reads_back_to_the_last_digit(certificate, tmp_path):
-    path, _ = certificate.save(tmp_path / "run")
+    path, _ = save_certificate(certificate, tmp_path / "run")
     found, unchanged = load_certificate(path)
     assert unchanged
     assert found.to_json() == certificate.to_json()
@@ -173,7 +172,7 @@ def verify(path):
 
 @pytest.mark.parametrize("name", ["certificate.json", "report.html"])
 def test_verify_tells_by_its_exit_code_whether_a_file_was_changed(certificate, tmp_path, name):
-    certificate.save(tmp_path)
+    save_certificate(certificate, tmp_path)
     path = tmp_path / name
     done = verify(path)
     assert (done.exit_code, done.stdout) == (0, f"{path} is as it was written\n")

@@ -11,6 +11,7 @@ from test_parity import served
 from drive_env.devices import find_device
 from drive_env.gains import FITTED_RULE, rule_gains, write_gains
 from drive_env.motors import find_motor
+from tuning.identify.true_plant import true_plant
 from tuning.response.frequency_response import measure
 from tuning.response.held_samples import seen_by_bus
 from tuning.response.linear_model import Plant, position_open_loop, velocity_open_loop
@@ -27,7 +28,7 @@ GRID = np.geomspace(5.0, 1000.0, 4000)
 def tuned(load, **options):
     """Machines with gains that leave them margins, and what the machines truly are."""
     target = emulated(load=load, **options)
-    plants = [Plant.from_machine(target.drives, axis) for axis in range(target.num_axes)]
+    plants = [true_plant(target.drives, axis) for axis in range(target.num_axes)]
     gains = rule_gains(target.device, target.motor, np.array([plant.inertia for plant in plants]), SOFT)
     write_gains(target.drives, gains)
     return target, plants, gains

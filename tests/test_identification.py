@@ -23,8 +23,8 @@ from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.gains import write_gains
 from mechanics.shaft import way
 from tuning.compare.suite import load_suite, open_group, open_machines
-from tuning.identify import identification
-from tuning.identify.identification import NAMES, identify
+from tuning.identify.estimate import NAMES, refused
+from tuning.identify.identification import identify
 from tuning.identify.quick_identification import identify_briefly
 from tuning.identify.true_plant import true_plant
 from tuning.identify.working_state import borrowed
@@ -568,7 +568,7 @@ def test_reads_out_of_step_with_the_drive_give_no_inductance(monkeypatch, step, 
 
 # --- pieces -----------------------------------------------------------------------------------------------------------
 def test_a_refusal_has_no_value_and_a_reason():
-    none = identification.refused("ohm", "too cold")
+    none = refused("ohm", "too cold")
     assert not none.is_known
     assert none.reason == "too cold"
 

@@ -12,7 +12,8 @@ from drive_env.devices import find_device
 from drive_env.emulator.loop_trace import trace_loops
 from drive_env.gains import Gains, gains_from_bandwidths, write_gains
 from drive_env.motors import find_motor
-from tuning.identify.identification import Estimate, Identification, refused
+from tuning.identify.estimate import Estimate, Identification, refused
+from tuning.identify.true_plant import true_plant
 from tuning.response.linear_model import (
     Plant,
     current_open_loop,
@@ -139,7 +140,7 @@ def test_a_machine_without_faults_has_the_loop_that_the_model_computes(load):
     with EmulatedDrives(
         load=load, ideal=True, friction="none", parameters={"motor.encoder_interpolation": 65536.0}
     ) as drives:
-        plant = Plant.from_machine(drives)
+        plant = true_plant(drives)
         gains = gains_from_bandwidths(
             drives.device, drives.motor, plant.inertia, current_hz=1000.0, velocity_hz=20.0, position_hz=5.0
         )
@@ -163,7 +164,7 @@ def test_a_machine_without_faults_has_the_loop_that_the_model_computes(load):
 def test_the_true_plant_of_a_two_mass_machine_is_what_its_parameters_say():
     values = {"load.inertia": 2e-5, "load.stiffness": 3.0, "load.damping": 1e-4, "motor.inertia": 5e-6}
     with EmulatedDrives(load="two_mass", parameters=values) as drives:
-        plant = Plant.from_machine(drives)
+        plant = true_plant(drives)
     hub = 1e-9  # of the MJCF
     J_r = 5e-6 + hub
     assert plant.inertia == pytest.approx(J_r + 2e-5)
@@ -177,7 +178,7 @@ def test_the_true_plant_of_a_two_mass_machine_is_what_its_parameters_say():
 @pytest.mark.parametrize(("load", "message"), [("gantry", "couples 2 axes")])
 def test_a_machine_with_several_axes_has_no_such_plant(load, message):
     with EmulatedDrives(load=load) as drives, pytest.raises(ValueError, match=message):
-        Plant.from_machine(drives)
+        true_plant(drives)
 
 
 # --- what is identified -----------------------------------------------------------------------------------------------

@@ -11,7 +11,8 @@ from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.trace import Trace
 from drive_env.gains import write_gains
-from tuning.identify.identification import NAMES, identify
+from tuning.identify.estimate import NAMES
+from tuning.identify.identification import identify
 from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken
 from tuning.target import emulated
 

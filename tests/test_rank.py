@@ -17,7 +17,8 @@ from drive_env.trials.score import HiddenScore
 from tuning.commands.cli import app
 from tuning.compare import comparison as compare_module
 from tuning.compare import tuners
-from tuning.compare.comparison import compare, save
+from tuning.compare.comparison import compare
+from tuning.compare.comparison_files import save
 from tuning.compare.suite import load_suite, open_group
 from tuning.compare.tuners import MissingTunerError, find_tuner, search_tuner, tuner_rows
 from tuning.outcome import Outcome

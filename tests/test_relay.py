@@ -10,7 +10,7 @@ import pytest
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.gains import gains_in_si, write_gains
 from drive_env.trials.positioning import CYCLE
-from tuning.response.linear_model import Plant
+from tuning.identify.true_plant import true_plant
 from tuning.response.margins import margins
 from tuning.rules.lags import velocity_lag
 from tuning.rules.optima import take_current
@@ -33,7 +33,7 @@ STILL = {"load.coulomb": 0.0, "load.breakaway": 0.0, "load.viscous": 0.0}
 def swung(**options):
     """Return the swing of an axis, its plant, and the target as the experiment left it."""
     with emulated(num_threads=1, **options) as target:
-        plant = Plant.from_machine(target.drives)
+        plant = true_plant(target.drives)
         before = target.drives.read(0x6064)
         write_gains(target.drives, np.array([relay_rule(target.device, target.motor, plant).gains]))
         swing = relay_experiment(target)

@@ -13,6 +13,7 @@ from drive_env.devices import find_device
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.gains import RAW_MAX, Gains, gains_in_si, write_gains
 from drive_env.motors import MOTORS, find_motor
+from tuning.identify.true_plant import true_plant
 from tuning.response.linear_model import Plant, current_open_loop, position_open_loop, velocity_open_loop
 from tuning.response.margins import margins
 from tuning.rules.internal_model import imc_first_order, simc_first_order, simc_integrating
@@ -125,7 +126,7 @@ def velocity_step(rule, corner):
     parameters = {"stage.velocity_filter": corner, "motor.viscous": 2e-5}
     parameters |= dict.fromkeys(("load.coulomb", "load.breakaway", "load.viscous"), 0.0)
     with EmulatedDrives(load="inertia", ideal=True, parameters=parameters, num_threads=1) as drives:
-        proposal = propose(rule, drives.device, drives.motor, Plant.from_machine(drives))
+        proposal = propose(rule, drives.device, drives.motor, true_plant(drives))
         write_gains(drives, np.array([proposal.gains]))
         motion.enable(drives, mode="csv")
         drives.write((0x60C2, 1), 1)

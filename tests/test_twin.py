@@ -27,7 +27,8 @@ from tuning.auto.twin import (
     search,
     twin_parameters,
 )
-from tuning.identify.identification import Estimate, Identification, refused
+from tuning.identify.estimate import Estimate, Identification, refused
+from tuning.identify.true_plant import true_plant
 from tuning.response.linear_model import Plant
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
@@ -46,7 +47,7 @@ def test_the_twin_is_the_plant_that_was_identified(plant):
     load = "two_mass" if plant.is_elastic else "inertia"
     values = twin_parameters(DEVICE, MOTOR, KNOWN._replace(plant=plant))
     with EmulatedDrives(load=load, parameters=values, supply=plant.supply, num_threads=1) as drives:
-        true = Plant.from_machine(drives)
+        true = true_plant(drives)
     for name in ("R", "L", "supply", "inertia", "anti_resonance", "resonance", "damping", "velocity_filter"):
         if name != "damping" or plant.is_elastic:
             assert getattr(true, name) == pytest.approx(getattr(plant, name), rel=0.01), name
@@ -129,7 +130,7 @@ def test_the_twin_swings_as_long_as_the_axis_does():
     plant = Plant.from_identification(DEVICE, MOTOR, 22.0, identification(**pair))
     values = twin_parameters(DEVICE, MOTOR, known_of(plant, identification(**pair), math.inf))
     with EmulatedDrives(load="two_mass", parameters=values, supply=22.0, num_threads=1) as drives:
-        assert Plant.from_machine(drives).damping == pytest.approx(0.3, rel=0.01)
+        assert true_plant(drives).damping == pytest.approx(0.3, rel=0.01)
 
 
 def test_scores_do_not_depend_on_the_lane_nor_on_the_other_axes():

@@ -213,6 +213,7 @@ def _what_is_written(group: list[Any]) -> str:
 
 def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, json: bool) -> TunerRun:
     from agents.tuner.tuning_run import run
+    from tuning.certificate.certificate_files import certificate_files
 
     def show(trial: TrialShown) -> None:
         if json:
@@ -240,7 +241,7 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
     folder.mkdir(parents=True, exist_ok=True)
     return run(
         target, policy, folder / "before.toml", name=agent, keep=store, show=show, say=say,
-        files=lambda certificate: certificate.files(folder),
+        files=lambda certificate: certificate_files(certificate, folder),
     )  # fmt: skip
 
 

@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from agents.policies.policy import load_policy
+from agents.policies.policy import ACTOR, load_policy
 from agents.shipped import shipped, shipped_names
 
 CHECKPOINT = ".zip"  # ending of a file of Stable-Baselines3, which holds pickles
-ACTOR = "observation"  # the entry of a dict observation that the actor sees
 
 
 class PolicyNotFoundError(ValueError):

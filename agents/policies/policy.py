@@ -18,6 +18,8 @@ from agents.policies.agent_file import AgentFile, BundleError
 
 Array = NDArray[np.float32]
 
+ACTOR = "observation"  # the entry of a dict observation that the actor sees
+
 # Kind of a bundle -> what is made of one: a class or function that takes it. Another kind of agent is another row.
 KINDS: dict[str, str] = {
     "mlp": "agents.policies.policy:MlpPolicy",

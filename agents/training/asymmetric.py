@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from torch import nn
 
-from agents.policies.open_policy import ACTOR
+from agents.policies.policy import ACTOR
 
 
 class _Split(nn.Module):  # type: ignore[misc]

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from agents.training.algorithms import algorithm_class
 from mechanics.untrusted import MOST_TEXT, parse_json, read_member
 
 MOST_UNPACKED = 16_000_000_000  # bytes of a replay buffer: a million observations of a thousand entries, twice
@@ -133,8 +134,6 @@ def load(path: Path, env: Any = None, *, trust: bool = False) -> tuple[Any, Any]
     Raises:
         CheckpointError: If the file is none; UntrustedError without `trust`.
     """
-    from agents.training.train import algorithm_class
-
     run = read_run(path)
     check_trust(path, trust)
     names = _names(path)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.policies.open_policy import ACTOR
+from agents.policies.policy import ACTOR
 
 STEPS = 60_000  # of all lanes together
 BATCH, UPDATES, LEARNING_RATE = 1024, 1200, 1e-3

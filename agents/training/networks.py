@@ -9,8 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from agents.policies.agent_file import AgentFile, BundleError, installed
-from agents.policies.open_policy import ACTOR
-from agents.policies.policy import ACTIVATIONS
+from agents.policies.policy import ACTIVATIONS, ACTOR
 
 _ACTIVATIONS = {"Tanh": "tanh", "ReLU": "relu", "ELU": "elu", "LeakyReLU": "leaky_relu", "SiLU": "silu"}
 PACKAGES = ("drive-env", "numpy", "torch", "stable-baselines3", "sb3-contrib", "mujoco", "numba")

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import yaml
 
+from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import merge
-from agents.training.train import ALGORITHMS, DivergedError, TrainingRun, train
+from agents.training.train import DivergedError, TrainingRun, train
 
 if TYPE_CHECKING:
     from tuning.runs.pools import Pool

@@ -22,6 +22,7 @@ import numpy as np
 
 from agents.policies.agent_file import AgentFile, plain
 from agents.training import checkpoint
+from agents.training.algorithms import ALGORITHMS, algorithm_class, need
 from agents.training.hyperparameters import RUN_KEYS, HyperparameterError, schedule
 from agents.training.learning_curve import draw_learning_curve
 from agents.training.networks import bundle_of
@@ -31,12 +32,6 @@ from agents.training.training_table import TrainingTable
 
 logger = logging.getLogger(__name__)
 
-# Algorithm -> its class.
-ALGORITHMS = {
-    "ppo": "stable_baselines3:PPO",
-    "sac": "stable_baselines3:SAC",
-    "recurrent_ppo": "sb3_contrib:RecurrentPPO",
-}
 CHECKPOINT, AGENT, TABLE, CURVE = "checkpoint.zip", "agent.npz", "training.csv", "learning_curve.png"
 ROWS = 200  # of the table, about
 IMITATION = 1_000_000  # a segment's number that no run has, for seeds
@@ -49,10 +44,6 @@ _WHOLE = ("n_steps", "batch_size", "n_epochs", "buffer_size", "learning_starts",
 
 class DivergedError(ValueError):
     """The networks hold what nothing can act with: the training is lost; the message says what to change."""
-
-
-class MissingPackageError(ImportError):
-    """A package that training needs is not installed; the message says which extra has it."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +235,7 @@ def with_figures(bundle: AgentFile, figures: Mapping[str, Any], seeds: Mapping[s
 
 def make_env(run: TrainingRun) -> tuple[CountedLanes, Any]:
     """Return counted lanes, and the VecEnv of Stable-Baselines3 over them."""
-    _need("stable_baselines3")
+    need("stable_baselines3")
     from drive_env.envs.stable_baselines import LanesVecEnv
 
     options = run.hyperparameters.get("env_kwargs") or {}
@@ -291,13 +282,6 @@ def is_sound(model: Any) -> bool:
         deviation = model.policy.log_std.exp()
         weights += [deviation, 1.0 / deviation]
     return all(bool(weight.isfinite().all()) for weight in weights)
-
-
-def algorithm_class(name: str) -> Any:
-    """Return the class of an algorithm."""
-    module, _, kind = ALGORITHMS[name].partition(":")
-    _need(module)
-    return getattr(importlib.import_module(module), kind)
 
 
 def segment_length(run: TrainingRun, lanes: CountedLanes) -> int:
@@ -388,15 +372,6 @@ def _with_classes(value: Any) -> Any:
         except AttributeError:
             raise HyperparameterError(f"torch.nn has no {value[3:]!r}; activations are nn.Tanh, nn.ReLU, ...") from None
     return value
-
-
-def _need(package: str) -> None:
-    try:
-        importlib.import_module(package)
-    except ImportError:
-        raise MissingPackageError(
-            f"training needs {package}, which is not installed: pip install 'drive-env[agents]'"
-        ) from None
 
 
 def _segments_class() -> Any:

@@ -13,9 +13,10 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from drive_env import cia402, motion
+from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
+from drive_env.drives import motion
 from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.envs.bus_delays import BusDelays

@@ -12,8 +12,9 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env import cia402, motion
+from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.drives import motion
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.cyclic_control import Hooks, cyclic_control

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import cia402, motion
+from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.drives import motion
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import cia402, motion
+from drive_env import cia402
 from drive_env.devices.gain_set import GainSet
 from drive_env.dictionary.roles import Role
+from drive_env.drives import motion
 from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import write_gains

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env import cia402, motion
+from drive_env import cia402
+from drive_env.drives import motion
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.motors import Motor

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import cia402, motion
+from drive_env import cia402
+from drive_env.drives import motion
 from drive_env.envs.randomisation import BESIDE, Distributions, Law
 from mechanics.near_names import did_you_mean
 from mechanics.untrusted import MOST_RECORDING, check_size

@@ -12,7 +12,7 @@ from tuning.response.margins import margins
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.gains import Gains
-    from tuning.identify.identification import Identification
+    from tuning.identify.estimate import Identification
     from tuning.response.linear_model import Plant
     from tuning.target import Target
 

@@ -15,7 +15,7 @@ from tuning.certificate.certificate import verdict
 if TYPE_CHECKING:
     from tuning.auto.proving import Shown
     from tuning.certificate.certificate import StepResponse
-    from tuning.identify.identification import Identification
+    from tuning.identify.estimate import Identification
     from tuning.response.linear_model import Plant
     from tuning.response.margins import Margins
     from tuning.response.measured_loop import AtLeast, MeasuredLoop

@@ -22,7 +22,7 @@ from tuning.target import Target
 
 if TYPE_CHECKING:
     from tuning.auto.run import AutoRun
-    from tuning.identify.identification import Identification
+    from tuning.identify.estimate import Identification
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

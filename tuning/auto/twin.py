@@ -22,7 +22,7 @@ from drive_env.trials.score import HiddenScore
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.motors import Motor
-    from tuning.identify.identification import Identification
+    from tuning.identify.estimate import Identification
     from tuning.response.linear_model import Plant
 
 Floats = NDArray[np.float64]

@@ -8,23 +8,20 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env.dictionary.roles import Role
-from drive_env.whole_file import content_hash, files_to_be
-from mechanics.untrusted import parse_json, read_text
+from drive_env.whole_file import content_hash
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from tuning.identify.identification import Identification
+    from tuning.identify.estimate import Identification
     from tuning.response.margins import Margins
     from tuning.response.measured_loop import AtLeast
     from tuning.target import Target
@@ -187,24 +184,6 @@ class Certificate:
         """Return the file's text."""
         return json.dumps(self.content() | {HASH: self.hash()}, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
-    def save(self, folder: str | Path) -> tuple[Path, Path]:
-        """Write certificate.json and report.html into a folder, made if needed, and return their paths."""
-        with self.files(folder) as paths:
-            return paths
-
-    @contextmanager
-    def files(self, folder: str | Path) -> Iterator[tuple[Path, Path]]:
-        """Have certificate.json and report.html on the disk while a block runs; they vanish again if it fails.
-
-        Raises:
-            OSError: If they cannot be written, with the file and the reason.
-        """
-        from tuning.certificate.report import to_html
-
-        certificate, report = Path(folder) / "certificate.json", Path(folder) / "report.html"
-        with files_to_be({certificate: self.to_json(), report: to_html(self)}):
-            yield certificate, report
-
 
 # --- from what tuners have --------------------------------------------------------------------------------------------
 SI_NAMES = ("torque P [V/A]", "torque T_i [s]", "velocity P [A*s/rad]", "velocity T_i [s]", "position P [1/s]")
@@ -288,59 +267,6 @@ def _bounds(margins: Margins, least: AtLeast | None) -> dict[str, float]:
     }
 
 
-# --- reading and checking ---------------------------------------------------------------------------------------------
-def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
-    """Return the certificate of a JSON file, and whether it is unchanged since it was written.
-
-    Raises:
-        CertificateError: If the file is no certificate.
-    """
-    data = _read(Path(path))
-    stated = data.pop(HASH)
-    unchanged = content_hash(data) == stated
-    data.pop("format")
-    try:
-        return _built(Certificate, data), unchanged
-    except (KeyError, TypeError, ValueError) as error:
-        raise CertificateError(f"{path} is no certificate of this version: {error}") from None
-
-
-def is_unchanged(path: str | Path) -> bool:
-    """Return whether a certificate.json, or a report.html, is as it was written.
-
-    Raises:
-        CertificateError: If the file is neither.
-    """
-    where = Path(path)
-    if where.suffix == ".html":
-        from tuning.certificate.report import html_is_unchanged
-
-        return html_is_unchanged(_text(where))
-    data = _read(where)
-    return bool(content_hash({k: v for k, v in data.items() if k != HASH}) == data[HASH])
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        data = parse_json(_text(path))
-    except CertificateError:
-        raise
-    except ValueError as error:
-        raise CertificateError(f"{path} is no certificate: {error}; give a certificate.json of drive-tune") from None
-    if not isinstance(data, dict) or HASH not in data or data.get("format") != FORMAT:
-        raise CertificateError(f"{path} is no certificate of format {FORMAT}; give a certificate.json of drive-tune")
-    return data
-
-
-def _text(path: Path) -> str:
-    try:
-        return read_text(path)
-    except OSError as error:
-        raise CertificateError(f"cannot read {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise CertificateError(f"{path} is no text; give a certificate.json of drive-tune") from None
-
-
 def _plain(value: Any) -> Any:
     """Return a value as JSON can have it."""
     if is_dataclass(value):
@@ -354,26 +280,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None if math.isnan(value) else "inf" if value > 0 else "-inf"
     return value
-
-
-def _built(kind: Any, data: Mapping[str, Any]) -> Any:
-    """Return a dataclass from what `_plain` made of it."""
-    kinds = get_type_hints(kind)
-    return kind(**{f.name: _value(kinds[f.name], data[f.name]) for f in fields(kind)})
-
-
-def _value(kind: Any, value: Any) -> Any:
-    if get_origin(kind) is tuple:
-        item = get_args(kind)[0]
-        return tuple(_built(item, one) for one in value) if is_dataclass(item) else tuple(value)
-    if get_origin(kind) is Mapping and is_dataclass(item := get_args(kind)[1]):
-        return {name: _built(item, one) for name, one in value.items()}
-    if kind == Mapping[str, float]:
-        return {name: _number(one) for name, one in value.items()}
-    if kind == Floats:
-        return np.array([_number(one) for one in value], float)
-    return _number(value) if kind is float else value
-
-
-def _number(value: Any) -> float:
-    return math.nan if value is None else float(value)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from matplotlib.figure import Figure
 
 from drive_env.devices import find_device
+from tuning.certificate.certificate import CertificateError
 from tuning.certificate.certificate_pictures import bode_picture, step_picture
 
 if TYPE_CHECKING:
@@ -64,8 +65,6 @@ def html_is_unchanged(text: str) -> bool:
     Raises:
         CertificateError: If the text is no report.
     """
-    from tuning.certificate.certificate import CertificateError
-
     content, seal, stated = text.rpartition(SEAL)
     if not seal:
         raise CertificateError("the file is no report of drive-tune: it does not end with its hash")

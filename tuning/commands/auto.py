@@ -58,13 +58,14 @@ def auto(
 def _run(target: Target, folder: Path, seed: int, store: bool) -> Result:
     from tuning.auto.certify import certificate
     from tuning.auto.one_button import auto as tune
+    from tuning.certificate.certificate_files import certificate_files
 
     file = folder / "before.toml"
     try:
         with progress_bar("tuning") as show:
             return tune(
                 target, file, seed=seed, keep=store, progress=lambda what, share: show(share),
-                files=lambda result: certificate(target, result, seed).files(folder),
+                files=lambda result: certificate_files(certificate(target, result, seed), folder),
             )  # fmt: skip
     except KeyboardInterrupt:
         fail(f"interrupted; {_left_behind(target, file)}", INTERRUPTED)

@@ -27,7 +27,7 @@ from tuning.commands.options import (
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from tuning.identify.identification import Identification
+    from tuning.identify.estimate import Identification
 
 TITLES = {
     "resistance": "winding resistance, a phase",

@@ -91,7 +91,7 @@ def _compare(
 
     from tuning.compare.against_best import all_rivals
     from tuning.compare.comparison import compare as run
-    from tuning.compare.comparison import save, settings_text
+    from tuning.compare.comparison_files import save, settings_text
     from tuning.compare.suite import groups, load_suite
     from tuning.compare.tuners import MissingTunerError, find_tuner, tuner_rows
     from tuning.runs import provenance, unfinished

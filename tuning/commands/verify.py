@@ -18,7 +18,7 @@ def verify(
     The hash shows a change, it is no signature: whoever writes another certificate can write another hash.
     """
     with errors_as_exit_codes():
-        from tuning.certificate.certificate import is_unchanged
+        from tuning.certificate.certificate_files import is_unchanged
 
         if not is_unchanged(file):
             fail(f"{file} was changed since it was written: its hash is not that of its content", REFUSED)

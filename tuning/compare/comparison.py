@@ -7,14 +7,12 @@ true inertia; a tuner never sees the score.
 
 from __future__ import annotations
 
-import csv
 import json
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -35,10 +33,9 @@ from tuning.outcome import Outcome, Tuner
 from tuning.runs.shard_log import ShardLog
 from tuning.search.trial_bench import read_gains
 from tuning.target import Target
-from tuning.toml_tables import toml
 
 if TYPE_CHECKING:
-    from tuning.identify.identification import Identification
+    from tuning.identify.estimate import Identification
     from tuning.runs.pools import Pool
 
 Floats = NDArray[np.float64]
@@ -359,40 +356,3 @@ def _summary(name: str, rows: Sequence[MachineRow]) -> TunerRow:
         sum(row.violations for row in rows),
         sum(row.failed for row in rows),
     )
-
-
-# --- files ------------------------------------------------------------------------------------------------------------
-def save(comparison: Comparison, folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write tuners.csv, rivals.csv, machines.csv, comparison.png and settings.toml into a folder that exists."""
-    from tuning.compare.against_best import RivalRow, all_rivals
-    from tuning.compare.comparison_picture import draw
-
-    _write_csv(folder / "tuners.csv", comparison.tuners, TunerRow)
-    _write_csv(folder / "rivals.csv", all_rivals(comparison), RivalRow)
-    _write_csv(folder / "machines.csv", comparison.rows, MachineRow)
-    (folder / "settings.toml").write_text(settings_text(settings), encoding="utf-8", newline="\n")
-    draw(comparison, folder / "comparison.png")
-
-
-def settings_text(settings: Mapping[str, Any]) -> str:
-    """Return settings as TOML; what is None is left out."""
-    return "".join(f"{name} = {_toml(value)}\n" for name, value in settings.items() if value is not None)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"[{', '.join(map(toml, value))}]" if isinstance(value, list | tuple) else toml(value)
-
-
-def _write_csv(path: Path, rows: Sequence[Any], kind: type) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        names = [field.name for field in fields(kind)]
-        writer.writerow(names)
-        for row in rows:
-            writer.writerow([_cell(getattr(row, name)) for name in names])
-
-
-def _cell(value: Any) -> Any:
-    return f"{value:.6g}" if isinstance(value, float) else value

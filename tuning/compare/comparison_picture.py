@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tuning.compare.comparison import WORSE as WORSE_FROM
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -21,8 +23,6 @@ def draw(comparison: Comparison, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
-
-    from tuning.compare.comparison import WORSE as WORSE_FROM
 
     tuners = list(reversed(comparison.tuners))  # the best at the top
     figure = Figure(figsize=(11.0, 1.9 + ROW * max(len(tuners), 4)), layout="constrained")

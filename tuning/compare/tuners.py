@@ -23,7 +23,7 @@ from tuning.search.trial_bench import TrialBench, read_gains
 from tuning.target import Target, timed
 
 if TYPE_CHECKING:
-    from tuning.identify.identification import Identification
+    from tuning.identify.estimate import Identification
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

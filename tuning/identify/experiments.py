@@ -14,7 +14,7 @@ from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import check_linear_model, gains_from_bandwidths, write_gains
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders
-from tuning.identify.identification import NAMES, Estimate, Identification, Progress, refused
+from tuning.identify.estimate import NAMES, Estimate, Identification, Progress, refused
 from tuning.identify.inertia import Mechanics, identify_mechanics
 from tuning.identify.standstill import standstill_resistances
 from tuning.identify.winding import Winding, identify_winding, pulse, to_torque_mode

@@ -23,7 +23,7 @@ from drive_env.dictionary.units import RPM
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.gains import write_gains
 from tuning.identify.confidence import gain_error, interval, t_quantile
-from tuning.identify.identification import Estimate, refused
+from tuning.identify.estimate import Estimate, refused
 from tuning.identify.working_state import CYCLE, GUESS, Working, cautious_gains, go_back, still_enabled
 from tuning.oscillation_watch import SOFTER, OscillationError, watch_of
 from tuning.stop_causes import stop_causes

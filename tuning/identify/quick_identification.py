@@ -21,8 +21,8 @@ from drive_env.dictionary.roles import Role
 from drive_env.gains import write_gains
 from drive_env.trials.gain_trial import Identified, Trials
 from tuning.identify.encoder_check import PULSED
+from tuning.identify.estimate import NAMES, Estimate, Identification, Progress, refused
 from tuning.identify.experiments import MECHANICS, RESPONSE, UNITS, WORST_MISFIT, Experiments
-from tuning.identify.identification import NAMES, Estimate, Identification, Progress, refused
 from tuning.identify.winding import BRIEFLY, identify_winding, pulse, to_torque_mode
 from tuning.identify.working_state import GUESS, Working, cautious_gains, enable, switch_off
 from tuning.oscillation_watch import shaken

@@ -18,7 +18,7 @@ from drive_env.dictionary.roles import Role
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.dead_time import dead_time
 from tuning.identify.encoder_check import able, stay_inside
-from tuning.identify.identification import Estimate, refused
+from tuning.identify.estimate import Estimate, refused
 from tuning.identify.winding import SUPPLY_IDLE, WIDEST
 from tuning.identify.working_state import BY_FIELD, CYCLE, Working, enable, still_enabled, switch_off
 from tuning.stop_causes import stop_causes

@@ -24,7 +24,7 @@ from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.dead_time import dead_time
-from tuning.identify.identification import Estimate, refused
+from tuning.identify.estimate import Estimate, refused
 from tuning.identify.working_state import CYCLE, Working, still_enabled
 from tuning.stop_causes import stop_causes
 

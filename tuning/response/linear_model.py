@@ -27,9 +27,8 @@ from drive_env.gains import Gains, check_linear_model
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.drives.interface import Drives
     from drive_env.motors import Motor
-    from tuning.identify.identification import Identification
+    from tuning.identify.estimate import Identification
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -127,17 +126,6 @@ class Plant:
         if math.isfinite(viscous):
             known["viscous"] = max(viscous, 0.0) * motor.torque_constant
         return cls.from_data_sheet(device, motor, supply, inertia, **known)
-
-    @classmethod
-    def from_machine(cls, drives: Drives, axis: int = 0) -> Plant:
-        """Return what an emulated axis truly is, linearised at its start; for tests.
-
-        Raises:
-            ValueError: For drives on a bus, whose truth nobody knows, and for a machine with several axes.
-        """
-        from tuning.identify.true_plant import true_plant
-
-        return true_plant(drives, axis)
 
 
 # --- the loops --------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from tuning.response.linear_model import controllers, outer_loop, velocity_open_
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from tuning.identify.identification import Estimate
+    from tuning.identify.estimate import Estimate
     from tuning.response.linear_model import Plant
     from tuning.response.plant_fit import PlantFit
 

@@ -1,0 +1,34 @@
+"""The algorithms of Stable-Baselines3 and its contributions that agents are trained with."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+# Algorithm -> its class.
+ALGORITHMS = {
+    "ppo": "stable_baselines3:PPO",
+    "sac": "stable_baselines3:SAC",
+    "recurrent_ppo": "sb3_contrib:RecurrentPPO",
+}
+
+
+class MissingPackageError(ImportError):
+    """A package that training needs is not installed; the message says which extra has it."""
+
+
+def need(package: str) -> None:
+    """Raise MissingPackageError for a package that is not installed."""
+    try:
+        importlib.import_module(package)
+    except ImportError:
+        raise MissingPackageError(
+            f"training needs {package}, which is not installed: pip install 'drive-env[agents]'"
+        ) from None
+
+
+def algorithm_class(name: str) -> Any:
+    """Return the class of an algorithm."""
+    module, _, kind = ALGORITHMS[name].partition(":")
+    need(module)
+    return getattr(importlib.import_module(module), kind)

@@ -1,0 +1,108 @@
+"""A certificate's files: written together with its report, read back to the last digit, and checked by their hashes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from drive_env.whole_file import content_hash, files_to_be
+from mechanics.untrusted import parse_json, read_text
+from tuning.certificate.certificate import FORMAT, HASH, Certificate, CertificateError, Floats
+from tuning.certificate.report import html_is_unchanged, to_html
+
+
+def save_certificate(certificate: Certificate, folder: str | Path) -> tuple[Path, Path]:
+    """Write certificate.json and report.html into a folder, made if needed, and return their paths."""
+    with certificate_files(certificate, folder) as paths:
+        return paths
+
+
+@contextmanager
+def certificate_files(certificate: Certificate, folder: str | Path) -> Iterator[tuple[Path, Path]]:
+    """Have certificate.json and report.html on the disk while a block runs; they vanish again if it fails.
+
+    Raises:
+        OSError: If they cannot be written, with the file and the reason.
+    """
+    told, report = Path(folder) / "certificate.json", Path(folder) / "report.html"
+    with files_to_be({told: certificate.to_json(), report: to_html(certificate)}):
+        yield told, report
+
+
+def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
+    """Return the certificate of a JSON file, and whether it is unchanged since it was written.
+
+    Raises:
+        CertificateError: If the file is no certificate.
+    """
+    data = _read(Path(path))
+    stated = data.pop(HASH)
+    unchanged = content_hash(data) == stated
+    data.pop("format")
+    try:
+        return _built(Certificate, data), unchanged
+    except (KeyError, TypeError, ValueError) as error:
+        raise CertificateError(f"{path} is no certificate of this version: {error}") from None
+
+
+def is_unchanged(path: str | Path) -> bool:
+    """Return whether a certificate.json, or a report.html, is as it was written.
+
+    Raises:
+        CertificateError: If the file is neither.
+    """
+    where = Path(path)
+    if where.suffix == ".html":
+        return html_is_unchanged(_text(where))
+    data = _read(where)
+    return bool(content_hash({k: v for k, v in data.items() if k != HASH}) == data[HASH])
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        data = parse_json(_text(path))
+    except CertificateError:
+        raise
+    except ValueError as error:
+        raise CertificateError(f"{path} is no certificate: {error}; give a certificate.json of drive-tune") from None
+    if not isinstance(data, dict) or HASH not in data or data.get("format") != FORMAT:
+        raise CertificateError(f"{path} is no certificate of format {FORMAT}; give a certificate.json of drive-tune")
+    return data
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_text(path)
+    except OSError as error:
+        raise CertificateError(f"cannot read {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise CertificateError(f"{path} is no text; give a certificate.json of drive-tune") from None
+
+
+def _built(kind: Any, data: Mapping[str, Any]) -> Any:
+    """Return a dataclass from what `_plain` made of it."""
+    kinds = get_type_hints(kind)
+    return kind(**{f.name: _value(kinds[f.name], data[f.name]) for f in fields(kind)})
+
+
+def _value(kind: Any, value: Any) -> Any:
+    if get_origin(kind) is tuple:
+        item = get_args(kind)[0]
+        return tuple(_built(item, one) for one in value) if is_dataclass(item) else tuple(value)
+    if get_origin(kind) is Mapping and is_dataclass(item := get_args(kind)[1]):
+        return {name: _built(item, one) for name, one in value.items()}
+    if kind == Mapping[str, float]:
+        return {name: _number(one) for name, one in value.items()}
+    if kind == Floats:
+        return np.array([_number(one) for one in value], float)
+    return _number(value) if kind is float else value
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)

@@ -1,0 +1,47 @@
+"""The files of a comparison: its tables as CSV, its picture, and the settings that give it again."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from tuning.compare.against_best import RivalRow, all_rivals
+from tuning.compare.comparison import Comparison, MachineRow, TunerRow
+from tuning.compare.comparison_picture import draw
+from tuning.toml_tables import toml
+
+
+def save(comparison: Comparison, folder: Path, settings: Mapping[str, Any]) -> None:
+    """Write tuners.csv, rivals.csv, machines.csv, comparison.png and settings.toml into a folder that exists."""
+    _write_csv(folder / "tuners.csv", comparison.tuners, TunerRow)
+    _write_csv(folder / "rivals.csv", all_rivals(comparison), RivalRow)
+    _write_csv(folder / "machines.csv", comparison.rows, MachineRow)
+    (folder / "settings.toml").write_text(settings_text(settings), encoding="utf-8", newline="\n")
+    draw(comparison, folder / "comparison.png")
+
+
+def settings_text(settings: Mapping[str, Any]) -> str:
+    """Return settings as TOML; what is None is left out."""
+    return "".join(f"{name} = {_toml(value)}\n" for name, value in settings.items() if value is not None)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"[{', '.join(map(toml, value))}]" if isinstance(value, list | tuple) else toml(value)
+
+
+def _write_csv(path: Path, rows: Sequence[Any], kind: type) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        names = [field.name for field in fields(kind)]
+        writer.writerow(names)
+        for row in rows:
+            writer.writerow([_cell(getattr(row, name)) for name in names])
+
+
+def _cell(value: Any) -> Any:
+    return f"{value:.6g}" if isinstance(value, float) else value
