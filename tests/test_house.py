@@ -17,11 +17,11 @@ MOST_LINES, MOST_ARGUMENTS = 60, 10
 LONG = {
     "agents/commands/evaluate.py evaluate", "agents/commands/tune.py tune", "agents/evaluation/evaluation.py evaluate",
     "agents/training/search.py search", "agents/training/train.py _segments_class",
-    "agents/tuner/tune_target.py tune_target", "drive_env/canopen/node.py __init__",
+    "agents/tuner/tune_target.py tune_target",
     "drive_env/commands/check_model.py check_model", "drive_env/commands/jog.py jog",
     "drive_env/commands/scope.py _record", "drive_env/commands/serve.py serve",
     "drive_env/emulator/emulated_drives.py __init__",
-    "drive_env/firmware/common/modes/hm.py generate", "drive_env/firmware/servo/power_stage.py power_stage",
+    "drive_env/firmware/servo/power_stage.py power_stage",
     "drive_env/firmware/servo/power_stage.py refresh_winding", "mechanics/packed.py _new_plant",
     "mechanics/stepping.py drive", "mechanics/stepping.py report", "mechanics/stepping.py rub",
     "tuning/commands/optimise.py optimise", "tuning/commands/rank.py _compare",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -110,18 +110,7 @@ class Node:
         self._restore_bus()
         self._module.restore(self.node_id, {})
 
-        self._sdo = SdoServer(self.dictionary.port, device.canopen.sdo_timeout)
-        self._emergency = EmergencyProducer(self._transmit)
-        self._conditions: dict[Hashable, ErrorCondition] = {}
-        self._heartbeat = HeartbeatProducer()
-        self._guarding = NodeGuarding()
-        self._consumers: list[HeartbeatConsumer] = []
-        indices = sorted({entry.index for entry in entries})
-        port = self.dictionary.port
-        self._rpdos = [ReceivePdo(i, self._module, port) for i in indices if i in communication.RPDO]
-        units = device.canopen.inhibit_unit, device.canopen.event_unit
-        self._tpdos = [TransmitPdo(i, self._module, port, *units) for i in indices if i in communication.TPDO]
-        self._pdos = {pdo.index: pdo for pdo in (*self._rpdos, *self._tpdos)}
+        self._make_services(sorted({entry.index for entry in entries}))
         self._handlers: dict[int, tuple[Callable[[bytes, float], None], ...]] = {}
         self._frames_left = self._frames_per_cycle = device.canopen.frames_per_cycle if takes_time else math.inf
         self._boot_time = device.canopen.boot_time if takes_time else 0.0
@@ -129,6 +118,21 @@ class Node:
         self._boot: Callable[[float], None] = self._reset_communication
         self._received: deque[Frame] = deque()
         self._has_lost = False  # frames, since its receive buffer was last half empty
+
+    def _make_services(self, indices: Sequence[int]) -> None:
+        """Make SDO server, emergencies, error control and the PDOs of the dictionary's indices."""
+        device = self._device
+        self._sdo = SdoServer(self.dictionary.port, device.canopen.sdo_timeout)
+        self._emergency = EmergencyProducer(self._transmit)
+        self._conditions: dict[Hashable, ErrorCondition] = {}
+        self._heartbeat = HeartbeatProducer()
+        self._guarding = NodeGuarding()
+        self._consumers: list[HeartbeatConsumer] = []
+        port = self.dictionary.port
+        self._rpdos = [ReceivePdo(i, self._module, port) for i in indices if i in communication.RPDO]
+        units = device.canopen.inhibit_unit, device.canopen.event_unit
+        self._tpdos = [TransmitPdo(i, self._module, port, *units) for i in indices if i in communication.TPDO]
+        self._pdos = {pdo.index: pdo for pdo in (*self._rpdos, *self._tpdos)}
 
     # --- the interface --------------------------------------------------------------------------------------------
     @property

@@ -97,63 +97,97 @@ def _run(drive, lane, velocity, dt):
 
 
 @stage
+def _search(drive, lane, state, active, dt):
+    """Search the switch, fast; return the state after it."""
+    method = drive.homing_method[lane]
+    sign = _search_sign(method)
+    direction = sign if state == SEARCH else -sign
+    drive.homing_direction[lane] = direction
+    if active:
+        state = BRAKE
+        # An axis that still comes from the other way leaves a narrow switch on that side.
+        v = drive.velocity_demand[lane]
+        drive.homing_direction[lane] = direction if v == 0.0 else (1.0 if v > 0.0 else -1.0)
+    elif method in (19, 21) and inputs.is_active(drive, lane, RIGHT if direction > 0.0 else LEFT):
+        # The search led away from the switch: it lies on the other side, or nowhere.
+        state = TURNED if state == SEARCH else FAILED
+    if state in (SEARCH, TURNED):
+        _run(drive, lane, (sign if state == SEARCH else -sign) * drive.homing_fast[lane], dt)
+    return state
+
+
+@stage
+def _come_to_rest(drive, lane, active, dt):
+    """Brake on the switch; return the state after it."""
+    _run(drive, lane, 0.0, dt)
+    # The axis lags behind its demand: where it comes to rest decides on which side of the edge it is.
+    if drive.velocity_demand[lane] == 0.0 and abs(drive.omega_slow[lane]) <= drive.standstill[lane]:
+        return TO_EDGE if active else AWAY
+    return BRAKE
+
+
+@stage
+def _come_back(drive, lane, sign, active, dt):
+    """Go back onto a narrow switch that braking carried the axis across, slowly; return the state after it."""
+    back = -drive.homing_direction[lane]
+    if not active:
+        _run(drive, lane, back * drive.homing_slow[lane], dt)
+        return AWAY
+    return TO_EDGE if back * sign < 0.0 else BRAKE
+
+
+@stage
+def _leave_switch(drive, lane, sign, active, dt):
+    """Look for the edge, slowly; return the state after it."""
+    if not active and drive.velocity_demand[lane] * sign < 0.0:
+        set_home(drive, lane, drive.theta_meas[lane], -drive.home_offset[lane])
+        return RETURN
+    if inputs.is_active(drive, lane, LEFT if sign > 0.0 else RIGHT):
+        return FAILED
+    _run(drive, lane, -sign * drive.homing_slow[lane], dt)
+    return TO_EDGE
+
+
+@stage
+def _return_to_edge(drive, lane, dt):
+    """Return to the edge and rest there; return the state after it."""
+    edge, acceleration = drive.homing_edge[lane], drive.homing_acceleration[lane]
+    x, v = profiles.trapezoid(
+        drive.position_demand[lane],
+        drive.velocity_demand[lane],
+        edge,
+        drive.homing_slow[lane],
+        acceleration,
+        acceleration,
+        dt,
+    )
+    drive.position_demand[lane] = x
+    drive.velocity_demand[lane] = v
+    if v == 0.0 and x == edge:
+        drive.homing_attained[lane] = 1
+        drive.target_reached[lane] = 1
+        return DONE
+    return RETURN
+
+
+@stage
 def generate(drive, lane, dt):
     """Run homing for one period of dt [s]; without a run the axis holds."""
     drive.loop_level[lane] = 2
     state = drive.homing_state[lane]
     method = drive.homing_method[lane]
-    fast, slow = drive.homing_fast[lane], drive.homing_slow[lane]
     sign = _search_sign(method)
     active = inputs.is_active(drive, lane, _switch(method))
     if state in (SEARCH, TURNED):
-        direction = sign if state == SEARCH else -sign
-        drive.homing_direction[lane] = direction
-        if active:
-            state = BRAKE
-            # An axis that still comes from the other way leaves a narrow switch on that side.
-            v = drive.velocity_demand[lane]
-            drive.homing_direction[lane] = direction if v == 0.0 else (1.0 if v > 0.0 else -1.0)
-        elif method in (19, 21) and inputs.is_active(drive, lane, RIGHT if direction > 0.0 else LEFT):
-            # The search led away from the switch: it lies on the other side, or nowhere.
-            state = TURNED if state == SEARCH else FAILED
-        if state in (SEARCH, TURNED):
-            _run(drive, lane, (sign if state == SEARCH else -sign) * fast, dt)
+        state = _search(drive, lane, state, active, dt)
     if state == BRAKE:
-        _run(drive, lane, 0.0, dt)
-        # The axis lags behind its demand: where it comes to rest decides on which side of the edge it is.
-        if drive.velocity_demand[lane] == 0.0 and abs(drive.omega_slow[lane]) <= drive.standstill[lane]:
-            state = TO_EDGE if active else AWAY
+        state = _come_to_rest(drive, lane, active, dt)
     elif state == AWAY:
-        # Braking carried the axis across a narrow switch: back onto it, slowly.
-        back = -drive.homing_direction[lane]
-        if not active:
-            _run(drive, lane, back * slow, dt)
-        else:
-            state = TO_EDGE if back * sign < 0.0 else BRAKE
+        state = _come_back(drive, lane, sign, active, dt)
     elif state == TO_EDGE:
-        if not active and drive.velocity_demand[lane] * sign < 0.0:
-            set_home(drive, lane, drive.theta_meas[lane], -drive.home_offset[lane])
-            state = RETURN
-        elif inputs.is_active(drive, lane, LEFT if sign > 0.0 else RIGHT):
-            state = FAILED
-        else:
-            _run(drive, lane, -sign * slow, dt)
+        state = _leave_switch(drive, lane, sign, active, dt)
     elif state == RETURN:
-        x, v = profiles.trapezoid(
-            drive.position_demand[lane],
-            drive.velocity_demand[lane],
-            drive.homing_edge[lane],
-            slow,
-            drive.homing_acceleration[lane],
-            drive.homing_acceleration[lane],
-            dt,
-        )
-        drive.position_demand[lane] = x
-        drive.velocity_demand[lane] = v
-        if v == 0.0 and x == drive.homing_edge[lane]:
-            state = DONE
-            drive.homing_attained[lane] = 1
-            drive.target_reached[lane] = 1
+        state = _return_to_edge(drive, lane, dt)
     elif state in (STOPPED, FAILED):
         _run(drive, lane, 0.0, dt)
         drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
