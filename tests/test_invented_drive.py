@@ -6,6 +6,8 @@ speeds in rpm, no cst, and fewer methods of homing.
 
 from __future__ import annotations
 
+import csv
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +31,10 @@ from drive_env.gains import has_linear_model, rule_gains
 from drive_env.motors import find_motor
 from tuning.auto.one_button import auto
 from tuning.commands.cli import app
+from tuning.compare.comparison import compare
+from tuning.compare.suite import SuiteMachine
 from tuning.identify.identification import identify
+from tuning.outcome import Outcome
 from tuning.rules.rules_by_name import propose
 from tuning.runs import sweep
 from tuning.runs.experiment import ExperimentError, SweptObject, load_experiment, resolve
@@ -39,6 +44,10 @@ from tuning.target import emulated
 FOLDER = Path(__file__).parent / "invented_drive"
 INVENTED = str(FOLDER)
 NAMES = ("speed_gain", "speed_integrator", "position_gain")
+NO_MODEL = (
+    f"{INVENTED}: this drive has no linear model of its loops; drive-tune sweep and optimise need none, and find gains "
+    "by trials"
+)
 SPEED_GAIN, SPEED_INTEGRATOR = "3200h:01", "3200h:02"
 
 
@@ -87,6 +96,51 @@ def test_the_command_writes_them_by_their_names(tmp_path):
     assert done.exit_code == 0, done.output
     head = (tmp_path / "found" / "trials.csv").read_text(encoding="utf-8").splitlines()[0]
     assert head.startswith("search,trial,axis,speed_gain,speed_integrator,position_gain,")
+
+
+SUITE = """
+device = {device}
+
+[[group]]
+load = "inertia"
+motor = "qbl4208"
+supply = [24, 26]
+[group.parameters]
+"load.inertia" = [4.8e-06, 4.32e-05]
+"""
+
+
+def test_tuners_are_ranked_on_it_under_the_names_of_its_gains(tmp_path):
+    suite, out = tmp_path / "suite.toml", tmp_path / "out"
+    suite.write_text(SUITE.format(device=json.dumps(INVENTED)), encoding="utf-8")
+    line = ["rank", "--suite", suite, "-t", "factory", "-t", "fitted", "-t", "random", "-t", "simc", "--trials", "2",
+            "--out", out]  # fmt: skip
+    done = CliRunner().invoke(app, [str(word) for word in line])
+    assert done.exit_code == 0, done.output
+    rows = list(csv.DictReader((out / "machines.csv").open(encoding="utf-8")))
+    preset = find_device(INVENTED).preset(find_motor("qbl4208"))
+    factory = [preset[f"Controller.{name}"] for name in ("Speed gain", "Speed integrator", "Position gain")]
+    for row in rows:
+        gains = [int(row[name]) for name in NAMES]
+        assert np.isfinite(float(row["hidden"]))
+        if row["tuner"] == "factory":
+            assert gains == factory
+        if row["tuner"] == "fitted":
+            assert float(row["relative"]) == pytest.approx(1.0, abs=0.3)  # the inertia that moves show is the true one
+        assert (row["failed"] == "True") == (row["tuner"] == "simc")
+    assert list(rows[0])[-4:] == [*NAMES, "note"]
+    assert {row["note"] for row in rows if row["tuner"] == "simc"} == {f"ValueError: {NO_MODEL}"}
+
+
+def test_a_tuner_that_returns_the_gains_of_another_drive_has_failed():
+    def of_another(target, rng):
+        n = target.num_axes
+        return Outcome(np.ones((n, 5), np.int64), np.zeros(n), *[np.zeros(n, np.int64)] * 3, ("",) * n)
+
+    (machine,) = (SuiteMachine("one", INVENTED, "inertia", "qbl4208", {}, 24.0),)
+    (row,) = compare([machine], {"of_another": of_another}).rows
+    assert row.failed
+    assert "integer gains of shape (1, 3), not int64 (1, 5)" in row.note
 
 
 def test_an_agent_tunes_them_as_an_episode():
