@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
-from drive_env.gains import Gains, write_gains
+from drive_env.gains import write_gains
 from tuning.identify.wiring import Key, changes, corrected, findings
 from tuning.identify.working_state import BOTH_ENDS
 from tuning.snapshot import Transaction, restore
@@ -106,7 +106,7 @@ def write(run: AutoRun, transaction: Transaction) -> Mask:
         axes.append(wanted | {key: int(column[k]) for key, column in kept.items()})
     restore(drives, replace(transaction.before, axes=tuple(axes)), going, whole=False)
     for axis in np.flatnonzero(going):
-        run.axes[axis].after = Gains(*map(int, run.gains[axis]))
+        run.axes[axis].after = tuple(map(int, run.gains[axis]))
     return going
 
 
