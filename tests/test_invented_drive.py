@@ -29,7 +29,7 @@ from drive_env.dictionary.units import UNITS, Context
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.tracking import Tracking
-from drive_env.gains import has_linear_model, rule_gains
+from drive_env.gains import gain_factors, has_linear_model, rule_gains
 from drive_env.motors import find_motor
 from tuning.auto.one_button import auto
 from tuning.certificate.certificate import si_gains
@@ -38,6 +38,7 @@ from tuning.compare.comparison import compare
 from tuning.compare.suite import SuiteMachine
 from tuning.identify.identification import identify
 from tuning.outcome import Outcome
+from tuning.response.frequency_response import measure
 from tuning.response.linear_model import controllers
 from tuning.rules.rules_by_name import propose
 from tuning.runs import sweep
@@ -75,6 +76,20 @@ def test_a_sweep_goes_over_its_objects():
     found = sweep.run(replace(load_experiment(), device=INVENTED, load="inertia", sweep=swept))
     assert len(found.order) == 6
     assert found.objects == (SPEED_GAIN, SPEED_INTEGRATOR)
+
+
+def test_the_sweep_that_ships_covers_the_same_gains_in_its_units():
+    found, known = load_experiment(device=INVENTED), load_experiment()
+    assert [swept.object for swept in found.sweep] == ["speed_gain", "speed_integrator"]
+    theirs = gain_factors(find_device(known.device))
+    for swept, other, factor, own in zip(
+        found.sweep, known.sweep, theirs[2:4], gain_factors(find_device(INVENTED)), strict=False
+    ):
+        assert (swept.low * own, swept.high * own) == pytest.approx((other.low * factor, other.high * factor), rel=0.05)
+        assert (swept.count, swept.spacing) == (other.count, other.spacing)
+    small = replace(found, sweep=tuple(replace(swept, count=2) for swept in found.sweep))
+    assert sweep.run(small).objects == (SPEED_GAIN, SPEED_INTEGRATOR)
+    assert load_experiment(device="tmcm1636_fw109").sweep == known.sweep  # which counts alike
 
 
 @pytest.mark.parametrize("name", ["2042h:01", "3041h:01"])  # another drive's; its own current loop, which is fixed
@@ -184,11 +199,13 @@ def test_what_needs_a_linear_model_says_that_it_has_none(tmp_path):
         for needs_it in (
             lambda: auto(target, tmp_path / "before.toml"),
             lambda: identify(target),
+            lambda: measure(target),
             lambda: propose("simc", device, motor, None),
             lambda: controllers(device, (1, 1, 1)),
         ):
             with pytest.raises(ValueError, match=re.escape(NO_MODEL)):
                 needs_it()
+        assert not target.drives.read(0x6064).any()  # nothing has moved
     assert list(tmp_path.iterdir()) == []
 
 
