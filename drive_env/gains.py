@@ -302,7 +302,7 @@ def per_chip(device: Device) -> dict[Part, float]:
     """Return how many integers of a device are one of the chip, by loop and part; exactly 1 where it counts alike.
 
     Raises:
-        ValueError: If the device names no cascade, or has a gain which that does not have.
+        ValueError: If the device names no cascade, or has a gain which that does not have, or has once.
     """
     known = device.gains
     if known.cascade != PI:
@@ -310,13 +310,19 @@ def per_chip(device: Device) -> dict[Part, float]:
             f"{device.name} names no cascade of its loops, so that no gains follow from its motor; give its gains.toml "
             f'cascade = "{PI}" if its loops are that one, or set gains by hand and use drive-tune sweep'
         )
-    context, ratios = _context(device), {}
+    context = _context(device)
+    ratios: dict[Part, float] = {}
     for row, own in zip(known.rows, gain_factors(device), strict=True):
         part = row.loop, row.part
         if part not in _CHIP:
             raise ValueError(
                 f"{device.name}: gains.toml: {row.name} is {row.part} of the {row.loop} loop, which the cascade "
                 f'"{PI}" does not have; it has {", ".join(f"{p} of {loop}" for loop, p in _CHIP)}'
+            )
+        if part in ratios:
+            raise ValueError(
+                f"{device.name}: gains.toml: {row.name} is a second {row.part} of the {row.loop} loop; the cascade "
+                f'"{PI}" has one'
             )
         ratios[part] = float(UNITS[_CHIP[part]].factor(context)) / own
     return ratios

@@ -248,6 +248,13 @@ def test_without_a_cascade_there_is_no_rule_and_every_method_says_so(tmp_path):
         assert not Path(out).exists()
 
 
+def test_two_gains_of_one_part_are_no_cascade():
+    device = find_device(INVENTED)
+    twice = (*device.gains.rows, device.gains.rows[0]._replace(name="speed_gain_2", key=(0x3200, 2)))
+    with pytest.raises(ValueError, match=r"gains.toml: speed_gain_2 is a second P of the velocity loop"):
+        rule_gains(device._replace(gains=replace(device.gains, rows=twice)), find_motor("qbl4208"), 1e-5)
+
+
 # --- the rest of a drive's life ---------------------------------------------------------------------------------------
 @pytest.mark.parametrize("load", ["inertia", "two_mass"])
 def test_it_keeps_the_contract(load):

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drive_env.dictionary.roles import Role
 from drive_env.gains import cascade_columns
 from tuning.response.linear_model import OPEN_LOOPS
 from tuning.response.margins import margins
@@ -62,8 +63,9 @@ def wrong_wiring(target: Target, identified: Identification) -> str:
     if direction is not None and direction.value < 0.0:
         return identified.estimates["inertia"].reason
     if pairs is not None and pairs.is_known and round(pairs.value) != target.motor.n_p:
+        index, _ = target.device.roles[Role.POLE_PAIRS]
         return (
             f"the motor has {pairs.value:.0f} pole pairs, and {target.motor.name} has {target.motor.n_p}: "
-            "it is another motor; give --motor, or correct 2056h"
+            f"it is another motor; give --motor, or correct {index:04X}h"
         )
     return ""

@@ -221,8 +221,8 @@ def _same_gains(experiment: Experiment, name: str) -> tuple[SweptObject, ...]:
         column = device.gains.column(gain.loop, gain.part)
         if column is None:
             raise ExperimentError(
-                f"{name} has no {gain.part} of the {gain.loop} loop, which the default experiment sweeps; give --config a "
-                f"file that sweeps some of {', '.join(device.gains.names)}"
+                f"{name} has no {gain.part} of the {gain.loop} loop, which the default experiment sweeps; give "
+                f"--config a file that sweeps some of {', '.join(device.gains.names)}"
             )
         other, ratio = device.gains.rows[column], factors[k] / theirs[column]
         if other.key == gain.key and ratio == 1.0:
