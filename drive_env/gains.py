@@ -14,7 +14,8 @@ units than the chip, which its bindings name.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,9 +28,12 @@ from drive_env.motors import Motor
 RAW_MAX = 32767  # the chip's registers are signed
 DEFAULT_INTEGRATION = 5.0  # T_i as a multiple of 1/w_v
 
+RawGains = Sequence[int] | NDArray[np.int64]  # in the order of the device's gain set
+Part = tuple[str, str]  # of a cascade: loop, and "P" or "I"
+
 
 class Gains(NamedTuple):
-    """Raw integers of a cascade of PI, PI and P loops."""
+    """Raw integers of a cascade of PI, PI and P loops, as the chip counts them."""
 
     torque_p: int
     torque_i: int
@@ -51,7 +55,7 @@ class Bandwidths(NamedTuple):
 
 
 class SiGains(NamedTuple):
-    """What raw gains are, whatever they act on.
+    """What raw gains are, whatever they act on; nan for one that a drive does not have.
 
     torque_p [V/A], torque_integration [s], velocity_p [A s/rad], velocity_integration [s], position_p [1/s].
     """
@@ -63,14 +67,19 @@ class SiGains(NamedTuple):
     position_p: float
 
 
-def gains_in_si(device: Device, supply: float, gains: Gains) -> SiGains:
-    """Return raw gains as gains [SI] of a drive with a supply voltage [V]; an integrator that is off takes for ever."""
+def gains_in_si(device: Device, supply: float, gains: RawGains) -> SiGains:
+    """Return gains of a device's set as gains [SI] with a supply voltage [V]; an integrator that is off takes for ever.
+
+    Raises:
+        ValueError: If the device names no cascade.
+    """
+    torque_p, torque_i, velocity_p, velocity_i, position_p = as_chip(device, gains)
     return SiGains(
-        torque_p=gains.torque_p * supply / (256.0 * device.current_full_scale),
-        torque_integration=65536.0 / device.current_rate / gains.torque_i if gains.torque_i else math.inf,
-        velocity_p=gains.velocity_p * device.current_full_scale / (256.0 * RPM * 32768.0),
-        velocity_integration=65536.0 / device.velocity_rate / gains.velocity_i if gains.velocity_i else math.inf,
-        position_p=gains.position_p / _POSITION_P_SCALE,
+        torque_p=torque_p * supply / (256.0 * device.current_full_scale),
+        torque_integration=65536.0 / device.current_rate / torque_i if torque_i else math.inf,
+        velocity_p=velocity_p * device.current_full_scale / (256.0 * RPM * 32768.0),
+        velocity_integration=65536.0 / device.velocity_rate / velocity_i if velocity_i else math.inf,
+        position_p=position_p / _POSITION_P_SCALE,
     )
 
 
@@ -85,7 +94,7 @@ def gains_from_bandwidths(
     supply: float | None = None,
     integration: float = DEFAULT_INTEGRATION,
 ) -> Gains:
-    """Return the raw gains for the bandwidths wanted.
+    """Return the raw gains for the bandwidths wanted, of a device whose gain set is that of the chip.
 
     Args:
         device: The drive.
@@ -98,9 +107,13 @@ def gains_from_bandwidths(
         integration: Integration time of the velocity loop as a multiple of 1/w_v.
 
     Raises:
-        ValueError: If a gain leaves its range, or the drive has no linear model of its loops.
+        ValueError: If a gain leaves its range, or the device has other gains than the chip: `bandwidth_gains` has any.
     """
-    check_linear_model(device)
+    if device.gains.names != Gains._fields:
+        raise ValueError(
+            f"{device.name} has the gains {', '.join(device.gains.names)}, not {', '.join(Gains._fields)}; take "
+            "bandwidth_gains, which returns those of any device"
+        )
     raw = bandwidth_gains(
         device, motor, inertia, current_hz=current_hz, velocity_hz=velocity_hz, position_hz=position_hz,
         supply=supply, integration=integration,
@@ -140,15 +153,16 @@ def bandwidth_gains(
 
 
 def bandwidths_from_gains(
-    device: Device, motor: Motor, inertia: float, gains: Gains, *, supply: float | None = None
+    device: Device, motor: Motor, inertia: float, gains: RawGains, *, supply: float | None = None
 ) -> Bandwidths:
-    """Return what raw gains mean; the inverse of `gains_from_bandwidths`."""
+    """Return what gains of a device's set mean; the inverse of `bandwidth_gains`. nan for what it has no gain of."""
     two_pi = 2.0 * math.pi
+    torque_p, _, velocity_p, velocity_i, position_p = as_chip(device, gains)
     return Bandwidths(
-        current_hz=gains.torque_p / _torque_p_scale(device, motor, supply) / two_pi,
-        velocity_hz=gains.velocity_p / _velocity_p_scale(device, motor, inertia) / two_pi,
-        velocity_integration_s=65536.0 / device.velocity_rate / gains.velocity_i if gains.velocity_i else math.inf,
-        position_hz=gains.position_p / _POSITION_P_SCALE / two_pi,
+        current_hz=torque_p / _torque_p_scale(device, motor, supply) / two_pi,
+        velocity_hz=velocity_p / _velocity_p_scale(device, motor, inertia) / two_pi,
+        velocity_integration_s=65536.0 / device.velocity_rate / velocity_i if velocity_i else math.inf,
+        position_hz=position_p / _POSITION_P_SCALE / two_pi,
     )
 
 
@@ -230,11 +244,6 @@ def small_time_constants(device: Device, velocity_filter: ArrayLike, current_hz:
                       + 1.0 / device.velocity_rate)  # fmt: skip
 
 
-def scaled(raw: NDArray[Any], factor: ArrayLike) -> NDArray[np.int64]:
-    """Return raw gains times a factor as integers, cut off at 1 and 32767."""
-    return np.asarray(np.clip(np.rint(raw * np.asarray(factor, float)), 1, RAW_MAX), np.int64)
-
-
 # --- other devices' gains ---------------------------------------------------------------------------------------------
 PI = "pi"  # the cascade, as a device names it
 # The chip's gains in the order of `Gains`: loop and part, and the unit that it counts them in.
@@ -248,42 +257,113 @@ _CHIP = {
 
 
 def has_linear_model(device: Device) -> bool:
-    """Return whether the loops of a device are those of the linear model: the whole cascade, in the chip's units."""
-    rows = device.gains.rows
-    parts = {(row.loop, row.part): device.bindings[row.key].unit for row in rows}
-    return device.gains.cascade == PI and list(parts.items()) == list(_CHIP.items()) and len(rows) == len(parts)
+    """Return whether the loops of a device are those of the linear model: it has every gain of the cascade, once."""
+    return not _lacks(device)
 
 
 def check_linear_model(device: Device) -> None:
-    """Raise ValueError unless a device's loops are those of the linear model."""
-    if not has_linear_model(device):
+    """Raise ValueError unless a device's loops are those of the linear model, saying what it lacks."""
+    if lacks := _lacks(device):
         raise ValueError(
-            f"{device.name}: this drive has no linear model of its loops; drive-tune sweep and optimise need none, and "
-            "find gains by trials"
+            f"{device.name}: this drive has no linear model of its loops: {lacks}; drive-tune sweep and optimise need "
+            "none, and find gains by trials"
         )
 
 
-def _of_device(device: Device, raw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return raw gains of the chip, shape (..., 5), as those of a device, (..., count), in its units."""
+def _lacks(device: Device) -> str:
+    """Return what a device lacks for the linear model, "" for nothing."""
+    if device.gains.cascade != PI:
+        return "its gains.toml names no cascade"
+    own = [(row.loop, row.part) for row in device.gains.rows]
+    missing = [f"{part} of the {loop} loop" for loop, part in _CHIP if (loop, part) not in own]
+    if missing:
+        return f"its gains.toml has no {', no '.join(missing)}"
+    return "" if len(own) == len(_CHIP) else f"its gains.toml has {len(own)} gains, and the cascade {len(_CHIP)}"
+
+
+def cascade_columns(device: Device) -> list[int]:
+    """Return where in a device's gain set those of the cascade are: P, I of current, P, I of velocity, P of position.
+
+    Raises:
+        ValueError: If the drive has no linear model of its loops.
+    """
+    check_linear_model(device)
+    own = [(row.loop, row.part) for row in device.gains.rows]
+    return [own.index(part) for part in _CHIP]
+
+
+def gain_factors(device: Device) -> list[float]:
+    """Return what an integer of each gain is in the drive record: duty/A, A s/rad, 1/s; of an I, a share of P e."""
+    context = _context(device)
+    return [float(UNITS[device.bindings[row.key].unit].factor(context)) for row in device.gains.rows]
+
+
+def per_chip(device: Device) -> dict[Part, float]:
+    """Return how many integers of a device are one of the chip, by loop and part; exactly 1 where it counts alike.
+
+    Raises:
+        ValueError: If the device names no cascade, or has a gain which that does not have, or has once.
+    """
     known = device.gains
     if known.cascade != PI:
         raise ValueError(
             f"{device.name} names no cascade of its loops, so that no gains follow from its motor; give its gains.toml "
             f'cascade = "{PI}" if its loops are that one, or set gains by hand and use drive-tune sweep'
         )
-    context, order = Context(65536.0, device.current_full_scale / 32768.0), list(_CHIP)
-    columns, ratios = [], []
-    for row in known.rows:
+    context = _context(device)
+    ratios: dict[Part, float] = {}
+    for row, own in zip(known.rows, gain_factors(device), strict=True):
         part = row.loop, row.part
         if part not in _CHIP:
             raise ValueError(
                 f"{device.name}: gains.toml: {row.name} is {row.part} of the {row.loop} loop, which the cascade "
-                f'"{PI}" does not have; it has {", ".join(f"{p} of {loop}" for loop, p in order)}'
+                f'"{PI}" does not have; it has {", ".join(f"{p} of {loop}" for loop, p in _CHIP)}'
             )
-        columns.append(order.index(part))
-        chips, own = (float(UNITS[name].factor(context)) for name in (_CHIP[part], device.bindings[row.key].unit))
-        ratios.append(chips / own)
-    return np.asarray(raw[..., columns] * np.array(ratios))
+        if part in ratios:
+            raise ValueError(
+                f"{device.name}: gains.toml: {row.name} is a second {row.part} of the {row.loop} loop; the cascade "
+                f'"{PI}" has one'
+            )
+        ratios[part] = float(UNITS[_CHIP[part]].factor(context)) / own
+    return ratios
+
+
+def as_chip(device: Device, gains: RawGains) -> list[float]:
+    """Return gains of a device's set as the chip counts them, in the order of `Gains`; nan for one that it lacks.
+
+    Raises:
+        ValueError: If the device names no cascade.
+    """
+    own = {part: float(value) / ratio for value, (part, ratio) in zip(gains, per_chip(device).items(), strict=True)}
+    return [own.get(part, math.nan) for part in _CHIP]
+
+
+def integers_per_si(device: Device, supply: float) -> dict[Part, float]:
+    """Return how many integers of a device's gains are one in SI, by loop and part: of an I, of 1/T_i [1/s].
+
+    P of current [V/A], of velocity [A s/rad], of position [1/s]; the supply [V] is that of the drive.
+
+    Raises:
+        ValueError: If the device names no cascade.
+    """
+    chip = {
+        ("current", "P"): 256.0 * device.current_full_scale / supply,  # Q8.8, duty of the supply per full scale
+        ("current", "I"): 65536.0 / device.current_rate,
+        ("velocity", "P"): 256.0 * RPM * 32768.0 / device.current_full_scale,
+        ("velocity", "I"): 65536.0 / device.velocity_rate,
+        ("position", "P"): _POSITION_P_SCALE,
+    }
+    return {part: chip[part] * ratio for part, ratio in per_chip(device).items()}
+
+
+def _of_device(device: Device, raw: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return raw gains of the chip, shape (..., 5), as those of a device, (..., count), in its units."""
+    ratios, order = per_chip(device), list(_CHIP)
+    return np.asarray(raw[..., [order.index(part) for part in ratios]] * np.array(list(ratios.values())))
+
+
+def _context(device: Device) -> Context:
+    return Context(65536.0, device.current_full_scale / 32768.0)
 
 
 def write_gains(drives: Drives, gains: NDArray[np.int64], where: NDArray[np.bool_] | None = None) -> None:

@@ -19,7 +19,8 @@ HIDDEN = {"learned": [1.0, 2.0, 3.0, 8.0, 5.0], "tpe": [2.0, 2.5, 2.0, 4.0, 6.0]
 
 def comparison(table):
     def row(tuner, k, hidden):
-        return MachineRow(tuner, f"machine {k}", hidden, hidden / 2.0, 2.0, 1.0, 3, 0, 0, "", False, 1, 1, 1, 1, 1, "")
+        gains = {"torque_p": 1}
+        return MachineRow(tuner, f"machine {k}", hidden, hidden / 2.0, 2.0, 1.0, 3, 0, 0, "", False, gains, "")
 
     rows = tuple(row(name, k, hidden) for name, values in table.items() for k, hidden in enumerate(values))
     tuners = tuple(TunerRow(name, len(values), 1.0, 1.0, 0.0, 1.0, 3.0, 0, 0, 0) for name, values in table.items())

@@ -106,7 +106,7 @@ def test_a_second_ctrl_c_waits_until_everything_is_back(monkeypatch, tmp_path):
     [
         ("Transaction", "interrupted; nothing was changed"),
         ("prove", "interrupted; the drives are disabled and have the gains from before"),
-        ("Run.result", "interrupted; the drives are disabled and have the gains from before"),
+        ("AutoRun.result", "interrupted; the drives are disabled and have the gains from before"),
         ("Transaction.__exit__", "interrupted; the drives are disabled and have the new gains: drive-tune undo"),
     ],
 )

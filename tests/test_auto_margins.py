@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from drive_env import cia402, motion
+from drive_env.devices import find_device
 from drive_env.gains import Gains, write_gains
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.result import AxisRun
@@ -127,7 +128,7 @@ def test_a_loop_that_comes_too_near_to_instability_gets_half_its_gain(velocity, 
 
     monkeypatch.setattr(auto_margins, "_margins", found)
     axis = AxisRun(Gains(*full), Gains(*full))
-    target = SimpleNamespace(linked=linked)
+    target = SimpleNamespace(linked=linked, device=find_device("tmcm1636"))
     run = SimpleNamespace(axes=[axis], gains=full[None].copy(), spare=np.zeros((1, 5), np.int64), target=target)
     response = SimpleNamespace(f=np.arange(80.0), refined=lambda k: (None, None, np.ones(80, bool)))
     if linked:  # nothing is known of its position loop

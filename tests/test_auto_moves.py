@@ -10,6 +10,7 @@ import pytest
 from test_auto import gains, standing_in
 
 from drive_env import cia402, motion
+from drive_env.devices import find_device
 from drive_env.gains import Gains, rule_gains, write_gains
 from drive_env.master.pace import Timing
 from drive_env.trials.positioning import WATCH
@@ -33,6 +34,8 @@ from tuning.response.linear_model import Plant
 from tuning.rules.rules_by_name import propose
 from tuning.target import emulated
 
+VELOCITY_P = Gains._fields.index("velocity_p")
+
 
 def finds(monkeypatch, wanted):
     """Have the search on twins find these gains, (num_axes, 5)."""
@@ -54,7 +57,7 @@ def axes():
 
 def test_the_gains_before_are_kept_where_a_move_is_better_with_them(axes, monkeypatch, tmp_path):
     target, good = axes
-    slow = faster(good, 0.6)
+    slow = faster(target.device.gains, good, 0.6)
     write_gains(target.drives, np.stack([good, slow]))
     finds(monkeypatch, np.stack([slow, good]))
     result = auto(target, tmp_path / "before.toml", experiments=standing_in)
@@ -65,7 +68,7 @@ def test_the_gains_before_are_kept_where_a_move_is_better_with_them(axes, monkey
     assert kept.after == kept.before == Gains(*good)
     assert any(note.startswith("the gains before are kept: J by the measured terms") for note in kept.notes)
     assert "they are those before" in kept.verified
-    assert tuned.after.velocity_p >= good[2] > tuned.before.velocity_p
+    assert tuned.after[VELOCITY_P] >= good[VELOCITY_P] > tuned.before[VELOCITY_P]
     assert not any("are kept" in note for note in tuned.notes)
     paper = certificate(target, result, seed=0)
     # One move is shown, that with the gains which are there; what was measured with others says what these do.
@@ -83,7 +86,7 @@ def test_the_gains_before_are_kept_where_a_move_is_better_with_them(axes, monkey
 
 def test_a_fault_with_the_gains_before_is_theirs_and_is_reset(axes, monkeypatch, tmp_path):
     target, good = axes
-    write_gains(target.drives, np.stack([faster(good, 0.6)] * 2))
+    write_gains(target.drives, np.stack([faster(target.device.gains, good, 0.6)] * 2))
     finds(monkeypatch, np.stack([good, good]))
     show, machine = ProvingGround.show, target.drives.machine
 
@@ -108,7 +111,7 @@ def test_a_fault_with_the_gains_before_is_theirs_and_is_reset(axes, monkeypatch,
 @pytest.mark.slow
 def test_where_one_more_move_fails_the_second_best_of_the_trials_is_taken(axes, monkeypatch, tmp_path):
     target, good = axes
-    finds(monkeypatch, np.stack([faster(good, 0.8), good]))
+    finds(monkeypatch, np.stack([faster(target.device.gains, good, 0.8), good]))
     run, show, tried, shown = ProvingGround.run, ProvingGround.show, [], []
 
     def seen(self, gains, where):
@@ -251,7 +254,7 @@ def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tm
     assert [tuple(row) for row in having[idle]] == [
         axis.after for axis, one in zip(result.axes, idle, strict=True) if one
     ]
-    assert all(axis.after.velocity_p >= 0.9 * wanted[k, 2] for k, axis in enumerate(result.axes) if k != 3)
+    assert all(axis.after[VELOCITY_P] >= 0.9 * wanted[k, VELOCITY_P] for k, axis in enumerate(result.axes) if k != 3)
 
 
 # --- where a trial begins ---------------------------------------------------------------------------------------------
@@ -400,7 +403,10 @@ RULES = "the gains of the fitted rule: with faster ones it shook"
 ])  # fmt: skip
 def test_who_shakes_at_rest_takes_calmer_gains(had, eased, swing, gains_now, said):
     axis = AxisRun(Gains(*FOUND), Gains(*FOUND), eased=eased)
-    run = SimpleNamespace(axes=[axis], gains=np.array([had]), spare=np.full((1, 5), 9), reference=np.array([RULE]))
+    run = SimpleNamespace(
+        target=SimpleNamespace(device=find_device("tmcm1636")), axes=[axis], gains=np.array([had]),
+        spare=np.full((1, 5), 9), reference=np.array([RULE]),
+    )  # fmt: skip
     _ease(run, 0, swing, "it shook")
     assert (run.gains[0].tolist(), axis.notes, axis.eased) == (gains_now, [said], eased + 1)
     assert not run.spare.any()

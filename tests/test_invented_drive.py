@@ -6,6 +6,9 @@ speeds in rpm, no cst, and fewer methods of homing.
 
 from __future__ import annotations
 
+import csv
+import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,20 +19,27 @@ from test_contract import Life
 from test_parity import WorldBus
 from typer.testing import CliRunner
 
+from agents.commands.cli import app as agent_app
+from agents.tuner.tune_target import gains_for, surrogate
 from drive_env import CanDrives, EmulatedDrives, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.access import ObjectAccessError
-from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import UNITS, Context
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.tracking import Tracking
-from drive_env.gains import has_linear_model, rule_gains
+from drive_env.gains import gain_factors, has_linear_model, rule_gains
 from drive_env.motors import find_motor
 from tuning.auto.one_button import auto
+from tuning.certificate.certificate import si_gains
 from tuning.commands.cli import app
+from tuning.compare.comparison import compare
+from tuning.compare.suite import SuiteMachine
 from tuning.identify.identification import identify
+from tuning.outcome import Outcome
+from tuning.response.frequency_response import measure
+from tuning.response.linear_model import controllers
 from tuning.rules.rules_by_name import propose
 from tuning.runs import sweep
 from tuning.runs.experiment import ExperimentError, SweptObject, load_experiment, resolve
@@ -39,6 +49,10 @@ from tuning.target import emulated
 FOLDER = Path(__file__).parent / "invented_drive"
 INVENTED = str(FOLDER)
 NAMES = ("speed_gain", "speed_integrator", "position_gain")
+NO_MODEL = (
+    f"{INVENTED}: this drive has no linear model of its loops: its gains.toml has no P of the current loop, no I of "
+    "the current loop; drive-tune sweep and optimise need none, and find gains by trials"
+)
 SPEED_GAIN, SPEED_INTEGRATOR = "3200h:01", "3200h:02"
 
 
@@ -62,6 +76,20 @@ def test_a_sweep_goes_over_its_objects():
     found = sweep.run(replace(load_experiment(), device=INVENTED, load="inertia", sweep=swept))
     assert len(found.order) == 6
     assert found.objects == (SPEED_GAIN, SPEED_INTEGRATOR)
+
+
+def test_the_sweep_that_ships_covers_the_same_gains_in_its_units():
+    found, known = load_experiment(device=INVENTED), load_experiment()
+    assert [swept.object for swept in found.sweep] == ["speed_gain", "speed_integrator"]
+    theirs = gain_factors(find_device(known.device))
+    for swept, other, factor, own in zip(
+        found.sweep, known.sweep, theirs[2:4], gain_factors(find_device(INVENTED)), strict=False
+    ):
+        assert (swept.low * own, swept.high * own) == pytest.approx((other.low * factor, other.high * factor), rel=0.05)
+        assert (swept.count, swept.spacing) == (other.count, other.spacing)
+    small = replace(found, sweep=tuple(replace(swept, count=2) for swept in found.sweep))
+    assert sweep.run(small).objects == (SPEED_GAIN, SPEED_INTEGRATOR)
+    assert load_experiment(device="tmcm1636_fw109").sweep == known.sweep  # which counts alike
 
 
 @pytest.mark.parametrize("name", ["2042h:01", "3041h:01"])  # another drive's; its own current loop, which is fixed
@@ -89,6 +117,51 @@ def test_the_command_writes_them_by_their_names(tmp_path):
     assert head.startswith("search,trial,axis,speed_gain,speed_integrator,position_gain,")
 
 
+SUITE = """
+device = {device}
+
+[[group]]
+load = "inertia"
+motor = "qbl4208"
+supply = [24, 26]
+[group.parameters]
+"load.inertia" = [4.8e-06, 4.32e-05]
+"""
+
+
+def test_tuners_are_ranked_on_it_under_the_names_of_its_gains(tmp_path):
+    suite, out = tmp_path / "suite.toml", tmp_path / "out"
+    suite.write_text(SUITE.format(device=json.dumps(INVENTED)), encoding="utf-8")
+    line = ["rank", "--suite", suite, "-t", "factory", "-t", "fitted", "-t", "random", "-t", "simc", "--trials", "2",
+            "--out", out]  # fmt: skip
+    done = CliRunner().invoke(app, [str(word) for word in line])
+    assert done.exit_code == 0, done.output
+    rows = list(csv.DictReader((out / "machines.csv").open(encoding="utf-8")))
+    preset = find_device(INVENTED).preset(find_motor("qbl4208"))
+    factory = [preset[f"Controller.{name}"] for name in ("Speed gain", "Speed integrator", "Position gain")]
+    for row in rows:
+        gains = [int(row[name]) for name in NAMES]
+        assert np.isfinite(float(row["hidden"]))
+        if row["tuner"] == "factory":
+            assert gains == factory
+        if row["tuner"] == "fitted":
+            assert float(row["relative"]) == pytest.approx(1.0, abs=0.3)  # the inertia that moves show is the true one
+        assert (row["failed"] == "True") == (row["tuner"] == "simc")
+    assert list(rows[0])[-4:] == [*NAMES, "note"]
+    assert {row["note"] for row in rows if row["tuner"] == "simc"} == {f"ValueError: {NO_MODEL}"}
+
+
+def test_a_tuner_that_returns_the_gains_of_another_drive_has_failed():
+    def of_another(target, rng):
+        n = target.num_axes
+        return Outcome(np.ones((n, 5), np.int64), np.zeros(n), *[np.zeros(n, np.int64)] * 3, ("",) * n)
+
+    (machine,) = (SuiteMachine("one", INVENTED, "inertia", "qbl4208", {}, 24.0),)
+    (row,) = compare([machine], {"of_another": of_another}).rows
+    assert row.failed
+    assert "integer gains of shape (1, 3), not int64 (1, 5)" in row.note
+
+
 def test_an_agent_tunes_them_as_an_episode():
     env = GainTuning(2, device=INVENTED, load="inertia", trials=2, num_threads=1)
     assert env.config.gains == NAMES
@@ -102,18 +175,84 @@ def test_an_agent_tunes_them_as_an_episode():
         GainTuning(1, device=INVENTED, gains=("torque_p",))
 
 
+def test_a_trained_tuner_changes_them_by_the_parts_that_they_play():
+    """It was trained on another drive, on gains over those of the fitted rule: names and units are nothing to it."""
+    with emulated(INVENTED, "inertia", num_threads=1) as target:
+        found = surrogate(target, np.random.default_rng(0)).gains
+        rule = rule_gains(target.device, target.motor, 3.0 * target.motor.inertia)
+    assert found.shape == (1, 3)
+    assert np.all(found > rule / 30) and np.all(found < rule * 30)
+
+
+def test_a_trained_tuner_names_the_gain_that_a_drive_lacks():
+    device = find_device(INVENTED)
+    fewer = device._replace(gains=replace(device.gains, rows=device.gains.rows[:2]))
+    with pytest.raises(ValueError, match=r"no P of the position loop among its gains, which the agent changes; train"):
+        gains_for({"gains": ["velocity_p", "position_p"]}, fewer)
+    assert gains_for({"gains": ["position_p", "velocity_p"]}, device) == ("position_gain", "speed_gain")
+
+
 def test_what_needs_a_linear_model_says_that_it_has_none(tmp_path):
     device, motor = find_device(INVENTED), find_motor("qbl4208")
     assert not has_linear_model(device)
-    says = "this drive has no linear model of its loops"
     with emulated(INVENTED, "inertia") as target:
-        with pytest.raises(ValueError, match=says):
-            auto(target, tmp_path / "before.toml")
-        with pytest.raises(ValueError, match=says):
-            identify(target)
-        with pytest.raises(ValueError, match=says):
-            propose("simc", device, motor, None)
+        for needs_it in (
+            lambda: auto(target, tmp_path / "before.toml"),
+            lambda: identify(target),
+            lambda: measure(target),
+            lambda: propose("simc", device, motor, None),
+            lambda: controllers(device, (1, 1, 1)),
+        ):
+            with pytest.raises(ValueError, match=re.escape(NO_MODEL)):
+                needs_it()
+        assert not target.drives.read(0x6064).any()  # nothing has moved
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("program", "command"), [(app, "auto"), (app, "rules"), (agent_app, "tune")])
+def test_commands_that_need_a_linear_model_end_with_that_line_and_leave_nothing(tmp_path, program, command):
+    out = [] if command == "rules" else ["--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(program, [command, "--device", INVENTED, "--load", "inertia", *out])
+    assert done.exit_code == 2, done.output
+    assert done.stderr.strip().endswith(NO_MODEL)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_its_gains_are_certified_under_its_own_names():
+    raw = find_device(INVENTED).preset(find_motor("qbl4208"))
+    gains = [raw[f"Controller.{name}"] for name in ("Speed gain", "Speed integrator", "Position gain")]
+    assert si_gains(find_device(INVENTED), 24.0, gains) == pytest.approx({
+        "speed gain [A*s/rad]": 0.051,
+        "speed integrator T_i [s]": 65536.0 / 5000.0 / 329.0,
+        "position gain [1/s]": 31.467,
+    })  # fmt: skip
+
+
+def test_without_a_cascade_there_is_no_rule_and_every_method_says_so(tmp_path):
+    folder, suite = tmp_path / "own", tmp_path / "suite.toml"
+    shutil.copytree(FOLDER, folder)
+    path = folder / "gains.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace('cascade = "pi"', ""), encoding="utf-8")
+    suite.write_text(SUITE.format(device=json.dumps(str(folder))), encoding="utf-8")
+    device = find_device(str(folder))
+    assert si_gains(device, 24.0, (51, 329, 31467)) == {}  # integers are all that is known
+    out = str(tmp_path / "out")
+    for line, says in (
+        (["auto", "--device", str(folder), "--load", "inertia", "--out", out], "its gains.toml names no cascade"),
+        (["optimise", "--device", str(folder), "--load", "inertia", "--out", out], "names no cascade of its loops"),
+        (["rank", "--suite", str(suite), "-t", "factory", "--out", out], "names no cascade of its loops"),
+    ):
+        done = CliRunner().invoke(app, line)
+        assert done.exit_code == 2, done.output
+        assert str(folder) in done.stderr and says in done.stderr and "drive-tune sweep" in done.stderr
+        assert not Path(out).exists()
+
+
+def test_two_gains_of_one_part_are_no_cascade():
+    device = find_device(INVENTED)
+    twice = (*device.gains.rows, device.gains.rows[0]._replace(name="speed_gain_2", key=(0x3200, 2)))
+    with pytest.raises(ValueError, match=r"gains.toml: speed_gain_2 is a second P of the velocity loop"):
+        rule_gains(device._replace(gains=replace(device.gains, rows=twice)), find_motor("qbl4208"), 1e-5)
 
 
 # --- the rest of a drive's life ---------------------------------------------------------------------------------------
@@ -129,7 +268,7 @@ def test_it_has_its_own_modes_and_methods_of_homing():
             with pytest.raises(ObjectAccessError):
                 drives.write(name, value)
         assert drives.read((0x3041, 1))[0] == 4021  # the current loop is what it is
-        assert Role.CURRENT_P not in drives.device.roles
+        assert not drives.device.gains.columns_of("current")
 
 
 def moved(drives):

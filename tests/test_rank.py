@@ -107,7 +107,7 @@ def test_what_a_tuner_did_is_counted_by_the_meter_not_by_itself():
     (row, *_) = compare(RIGID, {"slow": moves_and_slows}).rows
     assert row.moves == 1 and row.note == "slowed"
     assert 0.3 <= row.drive_seconds < 0.4
-    assert (row.velocity_p, row.position_p) == (445 // 5, 118 // 5)
+    assert (row.gains["velocity_p"], row.gains["position_p"]) == (445 // 5, 118 // 5)
 
 
 def test_a_violation_is_named():
@@ -135,7 +135,7 @@ def test_a_tuner_that_breaks_is_scored_by_what_it_left_and_the_others_go_on():
     found = compare(RIGID, {"broken": breaks, "truth": knows_the_truth})
     for row in found.of("broken"):
         assert row.failed and row.note == "RuntimeError: out of ideas entirely"
-        assert (row.velocity_p, row.position_p) == (700, 200)
+        assert (row.gains["velocity_p"], row.gains["position_p"]) == (700, 200)
     assert [row.relative for row in found.of("truth")] == pytest.approx([1.0] * 4)
     assert next(row for row in found.tuners if row.tuner == "broken").failed == 4
 
@@ -155,7 +155,7 @@ def test_a_comparison_follows_from_its_seed_and_from_nothing_else():
     alone, again, other = (compare(RIGID, {"search": tuner}, seed=seed).rows for seed in (0, 0, 1))
     beside = compare(RIGID, {"factory": find_tuner("factory"), "search": tuner}).of("search")
     assert alone == again == tuple(beside)
-    assert [row.velocity_p for row in alone] != [row.velocity_p for row in other]
+    assert [row.gains["velocity_p"] for row in alone] != [row.gains["velocity_p"] for row in other]
 
 
 class KilledError(Exception):
@@ -232,7 +232,7 @@ def test_the_tuners_of_the_issue_are_there():
 
 def test_the_factory_leaves_and_the_fitted_rule_computes():
     found = compare(RIGID, {name: find_tuner(name) for name in ("factory", "fitted")})
-    assert {row.velocity_p for row in found.of("factory")} == {445}
+    assert {row.gains["velocity_p"] for row in found.of("factory")} == {445}
     assert all(0.9 < row.relative < 1.2 and row.moves == 2 for row in found.of("fitted"))
 
 
@@ -252,7 +252,7 @@ def test_a_rule_identifies_once_for_all_rules(monkeypatch):
     assert calls == [1]
     simc, modulus = found.of("simc")[0], found.of("modulus_optimum")[0]
     assert simc.drive_seconds == modulus.drive_seconds > 1.0
-    assert simc.velocity_i != modulus.velocity_i
+    assert simc.gains["velocity_i"] != modulus.gains["velocity_i"]
     assert not simc.failed and simc.relative < 2.0
 
 

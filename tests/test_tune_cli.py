@@ -234,7 +234,7 @@ def test_the_picture_of_a_comparison_names_its_colour_and_has_every_median_at_it
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: figures.append(figure))
     rows = [
-        MachineRow(tuner, f"machine {k}", J, J, 1.0, 2.0, 3, 0, 0, "", False, 1, 1, 1, 1, 1, "")
+        MachineRow(tuner, f"machine {k}", J, J, 1.0, 2.0, 3, 0, 0, "", False, {"torque_p": 1}, "")
         for tuner, relative in (("auto", (0.6, 0.68, 0.8)), ("modulus", (0.9, 1.0, 1.4)))
         for k, J in enumerate(relative)
     ]

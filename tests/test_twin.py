@@ -16,7 +16,6 @@ from drive_env.motors import find_motor
 from drive_env.trials.gain_trial import OSCILLATION
 from tuning.auto import twin
 from tuning.auto.twin import (
-    LEAST,
     WORLDS,
     FrictionGuess,
     Known,
@@ -24,6 +23,7 @@ from tuning.auto.twin import (
     Spread,
     Twins,
     known_of,
+    least_gains,
     search,
     twin_parameters,
 )
@@ -191,7 +191,7 @@ def test_the_search_finds_better_gains_and_what_it_says_of_them_is_what_the_twin
     assert found.start[0] == first
     assert found.hidden[0, 0] < 0.6 * first
     assert np.all(np.diff(found.hidden[0]) >= 0.0)
-    assert found.gains.min(axis=(0, 1)).tolist()[3] >= LEAST.velocity_i
+    assert found.gains.min(axis=(0, 1)).tolist()[3] >= least_gains(DEVICE)[3] == 20  # a T_i of 0.65 s
 
 
 def test_gains_that_are_not_searched_stay_those_of_the_best_start():

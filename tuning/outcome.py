@@ -17,7 +17,7 @@ Integers = NDArray[np.int64]
 class Outcome(NamedTuple):
     """What a tuner did, of every axis.
 
-    gains: Raw integers in the order of `Gains`, shape (num_axes, 5).
+    gains: Raw integers in the order of the device's gain set, shape (num_axes, gains).
     drive_seconds: Time on the drive [s], (num_axes,).
     moves: Moves and other excitations, (num_axes,).
     aborts: What had to be stopped, (num_axes,).

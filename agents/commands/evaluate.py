@@ -28,7 +28,7 @@ from agents.commands.options import (
     print_json,
     progress_bar,
 )
-from drive_env.commands.options import Yes, was_typed
+from drive_env.commands.options import DeviceName, Yes, was_typed
 from drive_env.commands.tables import print_lines
 from tuning.commands.options import ask_to_turn
 
@@ -67,7 +67,7 @@ def evaluate(
     channel: Channel = None,
     node: Nodes = None,
     bitrate: Bitrate = None,
-    device: Annotated[str, typer.Option("--device", help="Drive by name.")] = "tmcm1636",
+    device: DeviceName = "tmcm1636",
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Of an emulator served so: time passes by SYNC.")
     ] = False,

@@ -86,6 +86,7 @@ def tune(
             raise ValueError(
                 f"agent {agent} acts in {policy.bundle.environment}; a tuner acts in ServoDrive/GainTuning-v0"
             )
+        _check_gains(policy, device)
         if trials is not None:
             policy.bundle.configuration["trials"] = trials
         folder = new_folder(out, "agent-tune")
@@ -105,6 +106,17 @@ def tune(
                 ask_to_turn(node, yes)
             result = _run(target, policy, folder, agent, store, json)
         _report(result, folder, json, bus)
+
+
+def _check_gains(policy: Any, device: str) -> None:
+    """Raise ValueError unless the agent, and what proves its gains, know a drive's loops: before anything moves."""
+    from agents.tuner.tune_target import gains_for
+    from drive_env.devices import find_device
+    from drive_env.gains import check_linear_model
+
+    known = find_device(device)
+    gains_for(policy.bundle.configuration, known)
+    check_linear_model(known)
 
 
 @contextmanager
@@ -215,6 +227,11 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
     from agents.tuner.tuning_run import run
     from tuning.certificate.certificate_files import certificate_files
 
+    known = target.device.gains
+    outer = known.columns_of("velocity", "position")
+    titles = [known.titles[k] for k in outer]
+    widths = [max(len(title) + 1, 11) for title in titles]
+
     def show(trial: TrialShown) -> None:
         if json:
             return
@@ -223,9 +240,8 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
             mark = "the fitted rule's gains, from which the agent sets out"
         if trial.aborted[0]:
             mark = f"stopped: it oscillated or tripped{f'; {mark}' if trial.number == 0 else ''}"
-        velocity_p, velocity_i, position_p = trial.gains[0, 2:]
-        figures = f"{trial.number or 'rule':>5} {velocity_p:>11} {velocity_i:>11} {position_p:>11}"
-        print_lines([f"{figures} {trial.measured[0]:>8.3f}  {mark}".rstrip()])
+        figures = "".join(f" {value:>{width}}" for value, width in zip(trial.gains[0, outer], widths, strict=True))
+        print_lines([f"{trial.number or 'rule':>5}{figures} {trial.measured[0]:>8.3f}  {mark}".rstrip()])
 
     def say(what: str) -> None:
         if not json:
@@ -234,7 +250,8 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
                 print("J, less is better, counts settling time, stiffness, noise and overshoot of a")
                 print("move, its reversal and the move with 1.5 times velocity P, which shows how near")
                 print("to oscillation the gains are.")
-                print("trial  velocity P  velocity I  position P        J")
+                names = (f" {title:>{width}}" for title, width in zip(titles, widths, strict=True))
+                print(f"trial{''.join(names)} {'J':>8}")
 
     if not json:
         print_lines([f"agent {agent} tunes {target.device.name} with {target.motor.name}: {target.machine}"])
@@ -273,9 +290,10 @@ def _print(done: TunerRun, refused: list[str], rule: float | None) -> None:
     result = done.result
     axis, certified = result.axes[0], done.certificate.axes[0]
     titles = find_device(done.certificate.device).gains.titles
-    lines = [f"{'':<7}{''.join(f'{name:>12}' for name in titles)}"]
+    width = max(12, *(len(title) + 2 for title in titles))
+    lines = [f"{'':<7}{''.join(f'{name:>{width}}' for name in titles)}"]
     for name, gains in (("before", axis.before), ("after", axis.after)):
-        lines.append(f"{name:<7}{''.join(f'{value:>12}' for value in gains)}")
+        lines.append(f"{name:<7}{''.join(f'{value:>{width}}' for value in gains)}")
     if axis.accepted and (said := _answer(done)):
         lines.append(said)
     if axis.accepted and rule is not None:

@@ -320,7 +320,7 @@ def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[d
     """Let the end of episodes tell of a tuner's own answers, which are gains that it tried, instead of incumbents.
 
     Args:
-        gains: The answers, (lanes, axes, 5).
+        gains: The answers, (lanes, axes, count).
         trials: What was told of every trial of all lanes, by the names of TRIAL_OF.
         last: What the environment told in the last step of each lane; changed.
     """

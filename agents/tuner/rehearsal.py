@@ -269,12 +269,12 @@ def _envelope(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _limits(target: Target, axis: int) -> Iterator[Check]:
-    amperes = _read(target, Role.CURRENT_LIMIT, axis) * 1e-3
+    amperes, (index, _) = _read(target, Role.CURRENT_LIMIT, axis) * 1e-3, target.device.roles[Role.CURRENT_LIMIT]
     text = f"at most {target.speed:.4g} rad/s and {target.current:.3g} A are commanded while it is identified"
     if amperes <= 0.0:
-        yield Check("limits", NO, f"{text}; the drive's limit 2003h is 0 A: set it to the motor's peak current")
+        yield Check("limits", NO, f"{text}; the drive's limit {index:04X}h is 0 A: set it to the motor's peak current")
     else:
-        yield Check("limits", OK, f"{text}; trials may take the drive's own limit, 2003h, {amperes:.3g} A")
+        yield Check("limits", OK, f"{text}; trials may take the drive's own limit, {index:04X}h, {amperes:.3g} A")
     window = _read(target, cia402.FOLLOWING_WINDOW, axis)
     yield Check("following error", OK, f"window 6065h is {window} inc; it is widened while the axis is shaken")
 

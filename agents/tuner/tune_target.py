@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from agents.shipped import TUNER, shipped
 
 if TYPE_CHECKING:
     from agents.policies.guard import GuardLimits
+    from drive_env.devices import Device
     from drive_env.drives.interface import Drives
     from tuning.outcome import Outcome
     from tuning.target import Target
@@ -29,7 +30,7 @@ class TrialShown(NamedTuple):
     """A trial of every machine of a target.
 
     number: 0 is the fitted rule's gains.
-    gains: Raw integers, (num_axes, 5) in the order of `Gains`.
+    gains: Raw integers, (num_axes, count) in the order of the device's gain set.
     measured: J by measured terms of the machine's worst axis, (num_machines,).
     aborted, better: Whether it was stopped; whether it became the incumbent, (num_machines,).
     faults: Names of emergencies, a tuple for each machine.
@@ -44,7 +45,7 @@ class TrialShown(NamedTuple):
 
 
 class Tuned(NamedTuple):
-    """What came of it: the answer's gains, raw (num_axes, 5), all trials, and which of them each machine's answer was.
+    """What came of it: the answer's gains, raw (num_axes, count), all trials, and each machine's answer among them.
 
     The answer is the policy's own choice (`answer`) where it makes one that was not stopped, else the best trial by
     measured terms that was not; of a machine all of whose trials were stopped it is the first one, the fitted rule's.
@@ -79,10 +80,11 @@ def tune_target(
         policy: What proposes, with its `bundle` for the configuration.
         show: Called after every trial.
         trials: How many; the agent's own number by default.
-        calm: Gains for an axis that shakes on though its trial was stopped, (num_axes, 5): the incumbent's, with which
-            it goes on, may be so near to the edge. By default those of the data sheet.
+        calm: Gains for an axis that shakes on though its trial was stopped, (num_axes, count): the incumbent's, with
+            which it goes on, may be so near to the edge. By default those of the data sheet.
 
     Raises:
+        ValueError: If the drive lacks a gain that the policy changes, or a rule for it.
         PolicyStoppedError: If the policy gives no number, or no answer within the envelope's limit for a stall (on
             emulated drives within `guard.PATIENT.stall`): the drives are at rest and disabled.
         RuntimeError: If a drive cannot be cleared any more.
@@ -100,6 +102,7 @@ def tune_target(
     fallback.calm = first_gains(target) if calm is None else calm
     drives = ObservedDrives(target.drives, fallback)
     configuration = dict(policy.bundle.configuration) | ({} if trials is None else {"trials": trials})
+    configuration["gains"] = gains_for(policy.bundle.configuration, target.device)
     write_gains(drives, first_gains(target))  # before anything is enabled: the drives may have any
     reach = np.where(target.high >= -target.low, target.high, target.low)
     env = GainTuning(
@@ -153,6 +156,33 @@ def tune_target(
     same = np.ones(target.num_axes, bool) if wanted is None else np.all(wanted == gains, axis=1)
     overruled = np.logical_not(same.reshape(-1, axes).all(axis=1))
     return Tuned(gains, tuple(shown), answers, overruled)
+
+
+def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ...]:
+    """Return the names that a device has for the gains which an agent changes.
+
+    An agent sees and changes gains over those of the fitted rule, so that neither names nor scales matter to it, but
+    the part that each plays in the cascade does.
+
+    Raises:
+        ValueError: If the device lacks such a gain, or names no cascade, and there is no rule for it.
+    """
+    from drive_env.devices import find_device
+    from drive_env.envs.gain_tuning import GainTuningConfig
+    from drive_env.gains import per_chip
+
+    trained = GainTuningConfig(**{name: configuration[name] for name in ("device", "gains") if name in configuration})
+    theirs = find_device(trained.device).gains
+    parts = [theirs.rows[k] for k in theirs.columns(trained.chosen)]
+    columns = [device.gains.column(gain.loop, gain.part) for gain in parts]
+    missing = [f"no {gain.part} of the {gain.loop} loop" for gain, k in zip(parts, columns, strict=True) if k is None]
+    if missing:
+        raise ValueError(
+            f"{device.name} has {', '.join(missing)} among its gains, which the agent changes; train an agent on it "
+            "(drive-agent train gain-tuning), or use drive-tune optimise"
+        )
+    per_chip(device)  # without a cascade there is no rule to begin with
+    return tuple(device.gains.names[k] for k in columns if k is not None)
 
 
 def best_unstopped(trials: Sequence[TrialShown], machine: int) -> TrialShown | None:

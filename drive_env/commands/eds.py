@@ -10,7 +10,7 @@ from drive_env.commands.options import errors_as_exit_codes
 
 
 def print_eds(
-    device: Annotated[str, typer.Argument(help="Drive by name; drive-env list devices shows them.")],
+    device: Annotated[str, typer.Argument(help="Drive by name (drive-env list devices), or by its path.")],
 ) -> None:
     """Print the EDS of a device: drive-env eds tmcm1636_fw109 > drive.eds."""
     from drive_env.devices import find_device

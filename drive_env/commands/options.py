@@ -38,7 +38,9 @@ Channel = Annotated[
 ]
 Bitrate = Annotated[int | None, typer.Option(help="Bit rate [bit/s], where the interface sets it.")]
 Nodes = Annotated[list[int] | None, typer.Option("--node", "-n", help="Node-ID; may be repeated.", show_default="1")]
-DeviceName = Annotated[str, typer.Option("--device", help="Drive by name.")]
+DeviceName = Annotated[
+    str, typer.Option("--device", help="Drive by name, or one of your own by its path: a folder, or a variant's .toml.")
+]
 Eds = Annotated[Path | None, typer.Option("--eds", help="EDS of any other CiA 402 drive, in place of --device.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the frames and send none.")]

@@ -118,6 +118,17 @@ class GainSet:
             softer[:, column] = np.maximum(raw[:, column] // divisor, 1)
         return softer
 
+    def scaled(self, raw: Integers, factor: ArrayLike, columns: Sequence[int]) -> Integers:
+        """Return gains of shape (..., count) with some of them times a factor, within their ranges; 1 at least."""
+        result = raw.copy()
+        wanted = np.rint(raw[..., columns] * np.asarray(factor, float))
+        result[..., columns] = np.clip(wanted, 1, self.highest[columns])
+        return result
+
+    def opens(self, raw: Sequence[int] | Integers, *loops: str) -> bool:
+        """Return whether gains of shape (count,) leave one of the loops open: its P is 0."""
+        return any(raw[k] == 0 for k in self.columns_of(*loops) if self.rows[k].part == "P")
+
     def read(self, drives: BasicDrives) -> Integers:
         """Return the gains that drives have, shape (num_axes, len(set))."""
         return np.stack([drives.read(key) for key in self.keys], axis=-1)

@@ -29,8 +29,6 @@ class Role(Enum):
     FIELD_ANGLE = "angle of the field in open loop"
     ELECTRICAL_ANGLE = "electrical angle by the encoder"
     HALL_ANGLE = "electrical angle by the hall sensors"
-    CURRENT_P = "current P"
-    CURRENT_I = "current I"
     TORQUE_ERROR = "error of the torque current"
     TORQUE_ERROR_SUM = "error sum of the torque current"
     FLUX_ERROR = "error of the flux current"

@@ -116,12 +116,13 @@ def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple
         + (", with other gains, and by how much these differ" if changed else ""),
         "position": "the measured velocity loop and position P",
     }
-    closed = run.plant is not None and 0 not in (run.before.torque_p, run.before.velocity_p)
+    known = device.gains
+    closed = run.plant is not None and not known.opens(run.before, "current", "velocity")
     shown = []
     for name, L in (("velocity", loops.velocity), ("position", loops.position)):
         if name == "position" and name not in run.margins:
             continue  # too little was seen, or an axis alone that never goes alone
-        if closed and not (name == "position" and run.before.position_p == 0) and not run.is_kept:
+        if closed and not known.opens(run.before, name) and not run.is_kept:
             assert run.plant is not None, "it was looked for"
             before = OPEN_LOOPS[name](device, run.plant, run.before, response.f)
             shown.append(

@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drive_env.dictionary.roles import Role
+from drive_env.gains import cascade_columns
 from tuning.response.linear_model import OPEN_LOOPS
 from tuning.response.margins import margins
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from drive_env.devices import Device
-    from drive_env.gains import Gains
     from tuning.identify.estimate import Identification
     from tuning.response.linear_model import Plant
     from tuning.target import Target
@@ -23,9 +26,9 @@ LOOKED_AT = 400  # frequencies of the model
 SENSITIVITY, STEP, STEPS = 4.0, 0.85, 16
 
 
-def unsafe_gains(device: Device, plant: Plant, gains: Gains) -> str:
+def unsafe_gains(device: Device, plant: Plant, gains: Sequence[int]) -> str:
     """Return why an axis is not to be moved with gains, "" if it may be."""
-    if 0 in (gains.torque_p, gains.velocity_p, gains.position_p):
+    if device.gains.opens(gains, *OPEN_LOOPS):
         return "a P gain is 0, and a loop open"
     rates = {"current": device.current_rate}
     for name, open_loop in OPEN_LOOPS.items():
@@ -40,17 +43,18 @@ def unsafe_gains(device: Device, plant: Plant, gains: Gains) -> str:
     return ""
 
 
-def sound_gains(device: Device, plant: Plant, gains: Gains) -> Gains:
+def sound_gains(device: Device, plant: Plant, gains: Sequence[int]) -> tuple[int, ...]:
     """Return gains with position P as far down as the position loop needs it by the model; as they are if none helps.
 
     A search by J alone may end with eight degrees of phase margin: where nothing disturbs that, it is the fastest.
     """
     f = np.geomspace(1.0, 0.49 * device.velocity_rate, LOOKED_AT)
+    *_, position_p = cascade_columns(device)
     for lowered in range(STEPS):
-        less = gains._replace(position_p=max(round(STEP**lowered * gains.position_p), 1))
+        less = tuple(max(round(STEP**lowered * gain), 1) if k == position_p else gain for k, gain in enumerate(gains))
         if margins(f, OPEN_LOOPS["position"](device, plant, less, f)).ms <= SENSITIVITY:
             return less
-    return gains
+    return tuple(gains)
 
 
 def wrong_wiring(target: Target, identified: Identification) -> str:
@@ -59,8 +63,9 @@ def wrong_wiring(target: Target, identified: Identification) -> str:
     if direction is not None and direction.value < 0.0:
         return identified.estimates["inertia"].reason
     if pairs is not None and pairs.is_known and round(pairs.value) != target.motor.n_p:
+        index, _ = target.device.roles[Role.POLE_PAIRS]
         return (
             f"the motor has {pairs.value:.0f} pole pairs, and {target.motor.name} has {target.motor.n_p}: "
-            "it is another motor; give --motor, or correct 2056h"
+            f"it is another motor; give --motor, or correct {index:04X}h"
         )
     return ""

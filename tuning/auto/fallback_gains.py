@@ -36,7 +36,7 @@ class FallbackGains(Observer):
         windows: Of 25 ms in a row in which it shakes; a trial has acted after the first.
 
     Attributes:
-        calm: Gains to calm with, (num_axes, 5), or None as long as none are known.
+        calm: Gains to calm with, (num_axes, count), or None as long as none are known.
         calmed: Axes that got them since the last `begin`, (num_axes,).
     """
 

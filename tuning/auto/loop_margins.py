@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.gains import Gains, scaled, write_gains
+from drive_env.gains import write_gains
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.moves import show
@@ -33,11 +33,7 @@ LEAST_LINES = 10  # of a frequency response, that are worth a judgement
 SENSITIVITY = 4.0  # greatest |1/(1+L)| that a measured loop may have
 CLOSE = {"phase": 14.0, "gain": 2.5}  # margins that this leaves at least [degrees, dB]
 SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # factors of gains by which a lively loop is calmed
-CALMED_NAMES = {"velocity": ("velocity P", "position P"), "position": ("position P",)}
-CALMED = {
-    loop: [Gains._fields.index(name.lower().replace(" ", "_")) for name in names]
-    for loop, names in CALMED_NAMES.items()
-}
+CALMED = {"velocity": ("velocity", "position"), "position": ("position",)}  # whose P is lowered for a loop
 LONGER = 2  # times as long it is shaken where too little was seen
 LEAST_WAY = 1e-3  # rad; an axis without any way is shaken as little as can be, and its response says so
 ALONE = (
@@ -118,13 +114,13 @@ def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
         why = f"{seen} of its lines are coherent, and {LEAST_LINES} are needed"
         _without_response(run, np.arange(run.target.num_axes) == k, "; ".join([why, *response.notes[k]]))
         return False
-    gains = run.gains[k]
-    for loop, calmed in CALMED.items():
+    gains, known = run.gains[k], run.target.device.gains
+    for loop, lowered in CALMED.items():
+        calmed = [column for column in known.columns_of(*lowered) if known.rows[column].part == "P"]
         if loop not in _loops(run):
             continue
         for factor in SOFTER:
-            softer = gains.copy()
-            softer[calmed] = scaled(gains[calmed], factor)
+            softer = known.scaled(gains, factor, calmed)
             found = _margins(run, response, softer, k)[loop]
             if found.ms <= SENSITIVITY:
                 break
@@ -134,8 +130,9 @@ def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
             )
             return False
         if factor != 1.0:
+            names = " and ".join(known.titles[column] for column in calmed)
             axis.notes.append(
-                f"{' and '.join(CALMED_NAMES[loop])} calmed to {100.0 * factor:.0f} %: the measured {loop} loop came "
+                f"{names} calmed to {100.0 * factor:.0f} %: the measured {loop} loop came "
                 "too near to instability; margins are computed from that response"
             )
         gains = softer

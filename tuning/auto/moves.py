@@ -12,7 +12,7 @@ from drive_env.safety.envelope import SafetyError
 from tuning.auto.load_step import SWING, load_step
 from tuning.auto.proving import RESTLESS
 from tuning.auto.run import MOVE_TIME, TRIAL_TIME
-from tuning.auto.trials import SCALED, faster
+from tuning.auto.trials import faster
 
 if TYPE_CHECKING:
     from tuning.auto.run import AutoRun
@@ -66,7 +66,7 @@ def show(run: AutoRun, where: Mask | None = None) -> None:
                 run.gains[k] = run.reference[k]
                 axis.notes.append(f"the gains of the fitted rule: with the eased ones, in one more move {why}")
             else:
-                run.gains[k] = faster(run.gains[k], AT_THE_EDGE)
+                run.gains[k] = faster(run.target.device.gains, run.gains[k], AT_THE_EDGE)
                 axis.notes.append(f"slowed to {100.0 * AT_THE_EDGE:.0f} % after the trial: in one more move {why}")
         # Axes of one machine pull at one load: one that is to move again has the others move with it.
         lanes = run.target.axes_per_machine
@@ -85,11 +85,12 @@ def _ease(run: AutoRun, k: int, swing: float, why: str) -> None:
         swing: Of its current over the rated one, RMS.
         why: What it did, in words.
     """
-    axis, rule = run.axes[k], run.reference[k]
+    axis, rule, known = run.axes[k], run.reference[k], run.target.device.gains
+    outer = known.columns_of("velocity", "position")
     factor = float(np.clip(EASED_TO * RESTLESS / swing, EASED_LEAST, EASED))
-    slowed = faster(run.gains[k], factor)
+    slowed = faster(known, run.gains[k], factor)
     is_rule = np.array_equal(run.gains[k], rule)
-    is_slow = bool(np.all(slowed[SCALED] <= rule[SCALED]))
+    is_slow = bool(np.all(slowed[outer] <= rule[outer]))
     if not is_rule and (swing > LIMIT_CYCLE or axis.eased == EASINGS - 1 or is_slow):
         run.gains[k] = rule
         axis.notes.append(f"the gains of the fitted rule: with faster ones {why}")

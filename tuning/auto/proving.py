@@ -111,8 +111,8 @@ class ProvingGround:
         target: The drives.
         plants: What each axis is; None where that is not known: such an axis takes no part.
         room: How far each rotor may turn from here [rad], low and high, each (num_axes,).
-        safe: Gains that hold, (num_axes, 5): what is stopped goes on with them.
-        reference: Gains whose softness under a load counts as 1, (num_axes, 5).
+        safe: Gains that hold, (num_axes, count): what is stopped goes on with them.
+        reference: Gains whose softness under a load counts as 1, (num_axes, count).
     """
 
     def __init__(
@@ -177,7 +177,7 @@ class ProvingGround:
         self._shaken |= where
 
     def run(self, gains: Integers, where: Mask) -> Proof:
-        """Try gains, raw integers of shape (num_axes, 5), on some axes; the others' figures mean nothing.
+        """Try gains, raw integers of shape (num_axes, count), on some axes; the others' figures mean nothing.
 
         Axes that pull at one thing move together, all of them with these gains.
         """

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import Gains
 from tuning.certificate.certificate import verdict
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ class AxisRun:
         reason: Why it stopped; "" while it goes on.
         reservations: What a user of the gains should not rely on; each takes the certificate's plain yes away.
         notes: What else there is to say.
-        before, after: Raw gains.
+        before, after: Raw gains, in the order of the device's gain set.
         identified: What its signals said, None before.
         plant: What was made of that, None where nothing could be.
         twin: Hidden J that the twin gives the gains it found.
@@ -45,8 +44,8 @@ class AxisRun:
         is_kept: Whether the gains before were better, and are the ones after.
     """
 
-    before: Gains
-    after: Gains
+    before: tuple[int, ...]
+    after: tuple[int, ...]
     reason: str = ""
     reservations: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

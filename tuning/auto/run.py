@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.gains import Gains, read_gains
+from drive_env.gains import read_gains
 from drive_env.trials.positioning import wrapped
 from tuning.auto.result import AxisRun, Result
 from tuning.auto.trial_order import OTHERS
@@ -44,14 +44,14 @@ class AutoRun:
 
     Attributes:
         axes: What became of every axis.
-        before: Raw gains that the drives came with, (num_axes, 5).
+        before: Raw gains that the drives came with, (num_axes, count).
         gains: The best so far, likewise.
-        others: What else was found, (2, num_axes, 5): the best if everything is as it was identified, and if friction
-            is less.
+        others: What else was found, (2, num_axes, count): the best if everything is as it was identified, and if
+            friction is less.
         spare: The second best that passed a trial, likewise; zeros where none did.
         reference: Those of the fitted rule, likewise.
-        fallbacks: What is tried when the twin's gains fail, (3, num_axes, 5): the fitted rule's; those before, or the
-            soft rule's; and those that are slow enough for any load, with which what is stopped goes on.
+        fallbacks: What is tried when the twin's gains fail, (3, num_axes, count): the fitted rule's; those before, or
+            the soft rule's; and those that are slow enough for any load, with which what is stopped goes on.
         modes: 6060h as the drives came, (num_axes,).
         unsafe: Why an axis is not to be moved with the gains before, "" where it may be.
         fresh: Axes that came fresh from the factory, (num_axes,).
@@ -68,11 +68,12 @@ class AutoRun:
         self.target = target
         self.rng = np.random.default_rng(seed)
         self.before: Integers = read_gains(drives)
-        self.axes = [AxisRun(Gains(*map(int, row)), Gains(*map(int, row))) for row in self.before]
-        self.gains, self.reference = (np.ones((n, len(Gains._fields)), np.int64) for _ in range(2))
-        self.others = np.ones((len(OTHERS), n, len(Gains._fields)), np.int64)
+        self.axes = [AxisRun(tuple(map(int, row)), tuple(map(int, row))) for row in self.before]
+        shape = n, target.device.gains.count
+        self.gains, self.reference = (np.ones(shape, np.int64) for _ in range(2))
+        self.others = np.ones((len(OTHERS), *shape), np.int64)
         self.spare: Integers = np.zeros_like(self.gains)
-        self.fallbacks = np.ones((3, n, len(Gains._fields)), np.int64)
+        self.fallbacks = np.ones((3, *shape), np.int64)
         self.unsafe = ["not looked at"] * n
         self.modes: Integers = drives.read(cia402.MODE)
         self.fresh: Mask = np.zeros(n, bool)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.roles import Role
-from drive_env.gains import Gains, gains_from_bandwidths, rule_gains
+from drive_env.gains import bandwidth_gains, rule_gains
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
 from tuning.auto.checks import sound_gains, unsafe_gains, wrong_wiring
@@ -108,7 +108,7 @@ def compute(run: AutoRun) -> None:
         plant = run.axes[axis].plant
         assert plant is not None, "an axis that goes on has one"
         for rows in (run.gains, *run.others):
-            rows[axis] = sound_gains(target.device, plant, Gains(*map(int, rows[axis])))
+            rows[axis] = sound_gains(target.device, plant, tuple(map(int, rows[axis])))
     for axis, hidden in zip(chosen, found.hidden[:, 0], strict=True):
         run.axes[axis].twin = float(hidden)
 
@@ -125,10 +125,10 @@ def _search_apart(run: AutoRun, known: Sequence[Known], starts: Integers, scaler
     return Optimum(found.gains[best], found.hidden[best], found.start[best])
 
 
-def calm_gains(target: Target, plant: Plant) -> Gains:
+def calm_gains(target: Target, plant: Plant) -> Integers:
     """Return gains that suit the rotor alone, too: within backlash, and above a resonance, it has no load."""
     velocity_hz = cautious_bandwidth(target.motor, plant.inertia) * ROTOR_SHARE
-    return gains_from_bandwidths(
+    return bandwidth_gains(
         target.device, target.motor, plant.inertia, current_hz=CALM_CURRENT_HZ, velocity_hz=velocity_hz,
         position_hz=POSITION_SHARE * velocity_hz, supply=plant.supply,
     )  # fmt: skip

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
-from drive_env.gains import Gains, write_gains
+from drive_env.gains import write_gains
 from tuning.identify.wiring import Key, changes, corrected, findings
 from tuning.identify.working_state import BOTH_ENDS
 from tuning.snapshot import Transaction, restore
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]
 
 LEAST_WAY = 0.2  # rad between the ends of the travel: finding the poles alone turns a rotor so far
-ENCODER_INIT = "ABN Encoder Settings.Encoder Init Mode"  # presets take the encoder's offset as known; here nobody knows
 
 
 def begin(run: AutoRun) -> None:
@@ -56,7 +55,8 @@ def commission(run: AutoRun) -> None:
     # No axis is at both ends: switches that say so are not there.
     unwired = run.fresh & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
     target.drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
-    run.note(unwired, "both limit switches were active, which no axis can be at: they are ignored (2005h)")
+    index, _ = target.device.roles[Role.LIMIT_SWITCHES]
+    run.note(unwired, f"both limit switches were active, which no axis can be at: they are ignored ({index:04X}h)")
     run.note(run.fresh, f"fresh from the factory: commissioned for {target.motor.name} first")
 
 
@@ -106,14 +106,18 @@ def write(run: AutoRun, transaction: Transaction) -> Mask:
         axes.append(wanted | {key: int(column[k]) for key, column in kept.items()})
     restore(drives, replace(transaction.before, axes=tuple(axes)), going, whole=False)
     for axis in np.flatnonzero(going):
-        run.axes[axis].after = Gains(*map(int, run.gains[axis]))
+        run.axes[axis].after = tuple(map(int, run.gains[axis]))
     return going
 
 
 def _commissioning(target: Target) -> dict[str, int]:
-    """Return what a drive must be told of its motor; how its encoder finds its angle is left as it is."""
+    """Return what a drive must be told of its motor; how its encoder finds its angle is left as it is.
+
+    Presets take the encoder's offset as known, and here nobody knows it.
+    """
     preset = target.device.preset(target.motor)
-    return {name: value for name, value in preset.items() if name != ENCODER_INIT}
+    left = target.device.roles.get(Role.ENCODER_INITIALISATION)
+    return {name: preset[name] for name, key in zip(preset, _keys(target, preset), strict=True) if key != left}
 
 
 def _keys(target: Target, names: Iterable[Any]) -> list[tuple[int, int]]:

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.gains import Gains, scaled, write_gains
+from drive_env.gains import write_gains
 from tuning.auto.proving import ProvingGround
 from tuning.auto.run import MOVE_TIME, TRIAL_TIME
 from tuning.auto.trial_order import Ladder, Rung
 
 if TYPE_CHECKING:
+    from drive_env.devices.gain_set import GainSet
     from tuning.auto.proving import Proof
     from tuning.auto.run import AutoRun
 
@@ -23,7 +24,6 @@ Mask = NDArray[np.bool_]
 
 BY_TRIAL = "by a move, its reversal, and a move with 1.5 times velocity P"  # how gains are verified, at the least
 LOUD = 0.06  # RMS increment of the current over the rated one, from which on an axis hunts at rest
-SCALED = [Gains._fields.index(name) for name in ("velocity_p", "velocity_i", "position_p")]
 WINDOW = 10  # following error that trips a trial, over its move: a slow loop lags by the whole of it
 
 
@@ -95,7 +95,7 @@ def _meant(run: AutoRun, axis: int, rung: Rung | None) -> Integers:
         return np.asarray(run.fallbacks[rung.fallback, axis])
     if rung.other is not None:
         return np.asarray(run.others[rung.other, axis])
-    return faster(run.gains[axis], rung.factor)
+    return faster(run.target.device.gains, run.gains[axis], rung.factor)
 
 
 def watch_following(run: AutoRun, where: Mask) -> None:
@@ -106,8 +106,6 @@ def watch_following(run: AutoRun, where: Mask) -> None:
     drives.write(cia402.FOLLOWING_WINDOW, window, where=where)
 
 
-def faster(gains: Integers, factor: float) -> Integers:
-    """Return gains with those of the outer loops times a factor, in the shape that they have."""
-    result = gains.copy()
-    result[..., SCALED] = scaled(gains[..., SCALED], factor)
-    return result
+def faster(known: GainSet, gains: Integers, factor: float) -> Integers:
+    """Return gains of shape (..., count) with those of the outer loops times a factor."""
+    return known.scaled(gains, factor, known.columns_of("velocity", "position"))

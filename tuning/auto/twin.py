@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import RAW_MAX, Gains, rule_gains
+from drive_env.gains import integers_per_si, rule_gains
 from drive_env.trials.gain_trial import OSCILLATION
 from drive_env.trials.positioning import Move, plan_move
 from drive_env.trials.score import HiddenScore
@@ -29,8 +29,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # What a search may go down to. Without an integral part a constant load leaves an error for ever, which outlasts the
-# quarter of a second that hidden J looks at: 20 is a T_i of 0.65 s.
-LEAST = Gains(1, 1, 1, 20, 1)
+# quarter of a second that hidden J looks at.
+LONGEST_INTEGRATION = 0.65536  # s, of the velocity loop
 FASTEST_RESONANCE = 500.0  # Hz; a faster one is taken as rigid: the physics' step does not resolve it
 LEAST_LOAD = 0.05  # of the total inertia: what is left for a load where the rotor's data sheet value takes all
 LEAST_RATIO = 1.03  # of resonance over anti-resonance: nearer to each other they cancel
@@ -214,6 +214,7 @@ class Twins:
         worlds: Sequence[MachineVariant] = WORLDS,
     ) -> None:
         self.lanes = lanes
+        self.device = device
         self.num_axes = len(known)
         elastic = np.array([is_elastic(one.plant) for one in known])
         self._parts = []
@@ -225,7 +226,7 @@ class Twins:
                 self._parts.append(part)
 
     def score(self, gains: Integers) -> Floats:
-        """Return what gains, raw integers of shape (n, lanes, 5), are worth over the worlds, (n, lanes).
+        """Return what gains, raw integers of shape (n, lanes, count), are worth over the worlds, (n, lanes).
 
         The mean of hidden J, in which gains count for worse that a trial would stop as oscillating.
         """
@@ -290,8 +291,8 @@ class _Part:
         return np.broadcast_to(values[:, None], self._shape).reshape(-1)
 
     def score(self, gains: Integers) -> Floats:
-        """Return the mean worth over the worlds, geometric, of gains (axes, lanes, 5)."""
-        every = np.repeat(gains.reshape(-1, len(Gains._fields)), self._shape[2], axis=0)
+        """Return the mean worth over the worlds, geometric, of gains (axes, lanes, count)."""
+        every = np.repeat(gains.reshape(-1, gains.shape[-1]), self._shape[2], axis=0)
         found = self._hidden.score(every)
         # A drive on which that swings would be stopped: a trial sees the move and the probe.
         beyond = np.maximum(found.swing.max(axis=1) / MOST_SWING, 1.0)
@@ -301,10 +302,20 @@ class _Part:
         self._hidden.close()
 
 
+def least_gains(device: Device) -> Integers:
+    """Return the least integers that a search may go down to, shape (count,)."""
+    least = np.ones(device.gains.count, np.int64)
+    integral = device.gains.column("velocity", "I")
+    if integral is not None:
+        per_second = integers_per_si(device, 1.0)["velocity", "I"]  # which no supply changes
+        least[integral] = max(round(per_second / LONGEST_INTEGRATION), 1)
+    return least
+
+
 class Optimum(NamedTuple):
     """What the search on twins found, of every axis, the best first.
 
-    gains: (n, found, 5) raw integers. hidden: their hidden J on the twin, (n, found). start: that of the best gains
+    gains: (n, found, count) raw integers. hidden: their hidden J on the twin, (n, found). start: that of the best gains
     that it started from, (n,).
     """
 
@@ -320,7 +331,7 @@ def search(
     *,
     generations: int = 24,
     keep: int = 12,
-    free: Sequence[str] = Gains._fields,
+    free: Sequence[str] | None = None,
     width: float = 1.0,
 ) -> Optimum:
     """Return the gains of the least hidden J on twins, found by an evolution strategy in the logarithms of the gains.
@@ -330,16 +341,18 @@ def search(
 
     Args:
         twins: The twins.
-        starts: Gains to begin with, shape (n, starts, 5), at most as many as the twins have lanes.
+        starts: Gains to begin with, shape (n, starts, count), at most as many as the twins have lanes.
         rng: For drawing.
         generations: How often a generation of `twins.lanes` sets is drawn and scored.
         keep: Sets that are returned.
-        free: Gains that are searched; the others stay those of the best start.
+        free: Names of the gains that are searched, all by default; the others stay those of the best start.
         width: First standard deviation of a gain's logarithm.
     """
-    n, lanes, d = twins.num_axes, twins.lanes, len(free)
-    columns = [Gains._fields.index(name) for name in free]
-    least = np.array(LEAST)[columns]
+    known = twins.device.gains
+    columns = known.columns(known.names if free is None else free)
+    n, lanes, d = twins.num_axes, twins.lanes, len(columns)
+    least, highest = least_gains(twins.device)[columns], known.highest[columns]
+    reach = np.array([math.log(top) for top in highest])
     first = starts[:, np.arange(lanes) % starts.shape[1]]
     hidden = twins.score(first)
     at = np.arange(n)
@@ -361,7 +374,7 @@ def search(
         # The best so far is drawn again, so that a mean which lost it finds back.
         drawn[:, 1] = np.log(np.maximum(pool_gains[:, 0, columns], 1).astype(float))
         gains = np.repeat(base[:, None], lanes, axis=1)
-        gains[:, :, columns] = np.clip(np.rint(np.exp(np.clip(drawn, 0.0, math.log(RAW_MAX)))), least, RAW_MAX)
+        gains[:, :, columns] = np.clip(np.rint(np.exp(np.clip(drawn, 0.0, reach))), least, highest)
         hidden = twins.score(gains)
         order = hidden.argsort(axis=1)[:, :parents]
         chosen = np.take_along_axis(drawn, order[:, :, None], axis=1)

@@ -21,6 +21,7 @@ from drive_env.whole_file import content_hash
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.devices.gain_set import Gain
     from tuning.identify.estimate import Identification
     from tuning.response.margins import Margins
     from tuning.response.measured_loop import AtLeast
@@ -114,8 +115,8 @@ class AxisCertificate:
         reason: Why it stopped, or how it was verified, in words: always said.
         reservations: What could not be checked, or is near to a limit: the yes is none without them.
         identified: Name -> parameter.
-        before, after: Raw integers in the order of `Gains`, of the drive before and now.
-        before_si, after_si: The same in SI, as `drive_env.gains.gains_in_si` has them: name with unit -> value.
+        before, after: Raw integers in the order of the device's gain set, of the drive before and now.
+        before_si, after_si: The same in SI, as `si_gains` has them: name with unit -> value.
         steps: Recorded moves.
         frequency_responses: Open loops.
         notes: What no integer reached, limits met, what was left out.
@@ -186,7 +187,13 @@ class Certificate:
 
 
 # --- from what tuners have --------------------------------------------------------------------------------------------
-SI_NAMES = ("torque P [V/A]", "torque T_i [s]", "velocity P [A*s/rad]", "velocity T_i [s]", "position P [1/s]")
+SI_UNITS = {  # of a gain by its loop and part, in the order of `SiGains`
+    ("current", "P"): "V/A",
+    ("current", "I"): "s",
+    ("velocity", "P"): "A*s/rad",
+    ("velocity", "I"): "s",
+    ("position", "P"): "1/s",
+}
 MARGIN_NAMES = {
     "phase_deg": "phase margin [deg]",
     "gain_db": "gain margin [dB]",
@@ -205,22 +212,33 @@ def identified(identification: Identification) -> dict[str, StatedParameter]:
 
 
 def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, float]:
-    """Return raw gains, five integers in the order of `Gains`, in SI with their units in the names."""
-    from drive_env.gains import Gains, gains_in_si
+    """Return gains of a device's set in SI, in its order, with their units in the names; nothing without a cascade.
 
-    return dict(zip(SI_NAMES, gains_in_si(device, supply, Gains(*map(int, gains))), strict=True))
+    Of an I it is the integration time T_i.
+    """
+    from drive_env.gains import PI, gains_in_si
+
+    if device.gains.cascade != PI:
+        return {}
+    found = dict(zip(SI_UNITS, gains_in_si(device, supply, tuple(map(int, gains))), strict=True))
+    return {_si_name(gain): found[gain.loop, gain.part] for gain in device.gains.rows}
+
+
+def _si_name(gain: Gain) -> str:
+    what = gain.title if gain.part == "P" else f"{gain.title.removesuffix(' I')} T_i"
+    return f"{what} [{SI_UNITS[gain.loop, gain.part]}]"
 
 
 def envelope(target: Target) -> dict[str, float]:
     """Return what a target allows; where it has several axes, each of them."""
-    allowed = target.drives.read(Role.CURRENT_LIMIT) * 1e-3
     rows = {
         "travel low [rad]": target.low,
         "travel high [rad]": target.high,
         "speed while identified [rad/s]": np.full(target.num_axes, target.speed),
         "current while identified [A]": np.full(target.num_axes, target.current),
-        "current in moves, 2003h [A]": allowed,
     }
+    if (limit := target.device.roles.get(Role.CURRENT_LIMIT)) is not None:
+        rows[f"current in moves, {limit[0]:04X}h [A]"] = target.drives.read(limit) * 1e-3
     names = [""] if target.num_axes == 1 else [f"axis {axis}: " for axis in range(target.num_axes)]
     return {f"{name}{what}": float(row[axis]) for axis, name in enumerate(names) for what, row in rows.items()}
 

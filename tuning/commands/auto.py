@@ -91,7 +91,10 @@ def _left_behind(target: Target, file: Path) -> str:
 
 
 def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
+    from drive_env.gains import cascade_columns
+
     if json:
+        names = target.device.gains.names
         rows = [
             {
                 "axis": k,
@@ -100,28 +103,29 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
                 "reservations": axis.reservations,
                 "reason": axis.reason,
                 "verified": axis.verified,
-                "before": axis.before._asdict(),
-                "after": axis.after._asdict(),
+                "before": dict(zip(names, axis.before, strict=True)),
+                "after": dict(zip(names, axis.after, strict=True)),
                 "notes": axis.notes,
             }
             for k, axis in enumerate(result.axes)
         ]
         summary = {"drive seconds": result.drive_seconds.tolist(), "stored": result.kept}
-        names = {"certificate": "certificate.json", "report": "report.html"}
-        files = {"snapshot": str(result.file)} | {what: str(folder / name) for what, name in names.items()}
+        written = {"certificate": "certificate.json", "report": "report.html"}
+        files = {"snapshot": str(result.file)} | {what: str(folder / name) for what, name in written.items()}
         print_json({"axes": rows} | summary | files)
         return
     columns = (
         Column("axis"), Column("", "name"), Column("torque\nP, I", "name"), Column("velocity\nP, I", "name"),
         Column("position\nP", "name"), Column("velocity\nloop", "name"), Column("position\nloop", "name"),
     )  # fmt: skip
-    cells = []
+    cells, cascade = [], cascade_columns(target.device)
     for k, axis in enumerate(result.axes):
         for name, gains in (("before", axis.before), ("after", axis.after)):
             told = name == "after" and axis.accepted
             margins = [_margins(axis, loop) if told else "" for loop in ("velocity", "position")]
-            pairs = f"{gains.torque_p}, {gains.torque_i}", f"{gains.velocity_p}, {gains.velocity_i}"
-            cells.append((str(k), name, *pairs, str(gains.position_p), *margins))
+            torque_p, torque_i, velocity_p, velocity_i, position_p = (gains[column] for column in cascade)
+            pairs = f"{torque_p}, {torque_i}", f"{velocity_p}, {velocity_i}"
+            cells.append((str(k), name, *pairs, str(position_p), *margins))
     print_table(columns, cells)
     lines = []
     for k, axis in enumerate(result.axes):

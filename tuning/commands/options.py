@@ -19,6 +19,7 @@ from drive_env.commands.options import REFUSED as REFUSED
 from drive_env.commands.options import USER_ERROR as USER_ERROR
 from drive_env.commands.options import Bitrate as Bitrate
 from drive_env.commands.options import Channel as Channel
+from drive_env.commands.options import DeviceName as DeviceName
 from drive_env.commands.options import Interface as Interface
 from drive_env.commands.options import Json as Json
 from drive_env.commands.options import Nodes as Nodes
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 # Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
 
 APART = "apart"  # of `tuning.target.AXES`
-DeviceName = Annotated[str, typer.Option("--device", help="Drive by name.")]
 MotorName = Annotated[str, typer.Option("--motor", help="Motor by name; its data sheet values are taken.")]
 LoadName = Annotated[str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF.")]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random, 0 or more.")]

@@ -28,6 +28,7 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from drive_env.devices.gain_set import GainSet
     from tuning.response.linear_model import Plant
     from tuning.rules.proposal import Proposal
     from tuning.snapshot import Transaction
@@ -182,7 +183,7 @@ def _as_json(target: Target, axis: _AxisRules) -> dict[str, Any]:
         "plant": asdict(plant),
         "proposals": {
             name: {
-                "gains": proposal.gains._asdict(),
+                "gains": dict(zip(target.device.gains.names, proposal.gains, strict=True)),
                 "wanted": dict(proposal.wanted),
                 "notes": list(proposal.notes),
                 "velocity_margins": _margins(target, plant, proposal)._asdict(),
@@ -199,7 +200,7 @@ def _print(target: Target, shown: _AxisRules, axis: int | None) -> None:
         return
     pair = f", resonances at {plant.anti_resonance:.0f} and {plant.resonance:.0f} Hz" if plant.is_elastic else ", rigid"
     title = f"{head}inertia {plant.inertia:.3g} kg m^2{pair}"
-    titles = ("2041h\nP", "\nI", "2042h\nP", "\nI", "2043h\nP", "cross\nHz", "phase\ndeg", "gain\ndB")
+    titles = (*_gain_titles(target.device.gains), "cross\nHz", "phase\ndeg", "gain\ndB")
     cells = []
     for name, proposal in rows.items():
         found = _margins(target, plant, proposal)
@@ -217,6 +218,16 @@ def _print(target: Target, shown: _AxisRules, axis: int | None) -> None:
     if shown.unswung:
         lines.append(f"{MEASURED}: nothing: {shown.unswung}")
     print_lines(lines)
+
+
+def _gain_titles(known: GainSet) -> list[str]:
+    """Return a column's title for each gain: its object, where it is another than that of the gain before, and part."""
+    told, titles = None, []
+    for gain in known.rows:
+        place = gain.loop, gain.key[0]
+        titles.append(f"{'' if place == told else f'{gain.key[0]:04X}h'}\n{gain.part}")
+        told = place
+    return titles
 
 
 def _apply(

@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import machine_of
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import Gains, rule_gains
+from drive_env.gains import rule_gains
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import HiddenScore
 from mechanics.untrusted import parse_json
@@ -52,7 +53,7 @@ class MachineRow:
     hidden, relative: Hidden J, and over that of the fitted rule. rule: That of the fitted rule.
     drive_seconds: Until the drive was last written to or moved [s], waits for the machines beside it included.
     moves: Of all its axes, each from standstill to standstill (moves.py). aborts: As the tuner says.
-    violations: Of all kinds. torque_p ... position_p: Raw gains of the machine's first axis.
+    violations: Of all kinds. gains: Raw gains of the machine's first axis, by the names that its device has for them.
     note: What the tuner says, or why it failed; then the gains are those that it left behind.
     """
 
@@ -67,11 +68,7 @@ class MachineRow:
     violations: int
     kinds: str
     failed: bool
-    torque_p: int
-    torque_i: int
-    velocity_p: int
-    velocity_i: int
-    position_p: int
+    gains: Mapping[str, int]
     note: str
 
 
@@ -306,6 +303,7 @@ def _rows(name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Ya
     """Return what a tuner made of every machine of a group."""
     hidden, outcome, audit = yardstick.score(tuned.gains), tuned.outcome, tuned.audit
     per_machine = len(tuned.gains) // len(group)
+    names = find_device(group[0].device).gains.names
     rows = []
     for k, machine in enumerate(group):
         axes = slice(k * per_machine, (k + 1) * per_machine)
@@ -324,8 +322,8 @@ def _rows(name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Ya
                 violations=int(counts.sum()),
                 kinds=", ".join(f"{kind} {count}" for kind, count in zip(KINDS, counts, strict=True) if count),
                 failed=outcome is None,
+                gains=dict(zip(names, map(int, tuned.gains[axes.start]), strict=True)),
                 note=" | ".join(notes).replace("\n", " "),
-                **Gains(*map(int, tuned.gains[axes.start]))._asdict(),
             )
         )
     return rows
@@ -333,7 +331,7 @@ def _rows(name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Ya
 
 def _checked_gains(outcome: Any, target: Target) -> Integers:
     """Return a tuner's gains; ValueError if they are none, which is the tuner's mistake."""
-    shape = (target.num_axes, len(Gains._fields))
+    shape = (target.num_axes, target.device.gains.count)
     gains = np.asarray(outcome.gains)
     if not isinstance(outcome, Outcome) or gains.shape != shape or not np.issubdtype(gains.dtype, np.integer):
         raise ValueError(

@@ -38,9 +38,18 @@ def _write_csv(path: Path, rows: Sequence[Any], kind: type) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = [field.name for field in fields(kind)]
-        writer.writerow(names)
-        for row in rows:
-            writer.writerow([_cell(getattr(row, name)) for name in names])
+        # A mapping has a column for each of its names, which are those of the first row.
+        table = [_columns({name: getattr(row, name) for name in names}) for row in rows]
+        writer.writerow(table[0] if table else names)
+        writer.writerows([[_cell(value) for value in row.values()] for row in table])
+
+
+def _columns(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row with the values of its mappings in their place."""
+    found: dict[str, Any] = {}
+    for name, value in row.items():
+        found |= value if isinstance(value, Mapping) else {name: value}
+    return found
 
 
 def _cell(value: Any) -> Any:

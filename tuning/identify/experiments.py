@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import check_linear_model, gains_from_bandwidths, write_gains
+from drive_env.gains import bandwidth_gains, check_linear_model, write_gains
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders
 from tuning.identify.estimate import NAMES, Estimate, Identification, Progress, refused
@@ -279,7 +279,7 @@ class Experiments:
                     ))  # fmt: skip
 
     def response_gains(self, working: Working, inertia: Floats) -> NDArray[np.int64]:
-        """Return raw gains for measuring a response, (num_axes, 5), for total inertias [kg*m^2]."""
+        """Return raw gains for measuring a response, (num_axes, count), for total inertias [kg*m^2]."""
         target, motor = working.target, working.target.motor
         rows = []
         for k in range(target.num_axes):
@@ -287,7 +287,7 @@ class Experiments:
             R, L = found["resistance"], found["inductance"]
             known = motor._replace(R_s=R.value if R.is_known else motor.R_s, L_q=L.value if L.is_known else motor.L_q)
             rows.append(
-                gains_from_bandwidths(
+                bandwidth_gains(
                     target.device,
                     known,
                     float(inertia[k]),

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.dictionary.units import RPM
 from drive_env.emulator.parameters import velocity_filter
-from drive_env.gains import write_gains
+from drive_env.gains import as_chip, write_gains
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.estimate import Estimate, refused
 from tuning.identify.working_state import CYCLE, GUESS, Working, cautious_gains, go_back, still_enabled
@@ -300,8 +300,9 @@ def hidden_ripple(target: Target, k: int, gains: Integers, inertia: float) -> fl
     supply = float(target.supply[k])
     windows, ticks = round(device.velocity_rate * CYCLE), round(device.current_rate / device.velocity_rate)
     dt, h = 1.0 / device.current_rate, 1.0 / device.velocity_rate
-    P_T, I_T = gains[0] / (256.0 * device.current_full_scale) * supply, gains[1] / 65536.0
-    P_V, I_V = gains[2] * device.current_full_scale / (256.0 * 32768.0 * RPM), gains[3] / 65536.0
+    torque_p, torque_i, velocity_p, velocity_i, _ = as_chip(device, gains)
+    P_T, I_T = torque_p / (256.0 * device.current_full_scale) * supply, torque_i / 65536.0
+    P_V, I_V = velocity_p * device.current_full_scale / (256.0 * 32768.0 * RPM), velocity_i / 65536.0
     b, a1, a2 = (float(x) for x in velocity_filter(np.asarray(device.stage["velocity_filter"].default), 1.0 / h))
     decay = float(np.exp(-motor.R_s * dt / motor.L_q))
     i = i_sum = omega = theta = before = z1 = z2 = total = applied = 0.0

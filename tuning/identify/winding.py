@@ -22,11 +22,13 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
+from drive_env.gains import cascade_columns, per_chip
 from tuning.identify.confidence import gain_error, interval, t_quantile
 from tuning.identify.dead_time import dead_time
 from tuning.identify.estimate import Estimate, refused
 from tuning.identify.working_state import CYCLE, Working, still_enabled
 from tuning.stop_causes import stop_causes
+from tuning.target import Target
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,6 +40,7 @@ PULSES = ((0.95, 3), (0.95, 1), (0.95, 1), (0.7, 3), (0.7, 1), (0.45, 3), (0.25,
 REPEATS, BRIEFLY = 8, 6
 LOOP_GAIN, LOOP_HZ = 4.0, 600.0  # P of the loop: so many winding resistances, or this bandwidth if that is less
 INTEGRAL_SHARE = 0.1  # of the integral gain that cancels the winding's lag: an instrument, not a controller
+LEAST_INTEGRAL = 8  # of 65536, a share of P e per tick: below it the sum over a millisecond says too little
 HOLD_HZ, HOLD_DAMPING = 7.0, 0.7  # our own slow position loop around the pulses
 # Over the data sheet's, centre and deviation: unit-to-unit spread and temperature.
 RESISTANCE_PRIOR, EMF_PRIOR = (1.1, 0.25), (0.965, 0.06)
@@ -78,12 +81,21 @@ class Winding(NamedTuple):
 
 
 def loop_gains(working: Working) -> tuple[Floats, float]:
-    """Return raw torque P of every axis, and I, of the loop that serves as an instrument."""
+    """Return raw P of the current loop of every axis, and I, of the loop that serves as an instrument."""
     target, motor = working.target, working.target.motor
+    known, per = target.device.gains, per_chip(target.device)
+    top_p, top_i = (known.rows[k].highest for k in _columns(target))
     volts_per_ampere = min(LOOP_GAIN * motor.R_s, 2.0 * np.pi * LOOP_HZ * motor.L_q)
-    P = np.rint(256.0 * target.device.current_full_scale * volts_per_ampere / target.supply)
-    cancels = 65536.0 * motor.R_s / motor.L_q / target.device.current_rate
-    return np.clip(P, 1, 32767), float(np.clip(np.rint(INTEGRAL_SHARE * cancels), 8, 32767))
+    P = np.rint(256.0 * target.device.current_full_scale * volts_per_ampere / target.supply * per["current", "P"])
+    cancels = 65536.0 * motor.R_s / motor.L_q / target.device.current_rate * per["current", "I"]
+    least = max(LEAST_INTEGRAL * per["current", "I"], 1.0)
+    return np.clip(P, 1, top_p), float(np.rint(np.clip(np.rint(INTEGRAL_SHARE * cancels), least, top_i)))
+
+
+def _columns(target: Target) -> tuple[int, int]:
+    """Return which gains are P and I of the current loop."""
+    P, integral, *_ = cascade_columns(target.device)
+    return P, integral
 
 
 def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
@@ -91,8 +103,9 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
     target, drives = working.target, working.target.drives
     motor, count = target.motor, target.num_axes
     P, integral = loop_gains(working)
-    drives.write(Role.CURRENT_P, P.astype(np.int64), where=working.where)
-    drives.write(Role.CURRENT_I, int(integral), where=working.where)
+    of_p, of_i = (target.device.gains.keys[k] for k in _columns(target))
+    drives.write(of_p, P.astype(np.int64), where=working.where)
+    drives.write(of_i, int(integral), where=working.where)
     J = 3.0 * motor.inertia / motor.torque_constant
     stiffness, damping = J * (2.0 * np.pi * HOLD_HZ) ** 2, 2.0 * HOLD_DAMPING * J * 2.0 * np.pi * HOLD_HZ
     room = np.maximum(working.current - np.abs(holding), 0.0)
@@ -194,7 +207,9 @@ def _winding(working: Working, axis: _AxisWinding, k: int, electrical: float, po
     target, motor = working.target, working.target.motor
     supply = float(target.supply[k])
     P_raw, I_raw = loop_gains(working)
-    P, share = P_raw[k] / (256.0 * target.device.current_full_scale), I_raw / 65536.0
+    per = per_chip(target.device)
+    P = P_raw[k] / per["current", "P"] / (256.0 * target.device.current_full_scale)
+    share = I_raw / per["current", "I"] / 65536.0
     emf = motor.torque_constant / (1.0 if motor.kind == "dc" else 1.5)
     row = target.device.stage["dead_time_current"]
     results: list[_Solved] = []

@@ -20,7 +20,7 @@ from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
-from drive_env.gains import gains_from_bandwidths, write_gains
+from drive_env.gains import bandwidth_gains, write_gains
 from drive_env.motors import Motor
 from tuning.identify.wiring import FINDINGS
 from tuning.target import Target
@@ -105,10 +105,10 @@ class Working:
 
 
 def cautious_gains(target: Target, inertia: ArrayLike, motor: Motor | None = None) -> Integers:
-    """Return raw gains, shape (num_axes, 5), for total inertias [kg*m^2], slow enough for rigid and elastic loads."""
+    """Return raw gains, (num_axes, count), for total inertias [kg*m^2], slow enough for rigid and elastic loads."""
     J = np.broadcast_to(np.asarray(inertia, float), (target.num_axes,))
     return np.array([
-        gains_from_bandwidths(
+        bandwidth_gains(
             target.device, motor or target.motor, float(J[k]), current_hz=CURRENT_HZ,
             velocity_hz=cautious_bandwidth(target.motor, float(J[k])), position_hz=POSITION_HZ,
             supply=float(target.supply[k]), integration=INTEGRATION,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.roles import Role
-from drive_env.gains import read_gains
+from drive_env.gains import check_linear_model, read_gains
 from drive_env.safety.envelope import swinging_allowed
 from tuning.identify.dead_time import dead_time_resistance
 from tuning.oscillation_watch import OscillationError, shaken, watch_of
@@ -102,7 +102,8 @@ def measure(
         progress: Called with the share done.
 
     Raises:
-        ValueError: For a loop, a kind or frequencies that cannot be, or a trace on a bus.
+        ValueError: For a loop, a kind or frequencies that cannot be, a trace on a bus, or a drive without a linear
+            model of its loops.
     """
     if loop not in LOOPS:
         raise ValueError(
@@ -120,6 +121,7 @@ def measure(
     axes = np.ones(target.num_axes, bool) if where is None else np.asarray(where, bool)
     if not axes.any():
         raise ValueError("no axis is chosen")
+    check_linear_model(target.device)  # which tells how strongly to shake, before anything moves
     closed = _closed_loops(target, loop)
     if not (axes & closed).any():
         raise ValueError("a P gain is 0 on every axis and the loop is open: give the drives gains first")

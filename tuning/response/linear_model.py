@@ -14,7 +14,6 @@ All angles are the rotor's; f is in Hz throughout.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,8 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.dictionary.units import UNITS, Context
-from drive_env.gains import Gains, check_linear_model
+from drive_env.gains import RawGains, cascade_columns, gain_factors
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -32,7 +30,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-RawGains = Sequence[int] | NDArray[np.int64]  # in the order of `Gains`
 
 
 @dataclass(frozen=True)
@@ -135,16 +132,16 @@ def current_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLik
     Args:
         device: The drive.
         plant: The axis.
-        gains: Raw integers in the order of `Gains`.
+        gains: Raw integers in the order of the device's gain set.
         f: Frequencies [Hz], shape (n,).
     """
-    raw, at = _raw(device, gains), _below(f, device.current_rate)
+    at = _below(f, device.current_rate)
     A, B = _machine(plant)
     T = 1.0 / device.current_rate
     Phi, Gamma, _, _ = _held(A, B, T)
     z = np.exp(2j * math.pi * at * T)
     winding = _response(Phi, Gamma, np.eye(len(B))[_CURRENT], z)
-    return np.asarray(controllers(device, raw).current(z) * plant.supply * winding / z)
+    return np.asarray(controllers(device, gains).current(z) * plant.supply * winding / z)
 
 
 def velocity_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) -> Complex:
@@ -153,12 +150,12 @@ def velocity_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLi
     Args:
         device: The drive.
         plant: The axis.
-        gains: Raw integers in the order of `Gains`.
+        gains: Raw integers in the order of the device's gain set.
         f: Frequencies [Hz], shape (n,).
     """
-    raw, at = _raw(device, gains), _below(f, device.velocity_rate)
+    at = _below(f, device.velocity_rate)
     z = np.exp(2j * math.pi * at / device.velocity_rate)
-    return np.asarray(controllers(device, raw).velocity(z) * velocity_plant(device, plant, raw, at))
+    return np.asarray(controllers(device, gains).velocity(z) * velocity_plant(device, plant, gains, at))
 
 
 def velocity_plant(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) -> Complex:
@@ -167,7 +164,7 @@ def velocity_plant(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) 
     Of the gains, those of the current loop matter.
     """
     at = _below(f, device.velocity_rate)
-    velocity = mean_velocity(device, plant, _raw(device, gains), at)
+    velocity = mean_velocity(device, plant, gains, at)
     return np.asarray(velocity * velocity_filter_response(device, plant, at))
 
 
@@ -177,16 +174,16 @@ def position_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLi
     Args:
         device: The drive.
         plant: The axis.
-        gains: Raw integers in the order of `Gains`.
+        gains: Raw integers in the order of the device's gain set.
         f: Frequencies [Hz], shape (n,).
     """
-    raw, at = _raw(device, gains), _below(f, device.velocity_rate)
+    at = _below(f, device.velocity_rate)
     z = np.exp(2j * math.pi * at / device.velocity_rate)
-    regulator = controllers(device, raw)
+    regulator = controllers(device, gains)
     # What the position loop reads is the angle itself: the differences, added up.
-    angle = mean_velocity(device, plant, raw, at) / device.velocity_rate / (1.0 - 1.0 / z)
+    angle = mean_velocity(device, plant, gains, at) / device.velocity_rate / (1.0 - 1.0 / z)
     inner = regulator.velocity(z) * angle
-    return np.asarray(regulator.position * inner / (1.0 + velocity_open_loop(device, plant, raw, at)))
+    return np.asarray(regulator.position * inner / (1.0 + velocity_open_loop(device, plant, gains, at)))
 
 
 def outer_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike, velocity: Complex) -> Complex:
@@ -195,7 +192,7 @@ def outer_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike, velo
     Args:
         device: The drive.
         plant: The axis; its velocity filter matters, which the position loop does not see.
-        gains: Raw integers in the order of `Gains`.
+        gains: Raw integers in the order of the device's gain set.
         f: Frequencies [Hz], shape (n,).
         velocity: Open loop of the velocity loop there, shape (n,).
     """
@@ -228,17 +225,9 @@ class Controllers(NamedTuple):
 
 
 def controllers(device: Device, gains: RawGains) -> Controllers:
-    """Return raw gains in SI."""
-    raw = _raw(device, (int(gain) for gain in gains))
-    context = Context(65536.0, device.current_full_scale / 32768.0)
-    names = ("current P", "I", "velocity P", "I", "position P")
-    return Controllers(*(value * float(UNITS[name].factor(context)) for value, name in zip(raw, names, strict=True)))
-
-
-def _raw(device: Device, gains: Iterable[int]) -> Gains:
-    """Return raw gains by their names; ValueError for a device whose loops are others than those of this model."""
-    check_linear_model(device)
-    return Gains(*gains)
+    """Return raw gains in SI; ValueError for a device whose loops are others than those of this model."""
+    factors = gain_factors(device)
+    return Controllers(*(int(gains[k]) * factors[k] for k in cascade_columns(device)))
 
 
 def velocity_filter_response(device: Device, plant: Plant, f: ArrayLike) -> Complex:

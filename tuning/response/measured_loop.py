@@ -62,7 +62,7 @@ class MeasuredLoop:
         open_loop: L; nan where nothing was measured.
         coherence: Of set-point with answer and with error, the lower of the two, 0...1.
         traced: Which frequencies come from an emulator's trace at the velocity loop's rate; no bus shows them.
-        gains: Raw gains in force, shape (axes, 5).
+        gains: Raw gains in force, shape (axes, count).
         fits: What the linear model makes of each axis; None of the position loop.
         peak_speed, peak_current: Of the shaking [rad/s], [A], shape (axes,).
         drive_time: Time that passed on the drives [s].
@@ -130,7 +130,7 @@ class MeasuredLoop:
         a factor that is known exactly, those of the torque loop by what the winding makes of them.
 
         Args:
-            gains: Raw gains, shape (5,).
+            gains: Raw gains, shape (count,).
             axis: Number of the axis.
             plant: The axis, for other gains of the torque loop; what was fitted by default.
             refined: Between the lines too, as `refined` has them; else the lines as they are.
@@ -144,7 +144,8 @@ class MeasuredLoop:
         then, now, known = self.gains[axis], np.asarray(gains), plant or fit.plant
         lines = self.f, self.open_loop[:, axis], self.trusted[:, axis]
         f, L, trusted = self.refined(axis) if refined else lines
-        if np.array_equal(then[:2], now[:2]):
+        current = self.device.gains.columns_of("current")
+        if np.array_equal(then[current], now[current]):
             z = np.exp(2j * math.pi * f / self.device.velocity_rate)
             ratio = controllers(self.device, now).velocity(z) / controllers(self.device, then).velocity(z)
         else:
@@ -157,7 +158,7 @@ class MeasuredLoop:
 
         Args:
             loop: "velocity" or "position".
-            gains: Raw gains, shape (5,).
+            gains: Raw gains, shape (count,).
             axis: Number of the axis.
         """
         fit = self.fits[axis]

@@ -132,7 +132,7 @@ def fit_plant(
 
     Args:
         device: The drive.
-        gains: Raw gains in force, shape (5,).
+        gains: Raw gains in force, shape (count,).
         f: Frequencies that are trusted [Hz], shape (n,).
         seen: Set-point to velocity, both as on the bus, shape (n,).
         spread: Standard deviation of each line over its size, shape (n,).

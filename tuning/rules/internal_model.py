@@ -46,8 +46,8 @@ def imc_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     """
     bench = Workbench(device, plant)
     wanted = imc_first_order(1.0 / plant.R, plant.L / plant.R, IMC_CURRENT * current_lag(device))
-    lag = plant.L / bench.p("torque", wanted.p)
-    bench.time("torque", wanted.time)
+    lag = plant.L / bench.p("current", wanted.p)
+    bench.time("current", wanted.time)
     small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 1.0 / IMC_VELOCITY)
     slope = plant.torque_constant / plant.inertia
     crossover = bench.p("velocity", 1.0 / (slope * IMC_VELOCITY * small)) * slope
@@ -65,8 +65,8 @@ def simc_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     bench = Workbench(device, plant)
     dead = current_lag(device)
     wanted = simc_first_order(1.0 / plant.R, plant.L / plant.R, dead, dead)
-    lag = plant.L / bench.p("torque", wanted.p)
-    bench.time("torque", wanted.time)
+    lag = plant.L / bench.p("current", wanted.p)
+    bench.time("current", wanted.time)
     small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 0.5)
     slope = plant.torque_constant / plant.inertia
     crossover = bench.p("velocity", simc_integrating(slope, small, small).p) * slope

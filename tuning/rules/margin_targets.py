@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import RAW_MAX, Gains
 from tuning.response.linear_model import controllers, current_open_loop, mean_velocity, velocity_plant
 from tuning.response.margins import Margins, margins
 from tuning.rules.proposal import Proposal, Rule, Workbench
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.gains import Part
     from drive_env.motors import Motor
     from tuning.response.linear_model import Plant
 
@@ -30,6 +30,8 @@ TARGETS = {"margin_45": (45.0, 8.0), "margin_55": (55.0, 12.0), "margin_60": (60
 
 POINTS = 1200  # frequencies: half a percent apart, so that a weakly damped resonance is not stepped over
 INTEGRATION = 4.0  # T_i times the velocity loop's crossover: the integral part costs 14 degrees
+CURRENT_P, CURRENT_I = ("current", "P"), ("current", "I")
+VELOCITY_P, VELOCITY_I, POSITION_P = ("velocity", "P"), ("velocity", "I"), ("position", "P")
 STEP = 1.06  # from one trial value of a gain to the next, until the first that fails
 
 
@@ -59,54 +61,54 @@ def propose(device: Device, plant: Plant, phase_deg: float, gain_db: float) -> P
         return phase >= phase_deg and found.gain_db >= gain_db
 
     f = np.geomspace(2.0, 0.49 * device.current_rate, POINTS)
-    torque_i = min(max(round(65536.0 / device.current_rate * plant.R / plant.L), 1), RAW_MAX)
-    unit = current_open_loop(device, plant, (1, torque_i, 1, 1, 1), f)
-    torque_p = _greatest(bench, "torque P", lambda p: margins(f, p * unit), enough, phase_deg, gain_db)
-    bench.raw("torque_p", torque_p)
-    bench.raw("torque_i", torque_i)
+    torque_i = bench.integer(CURRENT_I, bench.per_si[CURRENT_I] * plant.R / plant.L)
+    unit = current_open_loop(device, plant, bench.so_far({CURRENT_I: torque_i}), f)
+    torque_p = _greatest(bench, CURRENT_P, lambda p: margins(f, p * unit), enough, phase_deg, gain_db)
+    bench.raw(CURRENT_P, torque_p)
+    bench.raw(CURRENT_I, torque_i)
 
     f = np.geomspace(0.2, 0.49 * device.velocity_rate, POINTS)
     z = np.exp(2j * math.pi * f / device.velocity_rate)
-    inner = velocity_plant(device, plant, (torque_p, torque_i, 1, 1, 1), f)
+    inner = velocity_plant(device, plant, bench.so_far(), f)
     slope = plant.torque_constant / plant.inertia
 
     def velocity(p: int) -> Complex:
-        raw = Gains(torque_p, torque_i, p, _integral(bench, device, p, slope), 1)
+        raw = bench.so_far({VELOCITY_P: p, VELOCITY_I: _integral(bench, p, slope)})
         return np.asarray(controllers(device, raw).velocity(z) * inner)
 
-    velocity_p = _greatest(bench, "velocity P", lambda p: margins(f, velocity(p)), enough, phase_deg, gain_db)
-    bench.raw("velocity_p", velocity_p)
-    velocity_i = _integral(bench, device, velocity_p, slope)
-    bench.raw("velocity_i", velocity_i)
+    velocity_p = _greatest(bench, VELOCITY_P, lambda p: margins(f, velocity(p)), enough, phase_deg, gain_db)
+    bench.raw(VELOCITY_P, velocity_p)
+    bench.raw(VELOCITY_I, _integral(bench, velocity_p, slope))
 
-    raw = Gains(torque_p, torque_i, velocity_p, velocity_i, 1)
+    raw = bench.so_far()
     angle = mean_velocity(device, plant, raw, f) / device.velocity_rate / (1.0 - 1.0 / z)
     regulator = controllers(device, raw)
     unit = regulator.position * regulator.velocity(z) * angle / (1.0 + velocity(velocity_p))
-    position_p = _greatest(bench, "position P", lambda p: margins(f, p * unit), enough, phase_deg, gain_db)
-    bench.raw("position_p", position_p)
+    position_p = _greatest(bench, POSITION_P, lambda p: margins(f, p * unit), enough, phase_deg, gain_db)
+    bench.raw(POSITION_P, position_p)
     return bench.proposal()
 
 
-def _integral(bench: Workbench, device: Device, velocity_p: int, slope: float) -> int:
-    crossover = bench.si("velocity_p", velocity_p) * slope
-    return min(max(round(65536.0 / device.velocity_rate * crossover / INTEGRATION), 1), RAW_MAX)
+def _integral(bench: Workbench, velocity_p: int, slope: float) -> int:
+    crossover = bench.si(VELOCITY_P, velocity_p) * slope
+    return bench.integer(VELOCITY_I, bench.per_si[VELOCITY_I] * crossover / INTEGRATION)
 
 
 def _greatest(
     bench: Workbench,
-    title: str,
+    part: Part,
     margins_of: Callable[[int], Margins],
     enough: Callable[[Margins], bool],
     phase_deg: float,
     gain_db: float,
 ) -> int:
     """Return the greatest integer below the first that fails, 1 with a note if that fails itself."""
+    _, title, _, highest, *_ = bench.row(part)
     last, trial = 0, 1
-    while trial <= RAW_MAX and enough(margins_of(trial)):
+    while trial <= highest and enough(margins_of(trial)):
         last = trial
-        trial = max(trial + 1, math.ceil(trial * STEP)) if trial < RAW_MAX else RAW_MAX + 1
-        trial = RAW_MAX if last < RAW_MAX < trial else trial
+        trial = max(trial + 1, math.ceil(trial * STEP)) if trial < highest else highest + 1
+        trial = highest if last < highest < trial else trial
     if last == 0:
         found = margins_of(1)
         bench.note(
@@ -114,8 +116,8 @@ def _greatest(
             f"{found.phase_deg:.0f} degrees and {found.gain_db:.1f} dB"
         )
         return 1
-    if last == RAW_MAX:
-        bench.note(f"{title} ends at {RAW_MAX}, the greatest integer, with margin to spare")
+    if last == highest:
+        bench.note(f"{title} ends at {highest}, the greatest integer, with margin to spare")
         return last
     low, high = last, trial
     while high - low > 1:

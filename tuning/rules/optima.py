@@ -90,6 +90,6 @@ def symmetrical_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
 def take_current(bench: Workbench, device: Device, plant: Plant) -> float:
     """Take a current loop of the modulus optimum; return the lag that it is to the loops around it [s]."""
     found = modulus_optimum(1.0 / plant.R, plant.L / plant.R, current_lag(device))
-    reached = bench.p("torque", found.p)
-    bench.time("torque", found.time)
+    reached = bench.p("current", found.p)
+    bench.time("current", found.time)
     return plant.L / reached

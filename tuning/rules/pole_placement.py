@@ -50,8 +50,8 @@ def pole_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     # A winding that is fast by itself leaves the controller less to do, not nothing.
     natural = max(natural, 0.6 * plant.R / (CURRENT_DAMPING * plant.L))
     wanted = place_first_order(plant.L, plant.R, natural, CURRENT_DAMPING)
-    p = bench.p("torque", wanted.p)
-    bench.time("torque", p / (natural**2 * plant.L))
+    p = bench.p("current", wanted.p)
+    bench.time("current", p / (natural**2 * plant.L))
     # Of this damping the closed current loop lags as one of its proportional gain and resistance does.
     lag = plant.L / (p + plant.R)
     small = slow_enough(bench, plant, velocity_lag(device, plant, lag), LAG_SHARE)

@@ -1,4 +1,4 @@
-"""What a rule proposes: raw integers of the cascade, what was wanted, and what no integer reaches."""
+"""What a rule proposes: raw integers of the device's gains, what was wanted, and what no integer reaches."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from drive_env.dictionary.units import RPM
-from drive_env.gains import RAW_MAX, Gains
+from drive_env.gains import Part, check_linear_model, integers_per_si
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.devices.gain_set import Gain
     from drive_env.motors import Motor
     from tuning.response.linear_model import Plant
 
@@ -20,12 +20,12 @@ COARSE = 0.05  # a gain that an integer misses by more than this share is worth 
 class Proposal(NamedTuple):
     """Gains that a rule proposes.
 
-    gains: Raw integers.
+    gains: Raw integers in the order of the device's gain set.
     wanted: Raw value that the rule asked for, by the gain's name, before it became an integer.
     notes: What no integer reaches, and which limits were met; for people.
     """
 
-    gains: Gains
+    gains: tuple[int, ...]
     wanted: Mapping[str, float]
     notes: tuple[str, ...]
 
@@ -39,66 +39,78 @@ class Workbench:
     A rule designs a loop, takes its gains here, and designs the next loop around what it got: the integration time and
     the outer loop follow the bandwidth that is reached, not the one that was wanted.
 
+    Loops are "current", "velocity" and "position", as in a device's gain set.
+
     Args:
         device: The drive.
         plant: The axis.
+
+    Raises:
+        ValueError: If the drive has no linear model of its loops.
     """
 
     def __init__(self, device: Device, plant: Plant) -> None:
-        self._titles = dict(zip(device.gains.names, device.gains.titles, strict=True))
-        per_ampere = 256.0 * device.current_full_scale / plant.supply  # Q8.8, duty of the supply per full scale
-        self._raw_per_si = {
-            "torque_p": per_ampere,  # V/A
-            "torque_i": 65536.0 / device.current_rate,  # 1/s, of the integration time's inverse
-            "velocity_p": 256.0 * RPM * 32768.0 / device.current_full_scale,  # A*s/rad
-            "velocity_i": 65536.0 / device.velocity_rate,  # 1/s
-            "position_p": 4096.0 * 2.0 * math.pi / 65536.0 / RPM,  # 1/s
-        }
+        check_linear_model(device)
+        self._rows = {(row.loop, row.part): row for row in device.gains.rows}
+        self.per_si = integers_per_si(device, plant.supply)
         self._wanted: dict[str, float] = {}
-        self._raw: dict[str, int] = {}
+        self._raw: dict[Part, int] = {}
         self._notes: list[str] = []
 
     def p(self, loop: str, value: float) -> float:
-        """Take a proportional gain [V/A, A*s/rad, 1/s] of "torque", "velocity" or "position"; return what it became."""
-        return self._take(f"{loop}_p", value)
+        """Take a proportional gain [V/A, A*s/rad, 1/s] of a loop; return what it became."""
+        return self._take((loop, "P"), value)
 
     def time(self, loop: str, value: float) -> float:
-        """Take an integration time [s], infinite for none, of "torque" or "velocity"; return what it became."""
-        inverse = self._take(f"{loop}_i", 1.0 / value)
+        """Take an integration time [s], infinite for none, of the current or velocity loop; return what it became."""
+        inverse = self._take((loop, "I"), 1.0 / value)
         return 1.0 / inverse if inverse else math.inf
 
-    def raw(self, name: str, value: int) -> float:
+    def raw(self, part: Part, value: int) -> float:
         """Take an integer that a rule searched itself; return it in SI, of an I 1/s."""
-        self._wanted[name] = float(value)
-        self._raw[name] = value
-        return value / self._raw_per_si[name]
+        self._wanted[self._rows[part].name] = float(value)
+        self._raw[part] = value
+        return value / self.per_si[part]
 
-    def si(self, name: str, value: float) -> float:
+    def si(self, part: Part, value: float) -> float:
         """Return what a raw gain means in SI, of an I 1/s."""
-        return value / self._raw_per_si[name]
+        return value / self.per_si[part]
+
+    def row(self, part: Part) -> Gain:
+        """Return a gain of the device's set."""
+        return self._rows[part]
+
+    def integer(self, part: Part, wanted: float) -> int:
+        """Return the integer that is nearest to what is wanted of a gain, 1 at least."""
+        return min(max(round(wanted), 1), self._rows[part].highest)
 
     def note(self, text: str) -> None:
         """Say something to whoever reads the proposal."""
         self._notes.append(text)
 
+    def so_far(self, more: Mapping[Part, int] | None = None) -> tuple[int, ...]:
+        """Return what was taken so far, and more, in the device's order; 1 for what is not taken yet."""
+        found = self._raw | dict(more or {})
+        return tuple(found.get(part, 1) for part in self._rows)
+
     def proposal(self) -> Proposal:
         """Return what was taken."""
-        return Proposal(Gains(**self._raw), dict(self._wanted), tuple(self._notes))
+        return Proposal(tuple(self._raw[part] for part in self._rows), dict(self._wanted), tuple(self._notes))
 
-    def _take(self, name: str, value: float) -> float:
-        wanted = value * self._raw_per_si[name]
-        self._wanted[name] = wanted
-        raw = 0 if wanted == 0.0 else min(max(round(wanted), 1), RAW_MAX)
-        self._raw[name] = raw
-        title = self._titles[name]
-        if wanted > RAW_MAX + 0.5:
+    def _take(self, part: Part, value: float) -> float:
+        gain, wanted = self._rows[part], value * self.per_si[part]
+        self._wanted[gain.name] = wanted
+        raw = 0 if wanted == 0.0 else self.integer(part, wanted)
+        self._raw[part] = raw
+        title, highest = gain.title, gain.highest
+        if wanted > highest + 0.5:
             self.note(
-                f"{title} would have to be {wanted:.0f}, and no integer above {RAW_MAX} exists: "
-                f"{100.0 * RAW_MAX / wanted:.0f} % of it is reached"
+                f"{title} would have to be {wanted:.0f}, and no integer above {highest} exists: "
+                f"{100.0 * highest / wanted:.0f} % of it is reached"
             )
         elif 0.0 < wanted < 0.5:
             self.note(f"{title} would have to be {wanted:.2g}, and 1 is the least: {1.0 / wanted:.1f} times as much")
         elif raw and abs(raw / wanted - 1.0) > COARSE:
             self.note(f"{title} would have to be {wanted:.2f}; no integer comes nearer than {raw}, "
                       f"{100.0 * abs(raw / wanted - 1.0):.0f} % off")  # fmt: skip
-        return raw / self._raw_per_si[name]
+        return raw / self.per_si[part]

@@ -1,4 +1,4 @@
-"""The rules by name: from what is known of an axis to raw integers of 2041h to 2043h.
+"""The rules by name: from what is known of an axis to raw integers of its drive's gains.
 
 A rule proposes; nothing is written.
 """

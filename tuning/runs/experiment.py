@@ -20,6 +20,7 @@ from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment_of
+from drive_env.gains import gain_factors
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.untrusted import read_toml
@@ -141,7 +142,8 @@ def load_experiment(config: str | Path | None = None, **overrides: Any) -> Exper
 
     Args:
         config: The file.
-        overrides: device, motor, load or seed in place of the file's; None keeps the file's.
+        overrides: device, motor, load or seed in place of the file's; None keeps the file's. The experiment that ships
+            sweeps the same gains of any device, over the same range in its units.
 
     Raises:
         ExperimentError: With the key, its value, the limit and the remedy.
@@ -156,7 +158,10 @@ def load_experiment(config: str | Path | None = None, **overrides: Any) -> Exper
         raise ExperimentError(
             f"{path} is not valid TOML: {error}; compare it with drive-tune sweep --show-config"
         ) from None
-    experiment = replace(_parse(data), **{key: value for key, value in overrides.items() if value is not None})
+    written = _parse(data)
+    experiment = replace(written, **{key: value for key, value in overrides.items() if value is not None})
+    if config is None and experiment.device != written.device:
+        experiment = replace(experiment, sweep=_same_gains(written, experiment.device))
     resolve(experiment)
     return experiment
 
@@ -201,6 +206,33 @@ def resolve(experiment: Experiment) -> Resolved:
     return Resolved(device, entries, scaler, velocity, acceleration)
 
 
+def _same_gains(experiment: Experiment, name: str) -> tuple[SweptObject, ...]:
+    """Return what an experiment sweeps as another device has it: its gains of the same parts, in its units."""
+    try:
+        device = find_device(name)
+    except ValueError as error:
+        raise ExperimentError(str(error)) from None
+    own, dictionary = find_device(experiment.device), find_device(experiment.device).new_dictionary()
+    factors, theirs, found = gain_factors(own), gain_factors(device), []
+    for number, swept in enumerate(experiment.sweep, 1):
+        entry = _swept_entry(own, dictionary, number, swept)
+        k = own.gains.keys.index((entry.index, entry.sub))
+        gain = own.gains.rows[k]
+        column = device.gains.column(gain.loop, gain.part)
+        if column is None:
+            raise ExperimentError(
+                f"{name} has no {gain.part} of the {gain.loop} loop, which the default experiment sweeps; give "
+                f"--config a file that sweeps some of {', '.join(device.gains.names)}"
+            )
+        other, ratio = device.gains.rows[column], factors[k] / theirs[column]
+        if other.key == gain.key and ratio == 1.0:
+            found.append(swept)
+            continue
+        low, high = (min(max(round(end * ratio), 1), other.highest) for end in (swept.low, swept.high))
+        found.append(replace(swept, object=other.name, low=low, high=high))
+    return tuple(found)
+
+
 def gain_objects(device: Device, dictionary: ObjectDictionary) -> list[Entry]:
     """Return the entries that a sweep can vary: the writable gains."""
     return [
@@ -218,12 +250,15 @@ def label(entry: Entry) -> str:
 # --- checks -----------------------------------------------------------------------------------------------------------
 def _swept_entry(device: Device, dictionary: ObjectDictionary, number: int, swept: SweptObject) -> Entry:
     where = f"sweep {number}"
-    match = _INDEX.fullmatch(swept.object.strip())
+    match, known, gains = _INDEX.fullmatch(swept.object.strip()), device.gains, gain_objects(device, dictionary)
+    by_name = known.keys[known.names.index(swept.object)] if swept.object in known.names else swept.object
     try:
-        entry = dictionary.find((int(match[1], 16), int(match[2], 16)) if match else swept.object)
+        entry = dictionary.find((int(match[1], 16), int(match[2], 16)) if match else by_name)
     except ObjectAccessError as error:
-        raise ExperimentError(f"{where}: object: {str(error).rsplit(' (abort code', 1)[0]}") from None
-    gains = gain_objects(device, dictionary)
+        raise ExperimentError(
+            f"{where}: object: {str(error).rsplit(' (abort code', 1)[0]}; gains of {device.name} are "
+            f"{', '.join(known.names)}"
+        ) from None
     if entry not in gains:
         raise ExperimentError(
             f"{where}: object = {swept.object!r} is {entry.label}, no writable gain; "
