@@ -10,7 +10,7 @@ import pytest
 from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
-from drive_env.trials.gain_trial import OSCILLATION
+from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import WATCH
 from tuning.auto.fallback_gains import FallbackGains
 

@@ -13,7 +13,7 @@ from drive_env.devices import find_device
 from drive_env.dictionary.units import RPM
 from drive_env.gains import Gains, rule_gains
 from drive_env.motors import find_motor
-from drive_env.trials.gain_trial import OSCILLATION
+from drive_env.trials.oscillation import OSCILLATION
 from tuning.auto import twin
 from tuning.auto.twin import (
     WORLDS,

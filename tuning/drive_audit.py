@@ -21,6 +21,7 @@ from drive_env.drives.interface import Drives
 from drive_env.drives.observed import Observer
 from drive_env.drives.speeds import per_increment
 from drive_env.drives.trace import Trace
+from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import CYCLE, wrapped
 from tuning.move_counter import MoveCounter
 from tuning.target import Target
@@ -35,7 +36,6 @@ Mask = NDArray[np.bool_]
 # What counts as a violation, each time anew that it begins:
 OVERSPEED = 1.2  # times the target's limit of speed
 BLOCK, SHAKING_BLOCKS = 25, 4  # [cycles]: an oscillation that nobody has stopped after 100 ms
-SHAKING = 0.4  # RMS change of the current per ms over the rated current, as gain_trial.OSCILLATION
 SLACK = 0.02  # rev beyond the travel that are none yet: a few counts of an overshoot at its end
 KINDS = ("left its travel", "too fast", "oscillated", "tripped")
 
@@ -143,7 +143,7 @@ class DriveAudit(Observer):
             self._in_block += len(part)
             at += len(part)
             if self._in_block == BLOCK:
-                shaking = np.sqrt(self._squares / BLOCK) > SHAKING * self._rated
+                shaking = np.sqrt(self._squares / BLOCK) > OSCILLATION * self._rated
                 self._shaken = np.where(shaking, self._shaken + 1, 0)
                 self.violations[KINDS.index("oscillated")] += self._shaken == SHAKING_BLOCKS
                 self._squares, self._in_block = np.zeros_like(self._squares), 0

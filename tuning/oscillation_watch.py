@@ -19,7 +19,7 @@ from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.observed import Observer
 from drive_env.drives.trace import Trace
 from drive_env.gains import write_gains
-from drive_env.trials.gain_trial import OSCILLATION
+from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import WATCH
 
 Floats = NDArray[np.float64]

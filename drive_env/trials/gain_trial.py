@@ -20,6 +20,7 @@ from drive_env.drives.interface import Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.gains import write_gains
 from drive_env.motors import Motor
+from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
 from drive_env.trials.score import Terms, cost
 
@@ -31,9 +32,6 @@ PHASES = ("move", "reversal", "probe")
 PROBE = 1.5  # velocity P of the probe over that of the trial
 
 # The watch looks every 25 ms at what has passed since its last look: what oscillates is stopped within 50 ms.
-# RMS change of the current from millisecond to millisecond, over the rated current. The edges of a profile make 0.1 on
-# a fast loop; a limit cycle, whose current goes from limit to limit, 1 and more.
-OSCILLATION = 0.4
 RECOVERY, RECOVERY_TIME = 5, 0.01  # attempts, and the time between them [s]
 
 
@@ -205,8 +203,7 @@ class Trials:
                 trace = self._record(objects, WATCH)
             traces.append(trace)
             down = where & ~cia402.matches(trace[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
-            change = np.diff(trace[cia402.TORQUE_ACTUAL], axis=0) * 1e-3
-            shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * self._motor.rated_current
+            shaking = shakes(trace[cia402.TORQUE_ACTUAL], self._motor.rated_current)
             new = self._whole_lanes(down | shaking) & where & ~stopped
             if new.any():
                 write_gains(drives, incumbent, new)

@@ -17,7 +17,7 @@ from drive_env.drives.interface import Drives
 from drive_env.drives.observed import Observer
 from drive_env.drives.trace import Trace
 from drive_env.gains import write_gains
-from drive_env.trials.gain_trial import OSCILLATION
+from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import WATCH
 
 Floats = NDArray[np.float64]
@@ -43,7 +43,7 @@ class FallbackGains(Observer):
     def __init__(self, num_axes: int, rated_current: float, windows: int = WINDOWS) -> None:
         self.calm: Integers | None = None
         self.calmed: Mask = np.zeros(num_axes, bool)
-        self._threshold = OSCILLATION * rated_current
+        self._rated = rated_current
         self._most = windows
         self._windows = np.zeros(num_axes, np.int64)
 
@@ -63,8 +63,7 @@ class FallbackGains(Observer):
         """Calm what has shaken too long."""
         if self.calm is None or cia402.TORQUE_ACTUAL not in asked or len(trace) != WATCH:
             return
-        change = np.diff(trace[cia402.TORQUE_ACTUAL], axis=0) * 1e-3
-        shaking = np.sqrt(np.mean(change**2, axis=0)) > self._threshold
+        shaking = shakes(trace[cia402.TORQUE_ACTUAL], self._rated)
         self._windows = np.where(shaking, self._windows + 1, 0)
         late = self._windows >= self._most
         if late.any():

@@ -17,7 +17,8 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.trace import Trace
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
-from drive_env.trials.gain_trial import OSCILLATION, PHASES, Trial, Trials, measured_cost, softness
+from drive_env.trials.gain_trial import PHASES, Trial, Trials, measured_cost, softness
+from drive_env.trials.oscillation import OSCILLATION, shakes
 from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
 from drive_env.trials.score import TRIP, Terms, cost
 
@@ -281,8 +282,7 @@ class ProvingGround:
 
     def _shakes(self, seen: Trace) -> Mask:
         """Return which axes oscillated in a recording, or are off at its end."""
-        change = np.diff(seen[cia402.TORQUE_ACTUAL], axis=0) * 1e-3
-        shaking = np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * self.target.motor.rated_current
+        shaking = shakes(seen[cia402.TORQUE_ACTUAL], self.target.motor.rated_current)
         return np.asarray(shaking | ~cia402.matches(seen[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED))
 
     def _stop(self, where: Mask) -> Mask:

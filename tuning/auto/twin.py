@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import integers_per_si, rule_gains
-from drive_env.trials.gain_trial import OSCILLATION
+from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, plan_move
 from drive_env.trials.score import HiddenScore
 

@@ -1,0 +1,23 @@
+"""When an axis that moves counts as oscillating: the one criterion of trials, tuners and audits.
+
+RMS change of the current from millisecond to millisecond, over the rated current. The edges of a profile make 0.1 on a
+fast loop; a limit cycle, whose current goes from limit to limit, 1 and more.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+OSCILLATION = 0.4
+
+
+def shakes(milliamperes: NDArray[np.integer], rated_current: float) -> NDArray[np.bool_]:
+    """Return which axes oscillate.
+
+    Args:
+        milliamperes: Torque-producing current, a sample per millisecond [mA], shape (n, axes).
+        rated_current: Of the motor [A].
+    """
+    change = np.diff(milliamperes, axis=0) * 1e-3
+    return np.asarray(np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * rated_current)
