@@ -161,7 +161,9 @@ def test_a_machine_of_several_axes_is_as_good_as_its_worst():
 def gantry_known(target, where):
     """Return the identification of two axes whose truth is known: what each pushes while both accelerate alike."""
     motor, found = target.motor, []
-    for inertia in np.concatenate([moved_inertia(group.load) for group in target.drives._groups]).reshape(-1):
+    for inertia in np.concatenate(
+        [moved_inertia(group.load) for group in target.drives.machine.drives._groups]
+    ).reshape(-1):
         values = {
             "resistance": motor.R_s, "inductance": motor.L_q, "inertia": inertia, "coulomb": 0.3, "viscous": 1e-3,
             "offset": 0.0, "velocity_filter": 400.0, "pole_pairs": float(motor.n_p), "encoder_direction": 1.0,
@@ -204,7 +206,7 @@ def proving(target, safe):
 
 
 def fitted(target):
-    inertia = np.concatenate([moved_inertia(group.load).reshape(-1) for group in target.drives._groups])
+    inertia = np.concatenate([moved_inertia(group.load).reshape(-1) for group in target.drives.machine.drives._groups])
     return np.array([rule_gains(target.device, target.motor, J, supply=24.0)[0] for J in inertia])
 
 
