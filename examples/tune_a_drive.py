@@ -32,4 +32,6 @@ with emulated(load=options.load) as target:  # a real drive: on_bus(channel="can
     motion.start_move(target.drives, 32_768, relative=True)  # half a turn
     trace = target.drives.record(["Position actual value"], duration=0.5)
     position = trace["Position actual value"]
-    print(*gains, f"moved by [inc]: {position[-1] - position[0]}", sep="\n")
+    for one in gains:
+        print(", ".join(f"{name}={value}" for name, value in zip(target.device.gains.names, one, strict=True)))
+    print(f"moved by [inc]: {position[-1] - position[0]}")

@@ -22,7 +22,7 @@ def pair():
 
 def both(pair, *arguments, **named):
     long, short = pair
-    long._images.clear()
+    long._prepared.clear()
     return long.record(*arguments, **named), short.record(*arguments, **named)
 
 
@@ -40,7 +40,7 @@ def test_the_integers_are_the_same_cycle_by_cycle(pair):
         targets = rng.integers(-2_000_000, 2_000_000, (cycles, 3) if k % 2 else cycles)
         traces = both(pair, CHANGING, cycles * 1e-3, play={0x60FF: targets})
         assert_equal(traces, CHANGING)
-    assert len(pair[1]._images) == 1
+    assert len(pair[1]._prepared) == 1
 
 
 def test_every_number_that_can_be_recorded_is_the_same(pair):
@@ -113,4 +113,4 @@ def test_few_calls_are_kept():
     with EmulatedDrives(load="inertia", num_threads=1) as drives:
         for k in range(200):
             drives.record([0x6064] * (k + 1), 0.001)
-        assert len(drives._images) == 64
+        assert len(drives._prepared) == 64

@@ -28,7 +28,7 @@ from drive_env.node.store import Store
 from drive_env.pictures.demonstration import DemonstrationError, load_demonstration
 from mechanics import untrusted
 from mechanics.untrusted import UntrustedFileError, parse_json, parse_toml, read_arrays, read_bytes, read_toml
-from tuning.certificate import certificate
+from tuning.certificate import certificate, certificate_files
 from tuning.commands.cli import app as tune_app
 from tuning.compare.suite import load_suite
 from tuning.runs.experiment import ExperimentError, load_experiment
@@ -327,7 +327,7 @@ def test_hyper_parameters_within_limits(text, told, tmp_path):
 def test_a_certificate_within_limits(tmp_path):
     (tmp_path / "certificate.json").write_text(DEEP_JSON)
     with pytest.raises(certificate.CertificateError, match=r"certificate\.json is no certificate: .* 40 deep"):
-        certificate.is_unchanged(tmp_path / "certificate.json")
+        certificate_files.is_unchanged(tmp_path / "certificate.json")
 
 
 def test_a_device_without_end_is_no_file_of_anybody(tmp_path):
