@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drive_env.master import pace as module
-from drive_env.master.pace import RealTimePace, Timing
+from drive_env.master.pace import LockstepPace, RealTimePace, Timing
 from drive_env.master.sampling import run_cycles
 
 CYCLE = 0.001
@@ -87,3 +87,37 @@ def test_the_first_set_points_do_not_wait_for_the_sync_they_belong_to(clock):
     clock.now += 0.0004  # a policy thinks
     run_cycles(Port(), pace, 2, [(0x201, np.zeros((2, 4), np.uint8))], None, 1.0)
     assert sent == [(0x201, 0.4), (0x80, 1.0), (0x201, 2.0), (0x80, 2.0)]
+
+
+@pytest.mark.parametrize("ahead", [0, 1, 3])
+def test_in_lockstep_what_is_looked_at_does_not_depend_on_how_fast_this_computer_is(ahead):
+    """A fast emulator's rows come before they are waited for, a slow one's just then: the same chunks are looked at."""
+
+    class Answers:
+        """Samples of an emulator that has answered `ahead` more SYNCs than somebody waits for."""
+
+        rows = 0
+
+        def complete(self):
+            return min(self.rows + ahead, port.syncs)
+
+        def missing(self, rows, timeout):
+            raise AssertionError(f"row {rows} stayed out")
+
+    class Port:
+        syncs = 0
+
+        def send(self, can_id, data=b""):
+            self.syncs += can_id == 0x80
+
+        def receive(self, timeout=0.0, done=None):
+            return False
+
+        def wait(self, done, timeout):
+            while not done() and samples.rows < self.syncs:
+                samples.rows += 1
+            return done()
+
+    port, samples, looked = Port(), Answers(), []
+    run_cycles(port, LockstepPace(), 5, [], samples, 1.0, observe=lambda first, last: looked.append((first, last)))
+    assert looked == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]

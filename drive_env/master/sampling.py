@@ -96,14 +96,15 @@ def run_cycles(
     Raises:
         NoAnswerError: If TPDOs stay out.
     """
-    window = 1 if observe is not None and pace.time_waits else pace.window
+    window = 0 if observe is not None and pace.time_waits else pace.window
     frames = [(can_id, [row.tobytes() for row in rows]) for can_id, rows in rpdos]
-    seen = 0
+    seen = needed = 0
 
     def look() -> None:
         nonlocal seen
         if samples is not None and observe is not None:
-            complete = min(samples.complete(), cycles)
+            # Where time waits, what is seen must not depend on how fast this computer is: only what was waited for.
+            complete = min(samples.complete(), max(needed, 0) if pace.time_waits else cycles)
             if complete > seen:
                 first, seen = seen, complete
                 observe(first, complete)

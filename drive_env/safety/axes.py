@@ -25,7 +25,8 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 BASELINE = 0.008  # s at least between two positions that tell a speed
-JUMP_TURNS, JUMP_SHARE = 0.003, 2.0  # rev, and of the way that the speed explains: more is a new zero, not a movement
+# Rev, though so many counts at least, and of the way that the speed explains: more is a new zero, not a movement.
+JUMP_TURNS, JUMP_COUNTS, JUMP_SHARE = 0.003, 1.5, 2.0
 CURRENT_MEMORY = 0.03  # s
 
 
@@ -85,6 +86,8 @@ class Axes:
         # The position and its time from which the speed is reckoned.
         self._base = np.zeros(count, np.int64)
         self._base_time = np.full(count, -math.inf)
+        self._step_speed = np.zeros(count)  # of the newest two positions [inc/s]
+        self._was_enabled = np.zeros(count, bool)  # at the look before
 
     def now(self) -> float:
         """Return the time by which the axes are seen [s]: that of lockstep where time waits."""
@@ -94,6 +97,10 @@ class Axes:
     def may_turn(self) -> Mask:
         """Which axes count as live."""
         return self.live | self.assumed
+
+    def is_enabled(self) -> Mask:
+        """Return which axes were in operation enabled when they were seen last."""
+        return np.asarray(cia402.matches(self.status, cia402.OPERATION_ENABLED))
 
     def of_nodes(self, nodes: Sequence[int]) -> Mask:
         """Return which axes belong to nodes, by position."""
@@ -149,6 +156,7 @@ class Axes:
         now = self.now()
         has_new_zero = False
         if STATUSWORD in rows:
+            self._was_enabled = np.where(where, self.is_enabled(), self._was_enabled)
             self.status = np.where(where, rows[STATUSWORD][-1], self.status)
             shown = cia402.is_live(self.status)
             current = where & (epoch >= self.epoch) & ~self.in_flight
@@ -189,17 +197,25 @@ class Axes:
         return has_new_zero
 
     def _find_jumps(self, before: Integers, rows: Integers, now: float, where: Mask) -> bool:
-        """Return whether homing has set a new zero: the rotor has not moved, and its limits neither."""
-        homing = where & self._placed & (self.mode == HM)
-        if not homing.any():
-            return False
+        """Return whether homing has set a new zero: the rotor has not moved, and its limits neither.
+
+        Only an axis in operation enabled homes, and what its speed explains is a movement: an axis that another cause
+        accelerates in homing mode must not be taken for one whose zero moves with it.
+        """
         path = np.vstack([before, rows])
         steps = wrapped(np.diff(path, axis=0))
         elapsed = np.clip((now - self._position_time) / len(rows), self._drives.description.cycle, 1.0)
-        explained = JUMP_TURNS * np.maximum(self.rotor.scale, 1.0) + JUMP_SHARE * np.abs(self.velocity) * elapsed
+        before_it = np.vstack([self._step_speed * elapsed, steps[:-1]])  # the step before each
+        known_speed, self._step_speed = self._step_speed, np.where(where, steps[-1] / elapsed, self._step_speed)
+        homing = where & self._placed & (self.mode == HM) & (self.is_enabled() | self._was_enabled)
+        if not homing.any():
+            return False
+        speed = np.maximum(np.abs(self.velocity) * elapsed, np.abs(before_it))
+        explained = np.maximum(JUMP_TURNS * self.rotor.scale, JUMP_COUNTS) + JUMP_SHARE * speed
         jumps = np.where(homing & (np.abs(steps) > explained), steps, 0).sum(axis=0)
         if not jumps.any() or not self.rotor.is_placed:
             return False
+        self._step_speed = np.where(jumps != 0, known_speed, self._step_speed)
         turns = self.rotor.turns(self.position) - jumps / self.rotor.scale
         turns = np.where(jumps != 0, turns, self.rotor.turns(self.position))
         self.rotor.place(self.position, self.rotor.scale, turns)

@@ -83,16 +83,60 @@ class Bounds:
         self.has_position = bool(np.any((self.low > -NO_LIMIT) | (self.high < NO_LIMIT)))
 
 
-def read_bounds(limits: Limits, drives: CanDrives, rotor: RotorAngle, ends: tuple[Floats, Floats]) -> Bounds:
+@dataclass(frozen=True)
+class RotorLimits:
+    """The user's limits as the rotor's own, which no scale moves, shape (num_axes,) each; nan where there are none.
+
+    Attributes:
+        low: Lowest place [rev].
+        high: Highest place [rev].
+        velocity: Highest speed [rev/s]; nan, too, where a count of 606Ch is not known.
+        following: Largest following error [rev]; nan, too, where the scale is not known.
+    """
+
+    low: Floats
+    high: Floats
+    velocity: Floats
+    following: Floats
+
+
+def rotor_limits(limits: Limits, drives: CanDrives, rotor: RotorAngle, here: Integers) -> RotorLimits:
+    """Return what the user's limits are of the rotors now.
+
+    Args:
+        limits: The user's.
+        drives: The drives.
+        rotor: Where their rotors are.
+        here: What 6064h shows [inc].
+    """
+    count = drives.num_axes
+    low, high = (None, None) if limits.position is None else limits.position
+    turns = rotor.turns(here)
+    scale = np.where(rotor.scale > 1.0, rotor.scale, np.nan)
+    return RotorLimits(
+        turns + (given(low, count) - here) / rotor.scale,
+        turns + (given(high, count) - here) / rotor.scale,
+        given(limits.velocity, count) * increments_per_count(_speed_unit(drives), rotor.scale) / scale,
+        given(limits.following_error, count) / scale,
+    )
+
+
+def _speed_unit(drives: CanDrives) -> str:
+    known = drives.description
+    return known.dictionary.find(VELOCITY).unit if known.has(VELOCITY) else ""
+
+
+def read_bounds(limits: Limits, drives: CanDrives, rotor: RotorAngle, of_rotors: RotorLimits) -> Bounds:
     """Return the limits of every axis; those that the user left open are read from the drives.
 
     Args:
         limits: The user's.
         drives: The drives.
         rotor: Where their rotors are.
-        ends: The user's limits of position [rev], nan where there are none.
+        of_rotors: The user's, as the rotors'.
     """
     low, high = _own_range(drives)
+    ends = (of_rotors.low, of_rotors.high)
     is_given = ~(np.isnan(ends[0]) & np.isnan(ends[1]))
     # Only the user's: a drive's own range is widened by who homes it, and the user's place is not.
     bottom, top = (np.nan_to_num(rotor.increments(end), nan=0.0, posinf=2.0**61, neginf=-(2.0**61)) for end in ends)
@@ -102,11 +146,11 @@ def read_bounds(limits: Limits, drives: CanDrives, rotor: RotorAngle, ends: tupl
     high = np.where(high >= 2**60, NO_LIMIT, high)
 
     known_scale = rotor.scale > 1.0
-    known = drives.description
-    unit = known.dictionary.find(VELOCITY).unit if known.has(VELOCITY) else ""
+    unit = _speed_unit(drives)
     count = increments_per_count(unit, rotor.scale)
     told = ~np.isnan(count)
-    velocity = _magnitude(drives, given(limits.velocity, drives.num_axes), MAX_PROFILE_VELOCITY)
+    top = _at_scale(given(limits.velocity, drives.num_axes), of_rotors.velocity * rotor.scale / count)
+    velocity = _magnitude(drives, top, MAX_PROFILE_VELOCITY)
     ours = (velocity >= NO_LIMIT) & known_scale & told
     default = np.rint(DEFAULT_SPEED * rotor.scale / np.where(told, count, 1.0))
     velocity = np.where(ours, default, velocity).astype(np.int64)
@@ -123,7 +167,11 @@ def read_bounds(limits: Limits, drives: CanDrives, rotor: RotorAngle, ends: tupl
         velocity,
         count,
         _magnitude(drives, given(limits.current, drives.num_axes), drives.description.role(Role.CURRENT_LIMIT)),
-        _magnitude(drives, given(limits.following_error, drives.num_axes), FOLLOWING_WINDOW),
+        _magnitude(
+            drives,
+            _at_scale(given(limits.following_error, drives.num_axes), of_rotors.following * rotor.scale),
+            FOLLOWING_WINDOW,
+        ),
         braking,
         np.maximum.reduce([braking, *(_rate(drives, key, rotor.scale) for key in (ACCELERATION, DECELERATION))]),
         np.where(known_scale, REST_TURNS * rotor.scale, REST_INCREMENTS),
@@ -154,6 +202,11 @@ def read_own(drives: CanDrives, key: Key, absent: int) -> Integers:
             found: Integers = drives.read_entry(drives.description.dictionary.find(key))
             return found
     return np.full(drives.num_axes, absent, np.int64)
+
+
+def _at_scale(user: Floats, now: Floats) -> Floats:
+    """Return the user's limit in whole counts of today's scale; as it was given where the scale is not known."""
+    return np.where(np.isfinite(now), np.maximum(np.floor(now + 1e-6), 1.0), user)
 
 
 def _magnitude(drives: CanDrives, user: Floats, key: Key | None) -> Integers:

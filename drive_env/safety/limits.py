@@ -28,9 +28,11 @@ class Limits:
             the rotor when the drives are opened, and stays there whatever moves the scale or the zero (2058h, 608Fh,
             homing); homing keeps to it, too. The drive's own are 607Dh, from which homing is exempt.
         velocity: Highest speed either way [unit of 606Ch]; the drive's is 607Fh, if it has one, else 6,000 rpm of the
-            rotor. No axis may be faster than its quick stop (6085h) brings to rest within a second.
+            rotor. What is given is a speed of the rotor at the scale of that moment, and stays that whatever moves the
+            scale. No axis may be faster than its quick stop (6085h) brings to rest within a second.
         current: Highest current or torque either way [unit of 6077h]; the drive's is its current limit.
-        following_error: Largest distance of demand and position in pp and csp; the drive's is 6065h.
+        following_error: Largest distance of demand and position in pp and csp; the drive's is 6065h. What is given is
+            an angle of the rotor, too.
         oscillation: Quick-stop an axis whose current oscillates.
         stall: Longest pause between two calls while an axis is enabled [s]; None for any.
         silence: Silence of this process after which the drive stops by itself [s]. None switches nothing on in a drive:

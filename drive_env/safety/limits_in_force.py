@@ -19,11 +19,13 @@ from drive_env.safety.bounds import (
     POSITION_HIGH,
     POSITION_LOW,
     Bounds,
+    RotorLimits,
     read_bounds,
     read_own,
+    rotor_limits,
 )
 from drive_env.safety.lending import Lending
-from drive_env.safety.limits import NO_LIMIT, Limits, given
+from drive_env.safety.limits import NO_LIMIT, Limits
 from drive_env.safety.objects import POSITION
 from drive_env.safety.rotor import HOME_OFFSET, read_scale
 
@@ -62,12 +64,12 @@ class LimitsInForce:
         self._drives = drives
         self._axes = axes
         self._lending = lending
-        self._ends = self._capture()
+        self._of_rotors = self._capture()
 
     def change(self, user: Limits) -> None:
-        """Take other limits; those of position are places of the rotors as 6064h shows them now."""
+        """Take other limits, as the rotors' own at the scale and zero of now."""
         self.user = user
-        self._ends = self._capture()
+        self._of_rotors = self._capture()
         self.forget()
         if self._axes.is_armed:
             self.lend()
@@ -77,16 +79,12 @@ class LimitsInForce:
         self._generation += 1
         self.latest = None
 
-    def _capture(self) -> tuple[Floats, Floats]:
-        """Return the user's limits of position as places of the rotors [rev]; nan where there are none."""
-        count = self._drives.num_axes
-        if self.user.position is None:
-            return np.full(count, math.nan), np.full(count, math.nan)
-        self.place()
-        low, high = (given(end, count) for end in self.user.position)
-        here = self._axes.position.astype(float)
-        turns = self._axes.rotor.turns(self._axes.position)
-        return tuple(turns + (end - here) / self._axes.rotor.scale for end in (low, high))  # type: ignore[return-value]
+    def _capture(self) -> RotorLimits:
+        """Return the user's limits as the rotors' own, at the scale and zero of now."""
+        user = self.user
+        if not (user.position is None and user.velocity is None and user.following_error is None):
+            self.place()
+        return rotor_limits(user, self._drives, self._axes.rotor, self._axes.position)
 
     def place(self) -> None:
         """Read where the rotors are and what a revolution counts; what moved scale or zero has not moved them."""
@@ -104,7 +102,7 @@ class LimitsInForce:
         if bounds is None:
             if not self._axes.rotor.is_placed:
                 self.place()
-            bounds = read_bounds(self.user, self._drives, self._axes.rotor, self._ends)
+            bounds = read_bounds(self.user, self._drives, self._axes.rotor, self._of_rotors)
             # A whole number of counts, but for rounding where they are rpm.
             counts = np.floor(bounds.braking * STOP_WITHIN / np.nan_to_num(bounds.count, nan=1.0) + 1e-6)
             ramp = np.where(bounds.braking > 0.0, counts, float(NO_LIMIT))

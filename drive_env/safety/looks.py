@@ -24,8 +24,13 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 UNSAMPLED = 0.010  # s between two looks at what no PDO carries
-ASK = 0.015  # s for an answer to a look
+ASK = 0.015  # s for an answer to a look, where time passes
 SILENT = 0.05  # s for which one that did not answer is not asked again: it must not hold up the others
+
+
+def answer_time(drives: CanDrives) -> float:
+    """Return how long to wait for an answer to a look [s]: where time waits, nothing runs on meanwhile."""
+    return drives.description.answer_timeout if drives.time_waits else ASK
 
 
 class Looks:
@@ -112,7 +117,7 @@ class Looks:
             rows = {}
             for entry in entries:
                 index, sub = self._drives.description.key(entry, part)
-                data = self._drives.sdo(node).ask(index, sub, ASK)
+                data = self._drives.sdo(node).ask(index, sub, answer_time(self._drives))
                 if data is None:
                     complete = False
                     self._silent[node] = self._axes.now() + SILENT

@@ -16,7 +16,7 @@ from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce
-from drive_env.safety.looks import ASK
+from drive_env.safety.looks import answer_time
 from drive_env.safety.objects import CONTROLWORD, QUICK_STOP_OPTION
 from drive_env.safety.stopping import AxisStop, Phase, Sample, Stop
 
@@ -127,7 +127,7 @@ class StopRunner:
             if not one.holds or one.phase is not Phase.RAMP or axis in self._held:
                 continue
             node, part = divmod(axis, per_node)
-            data = self._drives.sdo(node).ask(*self._drives.description.key(entry, part), ASK)
+            data = self._drives.sdo(node).ask(*self._drives.description.key(entry, part), answer_time(self._drives))
             if data is None:
                 continue
             self._held.add(axis)
