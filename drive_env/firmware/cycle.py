@@ -164,7 +164,7 @@ class Firmware(NamedTuple):
 def _after(first: Stage, second: Stage) -> Stage:
     """Return the stage that runs one stage of two arguments and then another, with the same."""
 
-    @stage
+    @inlined
     def both(drive, of):
         first(drive, of)
         second(drive, of)
@@ -175,7 +175,7 @@ def _after(first: Stage, second: Stage) -> Stage:
 def _after_of_three(first: Stage, second: Stage) -> Stage:
     """Return the stage that runs one stage of three arguments and then another, with the same."""
 
-    @stage
+    @inlined
     def both(drive, of, more):
         first(drive, of, more)
         second(drive, of, more)
@@ -311,7 +311,7 @@ class _Events(NamedTuple):
 
 
 def _events(causes_gone: Stage, cause_bits: Stage) -> _Events:
-    @stage
+    @inlined
     def tell_state(drive, lane):
         """Write the statusword."""
         fsa.update_statusword(drive, lane, modes.mode_bits(drive, lane) | cause_bits(drive, lane))

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from drive_env import cia402
 from drive_env.firmware.common import fsa, limits
-from mechanics.compiled import stage
+from mechanics.compiled import inlined, stage
 
 CUT, STOP, LIMIT, WARN = 0, 1, 2, 3
 BLOCKS_NEGATIVE, BLOCKS_POSITIVE = 1, 2
@@ -84,8 +84,18 @@ def _conditions(causes: Sequence[Cause]) -> Any:
     def none(drive, lane):
         return 0
 
-    def also(before: Any, condition: Any, bit: int, hiding_fault: int) -> Any:
-        @stage
+    def also(before: Any, condition: Any, bit: int) -> Any:
+        @inlined
+        def conditions(drive, lane):
+            bits = before(drive, lane)
+            if condition(drive, lane, (drive.active[lane] & bit) != 0):
+                bits |= bit
+            return bits
+
+        return conditions
+
+    def unless_hidden(before: Any, condition: Any, bit: int, hiding_fault: int) -> Any:
+        @inlined
         def conditions(drive, lane):
             bits = before(drive, lane)
             if drive.fault[lane] != hiding_fault and condition(drive, lane, (drive.active[lane] & bit) != 0):
@@ -97,8 +107,10 @@ def _conditions(causes: Sequence[Cause]) -> Any:
     found: Any = none
     for row, cause in enumerate(causes):
         if cause.condition is not None:
-            hiding = row_of(causes, cause.unless) + 1 if cause.unless else -1
-            found = also(found, cause.condition, 1 << row, hiding)
+            if cause.unless:
+                found = unless_hidden(found, cause.condition, 1 << row, row_of(causes, cause.unless) + 1)
+            else:
+                found = also(found, cause.condition, 1 << row)
     return found
 
 
@@ -148,7 +160,7 @@ def _look(masks: _Masks, conditions: Any, told_when_left: int) -> Any:
             software_negative if limits.demand_below(drive, lane) else 0
         )
 
-    @stage
+    @inlined
     def look(drive, lane):
         present = conditions(drive, lane)
         drive.present[lane] = present
@@ -204,7 +216,7 @@ def _cause_flags(held: int, flags: tuple[int, ...]) -> Any:
     """Return the stage (drive, lane) -> status flags."""
     rows = len(flags)
 
-    @stage
+    @inlined
     def cause_flags(drive, lane):
         """Return the status flags of what is wrong now, in whatever state the drive is."""
         shown = drive.present[lane]
@@ -238,14 +250,14 @@ def protection_of(causes: Sequence[Cause]) -> Protection:
     def causes_gone(drive, lane):
         return conditions(drive, lane) & faults & ~tried_again == 0
 
-    @stage
+    @inlined
     def protect(drive, lane):
         appeared = look(drive, lane)
         if appeared != 0:
             react(drive, lane, appeared)
         drive.cause_flags[lane] = cause_flags(drive, lane)
 
-    @stage
+    @inlined
     def statusword_bits(drive, lane):
         bits = 0x0800 if drive.active[lane] & software else 0
         if drive.mode_display[lane] == csp and drive.fault[lane] == following_fault:
