@@ -9,6 +9,7 @@ stays enabled, a warning only tells.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import reduce
 from typing import Any, NamedTuple
 
 from drive_env import cia402
@@ -77,41 +78,60 @@ def row_of(causes: Sequence[Cause], name: str) -> int:
     return next((row for row, cause in enumerate(causes) if cause.name == name), -1)
 
 
+TOGETHER = 4  # conditions in one function: each function takes the compiler's time, and each nested in another more
+
+
 def _conditions(causes: Sequence[Cause]) -> Any:
     """Return the stage (drive, lane) -> the causes whose condition holds now, as bits 1 << row."""
-
-    @stage
-    def none(drive, lane):
-        return 0
-
-    def also(before: Any, condition: Any, bit: int) -> Any:
-        @inlined
-        def conditions(drive, lane):
-            bits = before(drive, lane)
-            if condition(drive, lane, (drive.active[lane] & bit) != 0):
-                bits |= bit
-            return bits
-
-        return conditions
-
-    def unless_hidden(before: Any, condition: Any, bit: int, hiding_fault: int) -> Any:
-        @inlined
-        def conditions(drive, lane):
-            bits = before(drive, lane)
-            if drive.fault[lane] != hiding_fault and condition(drive, lane, (drive.active[lane] & bit) != 0):
-                bits |= bit
-            return bits
-
-        return conditions
-
-    found: Any = none
+    rows: list[tuple[Any, int]] = []
     for row, cause in enumerate(causes):
         if cause.condition is not None:
-            if cause.unless:
-                found = unless_hidden(found, cause.condition, 1 << row, row_of(causes, cause.unless) + 1)
-            else:
-                found = also(found, cause.condition, 1 << row)
-    return found
+            hiding = row_of(causes, cause.unless) + 1 if cause.unless else None
+            rows.append((cause.condition if hiding is None else _unless_hidden(cause.condition, hiding), 1 << row))
+    rows += [(_never, 0)] * (-len(rows) % TOGETHER)
+    groups = [_any_of_four(*zip(*rows[k : k + TOGETHER], strict=True)) for k in range(0, len(rows), TOGETHER)]
+    return reduce(_either, groups)
+
+
+@inlined
+def _never(drive, lane, told):
+    return False
+
+
+def _unless_hidden(condition: Any, fault: int) -> Any:
+    @inlined
+    def unless_hidden(drive, lane, told):
+        return drive.fault[lane] != fault and condition(drive, lane, told)
+
+    return unless_hidden
+
+
+def _any_of_four(conditions: tuple[Any, ...], bits: tuple[int, ...]) -> Any:
+    first, second, third, fourth = conditions
+    bit_1, bit_2, bit_3, bit_4 = bits
+
+    @stage
+    def any_of_four(drive, lane):
+        active, found = drive.active[lane], 0
+        if first(drive, lane, active & bit_1 != 0):
+            found |= bit_1
+        if second(drive, lane, active & bit_2 != 0):
+            found |= bit_2
+        if third(drive, lane, active & bit_3 != 0):
+            found |= bit_3
+        if fourth(drive, lane, active & bit_4 != 0):
+            found |= bit_4
+        return found
+
+    return any_of_four
+
+
+def _either(first: Any, second: Any) -> Any:
+    @inlined
+    def either(drive, lane):
+        return first(drive, lane) | second(drive, lane)
+
+    return either
 
 
 class _Masks(NamedTuple):
