@@ -62,9 +62,11 @@ def ticks() -> dict[str, float]:
     cycles = 2000
     for name, machines in (("1 lane", 1), ("8 lanes", 8)):
         drives = running_drives(machines, 1)
-        group = drives._groups[0]
-        seconds = best_time(lambda g=group, d=drives: d.device.firmware.run_drives_alone(d._records, g._rates, cycles))
-        result[name] = seconds / (cycles * group._rates.windows * group._rates.ticks * machines) * 1e9
+        group = drives.inside.groups[0]
+        seconds = best_time(
+            lambda g=group, d=drives: d.device.firmware.run_drives_alone(d.inside.records, g.rates, cycles)
+        )
+        result[name] = seconds / (cycles * group.rates.windows * group.rates.ticks * machines) * 1e9
     return result
 
 
@@ -74,19 +76,19 @@ def bound(load: str = LOAD, machines: int = 64) -> dict[str, float]:
     The parts are measured in turn, so that a slower moment of the machine slows all of them.
     """
     drives = running_drives(machines, 1, load, SLOW_PPS)
-    groups, cycles, run_alone = drives._groups, 40, drives.device.firmware.run_drives_alone
+    groups, cycles, run_alone = drives.inside.groups, 40, drives.device.firmware.run_drives_alone
     moving = [(group.load.data.qpos.copy(), group.load.data.qvel.copy()) for group in groups]
 
     def physics() -> None:
         for group in groups:
-            mujoco.mj_step(group.load.model, group.load.data, cycles * group._rates.windows)
+            mujoco.mj_step(group.load.model, group.load.data, cycles * group.rates.windows)
 
     whole = alone = steps = float("inf")
     for _ in range(8):
         whole = min(whole, best_time(lambda: drives.advance(cycles * 1e-3), 1))
         alone = min(
             alone,
-            best_time(lambda: run_alone(drives._records, groups[0]._rates, cycles), 1),
+            best_time(lambda: run_alone(drives.inside.records, groups[0].rates, cycles), 1),
         )
         kept = [(group.load.data.qpos.copy(), group.load.data.qvel.copy()) for group in groups]
         for group, (qpos, qvel) in zip(groups, moving, strict=True):

@@ -46,7 +46,7 @@ class Bench:
             drawn = RandomMachines(drives, Distributions.load(load))
             drawn.redraw([np.random.default_rng((seed, lane)) for lane in range(machines)])
             self.device, self.motor = drives.device, drives.motor
-            loads = [shaft_load(group.load).inertia + group.load.armature for group in drives._groups]
+            loads = [shaft_load(group.load).inertia + group.load.armature for group in drives.inside.groups]
             self.inertia: Floats = np.concatenate(loads).reshape(-1)
             axes = drives.load.num_axes
             self.hidden = HiddenScore("tmcm1636", load, motor, machines, num_threads=num_threads)

@@ -186,7 +186,7 @@ def tune(drives: EmulatedDrives, commissioned: NDArray[np.int64]) -> None:
     from tuning.identify.moved_inertia import moved_inertia
 
     motor = drives.motor
-    inertia = np.concatenate([moved_inertia(group.load).reshape(-1) for group in drives._groups])
+    inertia = np.concatenate([moved_inertia(group.load).reshape(-1) for group in drives.inside.groups])
     # What a drive measures is inertia over torque constant.
     share = np.repeat(drives.machine.parameters["motor.psi_m"] / motor.psi_m, drives.load.num_axes)
     wanted = commissioned * inertia / share / (COMMISSIONED_INERTIA * motor.inertia)

@@ -73,7 +73,7 @@ class Truth:
 
     def __init__(self, drives):
         self.num_axes = drives.num_axes
-        self._views = [drives._records[name] for name in self._FIELDS]
+        self._views = [drives.inside.records[name] for name in self._FIELDS]
         self._rows = [np.empty((4096, *view.shape), view.dtype) for view in self._views]
         self.cycles = 0
         self.sample()

@@ -44,7 +44,7 @@ def everything(drives):
 
 def state(drives):
     """Return everything that the drives are, to the last bit."""
-    return everything(drives), drives._records.tobytes()
+    return everything(drives), drives.inside.records.tobytes()
 
 
 def refusal(drives, name, value, **how):

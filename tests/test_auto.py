@@ -489,7 +489,7 @@ def hidden_ratio(target, machines, found):
     score = HiddenScore(drives.device.name, drives.load.name, drives.motor.name, len(machines),
                         friction=machines[0].friction)  # fmt: skip
     score.set_machines(drives.machine.parameters, drives.machine.supply.reshape(-1, axes)[:, 0])
-    J = np.concatenate([moved_inertia(group.load).reshape(-1) for group in drives._groups])
+    J = np.concatenate([moved_inertia(group.load).reshape(-1) for group in drives.inside.groups])
     reach = np.where(target.high >= -target.low, target.high, target.low)
     score.set_moves(plan_move(drives.motor, J, drives.read((0x2058, 0)), reach))
     rule = [rule_gains(drives.device, drives.motor, j, supply=v)[0] for j, v in zip(J, target.supply, strict=True)]

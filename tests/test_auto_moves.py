@@ -162,7 +162,7 @@ def gantry_known(target, where):
     """Return the identification of two axes whose truth is known: what each pushes while both accelerate alike."""
     motor, found = target.motor, []
     for inertia in np.concatenate(
-        [moved_inertia(group.load) for group in target.drives.machine.drives._groups]
+        [moved_inertia(group.load) for group in target.drives.machine.drives.inside.groups]
     ).reshape(-1):
         values = {
             "resistance": motor.R_s, "inductance": motor.L_q, "inertia": inertia, "coulomb": 0.3, "viscous": 1e-3,
@@ -206,7 +206,9 @@ def proving(target, safe):
 
 
 def fitted(target):
-    inertia = np.concatenate([moved_inertia(group.load).reshape(-1) for group in target.drives.machine.drives._groups])
+    inertia = np.concatenate(
+        [moved_inertia(group.load).reshape(-1) for group in target.drives.machine.drives.inside.groups]
+    )
     return np.array([rule_gains(target.device, target.motor, J, supply=24.0)[0] for J in inertia])
 
 
@@ -423,7 +425,7 @@ def swing_of(drives):
     seen = []
     for _ in range(100):
         drives.advance(0.001)
-        seen.append(drives._records["i_q"].reshape(-1)[: drives.num_axes].copy())
+        seen.append(drives.inside.records["i_q"].reshape(-1)[: drives.num_axes].copy())
     return np.std(seen, axis=0) / drives.motor.rated_current
 
 

@@ -40,7 +40,7 @@ def test_every_object_reads_alike_while_the_axes_move(drives):
     drives.write(0x60FF, np.arange(10) * 70_000 - 300_000)
     drives.advance(0.05)
     for number in range(10):
-        axis = Axis(drives._objects, number)
+        axis = Axis(drives.inside.objects, number)
         for entry in ENTRIES:
             assert axis.port(entry).read() == drives.read((entry.index, entry.sub))[number], entry.label
 
@@ -58,14 +58,14 @@ def test_every_bound_object_reads_alike_whatever_is_in_the_record(shared, data):
         value = data.draw(st.floats(-1e9, 1e9) | st.sampled_from([np.inf, -np.inf, np.nan, 0.0, 0.5e-3, 1.5e-3]))
     else:
         value = data.draw(st.integers(-(2**31), 2**31 - 1))
-    before = shared._records[field.name].copy()
+    before = shared.inside.records[field.name].copy()
     with np.errstate(all="ignore"):
-        set_lanes(shared._records, field.name, np.full(10, value), part=binding.part)
+        set_lanes(shared.inside.records, field.name, np.full(10, value), part=binding.part)
         try:
             expected = int(shared.read((entry.index, entry.sub))[9])
-            assert Axis(shared._objects, 9).port(entry).read() == expected, (entry.label, value)
+            assert Axis(shared.inside.objects, 9).port(entry).read() == expected, (entry.label, value)
         finally:
-            shared._records[field.name] = before
+            shared.inside.records[field.name] = before
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_every_bound_object_reads_alike_whatever_is_in_the_record(shared, data):
 )
 def test_every_write_does_what_the_dictionary_of_all_axes_does(drives, entry):
     key = entry.index, entry.sub
-    axis = Axis(drives._objects, 9)
+    axis = Axis(drives.inside.objects, 9)
     port = axis.port(entry)
     only = np.arange(10) == 8
     for raw in {entry.low - 1, entry.low, entry.low + 1, 0, 2, 3, 15, entry.default, entry.high, entry.high + 1}:
@@ -94,7 +94,7 @@ def test_every_write_does_what_the_dictionary_of_all_axes_does(drives, entry):
         assert drives.read(key)[7] == drives.read(key)[0]
     for field in FIRMWARE.layout.fields:
         if field.name != "random":  # each axis has its own noise
-            block = drives._records[field.name].reshape(2, -1, 8)[1]
+            block = drives.inside.records[field.name].reshape(2, -1, 8)[1]
             assert np.array_equal(block[:, 0], block[:, 1], equal_nan=True), field.name
 
 
@@ -103,7 +103,7 @@ def test_emergencies_of_one_axis_leave_the_others_alone(drives):
     motion.enable(drives, mode="pv")
     drives.machine.enable_input = np.arange(10) % 2 == 0
     drives.advance(0.001)
-    axis = Axis(drives._objects, 3)
+    axis = Axis(drives.inside.objects, 3)
     assert [e.error_register for e in axis.take_emergencies()] == [0x81]
     assert axis.take_emergencies() == []
     assert [m.axis for m in drives.emergencies()] == [1, 5, 7, 9]
@@ -114,8 +114,8 @@ def test_a_trip_takes_one_axis_from_operation_enabled_only(drives):
     drives.machine.enable_input = True
     some = np.arange(10) != 4
     motion.enable(drives, mode="pv", where=some)
-    assert Axis(drives._objects, 3).trip()
-    assert not Axis(drives._objects, 4).trip()
+    assert Axis(drives.inside.objects, 3).trip()
+    assert not Axis(drives.inside.objects, 4).trip()
     drives.advance(0.01)
     fault = drives.read(0x6041) & 0x4F == 0x08
     assert fault.tolist() == [k == 3 for k in range(10)]

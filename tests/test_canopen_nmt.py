@@ -210,7 +210,7 @@ def test_reset_node_restores_everything(wire):
         rx 605  40 41 60 00 00 00 00 00
         tx 585  4B 41 60 00 50 02 00 00
     """)
-    assert wire.value(0x6081) == wire.drives._objects.stored(0)[0x6081, 0] != 4711
+    assert wire.value(0x6081) == wire.drives.inside.objects.stored(0)[0x6081, 0] != 4711
 
 
 def test_reset_communication_restores_1000h_to_1fffh_alone(wire):

@@ -45,14 +45,14 @@ def build():
 
 
 def lanes(drives, name):
-    return get_lanes(drives._records, name, drives.num_axes).astype(float)
+    return get_lanes(drives.inside.records, name, drives.num_axes).astype(float)
 
 
 def place(drives, electrical):
     """Turn the rotors to electrical angles [rad] by hand, and switch the drives off and on there."""
     angle = np.broadcast_to(np.asarray(electrical, float), drives.num_axes) / drives.motor.n_p
-    drives._groups[0].load.plant.qpos[:] = angle
-    set_lanes(drives._records, "theta_m", angle)
+    drives.inside.groups[0].load.plant.qpos[:] = angle
+    set_lanes(drives.inside.records, "theta_m", angle)
     drives.machine.power_cycle()
 
 
@@ -152,7 +152,7 @@ def test_open_loop_follows_its_demand_like_a_stepper_and_stalls_when_asked_too_f
     drives.write(0x2055, OPEN_LOOP)
     drives.write(0x2004, 2000)
     drives.write(0x6065, 0)
-    set_lanes(drives._records, "encoder_broken", np.ones(3))
+    set_lanes(drives.inside.records, "encoder_broken", np.ones(3))
     motion.enable(drives, mode="pv")
     drives.write(0x6083, [to_pps(50.0), to_pps(50.0), 2**31 - 1])
     drives.write(0x60FF, to_pps([10.0, -20.0, 300.0]))
@@ -267,7 +267,7 @@ def test_an_edge_that_is_crossed_back_is_no_speed(build):
     edge = -lanes(drives, "hall_true_offset")[0]
     sectors, speeds = [], []
     for k in range(100):
-        drives._groups[0].load.plant.qpos[:] = (edge + (0.02 if k % 2 else -0.02)) / N_P
+        drives.inside.groups[0].load.plant.qpos[:] = (edge + (0.02 if k % 2 else -0.02)) / N_P
         drives.advance(0.002)
         sectors.append(lanes(drives, "hall_sector")[0])
         speeds.append(drives.read(0x606C)[0])

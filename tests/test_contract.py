@@ -245,7 +245,7 @@ class Life:
         self.run(0.003)
         assert self.in_state(FAULT)
         assert [(m.axis, m.code) for m in drives.emergencies()] == [(k, 0x5441) for k in range(drives.num_axes)]
-        assert np.all(get_lanes(drives._records, "i_q", drives.num_axes) == 0.0)
+        assert np.all(get_lanes(drives.inside.records, "i_q", drives.num_axes) == 0.0)
         self.readable()
         drives.write(0x6040, 0x80)
         self.run(0.003)
@@ -278,7 +278,7 @@ class Life:
         status = drives.read(0x6041)
         assert np.all(status & 0x2400 == 0x0400)
         assert np.all(status & 0x1000)
-        position = get_lanes(drives._records, "load_position", drives.num_axes)
+        position = get_lanes(drives.inside.records, "load_position", drives.num_axes)
         home = position - drives.read(0x6064) / TURN * 2 * math.pi * self.per_radian
         # The edge is seen once per millisecond; belt, nut and bridge give a little.
         np.testing.assert_allclose(home, switch.high, atol=(slow * ratio).max() * 1.5e-3 + 1e-4)

@@ -283,9 +283,9 @@ def predicted_and_true(load, **parameters):
     motion.enable(drives, mode="cst")
     drives.write("Target torque", 3000)
     drives.advance(0.001)
-    group = drives._groups[0]
-    out = windows(drives._records, group.load.plant, group._rates, np.zeros((7, LANES)), 250)
-    assert get_lanes(drives._records, "omega_m", 1)[0] > 50  # it did turn
+    group = drives.inside.groups[0]
+    out = windows(drives.inside.records, group.load.plant, group.rates, np.zeros((7, LANES)), 250)
+    assert get_lanes(drives.inside.records, "omega_m", 1)[0] > 50  # it did turn
     return out
 
 

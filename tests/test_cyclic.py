@@ -55,7 +55,7 @@ def feed(drives, name, points, period, objects):
 
 
 def field(drives, name):
-    return get_lanes(drives._records, name, drives.num_axes).astype(float)
+    return get_lanes(drives.inside.records, name, drives.num_axes).astype(float)
 
 
 def prepare(drives, mode, period=1):

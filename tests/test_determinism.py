@@ -149,10 +149,10 @@ def test_setting_one_machine_leaves_the_others_bits(name):
         for index in OBJECTS:
             assert np.array_equal(found[index][:, 1:], expected[index][:, 1:])
         for field in ("qpos", "qvel"):  # MuJoCo's: machine by machine
-            values = [getattr(d._groups[0].load.plant, field).reshape(3, -1)[1:] for d in (one, other)]
+            values = [getattr(d.inside.groups[0].load.plant, field).reshape(3, -1)[1:] for d in (one, other)]
             assert np.array_equal(*values), field
         for field in ("mass", "friction"):  # machines last
-            values = [getattr(d._groups[0].load.plant, field)[..., 1:] for d in (one, other)]
+            values = [getattr(d.inside.groups[0].load.plant, field)[..., 1:] for d in (one, other)]
             assert np.array_equal(*values), field
 
 

@@ -216,9 +216,9 @@ def test_a_turning_axis_is_taken_over_at_its_speed(running):
 def test_positions_wrap_like_a_counter_and_the_axis_turns_on(running):
     near_the_end = 2**31 - 100_000
     shift = (near_the_end - int(running.read(0x6064)[0])) * 2 * np.pi / 65536
-    running._records["home_shift"] -= shift
+    running.inside.records["home_shift"] -= shift
     for field in ("position_demand", "theta_meas"):
-        running._records[field] += shift
+        running.inside.records[field] += shift
     trace = running.record([0x6064], 0.5)
     assert trace[0x6064][0, 0] > 2**31 - 120_000
     assert trace[0x6064][-1, 0] < -(2**31) + 600_000

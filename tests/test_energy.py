@@ -95,7 +95,7 @@ def balance(drives, duration):
     """Run for `duration` [s] and return the balance."""
 
     def lanes(name):
-        return get_lanes(drives._records, name, drives.num_axes).astype(float)
+        return get_lanes(drives.inside.records, name, drives.num_axes).astype(float)
 
     def stored():
         factor = lanes("phase_factor")
@@ -106,10 +106,12 @@ def balance(drives, duration):
 
     before = stored()
     sums = np.zeros((6, drives.num_axes))
-    group = drives._groups[0]
+    group = drives.inside.groups[0]
     rates = rates_of(drives.device, 1)
-    scratch = np.zeros((7, 8 * len(drives._records)))
-    run_axes(drives._records, group.load.plant, rates, scratch, drives.num_axes, round(duration / rates.period), sums)
+    scratch = np.zeros((7, 8 * len(drives.inside.records)))
+    run_axes(
+        drives.inside.records, group.load.plant, rates, scratch, drives.num_axes, round(duration / rates.period), sums
+    )
     magnetic, kinetic, turned, capacitor = stored() - before
     return Balance(*sums, magnetic, kinetic, drives.machine.load_torque * turned, capacitor)
 
@@ -143,7 +145,9 @@ def energies(request):
     load[4:8] = 0.8 * motor.rated_torque * np.sign(speed[4:8])
     drives.machine.load_torque = load
     drives.advance(0.3)
-    drives.write(0x6083, round(0.8 * motor.rated_torque / float(drives._records["J_rotor"][0, 0]) / 6.2832 * 65536))
+    drives.write(
+        0x6083, round(0.8 * motor.rated_torque / float(drives.inside.records["J_rotor"][0, 0]) / 6.2832 * 65536)
+    )
     new = speed.copy()
     new[8:12] *= 1.4
     new[12:] *= 0.1

@@ -39,7 +39,7 @@ def on_a_bus(emulated):
 def twin(emulated):
     """Return drives of one machine, at rest, with the noise that these have now."""
     other = EmulatedDrives(load=emulated.load, num_threads=1)
-    other._noise_seeds[:] = emulated._noise_seeds
+    other.inside.noise_seeds[:] = emulated.inside.noise_seeds
     other.machine.reset()
     return other
 

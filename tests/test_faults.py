@@ -25,7 +25,7 @@ WITH_EMERGENCY = [name for name in OF_MACHINES if FAULTS[name].emergency is not 
 
 
 def lanes(drives, name, part=0):
-    return get_lanes(drives._records, name, drives.num_axes, part).astype(float)
+    return get_lanes(drives.inside.records, name, drives.num_axes, part).astype(float)
 
 
 def turning(load="two_mass", window=30_000, friction=0.0, **options):
@@ -246,12 +246,12 @@ def test_a_short_dip_is_bridged_by_the_capacitor_and_a_long_one_trips():
         drives.machine.fault("supply_dip", duration=0.1, where=FIRST, voltage=0.0)
         drives.advance(0.3)
         assert drives.emergencies() == []
-        start = drives._now
+        start = drives.inside.cycle
         drives.machine.fault("supply_dip", where=FIRST, voltage=0.0)
         while not (found := drives.emergencies()):
             drives.advance(0.001)
     assert found[0].code == 0xFF00
-    assert (drives._now - start) * 0.001 == pytest.approx(2e-3 * 16.0 / 0.2, rel=0.05)
+    assert (drives.inside.cycle - start) * 0.001 == pytest.approx(2e-3 * 16.0 / 0.2, rel=0.05)
 
 
 # --- load -------------------------------------------------------------------------------------------------------------
@@ -382,11 +382,11 @@ def test_conditions_are_of_each_machine():
         drives.machine.fault("supply_surge", when="speed > 20", duration=0.01, voltage=30.0)
         drives.machine.fault("enable_lost", when="position < -3.0")
         motion.enable(drives, mode="pv", where=FIRST)
-        enabled = drives._now
+        enabled = drives.inside.cycle
         while not drives.machine.faults()[0].active[0]:
             drives.advance(0.001)
         # Seen at the end of the cycle in which the state was reached.
-        assert 5 <= drives._now - enabled <= 7
+        assert 5 <= drives.inside.cycle - enabled <= 7
         assert not drives.machine.faults()[0].active[1]
         drives.write(0x60FF, FAST, where=FIRST)
         drives.advance(0.5)
@@ -519,14 +519,14 @@ def test_a_line_that_is_none_is_told(text, message):
 
 def test_faults_that_together_cannot_be_stepped_are_called_off_with_a_warning():
     with EmulatedDrives(load="two_mass", num_threads=1) as drives:
-        inertia = drives._groups[0].load.get("inertia")
+        inertia = drives.inside.groups[0].load.get("inertia")
         drives.machine.fault("payload_jump", factor=0.1)
         drives.machine.fault("payload_jump", factor=0.1, at=0.005)
         drives.advance(0.003)
-        np.testing.assert_allclose(drives._groups[0].load.get("inertia"), 0.1 * inertia)
+        np.testing.assert_allclose(drives.inside.groups[0].load.get("inertia"), 0.1 * inertia)
         with pytest.warns(RuntimeWarning, match=r"fault 2 \(payload_jump\) is called off: together with the others"):
             drives.advance(0.01)
-        np.testing.assert_allclose(drives._groups[0].load.get("inertia"), 0.1 * inertia)
+        np.testing.assert_allclose(drives.inside.groups[0].load.get("inertia"), 0.1 * inertia)
         assert [fault.number for fault in drives.machine.faults()] == [1]
         drives.machine.clear_fault()
-        np.testing.assert_allclose(drives._groups[0].load.get("inertia"), inertia)
+        np.testing.assert_allclose(drives.inside.groups[0].load.get("inertia"), inertia)

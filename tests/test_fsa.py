@@ -124,9 +124,9 @@ def go_to(drives, state, quick_stop_option=6):
         drives.emergencies()
     elif state in (NRTSO, FRA):
         # A drive leaves these two by itself, within a millisecond.
-        set_lanes(drives._records, "fsa", np.full(drives.num_axes, int(state)))
-        set_lanes(drives._records, "drive_function", np.full(drives.num_axes, 1.0 if state is FRA else 0.0))
-        set_lanes(drives._records, "stopping", np.full(drives.num_axes, 1 if state is FRA else 0))
+        set_lanes(drives.inside.records, "fsa", np.full(drives.num_axes, int(state)))
+        set_lanes(drives.inside.records, "drive_function", np.full(drives.num_axes, 1.0 if state is FRA else 0.0))
+        set_lanes(drives.inside.records, "stopping", np.full(drives.num_axes, 1 if state is FRA else 0))
         return
     assert {state_of(word) for word in drives.read(0x6041)} == {state}
 
@@ -139,7 +139,7 @@ def set_supply(drives, volts, patience=1.0):
     while waited < patience:
         drives.advance(0.002)
         waited += 0.002
-        if (np.abs(get_lanes(drives._records, "u_dc", drives.num_axes) - goal) < 1.0).all():
+        if (np.abs(get_lanes(drives.inside.records, "u_dc", drives.num_axes) - goal) < 1.0).all():
             break
     drives.advance(0.002)
 
@@ -243,7 +243,7 @@ def test_transitions_0_and_1_come_with_power(drives):
 def test_every_pattern_in_every_state(many, start, option, before, high):
     many.machine.reset()
     go_to(many, start, option)
-    set_lanes(many._records, "controlword", np.full(256, before))
+    set_lanes(many.inside.records, "controlword", np.full(256, before))
     low = np.arange(256)
     many.write(0x6040, low | high)
     expected = [after_controlword(start, int(word), before, option) for word in low]

@@ -191,8 +191,8 @@ def test_latency_delays_gains_and_measurements():
     written = []
     write = environment.drives.write
     environment.drives.write = lambda name, value, where=None: (
-        written.append((environment.drives._now, name, int(value[0]))), write(name, value, where))  # fmt: skip
-    start = environment.drives._now
+        written.append((environment.drives.inside.cycle, name, int(value[0]))), write(name, value, where))  # fmt: skip
+    start = environment.drives.inside.cycle
     environment.step(np.full((1, 3), 0.5))
     acts = [now - start for now, name, value in written if name == POSITION_P and value != environment.base_gains[0, 4]]
     assert acts == [3]
@@ -206,7 +206,7 @@ def test_over_a_bus_the_same_policy_sees_the_same(mode):
     want, rewards = run(inside, 20)
     world = World(lockstep=True)
     served = EmulatedDrives(load="inertia", num_threads=1)
-    served._noise_seeds[:] = inside.drives._noise_seeds  # the episode's, drawn from its seed
+    served.inside.noise_seeds[:] = inside.drives.inside.noise_seeds  # the episode's, drawn from its seed
     served.machine.reset()
     world.add(served, [1])
     bus = WorldBus(world)

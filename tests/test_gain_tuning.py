@@ -228,7 +228,7 @@ def test_identified_inertia_is_that_of_the_machine(load, low, high):
         t_0 = 4.0 * float(small_time_constants(drives.device, 400.0))
         every = np.ones(drives.num_axes, bool)
         found, _ = Trials(drives, drives.motor, axes, t_0).identify(np.tile(reach(load), 16), every)
-        true = np.concatenate([inertia_of_all_axes_moving(group.load).reshape(-1) for group in drives._groups])
+        true = np.concatenate([inertia_of_all_axes_moving(group.load).reshape(-1) for group in drives.inside.groups])
     ratio = found.inertia / true
     assert np.median(ratio.reshape(16, -1), axis=0) == pytest.approx(1.0, abs=0.12)  # of every axis
     assert low < ratio.min()

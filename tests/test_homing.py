@@ -46,12 +46,12 @@ def belt(shared):
 
 
 def set_home_switch(drives, low, high):
-    set_lanes(drives._records, "switch_low", low, part=2)
-    set_lanes(drives._records, "switch_high", high, part=2)
+    set_lanes(drives.inside.records, "switch_low", low, part=2)
+    set_lanes(drives.inside.records, "switch_high", high, part=2)
 
 
 def carriage(drives):
-    return get_lanes(drives._records, "load_position", COUNT).astype(float)
+    return get_lanes(drives.inside.records, "load_position", COUNT).astype(float)
 
 
 def zero(drives):
@@ -104,7 +104,7 @@ def assert_homed(drives, edge):
 def test_recipe_of_section_8_3_homes_a_commissioned_drive_by_a_switch_that_is_pressed_by_hand():
     """Word for word; the preset has what the recipe does not name, the acceleration 609Ah."""
     with EmulatedDrives(load="inertia", num_threads=1) as drives:
-        set_lanes(drives._records, "wired", np.array([4]))  # the home switch; 2005h has the limit switches off
+        set_lanes(drives.inside.records, "wired", np.array([4]))  # the home switch; 2005h has the limit switches off
         released, pressed = (np.array([np.inf]), np.array([np.inf])), (np.array([-np.inf]), np.array([np.inf]))
         set_home_switch(drives, *released)
         drives.write(0x6060, 6)

@@ -20,7 +20,6 @@ LONG = {
     "agents/tuner/tune_target.py tune_target",
     "drive_env/commands/check_model.py check_model", "drive_env/commands/jog.py jog",
     "drive_env/commands/scope.py _record", "drive_env/commands/serve.py serve",
-    "drive_env/emulator/emulated_drives.py __init__",
     "drive_env/firmware/servo/power_stage.py power_stage",
     "drive_env/firmware/servo/power_stage.py refresh_winding", "mechanics/packed.py _new_plant",
     "mechanics/stepping.py drive", "mechanics/stepping.py report", "mechanics/stepping.py rub",
@@ -132,3 +131,17 @@ def size(node: ast.FunctionDef) -> dict[str, int]:
         "lines": node.end_lineno - node.lineno + 1 - docstring,
         "arguments": len(names) - (names[:1] in (["self"], ["cls"])),
     }
+
+
+def test_nobody_outside_looks_at_the_emulators_privates():
+    """They go by `EmulatedDrives.inside`, tests and tools too."""
+    private = {"_records", "_groups", "_objects", "_faults", "_noise_seeds", "_now", "_cycles", "_refresh_inertia"}
+    room = ROOT / "drive_env" / "emulator"
+    found = []
+    for path in [*(p for package in PACKAGES for p in (ROOT / package).rglob("*.py")), *(ROOT / "tests").glob("*.py")]:
+        if path.is_relative_to(room):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and node.attr in private and "drives" in ast.unparse(node.value):
+                found.append(f"{path.relative_to(ROOT)}:{node.lineno} {ast.unparse(node)}")
+    assert not found

@@ -43,7 +43,7 @@ ALLOWED = {
 def truth(drives, axis, offset):
     """Return the true values of an axis, in data sheet units of torque."""
     plant = true_plant(drives, axis)
-    group = next(g for g in drives._groups if g.machines.start <= axis < g.machines.stop)
+    group = next(g for g in drives.inside.groups if g.machines.start <= axis < g.machines.stop)
     load, copy = group.load, axis - group.machines.start
     ratio = np.abs(load.plant.motion[: load.num_frictions] @ way(load).joints.T)[:, 0]
     each = load.plant.friction[:, 0].T[copy] * ratio
@@ -481,7 +481,7 @@ def test_axes_that_pull_at_one_thing_move_together():
         assert axis.estimates["resistance"].is_known
         assert axis.estimates["inertia"].is_known, axis.estimates["inertia"].reason
     # Of the bridge as it travels, rotors included.
-    travelling = target.drives._groups[0].load.mass_matrix()[0][0, 0] * (0.04 / TURN) ** 2
+    travelling = target.drives.inside.groups[0].load.mass_matrix()[0][0, 0] * (0.04 / TURN) ** 2
     assert sum(axis.value("inertia") for axis in found) == pytest.approx(travelling, rel=0.03)
 
 
@@ -489,7 +489,7 @@ def test_axes_that_pull_at_one_thing_move_together():
 def test_the_joints_of_an_arm_are_identified_briefly_one_after_the_other():
     """Each by its own inertia: moved at once they pull at each other, and one seems to have a fifth of it."""
     with emulated(load="robot", num_machines=2, randomise=["load"], seed=0, num_threads=2) as target:
-        load = target.drives._groups[0].load
+        load = target.drives.inside.groups[0].load
         turning = way(load).joints
         alone = np.einsum("ad,cde,ae->ca", turning, load.mass_matrix(), turning)
         found = np.array([axis.value("inertia") for axis in identify_briefly(target)]).reshape(alone.shape)
@@ -499,7 +499,7 @@ def test_the_joints_of_an_arm_are_identified_briefly_one_after_the_other():
 def test_of_axes_that_pull_at_one_thing_a_brief_response_says_nothing_of_the_own_inertia():
     """An end of a gantry that is shaken alone moves all of the bridge, twice what it moves otherwise."""
     with emulated(load="gantry", num_threads=1) as target:
-        half = 0.5 * target.drives._groups[0].load.mass_matrix()[0][0, 0] * (0.04 / TURN) ** 2
+        half = 0.5 * target.drives.inside.groups[0].load.mass_matrix()[0][0, 0] * (0.04 / TURN) ** 2
         for axis in identify_briefly(target):
             assert axis.value("inertia") == pytest.approx(half, rel=0.2)
             assert not axis.told["inertia"].is_known

@@ -150,8 +150,8 @@ LANE_I = np.array([0, 100, 329, 824, 1647, 3294, 32767, 1])
 def eight():
     """Eight commissioned drives in one record, powered, at angle 0."""
     drives = EmulatedDrives(load="inertia", num_machines=8, ideal=True, num_threads=1)
-    set_lanes(drives._records, "drive_function", np.ones(8))
-    set_lanes(drives._records, "stage_on", np.ones(8))
+    set_lanes(drives.inside.records, "drive_function", np.ones(8))
+    set_lanes(drives.inside.records, "stage_on", np.ones(8))
     yield drives
     drives.close()
 
@@ -160,12 +160,12 @@ def test_velocity_regulator_is_the_chips_advanced_form(eight):
     """Random errors in rpm to current in LSB, limit 7 A: large ones and small ones, so that both clips act."""
     eight.write(VELOCITY_P, LANE_P)
     eight.write(VELOCITY_I, LANE_I)
-    set_lanes(eight._records, "loop_level", np.ones(8))
+    set_lanes(eight.inside.records, "loop_level", np.ones(8))
     generator = np.random.default_rng(0)
     size = 10.0 ** generator.uniform(-1, 4, (400, 8))
     demand, measured = (generator.normal(size=(400, 8)) * size * RPM for _ in range(2))
     out = np.empty((400, 3, 8))
-    run_motion_loops(eight._records[0], demand, measured, out)
+    run_motion_loops(eight.inside.records[0], demand, measured, out)
     clipped = 0
     for lane in range(8):
         regulator = AdvancedPI(LANE_P[lane], LANE_I[lane], 7.0 / CURRENT_LSB)
@@ -180,7 +180,7 @@ def test_velocity_regulator_is_the_chips_advanced_form(eight):
 def test_position_regulator_is_a_gain_of_q4_12(eight):
     """Velocity error = P/4096 rpm per 1/65536 revolution - measured velocity."""
     eight.write(POSITION_P, LANE_P)
-    records = eight._records
+    records = eight.inside.records
     set_lanes(records, "loop_level", np.full(8, 2.0))
     set_lanes(records, "position_demand", np.full(8, 1000 * TWO_PI / 65536))
     set_lanes(records, "theta_meas", np.full(8, -500 * TWO_PI / 65536))
@@ -197,7 +197,7 @@ def test_current_regulators_are_the_chips_advanced_form_and_end_in_the_voltage_c
     ref, i_d, i_q = (generator.normal(size=(400, 8)) * size for _ in range(3))
     angle = generator.uniform(-10, 10, (400, 8))
     out = np.empty((400, 4, 8))
-    run_current_loop(eight._records[0], ref, i_d, i_q, angle, out)
+    run_current_loop(eight.inside.records[0], ref, i_d, i_q, angle, out)
     cut = 0
     for lane in range(8):
         flux, torque = (AdvancedPI(LANE_P[lane], LANE_I[lane], DUTY_LIMIT * 32768) for _ in range(2))
@@ -220,27 +220,27 @@ def test_direction_of_the_shaft_turns_the_torque_set_point_round(eight):
     eight.write("Motor Shaft Direction", [0, 1] * 4)
     out = np.empty((1, 4, 8))
     zero = np.zeros((1, 8))
-    run_current_loop(eight._records[0], np.ones((1, 8)), zero, zero, zero, out)
+    run_current_loop(eight.inside.records[0], np.ones((1, 8)), zero, zero, zero, out)
     assert np.all(out[0, 1, ::2] > 0)
     assert np.array_equal(out[0, 1, 1::2], -out[0, 1, ::2])
 
 
 def test_torque_command_passes_by_the_velocity_regulator_whose_integrator_follows(eight):
     """After a change to a velocity mode, out = P e + x must start from the torque that was commanded."""
-    set_lanes(eight._records, "loop_level", np.zeros(8))
+    set_lanes(eight.inside.records, "loop_level", np.zeros(8))
     out = np.empty((3, 3, 8))
-    run_motion_loops(eight._records[0], np.full((3, 8), 2.5), np.full((3, 8), 1.0), out)
+    run_motion_loops(eight.inside.records[0], np.full((3, 8), 2.5), np.full((3, 8), 1.0), out)
     assert np.all(out[:, 0] == 2.5)
-    P = get_lanes(eight._records, "velocity_p", 8)
-    set_lanes(eight._records, "loop_level", np.ones(8))
+    P = get_lanes(eight.inside.records, "velocity_p", 8)
+    set_lanes(eight.inside.records, "loop_level", np.ones(8))
     after = np.empty((1, 3, 8))
-    run_motion_loops(eight._records[0], np.full((1, 8), 2.5), np.full((1, 8), 1.0), after)
-    jump = P * get_lanes(eight._records, "velocity_i", 8) * 1.5  # one sample's integration
+    run_motion_loops(eight.inside.records[0], np.full((1, 8), 2.5), np.full((1, 8), 1.0), after)
+    jump = P * get_lanes(eight.inside.records, "velocity_i", 8) * 1.5  # one sample's integration
     assert after[0, 0] - 2.5 == pytest.approx(jump, abs=1e-12)
 
 
 def test_nothing_comes_out_and_nothing_is_summed_while_the_power_stage_is_off(eight):
-    records = eight._records
+    records = eight.inside.records
     set_lanes(records, "drive_function", np.zeros(8))
     set_lanes(records, "stage_on", np.zeros(8))
     set_lanes(records, "loop_level", np.ones(8))
@@ -282,7 +282,7 @@ def test_each_regulators_output_follows_from_the_read_outs(ideal):
         i_ref = min(max(P_V / 256 * e_v + x_v / 256, -i_max), i_max)
         saturated += abs(i_ref) == i_max
         bound = P_V / 256 * 0.5 + 0.5 / 256 + 1e-6
-        assert abs(i_ref - get_lanes(drives._records, "i_q_ref", 1)[0] / CURRENT_LSB) <= bound
+        assert abs(i_ref - get_lanes(drives.inside.records, "i_q_ref", 1)[0] / CURRENT_LSB) <= bound
         # The same set-point from the next loop's read-outs, error + measured current, each to .5 mA.
         assert abs(i_ref - (e_q + milliamperes) * 1e-3 / CURRENT_LSB) <= bound + 1e-3 / CURRENT_LSB
 
@@ -291,8 +291,10 @@ def test_each_regulators_output_follows_from_the_read_outs(ideal):
             min(max(P_T / 256 * e * 1e-3 / CURRENT_LSB + x / 256, -limit), limit) for e, x in ((e_d, x_d), (e_q, x_q))
         )
         shorten = min(1.0, limit / max(math.hypot(d, q), 1e-9))
-        s, c = (get_lanes(drives._records, name, 1)[0] for name in ("sin_meas", "cos_meas"))
-        alpha, beta = (get_lanes(drives._records, name, 1)[0] * 32768 for name in ("duty_next_alpha", "duty_next_beta"))
+        s, c = (get_lanes(drives.inside.records, name, 1)[0] for name in ("sin_meas", "cos_meas"))
+        alpha, beta = (
+            get_lanes(drives.inside.records, name, 1)[0] * 32768 for name in ("duty_next_alpha", "duty_next_beta")
+        )
         bound = 2 * (P_T / 256 * 0.5e-3 / CURRENT_LSB + 0.5 / 256) + 1e-6
         assert abs(d * shorten - (c * alpha + s * beta)) <= bound
         assert abs(q * shorten - (c * beta - s * alpha)) <= bound
@@ -303,7 +305,7 @@ def test_each_regulators_output_follows_from_the_read_outs(ideal):
 # --- limits -------------------------------------------------------------------------------------------------------
 def test_a_blocked_axis_does_not_wind_up(eight):
     """Error 1000 rpm for 10 s, 50,000 samples: the integrator stays at the limit, and lets go as soon as it may."""
-    records = eight._records
+    records = eight.inside.records
     P, I = 445, 329
     eight.write(VELOCITY_P, P)
     eight.write(VELOCITY_I, I)
@@ -357,7 +359,7 @@ def test_the_torque_integrator_stops_at_the_voltages_limit():
 def test_a_duty_is_applied_one_pwm_period_after_the_samples_it_comes_from():
     """Tick 0 samples, tick 1 holds: the current is still 0 at the end of tick 0, on the closed form after tick 1."""
     drives = EmulatedDrives(load="inertia", ideal=True, num_threads=1)
-    records = drives._records
+    records = drives.inside.records
     set_lanes(records, "stage_on", np.ones(1))
     set_lanes(records, "angle_source", np.full(1, 3.0))
     set_lanes(records, "J_rotor", np.full(1, 1e30))
@@ -392,18 +394,18 @@ def crossover(frequency, gain):
 
 def sweep_axis(drives, level, frequency, amplitude, duration, samples):
     """Excite position (2) or velocity (1) demand with a sine per machine; return phasors, shape (8, machines)."""
-    group = drives._groups[0]
+    group = drives.inside.groups[0]
     drives.advance(0.001)  # the stage is switched on at the next millisecond
     t = WINDOW * np.arange(round(duration / WINDOW))
     demand = amplitude * np.sin(TWO_PI * np.multiply.outer(t, frequency))
     out = np.empty((len(t), 8, drives.num_axes))
-    excite(group._records, group.load.plant, group._rates, group._motion, drives.num_axes, level, demand, out)
+    excite(group.records, group.load.plant, group.rates, group.motion, drives.num_axes, level, demand, out)
     return np.array([phasors(out[:, k], frequency, WINDOW, samples) for k in range(8)])
 
 
 def sweep_current(drives, frequency, amplitude, ticks, samples):
     """Excite the current set-point with a sine per machine, rotors locked; return i_q and error, shape (machines,)."""
-    records = drives._records
+    records = drives.inside.records
     n = len(records) * LANES
     set_lanes(records, "stage_on", np.ones(drives.num_axes))
     set_lanes(records, "angle_source", np.full(drives.num_axes, 3.0))

@@ -309,11 +309,11 @@ def test_a_refused_setting_leaves_every_group_as_it_was():
     with EmulatedDrives(load="two_mass", num_machines=66) as drives:
         stiffness = np.full(66, 3.0)
         stiffness[65] = 60.0
-        before = [state(group.load) for group in drives._groups]
+        before = [state(group.load) for group in drives.inside.groups]
         with pytest.raises(ValueError, match="resonates"):
             drives.machine.set("load.stiffness", stiffness)
         assert np.all(drives.machine.parameters["load.stiffness"] == STIFFNESS)
-        assert [state(group.load) for group in drives._groups] == before
+        assert [state(group.load) for group in drives.inside.groups] == before
 
 
 def test_the_refusal_names_the_machine():

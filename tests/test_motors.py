@@ -227,7 +227,7 @@ def hold_duty(drives, duty):
     """Have the current loop hold a duty: without gain its integrator stays at what it is given."""
     motion.enable(drives, mode="cst")
     drives.write("Torque Mode Settings.Torque_P", 0)
-    set_lanes(drives._records, "current_sum_q", np.full(drives.num_axes, duty))
+    set_lanes(drives.inside.records, "current_sum_q", np.full(drives.num_axes, duty))
 
 
 @pytest.fixture
@@ -255,7 +255,7 @@ def test_qube_step_response_is_the_second_order_closed_form(qube):
         qube.advance(0.001)
         omega.append(qube.machine.rotor_speed[0])
         current.append(qube.machine.motor_torque[0] / K)
-        assert abs(get_lanes(qube._records, "i_d", 1)[0]) < 1e-12  # one winding in a frame that does not turn
+        assert abs(get_lanes(qube.inside.records, "i_d", 1)[0]) < 1e-12  # one winding in a frame that does not turn
     t = 0.001 * np.arange(1, 41) - TICK  # the bridge gets a duty one period after it was computed
     p1, p2 = np.roots([J * L, J * R, K * K])
     u = 9.0

@@ -202,8 +202,8 @@ def test_many_machines_in_fewer_models_are_the_same_machines(load, monkeypatch):
             motion.enable(drives, mode="pv")
             drives.write("Target velocity", 200_000)
             drives.advance(0.02)
-            records.append(drives._records.tobytes())
-            models.append([group.load.copies for group in drives._groups])
+            records.append(drives.inside.records.tobytes())
+            models.append([group.load.copies for group in drives.inside.groups])
     assert models == [[64, 64, 64, 8], [128, 72]]
     assert records[0] == records[1]
 

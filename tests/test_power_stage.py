@@ -369,7 +369,7 @@ def test_stall_torque_at_the_supplys_voltage(motor):
     drives = ideal_drives(motor, **{"load.inertia": 1e3})
     drives.machine.supply = HAND[motor]["volts"] / 4
     drives.write("Maximum Current", 45_000)
-    records = drives._records
+    records = drives.inside.records
     set_lanes(records, "undervoltage", np.zeros(1))
     motion.enable(drives, mode="cst")
     drives.write("Target torque", 32_000)

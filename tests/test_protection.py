@@ -299,7 +299,7 @@ def test_fault_comes_by_its_cause_and_goes_after_it(name):
         # What it did: statusword, 1001h, 2101h, one emergency; the stage is off.
         assert (REACTION_ACTIVE in [word & STATE for word in words]) == (row.reaction == RAMP)
         assert drives.machine.motor_torque[0] == 0.0
-        assert get_lanes(drives._records, "i_q", 1)[0] == 0.0
+        assert get_lanes(drives.inside.records, "i_q", 1)[0] == 0.0
         assert drives.read(0x1001).tolist() == [row.register, 0]
         assert drives.read(0x2101)[0] & FAULT_FLAGS == row.flag
         assert drives.read(0x2101)[1] & FAULT_FLAGS == 0
@@ -673,7 +673,7 @@ def test_brake_chopper_takes_what_braking_gives():
         volts, brake = [], []
         for _ in range(600):
             drives.advance(0.001)
-            volts.append(get_lanes(drives._records, "u_dc", 2))
+            volts.append(get_lanes(drives.inside.records, "u_dc", 2))
             brake.append(int(drives.read(0x2101)[0]) >> 18 & 1)
         volts = np.array(volts)
         assert messages(drives) == [(1, 0x3210, (0, 0, 0, 0, 0))]
@@ -694,11 +694,11 @@ def test_brake_chopper_hysteresis():
         drives.write("Brake Chopper.Voltage", 400)
         drives.write("Brake Chopper.Hysteresis", 100)
         drives.advance(0.002)
-        set_lanes(drives._records, "u_dc", np.array([45.0, 45.0]))
+        set_lanes(drives.inside.records, "u_dc", np.array([45.0, 45.0]))
         volts = []
         for _ in range(30):
             drives.advance(0.001)
-            volts.append(get_lanes(drives._records, "u_dc", 2))
+            volts.append(get_lanes(drives.inside.records, "u_dc", 2))
         volts = np.array(volts)
     R, C, I = 4.7, 2e-3, 0.1
     t = np.arange(1, 31) * 1e-3

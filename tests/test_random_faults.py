@@ -109,10 +109,10 @@ def test_the_last_episode_s_fault_does_not_meet_the_next_machine_and_an_impossib
         machines = RandomMachines(drives, Distributions.load(laws))
         machines.redraw(generators(2), stage=0.5)
         drives.advance(0.01)
-        np.testing.assert_allclose(drives._groups[0].load.get("inertia"), 0.1 * inertia)
+        np.testing.assert_allclose(drives.inside.groups[0].load.get("inertia"), 0.1 * inertia)
         machines.redraw(generators(2), stage=1.0)  # no warning of a fault that is called off
         drives.advance(0.01)
-        np.testing.assert_allclose(drives._groups[0].load.get("inertia"), 0.1 * inertia)
+        np.testing.assert_allclose(drives.inside.groups[0].load.get("inertia"), 0.1 * inertia)
         assert machines.values["fault.number"].tolist() == [0.0, 0.0]
 
 

@@ -28,17 +28,17 @@ def used():
 
 
 def fields(drives):
-    return {name: drives._records[name].copy() for name in FIRMWARE.layout.dtype.names if name != "padding"}
+    return {name: drives.inside.records[name].copy() for name in FIRMWARE.layout.dtype.names if name != "padding"}
 
 
 def test_a_restart_restores_what_single_writes_would(used):
-    objects = used._objects
-    before = used._records.copy()
+    objects = used.inside.objects
+    before = used.inside.records.copy()
     values = {key: value.copy() for key, value in objects._values.items() if isinstance(value, np.ndarray)}
     mask = np.arange(11) % 3 == 0
     objects.restart(mask)
     found, found_values = fields(used), {key: objects._values[key].copy() for key in values}
-    used._records[:] = before
+    used.inside.records[:] = before
     objects._values.update({key: value.copy() for key, value in values.items()})
     for key in sorted(objects._stored, key=lambda key: key != POSITION_SCALER):
         entry, raw = objects.entries.find(key), np.broadcast_to(objects._stored[key], (11,))
@@ -46,7 +46,7 @@ def test_a_restart_restores_what_single_writes_would(used):
             objects._set_value(entry, raw, mask)
         elif entry.access not in ("ro", "const"):  # what is read only the firmware computes
             objects._set_field(entry, raw, mask)
-    FIRMWARE.power_on(used._records, mask)
+    FIRMWARE.power_on(used.inside.records, mask)
     for name, expected in fields(used).items():
         assert np.array_equal(expected, found[name], equal_nan=True), name
     for key in values:
@@ -56,7 +56,7 @@ def test_a_restart_restores_what_single_writes_would(used):
 
 def test_what_is_stored_later_is_restored(used):
     used.reset_node()
-    used._objects.store(4, {(0x6081, 0): 777, POSITION_SCALER: 1000})
+    used.inside.objects.store(4, {(0x6081, 0): 777, POSITION_SCALER: 1000})
     used.reset_node()
     assert used.read(0x6081)[[3, 4]].tolist() == [2184533, 777]
     assert used.read(0x2058)[[3, 4]].tolist() == [65536, 1000]

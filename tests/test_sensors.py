@@ -356,4 +356,6 @@ def test_the_velocity_filter_must_lie_below_the_rate():
     drives = EmulatedDrives(load="inertia")
     with pytest.raises(ValueError, match="up to 2250 Hz, not 3000 Hz"):
         drives.machine.set("stage.velocity_filter", 3000.0)
-    assert get_lanes(drives._records, "velocity_filter_b", 1)[0] == pytest.approx(second_order_low_pass(400.0)[0][0])
+    assert get_lanes(drives.inside.records, "velocity_filter_b", 1)[0] == pytest.approx(
+        second_order_low_pass(400.0)[0][0]
+    )

@@ -42,7 +42,7 @@ class Soak:
     def __init__(self, load, seed):
         self.random = np.random.default_rng(seed)
         self.drives = EmulatedDrives(load=load, num_machines=MACHINES, seed=seed, randomise=True, num_threads=1)
-        self.scratch = np.zeros((7, 8 * len(self.drives._records)))
+        self.scratch = np.zeros((7, 8 * len(self.drives.inside.records)))
         self.sums = np.zeros((9, MACHINES))
         self.given = dict.fromkeys(OF_MACHINES, 0)
         self.called_off = 0
@@ -56,7 +56,7 @@ class Soak:
         motion.enable(self.drives, mode="pv")
 
     def lanes(self, name):
-        return get_lanes(self.drives._records, name, MACHINES).astype(float)
+        return get_lanes(self.drives.inside.records, name, MACHINES).astype(float)
 
     def order_faults(self):
         """About two faults a second and machine, of all kinds, numbers from their whole ranges."""
@@ -77,7 +77,7 @@ class Soak:
                 continue
             self.given[row.name] += 1
             if row.once:
-                self.moments.setdefault(self.drives._now + delay, []).append(machine)
+                self.moments.setdefault(self.drives.inside.cycle + delay, []).append(machine)
 
     def command(self):
         """Do what a master might: enable and reset, turn, halt, stop, switch off."""
@@ -100,19 +100,19 @@ class Soak:
 
     def cycle(self):
         drives = self.drives
-        if drives._now % 20 == 0:
+        if drives.inside.cycle % 20 == 0:
             self.command()
         self.order_faults()
-        drives._faults.act(drives._now)
+        drives.inside.faults.act(drives.inside.cycle)
         magnetic, capacitor, driven = self.stored()
         theta, measured, gain = self.lanes("theta_m"), self.lanes("theta_meas"), self.lanes("encoder_gain")
         wired, told = self.lanes("encoder_true_direction"), self.lanes("encoder_direction")
         gain = np.where(wired == told, gain, -gain)
         quiet = self.is_quiet()
-        quiet[self.moments.pop(drives._now, [])] = False
-        group = drives._groups[0]
-        run_cycle(drives._records, group.load.plant, group._rates, self.scratch, MACHINES, self.sums, self.change)
-        drives._now += 1
+        quiet[self.moments.pop(drives.inside.cycle, [])] = False
+        group = drives.inside.groups[0]
+        run_cycle(drives.inside.records, group.load.plant, group.rates, self.scratch, MACHINES, self.sums, self.change)
+        drives.inside.cycle += 1
         drives.emergencies()
         self.check_state()
         self.check_position(theta, measured, gain, quiet)
@@ -206,7 +206,7 @@ def soak(load, seconds, seed):
     assert run.drives.machine.faults() == []
     assert np.all(run.lanes("encoder_gain") == 1.0)
     assert np.all(run.lanes("encoder_true_direction") == run.drives.machine.parameters["motor.encoder_direction"])
-    assert not run.drives._groups[0].load.plant.jam.any()
+    assert not run.drives.inside.groups[0].load.plant.jam.any()
     psi = run.drives.machine.parameters["motor.psi_m"]
     np.testing.assert_array_equal(run.lanes("psi_nominal"), psi)  # nothing is left of any fault
     run.drives.close()
@@ -262,11 +262,11 @@ def bus_soak(seconds, seed):
                 faults.add(Order(row.name, 0.0, "", duration, int(rng.choice(nodes))))
                 given[row.name] += 1
             world.run_until(world.time + 0.001)
-            fsa = get_lanes(drives._records, "fsa", len(nodes)).astype(int)
-            words = get_lanes(drives._records, "statusword", len(nodes)).astype(int)
+            fsa = get_lanes(drives.inside.records, "fsa", len(nodes)).astype(int)
+            words = get_lanes(drives.inside.records, "statusword", len(nodes)).astype(int)
             assert np.array_equal(words & MASKS[fsa], CODES[fsa])
-            off = get_lanes(drives._records, "stage_on", len(nodes)) == 0.0
-            assert not get_lanes(drives._records, "i_q", len(nodes))[off].any()
+            off = get_lanes(drives.inside.records, "stage_on", len(nodes)) == 0.0
+            assert not get_lanes(drives.inside.records, "i_q", len(nodes))[off].any()
             assert all(world.wire.waiting(("node", node)) <= 2 * TRANSMIT_BUFFER for node in nodes)
             assert len(world.wire.injected) <= len(faults.listing()) + 1
             enabled += int((~off).sum())

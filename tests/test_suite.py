@@ -56,7 +56,7 @@ def test_every_machine_is_one_that_its_motor_moves_well():
     with warnings.catch_warnings():
         warnings.simplefilter("error", MisfitWarning)
         for target, indices in open_machines(machines):
-            packed = [group.load for group in target.drives._groups]
+            packed = [group.load for group in target.drives.inside.groups]
             seen = [shaft_load(load) for load in packed]
             ratio = np.concatenate([row.inertia / load.armature for row, load in zip(seen, packed, strict=True)])
             assert np.all((ratio > 0.5) & (ratio < 20.0)), [machines[k].name for k in indices]

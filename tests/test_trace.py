@@ -96,7 +96,7 @@ def test_a_frame_has_the_columns_of_the_table(trace):
 @pytest.mark.parametrize("text", ["500 rpm", "10 rev/s", "70000 pps", "1e3deg/s"])
 def test_a_quantity_is_written_as_the_command_line_takes_it(drives, text):
     drives.write("Profile velocity", text)
-    expected = parse(text, drives._objects.entries.find("Profile velocity"), 65536.0)
+    expected = parse(text, drives.inside.objects.entries.find("Profile velocity"), 65536.0)
     assert drives.read("Profile velocity").tolist() == [expected] * 2
 
 

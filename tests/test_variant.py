@@ -319,7 +319,7 @@ def test_both_names_of_the_sensor_selection_are_one_setting(drives):
 def test_halls_that_tell_the_velocity_are_watched(drives):
     drives.write((0x2042, 5), 1)
     motion.enable(drives, mode="pv")
-    set_lanes(drives._records, "hall_broken", np.ones(1))
+    set_lanes(drives.inside.records, "hall_broken", np.ones(1))
     drives.advance(0.01)
     assert [message.name for message in drives.emergencies()] == ["hall_error"]
 

@@ -161,7 +161,7 @@ def conversation(seed):
         world.receive(Frame(0x601 + k % 2, bytes.fromhex("40 64 60 00 00 00 00 00")), "master")
         world.receive(Frame(0x201 + k % 2, numbers.randbytes(2)), "other master")
         world.receive(SYNC)
-    states = [one._records.tobytes() for one in drives]
+    states = [one.inside.records.tobytes() for one in drives]
     world.close()
     return carried, states
 
@@ -208,7 +208,7 @@ def test_drives_advance_with_the_world():
     world.run_until(0.0105)
     twin = EmulatedDrives(load="inertia", num_threads=1)
     twin.advance(0.010)
-    assert drives._records.tobytes() == twin._records.tobytes()
+    assert drives.inside.records.tobytes() == twin.inside.records.tobytes()
     world.close()
     twin.close()
 
@@ -424,7 +424,7 @@ def test_a_reset_switches_the_motor_off_at_once_however_long_the_node_boots():
     world.receive(Frame(0x000, b"\x81\x05"))
     world.run_until(0.012)
     assert drives.read(0x6041)[0] & 0x6F == 0x40  # switch on disabled
-    assert drives._records["stage_on"][0, 0] == 0.0
+    assert drives.inside.records["stage_on"][0, 0] == 0.0
     world.close()
 
 

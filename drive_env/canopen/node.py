@@ -91,7 +91,7 @@ class Node:
         self.drives = drives
         self.first_axis = first_axis
         self._device = device
-        self._objects = drives._objects
+        self._objects = drives.inside.objects
         self._send = send
         self._now = 0.0
         self._is_online = False

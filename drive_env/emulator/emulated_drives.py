@@ -24,6 +24,7 @@ from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.trace import Trace
 from drive_env.emulator.group import Group, call_of, channels, rates_of
 from drive_env.emulator.inertia_check import warn_of_misfits
+from drive_env.emulator.inside import Inside
 from drive_env.emulator.live_dictionary import NOTHING, LiveDictionary
 from drive_env.emulator.machine import Machines, checked_supply
 from drive_env.emulator.parameters import (
@@ -55,6 +56,14 @@ MOST_PREPARED = 64  # calls of record that are kept prepared: more than any loop
 
 MOST_MACHINES = 65_536  # some 17 kB each: 1.1 GB
 BRAKE_TORQUE = 2.0  # of the motor's rated torque, usual for holding brakes
+
+
+def check_number_of_machines(number: int) -> None:
+    """Raise ValueError for a number of machines that cannot be."""
+    if number < 1:
+        raise ValueError(f"num_machines must be 1 or more, not {number}")
+    if number > MOST_MACHINES:
+        raise ValueError(f"num_machines must be {MOST_MACHINES} at most, not {number}")
 
 
 class EmulatedDrives:
@@ -112,10 +121,7 @@ class EmulatedDrives:
         integrator: str = "leapfrog",
         friction: str = "stribeck",
     ) -> None:
-        if num_machines < 1:
-            raise ValueError(f"num_machines must be 1 or more, not {num_machines}")
-        if num_machines > MOST_MACHINES:
-            raise ValueError(f"num_machines must be {MOST_MACHINES} at most, not {num_machines}")
+        check_number_of_machines(num_machines)
         self.device: Device = find_device(device)
         self.motor = find_motor(motor or self.DEFAULT_MOTOR)
         self.load = find_load(load)
@@ -126,7 +132,6 @@ class EmulatedDrives:
         self._records = self._firmware.layout.new_records(self.num_axes)
         self._threads = max(1, num_threads if num_threads is not None else usable_cores())
         self._executor: ThreadPoolExecutor | None = None
-        self._reported = np.zeros(num_machines, bool)
         numbers = (
             [first_machine] * num_machines if identical else list(range(first_machine, first_machine + num_machines))
         )
@@ -134,28 +139,42 @@ class EmulatedDrives:
         self._groups = self._build_groups(physics_steps, integrator, friction)
         self._turn = np.zeros(1, np.int64)
         self._fleet = cycle.Fleet(np.array([group.machinery.address for group in self._groups], np.int64), self._turn)
-        nothing = np.empty((0, 0, self.num_axes))
-        self._nothing = call_of(nothing, NOTHING, nothing, NOTHING, 1)
-        self._set_constants(float(volts[0]))
+        self._apply_what_was_drawn(float(volts[0]))
+        warn_of_misfits([group.load for group in self._groups], self.motor)
+        self._begin()
+        self.machine = Machines(self)
+        self.inside = Inside(self)
+        self._commission(np.array(numbers), is_commissioned=motor is not None)
+
+    def _apply_what_was_drawn(self, supply: float) -> None:
+        """Give the records what machines, motor and supply [V] are."""
+        self._set_constants(supply)
         for name, values in self._parameters.items():
             everywhere = np.ones(self.num_axes, bool)
             per_axis = np.repeat(values, self.load.num_axes)
             apply_to_records(self._records, self.device, self.motor, name, per_axis, everywhere)
         self._refresh_inertia()
         set_lanes(self._records, "brake_torque", np.full(self.num_axes, BRAKE_TORQUE * self.motor.rated_torque))
+
+    def _begin(self) -> None:
+        """Begin time: nothing is scheduled, no fault is there."""
         self._now = 0  # cycles since the beginning
         self._schedule: list[tuple[int, str, Floats, Mask]] = []
         self._prepared: dict[tuple[ObjectName | None, ...], PreparedRecord] = {}  # of calls of record
-        warn_of_misfits([group.load for group in self._groups], self.motor)
+        self._reported = np.zeros(self.num_machines, bool)
+        nothing = np.empty((0, 0, self.num_axes))
+        self._nothing = call_of(nothing, NOTHING, nothing, NOTHING, 1)
         self._faults = MachineFaults(self)
-        self.machine = Machines(self)
-        preset = {} if motor is None else self.device.preset(self.motor)
-        if motor is not None:
-            preset = {"Limit switches": 0 if self.load.has_switches else 3, **preset}
+
+    def _commission(self, numbers: Integers, *, is_commissioned: bool) -> None:
+        """Give the drives their dictionaries, with the motor's preset if they are commissioned, and start them."""
+        preset = {}
+        if is_commissioned:
+            preset = {"Limit switches": 0 if self.load.has_switches else 3, **self.device.preset(self.motor)}
         self._objects = LiveDictionary(self.device, self._records, self.num_axes, preset)
         serial = self.device.canopen.objects.get("serial_number")
         if serial is not None:
-            self._objects.engrave(serial, np.repeat(np.array(numbers) + 1, self.load.num_axes))
+            self._objects.engrave(serial, np.repeat(numbers + 1, self.load.num_axes))
         self._objects.restart(np.ones(self.num_axes, bool))
         self._scale: tuple[int, list[float | None]] = (-1, [])
 

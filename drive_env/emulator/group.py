@@ -75,19 +75,19 @@ class Group:
     ) -> None:
         self.machines = machines
         self.load = load
-        self._records = records
-        self._rates = rates
+        self.records = records
+        self.rates = rates
         num_axes = load.copies * load.num_axes
         self.axes = slice(machines.start * load.num_axes, machines.start * load.num_axes + num_axes)
         memory = records.view(np.uint8).reshape(len(records), firmware.layout.dtype.itemsize)
-        self._motion = np.zeros((7, len(records) * LANES))
+        self.motion = np.zeros((7, len(records) * LANES))
         self.machinery = firmware.machinery(
             records=records,
             reals=memory.view(np.float64),
             integers=memory.view(np.int32),
             plant=load.plant,
             rates=rates,
-            motion=self._motion,
+            motion=self.motion,
             first_axis=self.axes.start,
             num_axes=num_axes,
         )

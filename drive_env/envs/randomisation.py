@@ -246,7 +246,7 @@ class RandomMachines:
         self._orders: list[Order | None] = [None] * machines
         if distributions.faults is not None:
             for name in distributions.faults.names:
-                drives._faults.check(Order(name))
+                drives.inside.faults.check(Order(name))
             self.values |= {name: np.zeros(machines) for name in FAULT_VALUES}
 
     def redraw(self, rngs: Sequence[np.random.Generator], where: Mask | None = None, stage: float = 1.0) -> None:
@@ -294,7 +294,7 @@ class RandomMachines:
             if order is None:
                 continue
             try:
-                self._drives._faults.add(order, np.arange(len(where)) == lane)
+                self._drives.inside.faults.add(order, np.arange(len(where)) == lane)
             except ValueError:  # a payload with which this machine cannot be stepped: it stays sound
                 continue
             self.values["fault.number"][lane] = 1.0 + list(FAULTS).index(order.name)

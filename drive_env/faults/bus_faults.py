@@ -100,7 +100,7 @@ class BusFaults:
             if not is_of_wire and row.name not in OF_ONE_NODE:
                 assert node is not None
                 # Refused here if the machine refuses it; the world's own thread gives it to the machine.
-                self._drives_of(node)._faults.check(order)
+                self._drives_of(node).inside.faults.check(order)
             self._next_number += 1
             fault = _BusFault(self._next_number, order, row, given, condition, node, delay, length)
             self._faults.append(fault)
@@ -148,7 +148,7 @@ class BusFaults:
 
     def _is_active(self, fault: _BusFault) -> bool:
         if fault.inner is not None and fault.node is not None:
-            found = [one for one in self._drives_of(fault.node)._faults.listing() if one.number == fault.inner]
+            found = [one for one in self._drives_of(fault.node).inside.faults.listing() if one.number == fault.inner]
             return bool(found) and bool(found[0].active.any())
         return fault.ends is not None
 
@@ -190,7 +190,7 @@ class BusFaults:
         if fault.row.once:
             return True
         if fault.inner is not None and fault.node is not None:
-            return not any(one.number == fault.inner for one in self._drives_of(fault.node)._faults.listing())
+            return not any(one.number == fault.inner for one in self._drives_of(fault.node).inside.faults.listing())
         return fault.ends is not None and fault.ends <= now
 
     def _begin(self, fault: _BusFault) -> None:
@@ -250,6 +250,6 @@ class BusFaults:
         elif fault.row.name == "store_interrupted":
             self._emulated(fault.node).saves_lose_power = False
         elif fault.inner is not None:
-            faults = self._drives_of(fault.node)._faults
+            faults = self._drives_of(fault.node).inside.faults
             if any(one.number == fault.inner for one in faults.listing()):
                 faults.clear(fault.inner, np.ones(self._drives_of(fault.node).num_machines, bool))

@@ -85,7 +85,7 @@ class _MachineFault:
 
 def axes_that_fulfil(condition: Condition, drives: EmulatedDrives) -> Mask:
     """Return which axes fulfil a condition now, shape (num_axes,)."""
-    records, count = drives._records, drives.num_axes
+    records, count = drives.inside.records, drives.num_axes
     if condition.quantity == NO_CONDITION:
         return np.ones(count, bool)
     if condition.quantity == ENABLED:
@@ -118,14 +118,14 @@ class MachineFaults:
         drives, axis = self._drives, order.axis
         row, changes = self.check(order)
         given = checked_parameters(row, order.parameters)
-        delay, length = cycles_of(order, row, drives._cycles)
+        delay, length = cycles_of(order, row, drives.inside.cycles)
         condition = Condition.parse(order.when)
         axes = np.repeat(machines, self._axes_per_machine)
         if axis is not None:
             axes &= np.arange(drives.num_axes) % self._axes_per_machine == axis
         self._rehearse(changes, given, axes)
         self._next_number += 1
-        begins = np.full(drives.num_machines, drives._now + delay)
+        begins = np.full(drives.num_machines, drives.inside.cycle + delay)
         state = np.where(machines, DUE if condition.quantity == NO_CONDITION else WAITING, ABSENT)
         self._faults.append(
             _MachineFault(
@@ -244,8 +244,8 @@ class MachineFaults:
         fault.state[machines] = ON
         fault.ends[machines] = now + fault.length if fault.length < NEVER else NEVER
         if any(change.quantity == ENCODER_NOISE for change in fault.changes):
-            seeds = np.mod(self._drives._noise_seeds * SEED_STEP + fault.number, 2.0**32 - 1.0) + 1.0
-            set_lanes(self._drives._records, "encoder_random", np.floor(seeds), axes)
+            seeds = np.mod(self._drives.inside.noise_seeds * SEED_STEP + fault.number, 2.0**32 - 1.0) + 1.0
+            set_lanes(self._drives.inside.records, "encoder_random", np.floor(seeds), axes)
         self._refresh(fault)
 
     def _end(self, fault: _MachineFault, machines: Mask) -> None:
@@ -254,7 +254,7 @@ class MachineFaults:
         fault.state[machines] = OVER
         self._refresh(fault)
         if fault.row.name == "broken_coupling":
-            for group in self._drives._groups:
+            for group in self._drives.inside.groups:
                 group.load.mend("stiffness", machines[group.machines])
 
     def _forget(self) -> None:
@@ -316,30 +316,30 @@ class MachineFaults:
         if quantity.kind == "jam":
             return self._jam.copy()
         if quantity.kind == "load":
-            values = np.concatenate([group.load.get(quantity.name) for group in drives._groups])
+            values = np.concatenate([group.load.get(quantity.name) for group in drives.inside.groups])
             return np.repeat(values, self._axes_per_machine)
-        return get_lanes(drives._records, quantity.name, drives.num_axes, quantity.part).astype(float)
+        return get_lanes(drives.inside.records, quantity.name, drives.num_axes, quantity.part).astype(float)
 
     def _set(self, quantity: Quantity, values: Floats, axes: Mask) -> None:
         drives = self._drives
         if quantity.kind == "jam":
             self._jam = np.where(axes, values, self._jam)
-            for group in drives._groups:
+            for group in drives.inside.groups:
                 group.load.jam(self._jam[group.axes].reshape(-1, self._axes_per_machine))
         elif quantity.kind == "load":
             machines = self._machines(axes)
             per_machine = values[:: self._axes_per_machine]
-            for group in drives._groups:
+            for group in drives.inside.groups:
                 group.load.set(quantity.name, per_machine[group.machines], machines[group.machines])
-            drives._refresh_inertia()
+            drives.inside.refresh_inertia()
         elif quantity in (ENCODER_GAIN, ENCODER_DIRECTION):
-            change_encoder(drives._records, quantity.name, values, axes)
+            change_encoder(drives.inside.records, quantity.name, values, axes)
         else:
-            set_lanes(drives._records, quantity.name, values, axes, quantity.part)
+            set_lanes(drives.inside.records, quantity.name, values, axes, quantity.part)
 
     def _jump(self, angle: float, axes: Mask) -> None:
         """Put the counters off by an angle [rad], as if so many edges came within one sample."""
-        records, count = self._drives._records, self._drives.num_axes
+        records, count = self._drives.inside.records, self._drives.num_axes
         forwards = 1.0 - 2.0 * get_lanes(records, "encoder_true_direction", count).astype(float)
         counts = np.rint(angle * forwards * get_lanes(records, "encoder_counts", count).astype(float) / TWO_PI)
         for name in ("count", "count_zero"):

@@ -204,7 +204,7 @@ def _reach(drives: EmulatedDrives) -> tuple[Floats, bool]:
     from mechanics.shaft import way
 
     speed = from_raw(drives, PROFILE_VELOCITY, drives.read(PROFILE_VELOCITY))
-    found = way(drives._groups[0].load)
+    found = way(drives.inside.groups[0].load)
     reach, limited = np.empty(drives.num_axes), False
     for axis, (low, high) in enumerate(zip(found.low, found.high, strict=True)):
         end = TRAVEL_SHARE * (high if high >= -low else low)
@@ -222,7 +222,7 @@ def _load_torque(row: Demonstration, drives: EmulatedDrives) -> float:
         return 0.0  # nothing would hold against it
     from mechanics.shaft import way
 
-    packed = drives._groups[0].load
+    packed = drives.inside.groups[0].load
     # The disturbance's speed per speed of each rotor; the axis that feels it most.
     lever = np.abs(way(packed).joints @ packed.plant.disturbance[:, 0])
     return -LOAD_SHARE * drives.motor.rated_torque / float(lever.max())

@@ -150,7 +150,7 @@ class Recorder:
                                                                                followed_velocity))  # fmt: skip
         from mechanics.shaft import way
 
-        found = way(drives._groups[0].load)
+        found = way(drives.inside.groups[0].load)
         return Recording(
             load=drives.load,
             title=title or f"{drives.load.name} · {drives.motor.name} · {drives.device.name}",

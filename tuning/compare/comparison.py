@@ -250,7 +250,7 @@ def _true_inertia(target: Target) -> Floats:
 
     The axes of a machine move together: an axis pushes its own inertia, and what the others' acceleration puts on it.
     """
-    moved = np.concatenate([moved_inertia(group.load) for group in machine_of(target.drives).drives._groups])
+    moved = np.concatenate([moved_inertia(group.load) for group in machine_of(target.drives).drives.inside.groups])
     share = machine_of(target.drives).parameters["motor.psi_m"] / target.motor.psi_m
     return np.asarray(moved.reshape(-1) / np.repeat(share, target.axes_per_machine))
 

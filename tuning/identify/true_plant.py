@@ -33,7 +33,7 @@ def true_plant(drives: Drives, axis: int = 0) -> Plant:
     if emulated.load.num_axes != 1:
         raise ValueError(f"load {emulated.load.name!r} couples {emulated.load.num_axes} axes; the model has one")
     true = {name: float(values[axis]) for name, values in drives.machine.parameters.items()}
-    group = next(g for g in emulated._groups if g.machines.start <= axis < g.machines.stop)
+    group = next(g for g in emulated.inside.groups if g.machines.start <= axis < g.machines.stop)
     J, viscous, pair = _mechanics(group.load, axis - group.machines.start)
     motor = emulated.motor
     psi = true["motor.psi_m"]
