@@ -104,10 +104,10 @@ def look_first(
     timeout: float | None = None,
 ) -> None:
     """Raise NoAnswerError for a node that is silent: to open it as drives would send it an NMT command."""
+    from drive_env.master.can.port import Port, open_bus
+    from drive_env.master.can.sdo import SdoClient
     from drive_env.master.description import describe
     from drive_env.master.errors import NoAnswerError
-    from drive_env.master.port import Port, open_bus
-    from drive_env.master.sdo import SdoClient
 
     patience = describe(device, eds).answer_timeout if timeout is None else timeout
     port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))

@@ -122,8 +122,8 @@ def new_files(out: Path) -> tuple[Path, Path]:
 
 def _listen(interface: str | None, channel: str | None, nodes: list[int] | None, bitrate: int | None) -> None:
     """Raise OtherMastersError where another master is at work; nothing is sent."""
-    from drive_env.master.other_masters import OtherMasters
-    from drive_env.master.port import Port, open_bus
+    from drive_env.master.can.other_masters import OtherMasters
+    from drive_env.master.can.port import Port, open_bus
 
     port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
     try:
@@ -174,8 +174,8 @@ def _record(
     """Return rows of each entry, the number of the row at which the trigger fired, and what broke the rest off."""
     import numpy as np
 
+    from drive_env.master.can.other_masters import OtherMasters
     from drive_env.master.errors import BusError
-    from drive_env.master.other_masters import OtherMasters
 
     wanted = list(dict.fromkeys([*entries, trigger.entry] if trigger else entries))
     names = [(entry.index, entry.sub) for entry in wanted]

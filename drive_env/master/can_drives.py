@@ -26,18 +26,18 @@ from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.trace import Trace
+from drive_env.master.can.dry_run import DryPort, DrySdoClient
+from drive_env.master.can.network import PRE_OPERATIONAL, START, Network, check_nodes
+from drive_env.master.can.pdo import PdoConfiguration
+from drive_env.master.can.port import Port, open_bus
+from drive_env.master.can.process_data import ProcessData
+from drive_env.master.can.sdo import SdoClient
 from drive_env.master.cycle_runner import CycleRunner
 from drive_env.master.description import Description, check_timeout, describe
-from drive_env.master.dry_run import DryPort, DrySdoClient
 from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.master.network import PRE_OPERATIONAL, START, Network, check_nodes
 from drive_env.master.pace import LockstepPace, Pace, RealTimePace, Timing
-from drive_env.master.pdo import PdoConfiguration
-from drive_env.master.port import Port, open_bus
-from drive_env.master.process_data import ProcessData
 from drive_env.master.quantities import INCREMENTAL, increments_per_revolution, integers, is_quantity
 from drive_env.master.sampling import run_cycles
-from drive_env.master.sdo import SdoClient
 from drive_env.safety.envelope import Envelope
 from drive_env.safety.limits import Limits
 

@@ -15,11 +15,11 @@ from drive_env import cia402
 from drive_env.canopen.frames import SYNC
 from drive_env.dictionary.access import check_in_range, check_readable, check_writable
 from drive_env.dictionary.entries import Entry, ObjectName
+from drive_env.master.can.pdo import INTO_DRIVE, OUT_OF_DRIVE, check_mappable
+from drive_env.master.can.port import Port
+from drive_env.master.can.process_data import ProcessData
 from drive_env.master.description import Description, Key
 from drive_env.master.pace import Pace
-from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, check_mappable
-from drive_env.master.port import Port
-from drive_env.master.process_data import ProcessData
 from drive_env.master.sampling import Bytes, Samples, run_cycles
 
 if TYPE_CHECKING:

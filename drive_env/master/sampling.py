@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.canopen.frames import SYNC
+from drive_env.master.can.pdo import RemotePdo
+from drive_env.master.can.port import Port
 from drive_env.master.errors import BusError, NoAnswerError
 from drive_env.master.pace import Pace
-from drive_env.master.pdo import RemotePdo
-from drive_env.master.port import Port
 
 Bytes = NDArray[np.uint8]
 

@@ -5,7 +5,7 @@ Four lines of defence, each for the failure of the one before:
 - what the drives do is watched, by the samples of every communication cycle and otherwise by a thread of its own
   (`watch.py`, `judging.py`), and they are stopped by grades (`stop_runner.py`, `stopping.py`);
 - limits that are tighter than the drives' own are lent to them (`limits_in_force.py`, `lending.py`);
-- a process that dies is noticed by the drives themselves (`watchdogs.py`, `error_control.py`).
+- a process that dies is noticed by the drives themselves (`watchdogs.py`, `master/can/error_control.py`).
 
 Whether an axis is live is what its statusword says, and it counts as live from before a frame that could enable it is
 sent. A watchdog is given up only where the statusword, read back, shows every axis of its node off.

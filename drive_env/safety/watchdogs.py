@@ -10,10 +10,10 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.master.can.error_control import Beats, ErrorControl, Heartbeats, NoWatchdogError
 from drive_env.master.errors import BusError
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import POSITION_HIGH
-from drive_env.safety.error_control import Beats, ErrorControl, Heartbeats, NoWatchdogError
 from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits import NO_LIMIT

@@ -17,8 +17,8 @@ from canopen.sdo.client import SdoClient as CanopenClient
 
 from drive_env.canopen.frames import ERROR_CONTROL, NMT, SDO_REQUEST, SDO_RESPONSE
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.master.can.port import Port
 from drive_env.master.errors import BusError, NoAnswerError, refused
-from drive_env.master.port import Port
 
 _ABORT = 0x80
 _INITIATE = (0x40, 0x60)  # upload and download responses that name their object, upper three bits

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.entries import Entry
+from drive_env.master.can.pdo import INTO_DRIVE, OUT_OF_DRIVE, Direction, PdoConfiguration, RemotePdo, plan, too_many
 from drive_env.master.description import Description, Key
-from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, Direction, PdoConfiguration, RemotePdo, plan, too_many
 from drive_env.master.sampling import Bytes, Samples
 
 Integers = NDArray[np.int64]

@@ -14,10 +14,10 @@ from functools import partial
 from drive_env import cia402
 from drive_env.canopen.frames import ERROR_CONTROL
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.master.can.port import Port
+from drive_env.master.can.sdo import SdoClient
 from drive_env.master.description import Description
 from drive_env.master.errors import BusError
-from drive_env.master.port import Port
-from drive_env.master.sdo import SdoClient
 from drive_env.master.tidying import Tidying
 
 logger = logging.getLogger(__name__)

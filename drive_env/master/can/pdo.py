@@ -9,10 +9,10 @@ from typing import NamedTuple
 from drive_env.canopen.frames import EXTENDED, IDENTIFIER, INVALID, RPDO, TPDO
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.master.can.mapping import PDO_BITS, Slots, pack
+from drive_env.master.can.sdo import SdoClient
 from drive_env.master.description import Description
 from drive_env.master.errors import BusError, RefusedError
-from drive_env.master.mapping import PDO_BITS, Slots, pack
-from drive_env.master.sdo import SdoClient
 from drive_env.master.tidying import Tidying
 
 # Transmission types of a TPDO (CiA 301, table 74): at each SYNC; with a SYNC at all.
