@@ -32,7 +32,7 @@ from drive_env.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 # Response and commands of the usual modes: what `drive-env check-model` needs.
 DEFAULT = ("6062", "6064", "606C", "60FF", "6077")
@@ -163,7 +163,7 @@ def _fires(trigger: Trigger, values: Any, scales: list[float | None]) -> Any:
 
 
 def _record(
-    drives: CanDrives,
+    drives: BusDrives,
     entries: list[Any],
     trigger: Trigger | None,
     scales: list[float | None],
@@ -174,13 +174,12 @@ def _record(
     """Return rows of each entry, the number of the row at which the trigger fired, and what broke the rest off."""
     import numpy as np
 
-    from drive_env.master.can.other_masters import OtherMasters
     from drive_env.master.errors import BusError
 
     wanted = list(dict.fromkeys([*entries, trigger.entry] if trigger else entries))
     names = [(entry.index, entry.sub) for entry in wanted]
 
-    others = OtherMasters(drives.port, drives.nodes)
+    others = drives.link.other_masters()
 
     def record(seconds: float) -> dict[Any, Any]:
         try:
@@ -188,7 +187,7 @@ def _record(
         except BusError:
             others.check()  # samples that stay out are another master's doing, if there is one
             raise
-        drives.port.drain()
+        drives.link.drain()
         others.check()
         return {entry: trace[name] for entry, name in zip(wanted, names, strict=True)}
 

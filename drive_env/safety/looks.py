@@ -18,7 +18,7 @@ from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.objects import CURRENT, DEMAND, POSITION, STATUSWORD, VELOCITY
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -40,7 +40,7 @@ class Looks:
 
     def __init__(
         self,
-        drives: CanDrives,
+        drives: BusDrives,
         axes: Axes,
         limits: LimitsInForce,
         observe: Callable[[Mapping[Key, Integers], int, Mask], None],
