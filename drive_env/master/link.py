@@ -87,7 +87,10 @@ class Outputs(Protocol):
     """Rows of process data that go into the drives, ready to be sent."""
 
     def send(self, row: int) -> None:
-        """Hand out a row: the drives take it when the next cycle begins."""
+        """Hand out a row: the drives take it when the next cycle begins, once.
+
+        What is written to an object afterwards stays, so a link that repeats its last image must follow such writes.
+        """
 
 
 class Samples(Protocol):
@@ -178,7 +181,10 @@ class MasterWatch(Protocol):
         """
 
     def keep(self) -> None:
-        """Be heard, if it is due; called every few milliseconds whatever the program does."""
+        """Be heard, if it is due; called every few milliseconds whatever the program does, by the supervisor's thread.
+
+        What comes back is no sample of a run that is under way.
+        """
 
     def cease(self) -> None:
         """Never be heard again, so that the drives stop by themselves."""
