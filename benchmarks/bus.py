@@ -15,7 +15,7 @@ import numpy as np
 from drive_env import EmulatedDrives
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
-from drive_env.master.slcan_socket import SlcanSocket
+from drive_env.master.can.slcan_socket import SlcanSocket
 
 SECONDS = 5.0  # of 1 kHz SYNC
 TRANSFERS = 2000

@@ -36,8 +36,8 @@ from drive_env.cia402 import State
 from drive_env.dictionary import entries
 from drive_env.firmware.record import LANES
 from drive_env.master import description
+from drive_env.master.can.port import open_bus
 from drive_env.master.errors import BusError
-from drive_env.master.port import open_bus
 
 TURN = 65536  # increments
 RADIANS = 2.0 * np.pi / TURN

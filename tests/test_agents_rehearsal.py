@@ -20,7 +20,7 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.canopen.frames import NMT, SDO_REQUEST, Frame
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.master.sdo import SdoClient
+from drive_env.master.can.sdo import SdoClient
 from tuning.target import on_bus
 
 TURN = 65536

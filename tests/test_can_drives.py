@@ -18,11 +18,11 @@ from scripted_drive import ScriptedBus, ScriptedDrive
 from drive_env import CanDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
 from drive_env.master import quantities
+from drive_env.master.can.mapping import Slots, pack
+from drive_env.master.can.pdo import INTO_DRIVE, OUT_OF_DRIVE, slots
 from drive_env.master.description import describe
 from drive_env.master.errors import BusError, NoAnswerError, OpenError
-from drive_env.master.mapping import Slots, pack
-from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, slots
-from drive_env.master.process_data import integers
+from drive_env.master.packing import integers
 
 EDS = find_device("tmcm1636").eds.read_text(encoding="utf-8")
 
@@ -388,7 +388,7 @@ def test_emergencies_are_taken_from_where_1014h_says(drive, bus):
 def test_a_reset_waits_for_the_boot_up_and_a_missing_one_is_told(drives, drive, bus, monkeypatch):
     drives.reset_node()
     assert transcript(bus) == ["000  81 01"]
-    monkeypatch.setattr("drive_env.master.network.BOOT_TIMEOUT", 0.05)
+    monkeypatch.setattr("drive_env.master.can.network.BOOT_TIMEOUT", 0.05)
     monkeypatch.setattr(drive, "receive", lambda *_: [])
     with pytest.raises(NoAnswerError, match=r"node 1 sent no boot-up message \(700h \+ node\)"):
         drives.reset_node()
@@ -479,7 +479,7 @@ def test_a_late_program_keeps_the_time_of_advance_and_the_rows_of_record(drive, 
 def test_a_frame_is_read_in_pieces_and_several_at_once():
     import socket
 
-    from drive_env.master.slcan_socket import SlcanSocket
+    from drive_env.master.can.slcan_socket import SlcanSocket
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         bus = SlcanSocket(f"socket://127.0.0.1:{server.getsockname()[1]}", bitrate=500_000)

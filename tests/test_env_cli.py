@@ -128,7 +128,7 @@ def test_scan_shows_a_time_out_as_a_time_out(monkeypatch, capsys, silent, state,
             raise ObjectAccessError(0x0602_0000, what)
         return (402).to_bytes(4, "little")
 
-    monkeypatch.setattr("drive_env.master.sdo.SdoClient.read", read)
+    monkeypatch.setattr("drive_env.master.can.sdo.SdoClient.read", read)
     scan._print([scan._look(SilentPort(), 3, state, 0.3)], 0.3)
     assert capsys.readouterr().out == line + "\n"
 
@@ -608,7 +608,7 @@ def test_a_channel_whose_name_ends_in_a_large_number_is_logged(tmp_path, monkeyp
         def shutdown(self):
             pass
 
-    monkeypatch.setattr("drive_env.master.port.open_bus", lambda *_, **__: Bus())
+    monkeypatch.setattr("drive_env.master.can.port.open_bus", lambda *_, **__: Bus())
     file = tmp_path / f"session.{ending}"
     done = CliRunner().invoke(app, ["log", str(file), "--duration", "1"])
     assert done.exit_code == 0, done.exception

@@ -11,7 +11,7 @@ from test_parity import served
 
 from drive_env import CanDrives, Limits, SafetyError, cia402, motion
 from drive_env.devices import find_device
-from drive_env.safety.error_control import MASTERS
+from drive_env.master.can.error_control import MASTERS
 
 TURN = 65536
 SLACK = 0.025  # rev: bounds.SLACK_TURNS, and some counts of a settled axis

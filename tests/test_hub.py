@@ -26,9 +26,9 @@ from drive_env.bus.slcan import MAX_LINE, TOKEN_WANTED, Channel, format_frame, p
 from drive_env.bus.wire import Wire
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
+from drive_env.master.can.port import open_bus
+from drive_env.master.can.slcan_socket import SlcanSocket
 from drive_env.master.errors import OpenError
-from drive_env.master.port import open_bus
-from drive_env.master.slcan_socket import SlcanSocket
 
 
 class Echo:
@@ -817,7 +817,7 @@ def test_our_client_shows_its_token_and_says_what_is_wrong_with_it(monkeypatch, 
 
 
 def test_our_client_does_not_wait_for_ever_for_a_token_to_be_taken(monkeypatch):
-    monkeypatch.setattr("drive_env.master.slcan_socket.CONNECT_TIMEOUT", 0.1)
+    monkeypatch.setattr("drive_env.master.can.slcan_socket.CONNECT_TIMEOUT", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as mute, pytest.raises(OpenError, match="does not answer to the token"):
         SlcanSocket(f"socket://127.0.0.1:{mute.getsockname()[1]}", token=TOKEN)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from drive_env.master import pace as module
@@ -75,18 +74,24 @@ def test_the_first_set_points_do_not_wait_for_the_sync_they_belong_to(clock):
     """Their frames take time of the bus that a policy has left; later ones go out just before their SYNC."""
     sent = []
 
-    class Port:
+    class Sent:
+        """A link, and what goes out on it."""
+
         receive = staticmethod(clock.receive)
 
-        def send(self, can_id, data=b""):
-            sent.append((can_id, round(1e3 * (clock.now - 5.0), 6)))
+        def sync(self):
+            self.send("SYNC")
+
+        def send(self, what):
+            sent.append((what, round(1e3 * (clock.now - 5.0), 6)))
 
     pace = RealTimePace(CYCLE)
     pace.begin()
     pace.wait(clock.receive)  # a SYNC at 0
     clock.now += 0.0004  # a policy thinks
-    run_cycles(Port(), pace, 2, [(0x201, np.zeros((2, 4), np.uint8))], None, 1.0)
-    assert sent == [(0x201, 0.4), (0x80, 1.0), (0x201, 2.0), (0x80, 2.0)]
+    link = Sent()
+    run_cycles(link, pace, 2, link, None, 1.0)
+    assert sent == [(0, 0.4), ("SYNC", 1.0), (1, 2.0), ("SYNC", 2.0)]
 
 
 @pytest.mark.parametrize("ahead", [0, 1, 3])
@@ -99,18 +104,20 @@ def test_in_lockstep_what_is_looked_at_does_not_depend_on_how_fast_this_computer
         rows = 0
 
         def complete(self):
-            return min(self.rows + ahead, port.syncs)
+            return min(self.rows + ahead, link.syncs)
 
         def missing(self, rows, timeout):
             raise AssertionError(f"row {rows} stayed out")
 
-    class Port:
+    class Answering:
+        """Its link."""
+
         syncs = 0
 
-        def send(self, can_id, data=b""):
-            self.syncs += can_id == 0x80
+        def sync(self):
+            self.syncs += 1
 
-        def receive(self, timeout=0.0, done=None):
+        def receive(self, timeout=0.0):
             return False
 
         def wait(self, done, timeout):
@@ -118,6 +125,6 @@ def test_in_lockstep_what_is_looked_at_does_not_depend_on_how_fast_this_computer
                 samples.rows += 1
             return done()
 
-    port, samples, looked = Port(), Answers(), []
-    run_cycles(port, LockstepPace(), 5, [], samples, 1.0, observe=lambda first, last: looked.append((first, last)))
+    link, samples, looked = Answering(), Answers(), []
+    run_cycles(link, LockstepPace(), 5, None, samples, 1.0, observe=lambda first, last: looked.append((first, last)))
     assert looked == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)]

@@ -107,7 +107,7 @@ def bus(monkeypatch):
     """The bus that the command opens; put drives into its list."""
     made = ScriptedBus()
     made.drives = []
-    monkeypatch.setattr("drive_env.master.port.open_bus", lambda *_, **__: made)
+    monkeypatch.setattr("drive_env.master.can.port.open_bus", lambda *_, **__: made)
     return made
 
 

@@ -22,7 +22,7 @@ def drive(monkeypatch):
         return made.buses[-1]
 
     monkeypatch.setattr("drive_env.master.can_drives.open_bus", opened)
-    monkeypatch.setattr("drive_env.master.port.open_bus", opened)
+    monkeypatch.setattr("drive_env.master.can.port.open_bus", opened)
     return made
 
 

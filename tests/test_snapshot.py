@@ -20,8 +20,8 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.gains import write_gains
+from drive_env.master.can.sdo import SdoClient
 from drive_env.master.errors import BusError
-from drive_env.master.sdo import SdoClient
 from drive_env.safety.envelope import SafetyError
 from tuning.commands.cli import app
 from tuning.snapshot import (

@@ -42,7 +42,7 @@ from tuning.toml_tables import toml
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
     from tuning.target import Target
 
 Mask = NDArray[np.bool_]
@@ -191,7 +191,7 @@ def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
 _BUS = {"interface": str, "channel": str, "nodes": int, "bitrate": int, "pace": str}
 
 
-def check_same_drives(file: object, snapshot: Snapshot, drives: CanDrives, *, other_drive: bool = False) -> None:
+def check_same_drives(file: object, snapshot: Snapshot, drives: BusDrives, *, other_drive: bool = False) -> None:
     """Raise OtherDriveError unless the nodes of a bus are those that a snapshot was taken of.
 
     Args:

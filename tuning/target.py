@@ -316,7 +316,7 @@ def _address(
     interface: str | None, channel: str | None, nodes: tuple[int, ...], options: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return what opens these drives again; what a file cannot hold, such as an open bus, is left out."""
-    from drive_env.master.port import CHANNEL_VARIABLE, INTERFACE_VARIABLE
+    from drive_env.master.can.port import CHANNEL_VARIABLE, INTERFACE_VARIABLE
 
     found = {
         "interface": interface or os.environ.get(INTERFACE_VARIABLE),

@@ -163,7 +163,7 @@ def _answers(target: Target, axis: int) -> Iterator[Check]:
 def _samples(target: Target, axis: int) -> Iterator[Check]:
     """Look whether what is sampled and played fits, and whether its PDOs have identifiers."""
     from drive_env.canopen.frames import IDENTIFIER, RPDO, TPDO
-    from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, plan
+    from drive_env.master.can.pdo import INTO_DRIVE, OUT_OF_DRIVE, plan
 
     drives = bus_of(target.drives)
     description, watched = drives.description, []
@@ -331,7 +331,7 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
 
 def _communication(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
     """Yield what is written so that samples come in PDOs and the drive watches over its master."""
-    from drive_env.master.pdo import OUT_OF_DRIVE, slots
+    from drive_env.master.can.pdo import OUT_OF_DRIVE, slots
 
     known = bus_of(target.drives).description.dictionary
     for name, communication, mapping, pdos in (("RPDO", 0x1400, 0x1600, 1), ("TPDO", 0x1800, 0x1A00, 2)):

@@ -34,7 +34,7 @@ from drive_env.commands.options import (
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 Raw = Annotated[bool, typer.Option("--raw", help="Integers as the wire carries them, without units.")]
 
@@ -132,7 +132,7 @@ def set_object(
 
 
 def _tell_plan(
-    drives: CanDrives, entry: Entry, wanted: list[Any], increments: list[Any], text: str, *, raw: bool, json: bool
+    drives: BusDrives, entry: Entry, wanted: list[Any], increments: list[Any], text: str, *, raw: bool, json: bool
 ) -> None:
     """Say what the drive has, and what would be written; raises for a value that the object cannot take."""
     from drive_env.dictionary.access import check_limits, check_writable
@@ -165,7 +165,7 @@ def _refuse_to_enable(entry: Any, controlword: int) -> None:
         )
 
 
-def _ask_where_live(drives: CanDrives, what: str, yes: bool) -> None:
+def _ask_where_live(drives: BusDrives, what: str, yes: bool) -> None:
     """Have the user agree to a write where a drive may turn its motor; `ask` raises otherwise."""
     status = [int(word) for word in drives.read(cia402.STATUSWORD)]
     live = [f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if cia402.is_live(word)]

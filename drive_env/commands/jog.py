@@ -31,7 +31,7 @@ from drive_env.commands.options import (
 from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 DEFAULT_KEYS = [(int(name, 16), 0) for name in DEFAULT]
@@ -175,7 +175,7 @@ def _told(message: dict[str, Any]) -> str:
 
 def _tell_plan(
     motion: Any,
-    drives: CanDrives,
+    drives: BusDrives,
     speed: str,
     by: str | None,
     duration: float,
@@ -201,7 +201,7 @@ def _tell_plan(
     )
 
 
-def _turn(motion: Any, drives: CanDrives, velocity: int, duration: float, is_recorded: bool) -> Any:
+def _turn(motion: Any, drives: BusDrives, velocity: int, duration: float, is_recorded: bool) -> Any:
     """Turn in pv, then let the drive brake with its own deceleration; return the samples that were wanted of it."""
     motion.enable(drives, mode="pv")
     trace = None
@@ -218,7 +218,7 @@ def _turn(motion: Any, drives: CanDrives, velocity: int, duration: float, is_rec
     return trace
 
 
-def _go(motion: Any, drives: CanDrives, velocity: int, distance: int, is_recorded: bool) -> Any:
+def _go(motion: Any, drives: BusDrives, velocity: int, distance: int, is_recorded: bool) -> Any:
     """Move in pp, and give the drive its profile velocity back; return the samples that were wanted of it."""
     trace = None
     before = int(drives.read(cia402.PROFILE_VELOCITY)[0])
@@ -238,7 +238,7 @@ def _go(motion: Any, drives: CanDrives, velocity: int, distance: int, is_recorde
     return trace
 
 
-def _arrive(motion: Any, drives: CanDrives, velocity: int, timeout: float) -> None:
+def _arrive(motion: Any, drives: BusDrives, velocity: int, timeout: float) -> None:
     """Wait until the target is reached; RuntimeError for an axis that stands at a limit."""
     from drive_env.master.errors import BusError
 

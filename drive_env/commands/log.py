@@ -56,7 +56,7 @@ def log(
         from can.util import channel2int
 
         from drive_env.commands.frame_files import FRAME_FILES, FrameFile
-        from drive_env.master.port import open_bus
+        from drive_env.master.can.port import open_bus
 
         _check_format(file, WRITTEN)
         check_time("--duration", duration)
@@ -118,9 +118,9 @@ def replay(
         import can
 
         from drive_env.commands.replayed_motors import ANSWER_TIMEOUT
+        from drive_env.master.can.dry_run import show_frame
+        from drive_env.master.can.port import Port, open_bus
         from drive_env.master.description import check_timeout
-        from drive_env.master.dry_run import show_frame
-        from drive_env.master.port import Port, open_bus
 
         _check_format(file, FORMATS)
         if not file.is_file():
@@ -205,7 +205,7 @@ def _in_time(port: Any, frames: list[Any], speed: float, noted: list[int]) -> It
 def _is_from_a_master(frame: Any) -> bool:
     """Return whether the predefined connection set has a master send this identifier."""
     from drive_env.canopen.frames import ERROR_CONTROL, NMT, RPDO, SDO_REQUEST, SYNC
-    from drive_env.safety.error_control import MASTERS
+    from drive_env.master.can.error_control import MASTERS
 
     can_id = frame.arbitration_id
     if frame.is_remote_frame or can_id in (NMT, SYNC) or can_id - ERROR_CONTROL in MASTERS:

@@ -28,7 +28,7 @@ from drive_env.commands.options import (
 from drive_env.commands.tables import Column, tables
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 DEFAULT = ("6041", "6061", "6064", "606C", "6077")
 
@@ -69,11 +69,11 @@ def monitor(
                 pass  # the usual end
 
 
-def _look(drives: CanDrives, entries: list[Any]) -> dict[Any, Any]:
+def _look(drives: BusDrives, entries: list[Any]) -> dict[Any, Any]:
     return {entry: drives.read((entry.index, entry.sub)) for entry in entries}
 
 
-def _lines(drives: CanDrives, entries: list[Any], period: float, end: float) -> None:
+def _lines(drives: BusDrives, entries: list[Any], period: float, end: float) -> None:
     start = time.monotonic()
     while True:
         values = _look(drives, entries)
@@ -86,7 +86,7 @@ def _lines(drives: CanDrives, entries: list[Any], period: float, end: float) -> 
         time.sleep(period)
 
 
-def _table(drives: CanDrives, entries: list[Any], period: float, end: float) -> None:
+def _table(drives: BusDrives, entries: list[Any], period: float, end: float) -> None:
     from rich.live import Live
 
     increments = increments_per_revolution(drives)
@@ -106,7 +106,7 @@ def _table(drives: CanDrives, entries: list[Any], period: float, end: float) -> 
 
 
 def _draw(
-    drives: CanDrives,
+    drives: BusDrives,
     entries: list[Any],
     values: Any,
     increments: list[float | None],

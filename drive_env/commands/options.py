@@ -17,6 +17,7 @@ from drive_env.programs import CLOSED, output_is_closed
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
+    from drive_env.master.bus_drives import BusDrives
     from drive_env.master.can_drives import CanDrives
 
 REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
@@ -104,10 +105,10 @@ def look_first(
     timeout: float | None = None,
 ) -> None:
     """Raise NoAnswerError for a node that is silent: to open it as drives would send it an NMT command."""
+    from drive_env.master.can.port import Port, open_bus
+    from drive_env.master.can.sdo import SdoClient
     from drive_env.master.description import describe
     from drive_env.master.errors import NoAnswerError
-    from drive_env.master.port import Port, open_bus
-    from drive_env.master.sdo import SdoClient
 
     patience = describe(device, eds).answer_timeout if timeout is None else timeout
     port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
@@ -226,20 +227,20 @@ def ask(question: str, yes: bool) -> None:
         raise RuntimeError("nothing was changed")
 
 
-def increments_per_revolution(drives: CanDrives) -> list[float | None]:
+def increments_per_revolution(drives: BusDrives) -> list[float | None]:
     """Return the position increments of a revolution of every axis, None where the drive does not say."""
     from drive_env.master import quantities
 
     return quantities.increments_per_revolution(drives)
 
 
-def axis_name(drives: CanDrives, axis: int) -> str:
+def axis_name(drives: BusDrives, axis: int) -> str:
     """Return what a line calls an axis: its node and, of a node with several, its number in the node."""
     node, part = divmod(axis, drives.description.num_axes)
     return f"node {drives.nodes[node]}" + (f" axis {part}" if drives.description.num_axes > 1 else "")
 
 
-def axis_place(drives: CanDrives, axis: int) -> dict[str, Any]:
+def axis_place(drives: BusDrives, axis: int) -> dict[str, Any]:
     """Return what JSON calls an axis, as `axis_name` does a line."""
     node, part = divmod(axis, drives.description.num_axes)
     return {"node": drives.nodes[node]} | ({"axis": part} if drives.description.num_axes > 1 else {})

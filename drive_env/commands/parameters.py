@@ -35,7 +35,7 @@ from drive_env.commands.tables import Column, print_table
 from mechanics.untrusted import read_toml
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
     from drive_env.master.identity import Identity
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
@@ -157,7 +157,7 @@ def restore(
         check_no_commands(wanted, file, known.hints)
         bus = _Bus(interface, channel, node, device, eds, bitrate, timeout)
 
-        def check(drives: CanDrives) -> None:
+        def check(drives: BusDrives) -> None:
             check_same_drive(file, written, read_identity(drives), other_drive=other_drive)
             if axis_then not in (None, axis) and not other_drive:
                 raise ValueError(
@@ -325,12 +325,12 @@ def _connected(
     return connect(interface, channel, [node], device, eds, **options)
 
 
-def _check_axis(drives: CanDrives, axis: int) -> None:
+def _check_axis(drives: BusDrives, axis: int) -> None:
     if not 0 <= axis < drives.num_axes:
         raise ValueError(f"--axis {axis}: the node has {drives.num_axes} axes, from 0")
 
 
-def _toml(drives: CanDrives, axis: int, values: Mapping[tuple[int, int], int]) -> str:
+def _toml(drives: BusDrives, axis: int, values: Mapping[tuple[int, int], int]) -> str:
     """Return parameters as TOML; the objects' names are comments, their index is what counts."""
     from drive_env.master.identity import read_identity
     from drive_env.whole_file import FORMAT

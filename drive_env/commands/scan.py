@@ -36,7 +36,7 @@ def scan(
 ) -> None:
     """Find nodes and read what they say of themselves: 1000h, 1008h to 100Ah, 1018h. Nothing is written."""
     with errors_as_exit_codes():
-        from drive_env.master.port import Port, open_bus
+        from drive_env.master.can.port import Port, open_bus
 
         check_time("--timeout", timeout)
         if last < first:
@@ -86,8 +86,8 @@ def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, st
 def _look(port: Any, node: int, state: str, timeout: float) -> dict[str, Any]:
     from drive_env.devices import device_of
     from drive_env.dictionary.aborts import ObjectAccessError
+    from drive_env.master.can.sdo import SdoClient
     from drive_env.master.errors import BusError, NoAnswerError
-    from drive_env.master.sdo import SdoClient
 
     sdo = SdoClient(port, node)
     row: dict[str, Any] = {"node": node, "state": state}

@@ -32,7 +32,7 @@ from drive_env.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 # Response and commands of the usual modes: what `drive-env check-model` needs.
 DEFAULT = ("6062", "6064", "606C", "60FF", "6077")
@@ -122,8 +122,8 @@ def new_files(out: Path) -> tuple[Path, Path]:
 
 def _listen(interface: str | None, channel: str | None, nodes: list[int] | None, bitrate: int | None) -> None:
     """Raise OtherMastersError where another master is at work; nothing is sent."""
-    from drive_env.master.other_masters import OtherMasters
-    from drive_env.master.port import Port, open_bus
+    from drive_env.master.can.other_masters import OtherMasters
+    from drive_env.master.can.port import Port, open_bus
 
     port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
     try:
@@ -163,7 +163,7 @@ def _fires(trigger: Trigger, values: Any, scales: list[float | None]) -> Any:
 
 
 def _record(
-    drives: CanDrives,
+    drives: BusDrives,
     entries: list[Any],
     trigger: Trigger | None,
     scales: list[float | None],
@@ -175,12 +175,11 @@ def _record(
     import numpy as np
 
     from drive_env.master.errors import BusError
-    from drive_env.master.other_masters import OtherMasters
 
     wanted = list(dict.fromkeys([*entries, trigger.entry] if trigger else entries))
     names = [(entry.index, entry.sub) for entry in wanted]
 
-    others = OtherMasters(drives.port, drives.nodes)
+    others = drives.link.other_masters()
 
     def record(seconds: float) -> dict[Any, Any]:
         try:
@@ -188,7 +187,7 @@ def _record(
         except BusError:
             others.check()  # samples that stay out are another master's doing, if there is one
             raise
-        drives.port.drain()
+        drives.link.drain()
         others.check()
         return {entry: trace[name] for entry, name in zip(wanted, names, strict=True)}
 

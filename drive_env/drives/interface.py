@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from drive_env.drives.observed import Observer
     from drive_env.drives.trace import Trace
     from drive_env.emulator.machine import Machines
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
     from drive_env.safety.envelope import Envelope
 
 Mask = NDArray[np.bool_]
@@ -58,7 +58,7 @@ class Drives(BasicDrives, Protocol):
         """The emulated machines' side that no bus shows."""
 
     @property
-    def bus(self) -> CanDrives | None:
+    def bus(self) -> BusDrives | None:
         """The same drives as those of a bus: its nodes, frames and single axes."""
 
     @property
@@ -105,7 +105,7 @@ def machine_of(drives: Drives) -> Machines:
     return drives.machine
 
 
-def bus_of(drives: Drives) -> CanDrives:
+def bus_of(drives: Drives) -> BusDrives:
     """Return the drives of a bus; ValueError for emulated ones."""
     if drives.bus is None:
         raise ValueError("these drives are on no bus; this takes CanDrives")

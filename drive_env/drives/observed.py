@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
     from drive_env.drives.emergency import EmergencyMessage
     from drive_env.emulator.machine import Machines
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
     from drive_env.safety.envelope import Envelope
 
 CYCLE = 0.001  # s
@@ -92,7 +92,7 @@ class ObservedDrives:
         return None if any(observer.hides_machine for observer in self._observers) else self._drives.machine
 
     @property
-    def bus(self) -> CanDrives | None:
+    def bus(self) -> BusDrives | None:
         """The same drives as those of a bus, unobserved."""
         return self._drives.bus
 

@@ -1,61 +1,30 @@
-"""Drives on a CAN bus behind the Drives interface: real ones, or the emulator served on a bus.
-
-`read` and `write` are SDO transfers, always: a mapped object's last sample is a cycle old, and what is written in a
-synchronous PDO acts at the next SYNC only, so that a program would see other integers than on `EmulatedDrives`.
-`record` samples in synchronous TPDOs and plays in synchronous RPDOs, which it maps as needed.
-"""
+"""Drives on a CAN bus: real ones, or the emulator served on a bus."""
 
 from __future__ import annotations
 
-import atexit
-import contextlib
-import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 import can
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from drive_env.devices import device_of, find_device
-from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.dictionary.access import check_readable, check_writable, checked_values
-from drive_env.dictionary.entries import Entry, ObjectName
-from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
-from drive_env.drives.emergency import EmergencyMessage
-from drive_env.drives.trace import Trace
-from drive_env.master.cycle_runner import CycleRunner
-from drive_env.master.description import Description, check_timeout, describe
-from drive_env.master.dry_run import DryPort, DrySdoClient
-from drive_env.master.errors import BusError, NoAnswerError
-from drive_env.master.network import PRE_OPERATIONAL, START, Network, check_nodes
-from drive_env.master.pace import LockstepPace, Pace, RealTimePace, Timing
-from drive_env.master.pdo import PdoConfiguration
-from drive_env.master.port import Port, open_bus
-from drive_env.master.process_data import ProcessData
-from drive_env.master.quantities import INCREMENTAL, increments_per_revolution, integers, is_quantity
-from drive_env.master.sampling import run_cycles
-from drive_env.master.sdo import SdoClient
-from drive_env.safety.envelope import Envelope
+from drive_env.dictionary.entries import ObjectName
+from drive_env.master.bus_drives import BusDrives, checked_limits
+from drive_env.master.can.can_link import CanLink
+from drive_env.master.can.dry_run import DryPort
+from drive_env.master.can.network import check_nodes
+from drive_env.master.can.port import Port, open_bus
+from drive_env.master.description import check_timeout, describe
+from drive_env.master.pace import LockstepPace, Pace, RealTimePace
 from drive_env.safety.limits import Limits
 
-logger = logging.getLogger(__name__)
 
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-Key = tuple[int, int]
-
-_DEVICE_TYPE, _EMCY_COB_ID = 0x1000, 0x1014
-_IDENTITY = {(0x1018, 1): "vendor", (0x1018, 2): "product"}
-
-
-class CanDrives:
+class CanDrives(BusDrives):
     """Drives on a CAN bus, with the interface of `EmulatedDrives`: the same calls, the same integers.
 
     Axes are those of the first node, then those of the second, and so on. Nodes are started (NMT) when PDOs or a
-    safeguard need it; PDO mapping and error control are put back as they were by `close`.
+    safeguard need it; PDO mapping and error control are put back as they were by `close`. `record` samples in
+    synchronous TPDOs and plays in synchronous RPDOs.
 
     Args:
         device: Name of a known device; ignored with `eds`.
@@ -78,11 +47,6 @@ class CanDrives:
         ValueError: For an unknown device or pace, a node-ID or a time-out that cannot be.
     """
 
-    machine = None  # what no bus shows exists on emulators only
-
-    machine = None  # of the Drives interface: what emulated drives alone have
-    observers = ()
-
     def __init__(
         self,
         device: str = "tmcm1636",
@@ -99,416 +63,30 @@ class CanDrives:
         dry_run: bool | Callable[[str], None] = False,
         **options: Any,
     ) -> None:
-        self._description: Description = describe(device, eds)
-        self._description.timeout = None if timeout is None else check_timeout(timeout)
+        description = describe(device, eds)
+        description.timeout = None if timeout is None else check_timeout(timeout)
         for name, value in (timeouts or {}).items():
-            entry = self._description.dictionary.find(name)
+            entry = description.dictionary.find(name)
             check_timeout(value)
-            self._description.timeouts[entry.index, entry.sub] = value
-        self.device = self._description.device
-        self.nodes = check_nodes(nodes)
-        self.num_axes = len(self.nodes) * self._description.num_axes
+            description.timeouts[entry.index, entry.sub] = value
+        node_ids = check_nodes(nodes)
         if pace not in ("real-time", "lockstep"):
             raise ValueError(f"pace is 'real-time' or 'lockstep', not {pace!r}")
-        if not isinstance(safety, bool | Limits):  # None, say, must not quietly mean that nobody watches
-            raise TypeError(
-                f"safety = {safety!r} must be Limits, True for those of the drives, or False for an emulator"
-            )
+        checked_limits(safety)
         # A dry run has nothing to wait for either.
         by_sync = pace == "lockstep" or bool(dry_run)
-        self._pace: Pace = LockstepPace() if by_sync else RealTimePace(self._description.cycle)
-        self._port, self._sdo = self._connect(dry_run, bus, interface, channel, options)
-        self._dry = bool(dry_run)
-        self._network = Network(self._port, self.nodes)
-        self._network.on_boot = lambda node: self._sdo[self.nodes.index(node)].forget()
-        self._pdos = [PdoConfiguration(n, s, self._description) for n, s in zip(self.nodes, self._sdo, strict=True)]
-        self._process = ProcessData(self._description, self._pdos)
-        self._cycle_runner = CycleRunner(
-            self._description, self.num_axes, self._port, self._pace, self._process, self.start, self._catch_up,
-            self._dry,
-        )  # fmt: skip
-        self._started = False
-        self._closed = False
-        self.safety: Envelope | None = None
-        limits = Limits() if safety is True else safety
-        try:
-            self._greet()
-            if limits:
-                self.safety = Envelope(limits, self)
-                self._network.on_restart = self._on_restart
-        except BaseException:
-            self._port.close()
-            raise
-        # Without `with`, an exception ends the interpreter through here, and the drives must not go on alone.
-        atexit.register(self.close)
-
-    # --- the interface --------------------------------------------------------------------------------------------
-    def read(self, name: ObjectName) -> Integers:
-        """Return an object as the wire carries it, int64 of shape (num_axes,); a text as an array of str.
-
-        An UNSIGNED64, which some drives have, comes as uint64.
-
-        Raises:
-            ObjectAccessError: If there is no such object or it cannot be read; NoAnswerError if a node is silent.
-        """
-        self._enter()
-        values: Integers = self.read_entry(self._description.dictionary.find(name))
-        return values
-
-    def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object of the axes where the mask is true: one integer, one per axis, or a quantity, "500 rpm".
-
-        Type, access and range are checked before anything is sent. What only a drive can tell it tells one axis after
-        the other: those before the one that refuses keep the new value.
-
-        Raises:
-            ObjectAccessError: With the SDO abort code, if the object, the value or the state does not allow it.
-            SafetyError: If a limit does not; NoAnswerError if a node is silent.
-            ValueError: For a quantity that the object is none of.
-        """
-        self._enter()
-        entry = self._description.dictionary.find(name)
-        check_writable(entry)
-        axes = checked_mask(where, self.num_axes)
-        if isinstance(value, str) and not self._description.is_number(entry):
-            for axis in np.flatnonzero(axes):
-                self.write_axis(entry, int(axis), value)
-            return
-        if is_quantity(value):
-            scale = increments_per_revolution(self) if entry.unit in INCREMENTAL else [None] * self.num_axes
-            value = integers(str(value), entry, scale, axes)
-        raw = checked_values(entry, value, self.num_axes)
-        if self.safety is not None:
-            self.safety.before_write(entry, raw, axes)
-        for axis in np.flatnonzero(axes):
-            self.write_axis(entry, int(axis), int(raw[axis]))
-        if self.safety is not None:
-            self.safety.after_write(entry, raw, axes)
-
-    def advance(self, duration: float) -> None:
-        """Let `duration` [s] pass, whole communication cycles, with a SYNC in each.
-
-        In real time the duration is kept: where this computer was late, SYNCs are left out.
-
-        Raises:
-            SafetyError: If a limit is passed meanwhile; the drives are in quick stop then.
-        """
-        self._enter()
-        cycles = self._cycles(duration)
-        if cycles == 0:
-            return
-        self._cycle_runner.pass_time(cycles, self.safety)
-
-    def record(
-        self,
-        objects: ObjectName | Sequence[ObjectName],
-        duration: float,
-        play: Mapping[Any, ArrayLike] | None = None,
-        period: float = 0.001,
-    ) -> Trace:
-        """Let `duration` [s] pass while objects are recorded and played.
-
-        Cycle k: row k of `play` goes out in synchronous RPDOs, then SYNC, at which the drives take it and sample row
-        k of `objects`, which comes back in synchronous TPDOs. Objects of the last call stay mapped: a call with the
-        same ones costs no configuration, so a policy may record and play cycle by cycle.
-
-        Args:
-            objects: What to record: one object, or several; objects that the drive can map to a TPDO.
-            duration: Whole communication cycles [s].
-            play: Object -> integers to write, shape (cycles,) or (cycles, num_axes); objects for an RPDO.
-            period: Time between samples [s], whole communication cycles.
-
-        Raises:
-            ObjectAccessError: For an object that cannot be mapped, for more than fit, or a value out of range.
-            ValueError: For times that are no whole cycles, or rows that do not fit.
-            SafetyError: If a limit is passed; the drives are in quick stop then.
-            NoAnswerError: If samples stay out.
-        """
-        self._enter()
-        cycles, every = self._cycles(duration), self._cycles(period)
-        if every < 1:
-            raise ValueError(f"period must be at least {self._description.cycle:g} s, not {period:g} s")
-        given = play or {}
-        call = self._cycle_runner.call(object_names(objects), tuple(given))
-        played = self._cycle_runner.rows(call, tuple(given.values()), cycles)
-        found = self._cycle_runner.record(call, played, cycles, self.safety)
-        rows = -(-cycles // every)
-        values = {}
-        for entry in call.sampled:
-            key = (entry.index, entry.sub)
-            values[key] = np.tile(self.read_entry(entry), (rows, 1)) if self._dry else found[key][::every]
-        times = np.arange(rows, dtype=np.float64) * (every * self._description.cycle)
-        return Trace(times, values, self._description.dictionary, lambda: increments_per_revolution(self))
-
-    def emergencies(self) -> list[EmergencyMessage]:
-        """Return and forget the emergency messages since the last call, axis by axis in the order of each axis.
-
-        A node with several axes does not say which one sent an emergency: its first one stands for it.
-        """
-        self._enter()
-        if self._pace.time_waits:
-            self._catch_up()
-        messages = []
-        for node, code, register, extra in self._network.take_emergencies():
-            axis = self.nodes.index(node) * self._description.num_axes
-            name = self._description.emergency_name(code, extra)
-            messages.append(EmergencyMessage(axis, code, register, extra, name))
-        return sorted(messages, key=lambda message: message.axis)
-
-    def reset_node(self, where: Mask | None = None) -> None:
-        """Reset the drives (NMT reset node): values return to the stored ones, the automaton starts anew.
-
-        Raises:
-            NoAnswerError: If a node does not boot; ValueError if only some axes of a node are chosen.
-        """
-        self._enter()
-        axes = checked_mask(where, self.num_axes).reshape(len(self.nodes), self._description.num_axes)
-        if np.any(axes.any(axis=1) != axes.all(axis=1)):
-            raise ValueError("a node is reset with all its axes; choose all axes of a node or none")
-        chosen = [k for k in range(len(self.nodes)) if axes[k].any()]
-        if not chosen:
-            return
-        if self.safety is not None:
-            self.safety.before_reset(chosen)
-        if not self._dry:
-            self._network.reset([self.nodes[k] for k in chosen])
-        self.forget(chosen)
-        if self.safety is not None:
-            self.safety.after_reset(chosen)
-
-    def close(self) -> None:
-        """Stop what still runs, put PDOs and error control back, and close the bus; the drives cannot be used after."""
-        if self._closed:
-            return
-        if self.safety is not None:
-            self.safety.close()  # if something ends this, close can be called again, and is at the interpreter's end
-        self._closed = True
-        atexit.unregister(self.close)
-        try:
-            for k, pdos in enumerate(self._pdos):
-                if self.safety is not None and self.safety.has_lost(k):
-                    continue  # it is left to its watchdog: what it hears is what it heard
-                with _logged(f"the PDOs of node {self.nodes[k]} stay as they are"):
-                    pdos.restore()
-        finally:
-            self._port.close()
-
-    def __enter__(self) -> CanDrives:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if error is not None and self.safety is not None and not self._closed:
-            self.safety.stop(f"{kind.__name__ if kind else 'an exception'} in the program")
-        self.close()
-
-    @property
-    def bus(self) -> CanDrives:
-        """These drives, where others have to do with a bus."""
-        return self
-
-    @property
-    def timing(self) -> Timing:
-        """How punctual the SYNCs of the last `advance` or `record` were."""
-        return self._pace.timing
-
-    @property
-    def total_timing(self) -> Timing:
-        """How punctual all SYNCs were since the drives were opened."""
-        return self._pace.total
-
-    # --- what the envelope and the tools use ----------------------------------------------------------------------
-    @property
-    def description(self) -> Description:
-        """What is known of the device."""
-        return self._description
+        paced: Pace = LockstepPace() if by_sync else RealTimePace(description.cycle)
+        port: Port
+        if dry_run:
+            port = DryPort(dry_run if callable(dry_run) else print)
+        elif bus is not None:
+            port = Port(bus, owned=False)
+        else:
+            port = Port(open_bus(interface, channel, **options))
+        self._port = port
+        super().__init__(CanLink(port, node_ids, description), description, paced, safety)
 
     @property
     def port(self) -> Port:
         """The bus."""
         return self._port
-
-    @property
-    def time_waits(self) -> bool:
-        """Whether no time passes between two calls (lockstep)."""
-        return self._pace.time_waits
-
-    def sdo(self, node: int) -> SdoClient:
-        """Return the SDO client of a node, by its position in `nodes`."""
-        client: SdoClient = self._sdo[node]
-        return client
-
-    def write_raw(self, entry: Entry, axis: int, value: int) -> None:
-        """Write an object of one axis, past what is lent to it."""
-        node, index, sub, label = self._place_of(entry, axis)
-        data = self._description.encode(entry, value)
-        self._sdo[node].write(index, sub, data, f"{value} to {label}", self._description.patience(entry))
-
-    def read_raw(self, entry: Entry, axis: int) -> Any:
-        """Read an object of one axis as the drive has it, also where that is lent."""
-        node, index, sub, label = self._place_of(entry, axis)
-        data = self._sdo[node].read(index, sub, label, self._description.patience(entry))
-        return self._description.decode(entry, data)
-
-    def forget(self, nodes: Sequence[int]) -> None:
-        """Forget what nodes, by position, were configured to: they have restarted."""
-        for k in nodes:
-            self._pdos[k].forget()
-        self._process.forget()
-        self._started = False
-
-    def must_start(self) -> None:
-        """Take note that a node is not operational any more: the next command starts it."""
-        self._started = False
-
-    def hear_errors(self, hear: Callable[[bytes], None] | None) -> None:
-        """Have the error control messages of the nodes (heartbeats) handed to a function; None ends that."""
-        self._network.on_error_control = None if hear is None else lambda node, data: hear(data)
-
-    def prepare_watch(self, envelope: Envelope) -> None:
-        """Have mapped what an envelope watches."""
-        self._cycle_runner.prepare(envelope)
-
-    def sampled_entries(self) -> tuple[Entry, ...]:
-        """Return what comes with every SYNC."""
-        return self._cycle_runner.mapped()
-
-    def poll(self, envelope: Envelope) -> bool | None:
-        """Look at the drives by a SYNC of one's own, as `CycleRunner.poll`."""
-        return self._cycle_runner.poll(envelope)
-
-    @property
-    def is_dry(self) -> bool:
-        """Whether frames are printed and none are sent."""
-        return self._dry
-
-    def start(self) -> None:
-        """Take the nodes to NMT operational, once."""
-        if not self._started:
-            self._network.command(START)
-            self._started = True
-
-    def read_entry(self, entry: Entry) -> Any:
-        """Read an object of every axis without being watched."""
-        entry = self._description.shown_by(entry)
-        check_readable(entry)
-        values = [self.read_axis(entry, axis) for axis in range(self.num_axes)]
-        if not self._description.is_number(entry):
-            return np.array(values)
-        return np.array(values, np.int64 if entry.high is None or entry.high < 2**63 else np.uint64)
-
-    def read_axis(self, entry: Entry, axis: int) -> Any:
-        """Read an object of one axis; of one that has another value meanwhile (`Limits`) the program's own."""
-        found = self.read_raw(entry, axis)
-        return found if self.safety is None or not isinstance(found, int) else self.safety.own(entry, axis, found)
-
-    def write_axis(self, entry: Entry, axis: int, value: int | str) -> None:
-        """Write an object of one axis without being watched."""
-        if isinstance(value, str):
-            node, index, sub, label = self._place_of(entry, axis)
-            data = self._description.encode(entry, value)
-            self._sdo[node].write(index, sub, data, f"{value} to {label}", self._description.patience(entry))
-        elif self.safety is None or not self.safety.write_lent(entry, axis, value):
-            self.write_raw(entry, axis, value)
-
-    def pass_cycle(self) -> None:
-        """Let one cycle pass without being watched."""
-        run_cycles(self._port, self._pace, 1, [], None, self._description.answer_timeout)
-        self._pace.end(self._port.receive)
-        if self._pace.time_waits:
-            self._catch_up()
-
-    # --- inside ---------------------------------------------------------------------------------------------------
-    def _place_of(self, entry: Entry, axis: int) -> tuple[int, int, int, str]:
-        """Return the node of an axis by its position, and index, sub-index and label of an object there."""
-        node, part = divmod(axis, self._description.num_axes)
-        return node, *self._description.key(entry, part), self._description.label(entry, part)
-
-    def _connect(
-        self,
-        dry_run: bool | Callable[[str], None],
-        bus: can.BusABC | None,
-        interface: str | None,
-        channel: str | None,
-        options: Mapping[str, Any],
-    ) -> tuple[Port, list[Any]]:
-        if dry_run:
-            dry = DryPort(dry_run if callable(dry_run) else print)
-            return dry, [DrySdoClient(dry, node, self._description) for node in self.nodes]
-        port = Port(bus, owned=False) if bus is not None else Port(open_bus(interface, channel, **options))
-        return port, [SdoClient(port, node, self._alive) for node in self.nodes]
-
-    def _greet(self) -> None:
-        """Check that every node is there and is the device it is taken for."""
-        known = self._description.dictionary
-        for k, node in enumerate(self.nodes):
-            axis = k * self._description.num_axes
-            kind = self._wake(node, axis)
-            for key, what in _IDENTITY.items():
-                if not self._description.has(key):
-                    continue
-                entry = known.find(key)
-                found = self.read_axis(entry, axis)
-                if entry.default and found != entry.default:
-                    raise BusError(
-                        f"node {node} is not a {self._description.name}: its {what} ({entry.label}) is {found:X}h, and "
-                        f"the EDS says {entry.default:X}h; give its own EDS (eds=..., --eds)"
-                    )
-            self._check_variant(node, kind)
-            if self._description.has(_EMCY_COB_ID):
-                self._network.move_emergencies(node, self.read_axis(known.find(_EMCY_COB_ID), axis))
-
-    def _check_variant(self, node: int, kind: int) -> None:
-        """Raise BusError for a node that is another variant of the device, which may count in other units."""
-        name, known = self._description.name, self._description.dictionary
-        if self.device is None or kind == known.find(_DEVICE_TYPE).default:
-            return
-        vendor, product = (int(known.find((0x1018, sub)).default) for sub in (1, 2))
-        other = device_of(kind, vendor, product)
-        if other is not None and find_device(other).new_dictionary().find(_DEVICE_TYPE).default == kind:
-            raise BusError(
-                f"node {node} is a {other}, not a {name}: its device type (1000h:00) is {kind:08X}h; name it so "
-                f"(device={other!r}, --device {other})"
-            )
-
-    def _wake(self, node: int, axis: int) -> int:
-        """Have a node answer, and return its 1000h; one that is stopped, as it is after a master died, is woken."""
-        entry = self._description.dictionary.find(_DEVICE_TYPE)
-        try:
-            return int(self.read_axis(entry, axis))
-        except NoAnswerError:
-            self._network.command(PRE_OPERATIONAL, (node,))
-            kind = int(self.read_axis(entry, axis))
-            logger.warning("node %d was stopped (a master that died?) and is pre-operational now", node)
-            return kind
-
-    def _enter(self) -> None:
-        if self._closed:
-            raise BusError("these drives are closed; open them again")
-        if self.safety is not None:
-            self.safety.enter()
-
-    def _on_restart(self, node: int) -> None:
-        if self.safety is not None:
-            self.safety.restarted(self.nodes.index(node))
-
-    def _alive(self) -> None:
-        if self.safety is not None:
-            self.safety.alive()
-
-    def _catch_up(self) -> None:
-        """Return when an emulator in lockstep has simulated every SYNC: it answers in order."""
-        self.read_axis(self._description.dictionary.find(_DEVICE_TYPE), 0)
-
-    def _cycles(self, duration: float) -> int:
-        return whole_cycles(duration, self._description.cycle)
-
-
-@contextlib.contextmanager
-def _logged(consequence: str) -> Any:
-    """Log a failure to tidy up, and go on: what remains must be tried, too."""
-    try:
-        yield
-    except (BusError, ObjectAccessError) as error:
-        logger.error("%s: %s", error, consequence)

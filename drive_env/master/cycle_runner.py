@@ -1,4 +1,4 @@
-"""Communication cycles of `advance` and `record`: objects into PDOs, rows out and in, under the envelope's eyes."""
+"""Communication cycles of `advance` and `record`: objects mapped, rows out and in, under the envelope's eyes."""
 
 from __future__ import annotations
 
@@ -12,15 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
-from drive_env.canopen.frames import SYNC
 from drive_env.dictionary.access import check_in_range, check_readable, check_writable
 from drive_env.dictionary.entries import Entry, ObjectName
 from drive_env.master.description import Description, Key
+from drive_env.master.link import Link, Outputs, Samples
 from drive_env.master.pace import Pace
-from drive_env.master.pdo import INTO_DRIVE, OUT_OF_DRIVE, check_mappable
-from drive_env.master.port import Port
-from drive_env.master.process_data import ProcessData
-from drive_env.master.sampling import Bytes, Samples, run_cycles
+from drive_env.master.sampling import run_cycles
 
 if TYPE_CHECKING:
     from drive_env.safety.envelope import Envelope
@@ -59,28 +56,24 @@ class CycleRunner:
     Args:
         description: What device the nodes are.
         num_axes: Axes of all nodes.
-        port: The bus.
+        link: The bus.
         pace: When SYNCs are due.
-        process: The nodes' process data.
-        start: Takes the nodes to NMT operational, once.
+        start: Takes the nodes to where they exchange process data, once.
         catch_up: Returns when nodes in lockstep have seen every SYNC.
-        dry: Nobody is there: nothing is sampled.
     """
 
     def __init__(
         self,
         description: Description,
         num_axes: int,
-        port: Port,
+        link: Link,
         pace: Pace,
-        process: ProcessData,
         start: Callable[[], None],
         catch_up: Callable[[], None],
-        dry: bool,
     ) -> None:
         self._description, self._num_axes = description, num_axes
-        self._port, self._pace, self._process = port, pace, process
-        self._start, self._catch_up, self._dry = start, catch_up, dry
+        self._link, self._pace, self._process = link, pace, link.process
+        self._start, self._catch_up = start, catch_up
         self._calls: dict[object, RecordCall] = {}
         self._running = threading.RLock()  # one user of SYNC at a time: the program, or its supervisor
         self._nothing = RecordCall((), ())
@@ -91,9 +84,9 @@ class CycleRunner:
             samples = None
             if envelope is not None:
                 self._map(self._nothing, envelope)
-                samples = self._samples()
-            self._run(cycles, [], samples, envelope, skip_missed=True)
-            self._pace.end(self._port.receive)
+                samples = self._process.samples()
+            self._run(cycles, None, samples, envelope, skip_missed=True)
+            self._pace.end(self._link.receive)
 
     def prepare(self, envelope: Envelope) -> None:
         """Have mapped what the envelope watches, as far as it fits."""
@@ -112,16 +105,16 @@ class CycleRunner:
         if not self._running.acquire(blocking=False):
             return None
         try:
-            samples, epoch = self._samples(), envelope.epoch
+            samples, epoch = self._process.samples(), envelope.epoch
             if samples is None:
                 return None
             try:
-                self._port.send(SYNC)
-                if not self._port.wait(lambda: samples.complete() >= 1, POLL_TIMEOUT):
+                self._link.sync()
+                if not self._link.wait(lambda: samples.complete() >= 1, POLL_TIMEOUT):
                     return False
             finally:
                 samples.close()
-            rows = self._process.decode(samples, 0, 1)
+            rows = samples.decode(0, 1)
         finally:
             self._running.release()
         envelope.observe(rows, epoch)
@@ -143,11 +136,11 @@ class CycleRunner:
         sampled = tuple(dict.fromkeys(entries.find(name) for name in objects))
         for entry in sampled:
             check_readable(entry)
-        check_mappable(self._description, sampled, OUT_OF_DRIVE)
+        self._process.check_sampled(sampled)
         played = tuple(entries.find(name) for name in play)
         for entry in played:
             check_writable(entry)
-        check_mappable(self._description, played, INTO_DRIVE)
+        self._process.check_played(played)
         if len(self._calls) >= MOST_CALLS:
             self._calls.clear()
         made = self._calls[names] = RecordCall(sampled, played)
@@ -180,10 +173,10 @@ class CycleRunner:
             envelope.before_play(played)
         with self._running:
             self._map(call, envelope)
-            rpdos = self._process.encode(played) if played else []
-            samples = self._samples()
+            outputs = self._process.outputs(played)
+            samples = self._process.samples()
             epoch = None if any((entry.index, entry.sub) == CONTROLWORD for entry in played) else _NOW
-            found = self._run(cycles, rpdos, samples, envelope, epoch=epoch)
+            found = self._run(cycles, outputs, samples, envelope, epoch=epoch)
         if envelope is not None and cycles:
             envelope.after_play(played)
         return found
@@ -196,23 +189,18 @@ class CycleRunner:
             call.watched, call.chosen, call.mapping = watched, self._process.choose(call.sampled, watched), -1
         if call.mapping == self._process.mapping:
             return
-        for direction, entries in ((INTO_DRIVE, tuple(dict.fromkeys(call.played))), (OUT_OF_DRIVE, call.chosen)):
-            wanted = bool(entries) or direction is OUT_OF_DRIVE
-            if wanted and not self._process.is_mapped(direction, entries):
-                self._start()
-                self._process.map(direction, entries)
+        played = tuple(dict.fromkeys(call.played))
+        if not self._process.is_mapped(played, call.chosen):
+            self._start()
+            self._process.map(played, call.chosen)
         call.mapping = self._process.mapping
         if envelope is not None:
             envelope.sampled(self._process.sampled_entries())
 
-    def _samples(self) -> Samples | None:
-        pdos = self._process.sampled()
-        return Samples(self._port, pdos) if pdos and not self._dry else None
-
     def _run(
         self,
         cycles: int,
-        rpdos: list[tuple[int, Bytes]],
+        outputs: Outputs | None,
         samples: Samples | None,
         envelope: Envelope | None,
         *,
@@ -229,15 +217,15 @@ class CycleRunner:
 
             def watch(first: int, end: int) -> None:
                 nonlocal last
-                last = (first, end, self._process.decode(held, first, end))
+                last = (first, end, held.decode(first, end))
                 watcher.observe(last[2], asked)
 
         try:
             run_cycles(
-                self._port,
+                self._link,
                 self._pace,
                 cycles,
-                rpdos,
+                outputs,
                 samples,
                 self._description.answer_timeout,
                 observe=watch,
@@ -258,4 +246,4 @@ class CycleRunner:
             return {}
         if last is not None and last[:2] == (0, cycles):
             return last[2]
-        return self._process.decode(samples, 0, cycles)
+        return samples.decode(0, cycles)

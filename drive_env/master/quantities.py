@@ -18,7 +18,7 @@ from drive_env.dictionary.entries import Entry
 from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 
 class EnteredUnit(NamedTuple):
@@ -62,7 +62,7 @@ def find_unit(name: str, increments: float | None) -> EnteredUnit | None:
     return UNITS.get(name)
 
 
-def increments_per_revolution(drives: CanDrives) -> list[float | None]:
+def increments_per_revolution(drives: BusDrives) -> list[float | None]:
     """Return the position increments of a revolution of every axis, None where the drive does not say.
 
     Args:

@@ -18,7 +18,7 @@ from drive_env.safety.objects import CURRENT, HM, POSITION, STATUSWORD, VELOCITY
 from drive_env.safety.rotor import RotorAngle, wrapped
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -55,7 +55,7 @@ class Axes:
         is_counted: Whether 606Ch counts what 6064h counts, per second.
     """
 
-    def __init__(self, drives: CanDrives) -> None:
+    def __init__(self, drives: BusDrives) -> None:
         self._drives = drives
         known = drives.description
         self.is_counted = known.has(VELOCITY) and known.dictionary.find(VELOCITY).unit == COUNTED

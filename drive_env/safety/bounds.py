@@ -18,7 +18,7 @@ from drive_env.safety.objects import VELOCITY
 from drive_env.safety.rotor import HOME_OFFSET, RotorAngle
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -100,7 +100,7 @@ class RotorLimits:
     following: Floats
 
 
-def rotor_limits(limits: Limits, drives: CanDrives, rotor: RotorAngle, here: Integers) -> RotorLimits:
+def rotor_limits(limits: Limits, drives: BusDrives, rotor: RotorAngle, here: Integers) -> RotorLimits:
     """Return what the user's limits are of the rotors now.
 
     Args:
@@ -121,12 +121,12 @@ def rotor_limits(limits: Limits, drives: CanDrives, rotor: RotorAngle, here: Int
     )
 
 
-def _speed_unit(drives: CanDrives) -> str:
+def _speed_unit(drives: BusDrives) -> str:
     known = drives.description
     return known.dictionary.find(VELOCITY).unit if known.has(VELOCITY) else ""
 
 
-def read_bounds(limits: Limits, drives: CanDrives, rotor: RotorAngle, of_rotors: RotorLimits) -> Bounds:
+def read_bounds(limits: Limits, drives: BusDrives, rotor: RotorAngle, of_rotors: RotorLimits) -> Bounds:
     """Return the limits of every axis; those that the user left open are read from the drives.
 
     Args:
@@ -183,7 +183,7 @@ def read_bounds(limits: Limits, drives: CanDrives, rotor: RotorAngle, of_rotors:
 REST_TURNS, REST_INCREMENTS = 0.15, 2000.0  # rev/s, inc/s: what a velocity filter may show of a rotor at rest
 
 
-def _own_range(drives: CanDrives) -> tuple[Integers, Integers]:
+def _own_range(drives: BusDrives) -> tuple[Integers, Integers]:
     """Return 607Dh, corrected by the home offset (CiA 402); what is no range is none."""
     low, high = read_own(drives, POSITION_LOW, -NO_LIMIT), read_own(drives, POSITION_HIGH, NO_LIMIT)
     # The ends of the type, which are the factory's, are no limits; neither is an empty range.
@@ -195,7 +195,7 @@ def _own_range(drives: CanDrives) -> tuple[Integers, Integers]:
     )
 
 
-def read_own(drives: CanDrives, key: Key, absent: int) -> Integers:
+def read_own(drives: BusDrives, key: Key, absent: int) -> Integers:
     """Return an object of every axis, or what stands for it where the drive does not have it, whatever its EDS says."""
     if drives.description.has(key):
         with contextlib.suppress(RefusedError):
@@ -209,7 +209,7 @@ def _at_scale(user: Floats, now: Floats) -> Floats:
     return np.where(np.isfinite(now), np.maximum(np.floor(now + 1e-6), 1.0), user)
 
 
-def _magnitude(drives: CanDrives, user: Floats, key: Key | None) -> Integers:
+def _magnitude(drives: BusDrives, user: Floats, key: Key | None) -> Integers:
     """Return the user's limit, or the drive's if it has one; 0 and the end of the type switch the drive's off."""
     if np.isnan(user).any() and key is not None:
         found = read_own(drives, key, NO_LIMIT)
@@ -233,7 +233,7 @@ def increments_per_count(unit: str, scale: Floats) -> Floats:
     return np.where(scale > 1.0, scale / 60.0, np.nan) if unit in BY_MINUTE else np.full(len(scale), np.nan)
 
 
-def _rate(drives: CanDrives, key: Key, scale: Floats) -> Floats:
+def _rate(drives: BusDrives, key: Key, scale: Floats) -> Floats:
     """Return a deceleration [inc/s^2]; 0 where the drive has none, or counts it in units that we do not know."""
     known = drives.description
     if not known.has(key):

@@ -42,7 +42,7 @@ from drive_env.safety.objects import (
 from drive_env.safety.rotor import scale_objects
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -76,7 +76,7 @@ class Commands:
         modes: Returns the mode of operation of every axis.
     """
 
-    def __init__(self, drives: CanDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
+    def __init__(self, drives: BusDrives, axes: Axes, limits: LimitsInForce, modes: Callable[[], Integers]) -> None:
         self._drives = drives
         self._known = drives.description.dictionary
         self._current_limit = drives.description.role(Role.CURRENT_LIMIT)

@@ -5,7 +5,7 @@ Four lines of defence, each for the failure of the one before:
 - what the drives do is watched, by the samples of every communication cycle and otherwise by a thread of its own
   (`watch.py`, `judging.py`), and they are stopped by grades (`stop_runner.py`, `stopping.py`);
 - limits that are tighter than the drives' own are lent to them (`limits_in_force.py`, `lending.py`);
-- a process that dies is noticed by the drives themselves (`watchdogs.py`, `error_control.py`).
+- a process that dies is noticed by the drives themselves (`watchdogs.py`, `master/can/error_control.py`).
 
 Whether an axis is live is what its statusword says, and it counts as live from before a frame that could enable it is
 sent. A watchdog is given up only where the statusword, read back, shows every axis of its node off.
@@ -59,7 +59,7 @@ from drive_env.safety.watch import Watch
 from drive_env.safety.watchdogs import Watchdogs
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 logger = logging.getLogger(__name__)
 
@@ -85,7 +85,7 @@ class Envelope:
         ValueError: For limits that do not fit the number of axes.
     """
 
-    def __init__(self, limits: Limits, drives: CanDrives) -> None:
+    def __init__(self, limits: Limits, drives: BusDrives) -> None:
         limits.check_axes(drives.num_axes)
         self._drives = drives
         self._known = drives.description.dictionary
@@ -116,7 +116,7 @@ class Envelope:
         """What samples are asked for in: it grows with every controlword."""
         return self._axes.epoch
 
-    # --- what CanDrives calls -------------------------------------------------------------------------------------
+    # --- what BusDrives calls -------------------------------------------------------------------------------------
     def change(self, limits: Limits) -> None:
         """Take other limits; those of position are places of the rotors as 6064h shows them now."""
         limits.check_axes(self._drives.num_axes)

@@ -16,7 +16,7 @@ from drive_env.master.errors import BusError
 from drive_env.master.tidying import Tidying
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ class Lending:
         drives: The drives.
     """
 
-    def __init__(self, drives: CanDrives) -> None:
+    def __init__(self, drives: BusDrives) -> None:
         self._drives = drives
         self._loans: dict[tuple[Key, int], Loan] = {}
 

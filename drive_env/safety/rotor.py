@@ -13,7 +13,7 @@ from drive_env.master.description import Description, Key
 from drive_env.master.errors import RefusedError
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -72,7 +72,7 @@ def scale_objects(description: Description) -> tuple[Key, ...]:
     )
 
 
-def read_scale(drives: CanDrives) -> Floats:
+def read_scale(drives: BusDrives) -> Floats:
     """Return the increments of a revolution of every axis; nan where the drive does not say."""
     keys = scale_objects(drives.description)
     known = drives.description.dictionary

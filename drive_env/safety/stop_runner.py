@@ -21,7 +21,7 @@ from drive_env.safety.objects import CONTROLWORD, QUICK_STOP_OPTION
 from drive_env.safety.stopping import AxisStop, Phase, Sample, Stop
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class StopRunner:
     """
 
     def __init__(
-        self, drives: CanDrives, axes: Axes, limits: LimitsInForce, lending: Lending, cease: Callable[[], None]
+        self, drives: BusDrives, axes: Axes, limits: LimitsInForce, lending: Lending, cease: Callable[[], None]
     ) -> None:
         self.current: Stop | None = None
         self._drives = drives

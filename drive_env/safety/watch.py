@@ -28,7 +28,7 @@ from drive_env.safety.supervisor import Supervisor
 from drive_env.safety.watchdogs import Watchdogs
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ class Watch:
 
     def __init__(
         self,
-        drives: CanDrives,
+        drives: BusDrives,
         axes: Axes,
         limits: LimitsInForce,
         stops: StopRunner,
@@ -189,8 +189,8 @@ class Watch:
         else:
             return
         raise SafetyError(
-            "a node sends no process data at SYNC, though it was started: it cannot be watched; check 1005h and 18xxh, "
-            "and whether another master is on the bus"
+            "a node sends no process data at SYNC, though it was started: it cannot be watched; "
+            f"{self._drives.link.wording.check_samples}"
         )
 
     def observe(self, rows: Mapping[Key, Integers], epoch: int, where: Mask | None = None) -> None:
@@ -360,15 +360,12 @@ class Watch:
             self._missed = 0
             self._drives.must_start()
             self._stops.stop_for(
-                "a node sends no process data any more: it left NMT operational", "is another master there?"
+                f"a node sends no process data any more: it left {self._drives.link.wording.operational}",
+                "is another master there?",
             )
-        if (node := self._watchdogs.take_shared_id()) is not None:
-            self._axes.is_armed = False  # under another node-ID, once the program enables anew
-            self._stops.stop_for(
-                f"another program sends heartbeats as node-ID {node}, too, so that the drives would not notice the "
-                "death of either",
-                "end one of them",
-            )
+        if rival := self._watchdogs.take_rival():
+            self._axes.is_armed = False  # the watchdogs are set anew once the program enables
+            self._stops.stop_for(rival, "end one of them")
         pause = now - self._alive
         stall = self._limits.user.stall
         if stall is not None and pause > stall:

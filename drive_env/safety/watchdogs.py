@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,9 +10,9 @@ import numpy as np
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.errors import BusError
+from drive_env.master.link import NoWatchdogError
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import POSITION_HIGH
-from drive_env.safety.error_control import Beats, ErrorControl, Heartbeats, NoWatchdogError
 from drive_env.safety.errors import SafetyError, logged
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits import NO_LIMIT
@@ -21,13 +20,13 @@ from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.objects import CONTROLWORD, STATUSWORD
 
 if TYPE_CHECKING:
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.bus_drives import BusDrives
 
 logger = logging.getLogger(__name__)
 
-LEAST_SILENCE = 0.06  # s; what heartbeats of a computer that does other things besides can keep
+LEAST_SILENCE = 0.06  # s; what a computer that does other things besides can keep
 OF_TRAVEL = 0.25  # of the travel, that a dead master may use up
-LOCKSTEP_LOOK = 0.012  # s for which a drive in lockstep must stand still
+ROUNDING = 0.001  # s by which a drive may act later than asked: watchdogs count milliseconds
 
 
 class Watchdogs:
@@ -40,18 +39,14 @@ class Watchdogs:
         lending: What the drives have for a while, and get back before their watchdogs are given up.
     """
 
-    def __init__(self, drives: CanDrives, axes: Axes, limits: LimitsInForce, lending: Lending) -> None:
+    def __init__(self, drives: BusDrives, axes: Axes, limits: LimitsInForce, lending: Lending) -> None:
         self._drives = drives
         self._known = drives.description.dictionary
         self._axes = axes
         self._limits = limits
         self._lending = lending
-        self._heartbeats = Heartbeats(drives.port, drives.nodes)
-        self._controls = [
-            ErrorControl(node, drives.sdo(k), drives.description, self._heartbeats)
-            for k, node in enumerate(drives.nodes)
-        ]
-        self._beats: Beats | None = None
+        self._watch = drives.link.watch
+        self._is_set = False
         self._is_lockstep_proved = False
 
     def check(self) -> None:
@@ -60,59 +55,57 @@ class Watchdogs:
         Raises:
             BusError: If a node does not answer.
         """
-        if self._beats is None:
+        if not self._is_set:
             return
-        for control in self._controls:
-            if not control.is_in_force():
+        for k in range(len(self._drives.nodes)):
+            if not self._watch.is_in_force(k):
                 self._axes.is_armed = False
 
     def keep(self) -> None:
-        """Send the heartbeats that are due."""
-        if self._beats is not None:
-            self._beats.keep()
+        """Have the drives hear that this process lives, when it is due."""
+        self._watch.keep()
 
     def cease(self) -> None:
-        """Send no heartbeats any more, so that the drives stop by themselves."""
-        if self._beats is not None:
-            self._beats.cease()
+        """Have the drives hear nothing any more, so that they stop by themselves."""
+        self._watch.cease()
 
     def end(self) -> None:
-        """Send no heartbeats any more, since the watchdogs are given up."""
-        self._beats = None
+        """Have the drives hear nothing any more, since the watchdogs are given up."""
+        self._watch.end()
+        self._is_set = False
 
     def forget(self, node: int) -> None:
-        """Take note that a node, by position, was reset: its error control is its own again."""
-        self._controls[node].forget()
+        """Take note that a node, by position, was reset: its watchdog is its own again."""
+        self._watch.forget(node)
 
-    def take_shared_id(self) -> int | None:
-        """Return, once, the node-ID as which another program sends heartbeats, too; None if none does."""
-        if not self._heartbeats.is_shared or self._beats is None:
-            return None
-        node, self._heartbeats.node_id = self._heartbeats.node_id, 0
-        return node
+    def take_rival(self) -> str:
+        """Return, once, which other program keeps the drives from noticing this one's death; "" if none does."""
+        return self._watch.take_rival()
 
     def set(self) -> None:
-        """Have every drive watch over its master, and begin to send heartbeats; in lockstep, prove that time waits.
+        """Have every drive watch over its master, and begin to be heard; in lockstep, prove that time waits.
 
         Raises:
-            SafetyError: If a drive cannot watch, or time does not wait.
+            SafetyError: If a drive cannot watch, or not as soon as it must, or time does not wait.
         """
         if self._drives.time_waits:
             self._prove_lockstep()
             return
         if self._limits.user.silence is None:
             logger.warning("Limits(silence=None): no drive stops by itself when this process dies")
-            self._beats = None
+            self.end()
             return
-        self._heartbeats.choose()
         silence = self._silence()
         try:
-            for control in self._controls:
-                control.configure(silence)
+            self._watch.begin(silence)
         except NoWatchdogError as error:
             raise SafetyError(f"{error}") from None
-        self._beats = Beats(self._heartbeats, self._controls, silence)
-        self._beats.begin()
+        self._is_set = True
+        if self._watch.detection_time > silence + ROUNDING:
+            raise SafetyError(
+                f"the drives notice that this process is dead after {self._watch.detection_time:g} s, and {silence:g} "
+                "s are allowed; give Limits(silence=...) as long, or a position limit that leaves the room"
+            )
 
     def _silence(self) -> float:
         """Return after which silence the drives act [s]: a dead master must not leave the travel.
@@ -151,48 +144,30 @@ class Watchdogs:
         return chosen
 
     def _prove_lockstep(self) -> None:
-        """Raise SafetyError if time passes on a bus on which it should wait for SYNC.
-
-        A drive that sends heartbeats by itself tells it: none is due while no SYNC is sent.
-        """
-        producer = (0x1017, 0)
-        if self._is_lockstep_proved or not self._drives.description.has(producer):
+        """Raise SafetyError if time passes on a bus on which it should wait for SYNC."""
+        if self._is_lockstep_proved:
             return
-        entry = self._known.find(producer)
-        beats: list[bytes] = []
-        try:
-            before = int(self._drives.read_raw(entry, 0))
-            self._drives.hear_errors(beats.append)
-            self._drives.write_raw(entry, 0, 1)
-            self._drives.port.drain()
-            beats.clear()
-            time.sleep(LOCKSTEP_LOOK)
-            self._drives.read_raw(entry, 0)  # whoever is late answers after what was due before
-            self._drives.write_raw(entry, 0, before)
-        except ObjectAccessError:
-            return  # a drive without: nothing to tell it by
-        finally:
-            self._drives.hear_errors(None)
-        if len(beats) > 1:
+        passes = self._drives.link.time_passes()
+        if passes:
             raise SafetyError(
                 "pace='lockstep' is for an emulator that is served with --lockstep, and time passes on this bus by "
                 "itself: nobody would watch between two calls; open the drives with pace='real-time'"
             )
-        self._is_lockstep_proved = True
+        self._is_lockstep_proved = passes is not None
 
     def give_up(self) -> None:
         """Give drives back what they had and their watchdogs; what is not proved off keeps them and hears no more."""
         per_node = self._drives.description.num_axes
-        for k, (node, control) in enumerate(zip(self._drives.nodes, self._controls, strict=True)):
+        for k, node in enumerate(self._drives.nodes):
             axes = range(k * per_node, (k + 1) * per_node)
-            is_untouched = control.kind == "none" and not self._lending.has_lent(set(axes))
+            is_untouched = not self._watch.is_set(k) and not self._lending.has_lent(set(axes))
             if is_untouched and not self._axes.may_turn[axes.start : axes.stop].any():
                 continue
             if all(self._is_proved_off(axis) for axis in axes):
                 with logged():
                     self._lending.give_back(set(axes))
                 with logged():
-                    control.restore()
+                    self._watch.restore(k)
                 self._axes.take_for_off(self._axes.of_nodes([k]))
                 continue
             self._axes.lost.update(axes)
@@ -201,7 +176,7 @@ class Watchdogs:
                 "node %d could not be proved to be off: %s. Look at the machine, and keep the emergency stop at hand",
                 node,
                 "its watchdog stays, and it hears no more heartbeats, so that it stops by itself"
-                if control.kind != "none"
+                if self._watch.is_set(k)
                 else "it has no watchdog",
             )
 

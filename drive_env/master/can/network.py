@@ -5,26 +5,17 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
-from typing import NamedTuple
 
 from drive_env.canopen.frames import EMCY, ERROR_CONTROL, IDENTIFIER, INVALID, NMT
+from drive_env.master.can.port import Port
 from drive_env.master.errors import NoAnswerError
-from drive_env.master.port import Port
+from drive_env.master.link import ReceivedEmergency
 
 START, PRE_OPERATIONAL, RESET_NODE = 0x01, 0x80, 0x81  # NMT commands (CiA 301, 7.2.8.3.1)
 BOOT_UP = 0x00  # in an error control message
 BOOT_TIMEOUT = 5.0  # from a reset to the boot-up message [s]
 MAX_NODE = 127
 _EMCY_LAYOUT = struct.Struct("<HB5s")
-
-
-class ReceivedEmergency(NamedTuple):
-    """An emergency message of a node."""
-
-    node: int
-    code: int
-    error_register: int
-    extra: tuple[int, ...]
 
 
 class Network:

@@ -15,10 +15,10 @@ import canopen
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 from canopen.sdo.client import SdoClient as CanopenClient
 
-from drive_env.canopen.frames import ERROR_CONTROL, NMT, SDO_REQUEST, SDO_RESPONSE
+from drive_env.canopen.frames import NMT, SDO_REQUEST, SDO_RESPONSE
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.master.can.port import Port
 from drive_env.master.errors import BusError, NoAnswerError, refused
-from drive_env.master.port import Port
 
 _ABORT = 0x80
 _INITIATE = (0x40, 0x60)  # upload and download responses that name their object, upper three bits
@@ -108,10 +108,6 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
     def forget(self) -> None:
         """End the transfer that is under way: the node has booted, and knows nothing of it."""
         self._has_booted = True
-
-    def guard(self) -> None:
-        """Ask the node for its life (node guarding, CiA 301)."""
-        self._port.send(ERROR_CONTROL + self._node, remote=True, length=1)
 
     def _transfer(self, index: int, sub: int, data: bytes | None, what: str, timeout: float) -> bytes:
         with self._turn:

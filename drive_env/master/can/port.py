@@ -16,8 +16,8 @@ from typing import Any
 
 import can
 
+from drive_env.master.can.slcan_socket import SlcanSocket
 from drive_env.master.errors import BusError, OpenError
-from drive_env.master.slcan_socket import SlcanSocket
 
 Handler = Callable[[bytes], None]
 

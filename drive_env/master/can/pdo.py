@@ -9,10 +9,11 @@ from typing import NamedTuple
 from drive_env.canopen.frames import EXTENDED, IDENTIFIER, INVALID, RPDO, TPDO
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.master.can.mapping import PDO_BITS, Slots, pack
 from drive_env.master.description import Description
 from drive_env.master.errors import BusError, RefusedError
-from drive_env.master.mapping import PDO_BITS, Slots, pack
-from drive_env.master.sdo import SdoClient
+from drive_env.master.link import ObjectClient
+from drive_env.master.packing import Member
 from drive_env.master.tidying import Tidying
 
 # Transmission types of a TPDO (CiA 301, table 74): at each SYNC; with a SYNC at all.
@@ -32,15 +33,6 @@ class Direction(NamedTuple):
 
 INTO_DRIVE = Direction("RPDO", "played", 0x1400, 0x1600, RPDO)
 OUT_OF_DRIVE = Direction("TPDO", "recorded", 0x1800, 0x1A00, TPDO)
-
-
-class Member(NamedTuple):
-    """An object in a PDO: of which axis of the node, at which byte, how many."""
-
-    entry: Entry
-    axis: int
-    start: int
-    size: int
 
 
 class RemotePdo(NamedTuple):
@@ -134,7 +126,7 @@ class PdoConfiguration:
         description: What device it is.
     """
 
-    def __init__(self, node: int, sdo: SdoClient, description: Description) -> None:
+    def __init__(self, node: int, sdo: ObjectClient, description: Description) -> None:
         self._node = node
         self._sdo = sdo
         self._description = description

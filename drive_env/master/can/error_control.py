@@ -6,19 +6,18 @@ Each process sends heartbeats under a node-ID of its own: two that shared one wo
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
-from drive_env import cia402
 from drive_env.canopen.frames import ERROR_CONTROL
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.master.can.port import Port
+from drive_env.master.changed_objects import REMEDY, ChangedObjects
 from drive_env.master.description import Description
-from drive_env.master.errors import BusError
-from drive_env.master.port import Port
-from drive_env.master.sdo import SdoClient
-from drive_env.master.tidying import Tidying
+from drive_env.master.link import NoWatchdogError, ObjectClient
 
 logger = logging.getLogger(__name__)
 
@@ -28,13 +27,7 @@ BEATS_PER_TIMEOUT = 3  # of which two may be lost
 FIRST_BEATS = 3  # a drive watches from the first heartbeat that it gets on: one that is lost must not be the only one
 STAYS = 1  # 1029h:01: a communication error changes nothing (CiA 301, and the TMCM-1636)
 
-# 6007h, what an axis does when its connection is lost (CiA 402): nothing, or the quick stop.
-_ABORT_CONNECTION, NO_ACTION, QUICK_STOP_THEN = (cia402.ABORT_CONNECTION_OPTION, 0), b"\0\0", b"\3\0"
 _CONSUMERS, _GUARD_TIME, _LIFE_FACTOR, _ERROR_BEHAVIOUR = 0x1016, (0x100C, 0), (0x100D, 0), (0x1029, 1)
-
-
-class NoWatchdogError(BusError):
-    """A drive cannot watch over its master; the message says why and what to do."""
 
 
 class Heartbeats:
@@ -89,17 +82,24 @@ class ErrorControl:
         sdo: Its SDO client.
         description: What device it is.
         heartbeats: Those of this process.
+        guard: Asks the node for its life.
+
+    Attributes:
+        kind: "heartbeat", "life guarding" or "none".
+        time: The silence after which the node acts [s].
     """
 
-    def __init__(self, node: int, sdo: SdoClient, description: Description, heartbeats: Heartbeats) -> None:
+    def __init__(
+        self, node: int, sdo: ObjectClient, description: Description, heartbeats: Heartbeats, guard: Callable[[], None]
+    ) -> None:
         self._node = node
-        self._sdo = sdo
         self._description = description
         self._heartbeats = heartbeats
-        self._before: dict[tuple[int, int], bytes] = {}
-        self._set: dict[tuple[int, int], bytes] = {}
+        self._guard = guard
+        self._objects = ChangedObjects(node, sdo, description)
         self._watched_id = 0  # node-ID whose heartbeats the drive watches
-        self.kind = "none"  # or "heartbeat", "life guarding"
+        self.kind = "none"
+        self.time = math.inf
 
     def configure(self, timeout: float) -> None:
         """Have the drive act when the master falls silent for `timeout` [s].
@@ -112,24 +112,21 @@ class ErrorControl:
         try:
             if consumers := self._consumers():
                 self._watch_heartbeats(consumers, milliseconds)
-                self.kind = "heartbeat"
+                self.kind, self.time = "heartbeat", 1e-3 * milliseconds
             elif self._description.has(_GUARD_TIME) and self._description.has(_LIFE_FACTOR):
-                self._change(_GUARD_TIME, (milliseconds // BEATS_PER_TIMEOUT).to_bytes(2, "little"))
-                self._change(_LIFE_FACTOR, bytes((BEATS_PER_TIMEOUT,)))
-                self.kind = "life guarding"
+                guard_time = milliseconds // BEATS_PER_TIMEOUT
+                self._objects.change(_GUARD_TIME, guard_time.to_bytes(2, "little"))
+                self._objects.change(_LIFE_FACTOR, bytes((BEATS_PER_TIMEOUT,)))
+                self.kind, self.time = "life guarding", 1e-3 * guard_time * BEATS_PER_TIMEOUT
             if self.kind != "none" and self._description.has(_ERROR_BEHAVIOUR):
-                self._change(_ERROR_BEHAVIOUR, b"\0", only_from=bytes((STAYS,)))
-            if self._description.has(_ABORT_CONNECTION):
-                entry = self._description.dictionary.find(_ABORT_CONNECTION)
-                for part in range(self._description.num_axes):
-                    key = self._description.key(entry, part)
-                    self._change(key, QUICK_STOP_THEN, only_from=NO_ACTION)
+                self._objects.change(_ERROR_BEHAVIOUR, b"\0", only_from=bytes((STAYS,)))
+            self._objects.quick_stop_on_lost_connection()
         except ObjectAccessError as error:
-            raise NoWatchdogError(f"node {self._node} cannot watch over its master: {error}; {_REMEDY}") from None
+            raise NoWatchdogError(f"node {self._node} cannot watch over its master: {error}; {REMEDY}") from None
         if self.kind == "none":
             raise NoWatchdogError(
                 f"node {self._node} would not stop by itself when this process dies: it has neither a heartbeat "
-                f"consumer (1016h) nor life guarding (100Ch); {_REMEDY}"
+                f"consumer (1016h) nor life guarding (100Ch); {REMEDY}"
             )
 
     def is_in_force(self) -> bool:
@@ -140,12 +137,12 @@ class ErrorControl:
         """
         if self.kind == "heartbeat" and self._watched_id != self._heartbeats.node_id:
             return False
-        return all(self._read(key)[: len(data)] == data for key, data in self._set.items())
+        return self._objects.are_in_force()
 
     def beat(self) -> None:
         """Ask for the node's life, where it has no heartbeat consumer."""
         if self.kind == "life guarding":
-            self._sdo.guard()
+            self._guard()
 
     def restore(self) -> None:
         """Put the objects back as they were. Whoever calls has proved that the node's axes are off.
@@ -156,19 +153,12 @@ class ErrorControl:
         Raises:
             BusError: If the drive did not take all of them.
         """
-        before, self._before = self._before, {}
-        self._set.clear()
-        tidying = Tidying()
-        for (index, sub), data in before.items():
-            label = f"{index:04X}h:{sub:02X}"
-            tidying.step(partial(self._sdo.put_back, index, sub, data, label, self._description.answer_timeout))
-        tidying.end()
+        self._objects.restore()
         self.kind = "none"
 
     def forget(self) -> None:
         """Forget what was: the node was reset."""
-        self._before.clear()
-        self._set.clear()
+        self._objects.forget()
         self.kind = "none"
 
     def _consumers(self) -> list[tuple[int, int]]:
@@ -178,9 +168,9 @@ class ErrorControl:
         ours = (self._heartbeats.node_id << 16 | milliseconds).to_bytes(4, "little")
         living = []
         for key in consumers:
-            raw = int.from_bytes(self._read(key), "little")
+            raw = int.from_bytes(self._objects.read(key), "little")
             watched, period = raw >> 16 & 0x7F, raw & 0xFFFF
-            if key in self._before or not (watched and period) or watched == self._heartbeats.node_id:
+            if key in self._objects or not (watched and period) or watched == self._heartbeats.node_id:
                 pass  # ours, or nobody's
             elif self._heartbeats.is_alive(watched, 1e-3 * period):
                 living.append(watched)
@@ -189,30 +179,13 @@ class ErrorControl:
                 logger.warning("node %d still watches a master that died (node-ID %d)", self._node, watched)
             else:
                 logger.warning("node %d watches node-ID %d, which is silent: replaced meanwhile", self._node, watched)
-            self._change(key, ours, before=bytes(4) if watched in MASTERS else None)
+            self._objects.change(key, ours, before=bytes(4) if watched in MASTERS else None)
             self._watched_id = self._heartbeats.node_id
             return
         raise NoWatchdogError(
             f"node {self._node} has another master that lives (node-ID {living[0]}, 1016h), which may command it; end "
             "that program first: two masters of one drive undo each other's stops"
         )
-
-    def _read(self, key: tuple[int, int]) -> bytes:
-        return self._sdo.read(*key, f"{key[0]:04X}h:{key[1]:02X}", self._description.answer_timeout)
-
-    def _change(
-        self, key: tuple[int, int], data: bytes, only_from: bytes | None = None, before: bytes | None = None
-    ) -> None:
-        label, timeout = f"{key[0]:04X}h:{key[1]:02X}", self._description.answer_timeout
-        found = self._read(key)[: len(data)]
-        if only_from is not None and found != only_from:
-            return
-        if found != data:
-            self._sdo.write(*key, data, label, timeout)
-            if (now := self._read(key)[: len(data)]) != data:
-                raise NoWatchdogError(f"node {self._node} took {data.hex()} for {label} and has {now.hex()}; {_REMEDY}")
-        self._before.setdefault(key, found if before is None else before)
-        self._set[key] = data
 
 
 class Beats:
@@ -261,4 +234,93 @@ class Beats:
             control.beat()
 
 
-_REMEDY = "to move it without that, open it with Limits(silence=None) and keep the emergency stop at hand"
+class ErrorControls:
+    """The error control of all nodes, and the heartbeats and requests that keep it quiet.
+
+    Args:
+        port: The bus.
+        nodes: Node-IDs.
+        clients: The nodes' SDO clients.
+        description: What device they are.
+    """
+
+    def __init__(
+        self, port: Port, nodes: Sequence[int], clients: Sequence[ObjectClient], description: Description
+    ) -> None:
+        self._heartbeats = Heartbeats(port, nodes)
+        self._controls = [
+            ErrorControl(node, sdo, description, self._heartbeats, partial(_ask_for_life, port, node))
+            for node, sdo in zip(nodes, clients, strict=True)
+        ]
+        self._beats: Beats | None = None
+
+    @property
+    def detection_time(self) -> float:
+        """The silence after which every node has noticed [s]; infinite while they do not watch."""
+        return math.inf if self._beats is None else max(control.time for control in self._controls)
+
+    def begin(self, silence: float) -> None:
+        """Have every node act when its master falls silent for `silence` [s], and begin to send heartbeats.
+
+        Raises:
+            NoWatchdogError: If a drive cannot, or watches over another master that lives.
+            BusError: If a node does not answer.
+        """
+        self._heartbeats.choose()
+        for control in self._controls:
+            control.configure(silence)
+        self._beats = Beats(self._heartbeats, self._controls, silence)
+        self._beats.begin()
+
+    def keep(self) -> None:
+        """Send the heartbeats that are due."""
+        if self._beats is not None:
+            self._beats.keep()
+
+    def cease(self) -> None:
+        """Send no heartbeats any more, so that the drives stop by themselves."""
+        if self._beats is not None:
+            self._beats.cease()
+
+    def end(self) -> None:
+        """Send no heartbeats any more, since the watchdogs are given up."""
+        self._beats = None
+
+    def is_set(self, node: int) -> bool:
+        """Return whether a node's error control was set and not put back."""
+        return self._controls[node].kind != "none"
+
+    def is_in_force(self, node: int) -> bool:
+        """Return whether a node, asked, still watches over this master.
+
+        Raises:
+            BusError: If it does not answer.
+        """
+        return self._controls[node].is_in_force()
+
+    def restore(self, node: int) -> None:
+        """Put a node's objects back as they were.
+
+        Raises:
+            BusError: If the node did not take all of them.
+        """
+        self._controls[node].restore()
+
+    def forget(self, node: int) -> None:
+        """Forget what was: the node was reset, and its error control is its own again."""
+        self._controls[node].forget()
+
+    def take_rival(self) -> str:
+        """Return, once, which other program sends heartbeats as ours; "" if none does."""
+        if not self._heartbeats.is_shared or self._beats is None:
+            return ""
+        node, self._heartbeats.node_id = self._heartbeats.node_id, 0  # another one, once the program enables anew
+        return (
+            f"another program sends heartbeats as node-ID {node}, too, so that the drives would not notice the death "
+            "of either"
+        )
+
+
+def _ask_for_life(port: Port, node: int) -> None:
+    """Ask a node for its life (node guarding, CiA 301)."""
+    port.send(ERROR_CONTROL + node, remote=True, length=1)

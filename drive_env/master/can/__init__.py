@@ -1,0 +1,1 @@
+"""The link over CAN: frames, SDO, NMT, PDOs, SYNC, error control."""

@@ -1,0 +1,158 @@
+"""The link over CAN: SDO, NMT and emergencies, PDOs that go with SYNC, error control (CiA 301)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+from drive_env.canopen.frames import SYNC
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.entries import Entry
+from drive_env.master.can.dry_run import DryPort, DrySdoClient
+from drive_env.master.can.error_control import ErrorControls
+from drive_env.master.can.network import PRE_OPERATIONAL, START, Network
+from drive_env.master.can.other_masters import OtherMasters
+from drive_env.master.can.pdo import PdoConfiguration
+from drive_env.master.can.port import Port
+from drive_env.master.can.process_data import PdoProcessData
+from drive_env.master.can.sdo import SdoClient
+from drive_env.master.description import Description
+from drive_env.master.link import ObjectClient, ReceivedEmergency, Wording
+
+_EMCY_COB_ID, _PRODUCER_HEARTBEAT = 0x1014, (0x1017, 0)
+TIME_LOOK = 0.012  # s for which a drive in lockstep must stand still
+
+
+class CanLink:
+    """Nodes of one device on a CAN bus.
+
+    Args:
+        port: The bus; a `DryPort` for a dry run.
+        nodes: Node-IDs.
+        description: What device they are.
+    """
+
+    def __init__(self, port: Port, nodes: Sequence[int], description: Description) -> None:
+        self.port = port
+        self.nodes = tuple(nodes)
+        self.is_dry = isinstance(port, DryPort)
+        self.wording = Wording("NMT operational", "check 1005h and 18xxh, and whether another master is on the bus")
+        self._description = description
+        self._alive: Callable[[], None] = lambda: None
+        self._restarted: Callable[[int], None] = lambda node: None
+        self._network = Network(port, self.nodes)
+        self._network.on_restart = lambda node: self._restarted(self.nodes.index(node))
+        self._clients: list[ObjectClient] = []
+        if isinstance(port, DryPort):
+            self._clients += [DrySdoClient(port, node, description) for node in self.nodes]
+        else:
+            clients = [SdoClient(port, node, lambda: self._alive()) for node in self.nodes]
+            self._network.on_boot = lambda node: clients[self.nodes.index(node)].forget()
+            self._clients += clients
+        pdos = [PdoConfiguration(*one, description) for one in zip(self.nodes, self._clients, strict=True)]
+        self.process = PdoProcessData(port, description, pdos, self.is_dry)
+
+    @cached_property
+    def watch(self) -> ErrorControls:
+        """The nodes' error control; heartbeats are listened to from the first use on."""
+        return ErrorControls(self.port, self.nodes, self._clients, self._description)
+
+    def hear(self, alive: Callable[[], None], restarted: Callable[[int], None]) -> None:
+        """Take whom to tell of waiting for an answer, and of a node that has booted though nobody here has reset it."""
+        self._alive, self._restarted = alive, restarted
+
+    # --- objects and states -----------------------------------------------------------------------------------------
+    def sdo(self, node: int) -> ObjectClient:
+        """Return a node's SDO client."""
+        return self._clients[node]
+
+    def wake(self, node: int) -> None:
+        """Take a node to pre-operational, where it answers SDO requests."""
+        self._network.command(PRE_OPERATIONAL, (self.nodes[node],))
+
+    def welcome(self, node: int) -> None:
+        """Take emergencies of a node from the identifier that its 1014h says."""
+        if self._description.has(_EMCY_COB_ID):
+            cob_id = self._read(node, self._description.dictionary.find(_EMCY_COB_ID))
+            self._network.move_emergencies(self.nodes[node], cob_id)
+
+    def start(self) -> None:
+        """Take the nodes to NMT operational."""
+        self._network.command(START)
+
+    def reset(self, nodes: Sequence[int]) -> None:
+        """Reset nodes (NMT reset node) and wait until they have booted.
+
+        Raises:
+            NoAnswerError: If a node sends no boot-up message.
+        """
+        self._network.reset([self.nodes[k] for k in nodes])
+
+    def take_emergencies(self) -> list[ReceivedEmergency]:
+        """Return and forget the emergencies that came, in their order."""
+        return self._network.take_emergencies()
+
+    def time_passes(self) -> bool | None:
+        """Look whether a drive that sends heartbeats sends any that are due while no SYNC is sent.
+
+        Returns:
+            None for drives that cannot send any.
+
+        Raises:
+            BusError: If the node does not answer.
+        """
+        if not self._description.has(_PRODUCER_HEARTBEAT):
+            return None
+        producer = self._description.dictionary.find(_PRODUCER_HEARTBEAT)
+        beats: list[bytes] = []
+        try:
+            before = self._read(0, producer)
+            self._network.on_error_control = lambda node, data: beats.append(data)
+            self._write(0, producer, 1)
+            self.port.drain()
+            beats.clear()
+            time.sleep(TIME_LOOK)
+            self._read(0, producer)  # whoever is late answers after what was due before
+            self._write(0, producer, before)
+        except ObjectAccessError:
+            return None
+        finally:
+            self._network.on_error_control = None
+        return len(beats) > 1
+
+    def other_masters(self) -> OtherMasters:
+        """Begin to listen for frames that only a master sends."""
+        return OtherMasters(self.port, self.nodes)
+
+    # --- cycles -----------------------------------------------------------------------------------------------------
+    def sync(self) -> None:
+        """Send SYNC."""
+        self.port.send(SYNC)
+
+    def receive(self, timeout: float = 0.0) -> bool:
+        """Wait up to `timeout` [s] for a frame and hand it out; return whether one came."""
+        return self.port.receive(timeout)
+
+    def wait(self, done: Callable[[], bool], timeout: float) -> bool:
+        """Receive until `done()` or until `timeout` [s] has passed; return done()."""
+        return self.port.wait(done, timeout)
+
+    def drain(self) -> None:
+        """Hand out what has arrived, without waiting."""
+        self.port.drain()
+
+    def close(self) -> None:
+        """Close the bus if it is ours."""
+        self.port.close()
+
+    def _read(self, node: int, entry: Entry) -> int:
+        """Read a number that a node has once."""
+        known = self._description
+        data = self._clients[node].read(entry.index, entry.sub, known.label(entry, 0), known.patience(entry))
+        return int(known.decode(entry, data))
+
+    def _write(self, node: int, entry: Entry, value: int) -> None:
+        known, label = self._description, f"{value} to {self._description.label(entry, 0)}"
+        data = known.encode(entry, value)
+        self._clients[node].write(entry.index, entry.sub, data, label, known.patience(entry))

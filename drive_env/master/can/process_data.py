@@ -1,0 +1,168 @@
+"""Process data of several nodes in PDOs: objects of all axes to PDOs, and rows of integers to frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.dictionary.entries import Entry
+from drive_env.master.can.pdo import (
+    INTO_DRIVE,
+    OUT_OF_DRIVE,
+    Direction,
+    PdoConfiguration,
+    RemotePdo,
+    check_mappable,
+    plan,
+    too_many,
+)
+from drive_env.master.can.port import Port
+from drive_env.master.can.samples import PdoSamples
+from drive_env.master.description import Description
+from drive_env.master.packing import Bytes, pack_rows
+
+Integers = NDArray[np.int64]
+Groups = list[list[Entry]]
+
+
+class RpdoRows:
+    """Rows of frames that go into the drives.
+
+    Args:
+        port: The bus.
+        rpdos: Identifier and rows of bytes of each RPDO.
+    """
+
+    def __init__(self, port: Port, rpdos: Sequence[tuple[int, Bytes]]) -> None:
+        self._port = port
+        self._frames = [(can_id, [row.tobytes() for row in rows]) for can_id, rows in rpdos]
+
+    def send(self, row: int) -> None:
+        """Send a row; the drives take it at the next SYNC."""
+        for can_id, rows in self._frames:
+            self._port.send(can_id, rows[row])
+
+
+class PdoProcessData:
+    """What is mapped at present, and the way between its integers and its frames.
+
+    Args:
+        port: The bus.
+        description: What device the nodes are.
+        configurations: The PDOs of each node.
+        dry: Nobody is there: nothing is sampled.
+
+    Attributes:
+        mapping: Its number: it grows with every change.
+    """
+
+    def __init__(
+        self, port: Port, description: Description, configurations: Sequence[PdoConfiguration], dry: bool = False
+    ) -> None:
+        self._port = port
+        self._description = description
+        self._configurations = configurations
+        self._dry = dry
+        self._mapped: dict[str, tuple[tuple[Entry, ...], list[list[RemotePdo]]]] = {}
+        self._plans: dict[tuple[str, tuple[Entry, ...]], Groups | None] = {}
+        self.mapping = 0
+
+    def check_sampled(self, entries: Sequence[Entry]) -> None:
+        """Raise ObjectAccessError 06040041h for an object that no TPDO can carry."""
+        check_mappable(self._description, entries, OUT_OF_DRIVE)
+
+    def check_played(self, entries: Sequence[Entry]) -> None:
+        """Raise ObjectAccessError 06040041h for an object that no RPDO can carry."""
+        check_mappable(self._description, entries, INTO_DRIVE)
+
+    def choose(self, wanted: Sequence[Entry], welcome: Sequence[Entry]) -> tuple[Entry, ...]:
+        """Return what to sample: what is wanted, and of what is welcome besides, in its order, as much as fits.
+
+        Raises:
+            ObjectAccessError: 06040042h if not even what is wanted fits.
+        """
+        besides = [entry for entry in welcome if entry not in wanted]
+        while True:
+            entries = (*wanted, *besides)
+            if self._plan(OUT_OF_DRIVE, entries) is not None:
+                return entries
+            if not besides:
+                raise too_many(self._description, wanted, OUT_OF_DRIVE)
+            besides.pop()
+
+    def is_mapped(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> bool:
+        """Return whether the PDOs are such already: into the drive just these, out of it these and maybe others."""
+        return (not played or played == self._entries(INTO_DRIVE)) and self._carries(sampled)
+
+    def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
+        """Map entries of every axis to PDOs that go with SYNC, as far as they are not mapped.
+
+        Raises:
+            ObjectAccessError: If they do not fit or a drive refuses them.
+        """
+        if played and played != self._entries(INTO_DRIVE):
+            self._map(INTO_DRIVE, played)
+        if not self._carries(sampled):
+            self._map(OUT_OF_DRIVE, sampled)
+
+    def sampled_entries(self) -> tuple[Entry, ...]:
+        """Return what the mapped TPDOs carry."""
+        return self._entries(OUT_OF_DRIVE)
+
+    def outputs(self, played: Mapping[Entry, Integers]) -> RpdoRows | None:
+        """Return the frames of the mapped RPDOs, of integers of shape (cycles, num_axes); None if nothing is played."""
+        if not played:
+            return None
+        return RpdoRows(
+            self._port,
+            [
+                (pdo.can_id, pack_rows(pdo.members, played, k * self._description.num_axes))
+                for k, pdos in enumerate(self._mapped[INTO_DRIVE.name][1])
+                for pdo in pdos
+            ],
+        )
+
+    def samples(self) -> PdoSamples | None:
+        """Begin to collect the mapped TPDOs; None if there are none, or nobody is there."""
+        of_nodes = self._mapped.get(OUT_OF_DRIVE.name, ((), []))[1]
+        if self._dry or not any(of_nodes):
+            return None
+        return PdoSamples(self._port, of_nodes, self._description.num_axes)
+
+    def forget(self, nodes: Sequence[int]) -> None:
+        """Forget what nodes were configured to: they have restarted, and nothing counts as mapped."""
+        for k in nodes:
+            self._configurations[k].forget()
+        self.mapping += 1
+        self._mapped.clear()
+
+    def restore(self, node: int) -> None:
+        """Put every PDO of a node back as it was found.
+
+        Raises:
+            BusError: If not all of them could be.
+        """
+        self._configurations[node].restore()
+
+    def _entries(self, direction: Direction) -> tuple[Entry, ...]:
+        return self._mapped.get(direction.name, ((), []))[0]
+
+    def _carries(self, sampled: tuple[Entry, ...]) -> bool:
+        return set(sampled) <= set(self._entries(OUT_OF_DRIVE))
+
+    def _map(self, direction: Direction, entries: tuple[Entry, ...]) -> None:
+        groups = self._plan(direction, entries)
+        if groups is None:
+            raise too_many(self._description, entries, direction)
+        self.mapping += 1
+        self._mapped.pop(direction.name, None)
+        pdos = [configuration.configure(groups, direction) for configuration in self._configurations]
+        self._mapped[direction.name] = (entries, pdos)
+
+    def _plan(self, direction: Direction, entries: tuple[Entry, ...]) -> Groups | None:
+        key = (direction.name, entries)
+        if key not in self._plans:
+            self._plans[key] = plan(self._description, entries, direction)
+        return self._plans[key]

@@ -1,0 +1,97 @@
+"""Objects of a node that have another value while this master is there, and get back what they had."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from drive_env import cia402
+from drive_env.master.description import Description, Key
+from drive_env.master.link import NoWatchdogError, ObjectClient
+from drive_env.master.tidying import Tidying
+
+# 6007h, what an axis does when its connection is lost (CiA 402): nothing, or the quick stop.
+_ABORT_CONNECTION, _NO_ACTION, _QUICK_STOP = (cia402.ABORT_CONNECTION_OPTION, 0), b"\0\0", b"\3\0"
+REMEDY = "to move it without that, open it with Limits(silence=None) and keep the emergency stop at hand"
+
+
+class ChangedObjects:
+    """What a node's watchdog over its master needs changed, and what was there before.
+
+    Args:
+        node: The node's address, for messages.
+        sdo: Its objects.
+        description: What device it is.
+    """
+
+    def __init__(self, node: int, sdo: ObjectClient, description: Description) -> None:
+        self._node = node
+        self._sdo = sdo
+        self._description = description
+        self._before: dict[Key, bytes] = {}
+        self._set: dict[Key, bytes] = {}
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self._before
+
+    def read(self, key: Key) -> bytes:
+        """Return the bytes of an object."""
+        return self._sdo.read(*key, f"{key[0]:04X}h:{key[1]:02X}", self._description.answer_timeout)
+
+    def change(self, key: Key, data: bytes, only_from: bytes | None = None, before: bytes | None = None) -> None:
+        """Give an object other bytes, and see that it has them.
+
+        Args:
+            key: The object.
+            data: What it gets.
+            only_from: What it must have now, or else it is left alone.
+            before: What it gets back afterwards, if not what it has now.
+
+        Raises:
+            NoWatchdogError: If the node takes them and has others.
+            ObjectAccessError: If it refuses; BusError if it does not answer.
+        """
+        label, timeout = f"{key[0]:04X}h:{key[1]:02X}", self._description.answer_timeout
+        found = self.read(key)[: len(data)]
+        if only_from is not None and found != only_from:
+            return
+        if found != data:
+            self._sdo.write(*key, data, label, timeout)
+            if (now := self.read(key)[: len(data)]) != data:
+                raise NoWatchdogError(f"node {self._node} took {data.hex()} for {label} and has {now.hex()}; {REMEDY}")
+        self._before.setdefault(key, found if before is None else before)
+        self._set[key] = data
+
+    def quick_stop_on_lost_connection(self) -> None:
+        """Have every axis that would do nothing when its connection is lost do a quick stop then (6007h)."""
+        if not self._description.has(_ABORT_CONNECTION):
+            return
+        entry = self._description.dictionary.find(_ABORT_CONNECTION)
+        for part in range(self._description.num_axes):
+            self.change(self._description.key(entry, part), _QUICK_STOP, only_from=_NO_ACTION)
+
+    def are_in_force(self) -> bool:
+        """Return whether the node, asked, still has what was set.
+
+        Raises:
+            BusError: If it does not answer.
+        """
+        return all(self.read(key)[: len(data)] == data for key, data in self._set.items())
+
+    def restore(self) -> None:
+        """Put the objects back as they were.
+
+        Raises:
+            BusError: If the node did not take all of them.
+        """
+        before, self._before = self._before, {}
+        self._set.clear()
+        tidying = Tidying()
+        for (index, sub), data in before.items():
+            label = f"{index:04X}h:{sub:02X}"
+            tidying.step(partial(self._sdo.put_back, index, sub, data, label, self._description.answer_timeout))
+        tidying.end()
+
+    def forget(self) -> None:
+        """Forget what was: the node was reset."""
+        self._before.clear()
+        self._set.clear()

@@ -1,0 +1,319 @@
+"""What drives need of a fieldbus: objects of its nodes, process data, cycles, states, and a watch over the master.
+
+`BusDrives`, the safety envelope and the tools ask a link for these and know no fieldbus. CAN is one
+(`can/can_link.py`); another one is a class with these methods and a constructor like `CanDrives`.
+
+Nodes are counted from 0, in the order of `Link.nodes`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.dictionary.entries import Entry
+from drive_env.master.description import Key
+from drive_env.master.errors import BusError, NoAnswerError
+
+Integers = NDArray[np.int64]
+
+
+class NoWatchdogError(BusError):
+    """A drive cannot watch over its master; the message says why and what to do."""
+
+
+class ReceivedEmergency(NamedTuple):
+    """An emergency message of a node, which is named by its address."""
+
+    node: int
+    code: int
+    error_register: int
+    extra: tuple[int, ...]
+
+
+class Wording(NamedTuple):
+    """What messages call things on a link.
+
+    Attributes:
+        operational: The state in which nodes exchange process data.
+        check_samples: What to check where a node was started and sends none.
+    """
+
+    operational: str
+    check_samples: str
+
+
+class ObjectClient(Protocol):
+    """Reads and writes objects of a node, as bytes; one transfer at a time, whoever asks."""
+
+    def read(self, index: int, sub: int, label: str, timeout: float) -> bytes:
+        """Return the bytes of an object.
+
+        Raises:
+            ObjectAccessError: With the abort code, if the drive refuses.
+            NoAnswerError: If it does not answer; one try may take `timeout` [s].
+        """
+
+    def write(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
+        """Write the bytes of an object, once: a repeated write may mean something else.
+
+        Raises:
+            ObjectAccessError: With the abort code, if the drive refuses.
+            NoAnswerError: If it does not answer within `timeout` [s]; the drive may have taken the value or not.
+        """
+
+    def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
+        """Write what an object had before; a node that is silent is woken and waited for longer.
+
+        Raises:
+            ObjectAccessError, NoAnswerError: As `write` does.
+        """
+
+    def ask(self, index: int, sub: int, timeout: float) -> bytes | None:
+        """Return the bytes of a short object if they come within `timeout` [s], the wait for one's turn included."""
+
+    def command(self, index: int, sub: int, data: bytes) -> None:
+        """Send a short write without waiting: neither for an answer nor for a transfer that is under way.
+
+        Raises:
+            BusError: If the bus does not take it.
+        """
+
+
+class Outputs(Protocol):
+    """Rows of process data that go into the drives, ready to be sent."""
+
+    def send(self, row: int) -> None:
+        """Hand out a row: the drives take it when the next cycle begins, once.
+
+        What is written to an object afterwards stays, so a link that repeats its last image must follow such writes.
+        """
+
+
+class Samples(Protocol):
+    """Process data that come out of the drives in a run of cycles; row k belongs to its k-th cycle."""
+
+    def complete(self) -> int:
+        """Return how many rows are complete."""
+
+    def decode(self, first: int, last: int) -> dict[Key, Integers]:
+        """Return rows `first` to `last` (excluded), each object of shape (rows, num_axes).
+
+        Raises:
+            BusError: If what came is not what is mapped.
+        """
+
+    def missing(self, rows: int, timeout: float) -> NoAnswerError:
+        """Return the error for samples that stay out, of so many cycles and after so long a wait [s]."""
+
+    def close(self) -> None:
+        """Take nothing more."""
+
+
+class ProcessData(Protocol):
+    """Which objects the nodes exchange in every cycle.
+
+    Attributes:
+        mapping: Its number: it grows with every change.
+    """
+
+    mapping: int
+
+    def check_sampled(self, entries: Sequence[Entry]) -> None:
+        """Raise ObjectAccessError 06040041h for an object that cannot come with every cycle."""
+
+    def check_played(self, entries: Sequence[Entry]) -> None:
+        """Raise ObjectAccessError 06040041h for an object that cannot be sent with every cycle."""
+
+    def choose(self, wanted: Sequence[Entry], welcome: Sequence[Entry]) -> tuple[Entry, ...]:
+        """Return what to sample: what is wanted, and of what is welcome besides, in its order, as much as fits.
+
+        Raises:
+            ObjectAccessError: 06040042h if not even what is wanted fits.
+        """
+
+    def is_mapped(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> bool:
+        """Return whether cycles carry these already: just what is played, if anything is, and at least the samples."""
+
+    def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
+        """Have cycles carry entries of every axis; what is mapped into the drives stays where nothing is played.
+
+        Raises:
+            ObjectAccessError: If they do not fit or a drive refuses them.
+        """
+
+    def sampled_entries(self) -> tuple[Entry, ...]:
+        """Return what comes with every cycle."""
+
+    def outputs(self, played: Mapping[Entry, Integers]) -> Outputs | None:
+        """Return rows to send, of integers of shape (cycles, num_axes) for all that is mapped; None of nothing."""
+
+    def samples(self) -> Samples | None:
+        """Begin to collect what is mapped out of the drives; None where nothing is, or nobody is there."""
+
+    def forget(self, nodes: Sequence[int]) -> None:
+        """Forget what nodes were configured to: they have restarted, and nothing counts as mapped."""
+
+    def restore(self, node: int) -> None:
+        """Put a node's configuration back as it was found.
+
+        Raises:
+            BusError: If not all of it could be.
+        """
+
+
+class MasterWatch(Protocol):
+    """How the nodes notice that this process is dead, and stop their drives by themselves."""
+
+    @property
+    def detection_time(self) -> float:
+        """The silence after which every node has noticed [s]; infinite while they do not watch."""
+
+    def begin(self, silence: float) -> None:
+        """Have every node act when its master falls silent for `silence` [s], or less, and begin to be heard.
+
+        Raises:
+            NoWatchdogError: If a drive cannot, or watches over another master that lives.
+            BusError: If a node does not answer.
+        """
+
+    def keep(self) -> None:
+        """Be heard, if it is due; called every few milliseconds whatever the program does, by the supervisor's thread.
+
+        What comes back is no sample of a run that is under way.
+        """
+
+    def cease(self) -> None:
+        """Never be heard again, so that the drives stop by themselves."""
+
+    def end(self) -> None:
+        """Be heard no more, since the watchdogs are given up or were not wanted."""
+
+    def is_set(self, node: int) -> bool:
+        """Return whether a node's watchdog was set and not put back."""
+
+    def is_in_force(self, node: int) -> bool:
+        """Return whether a node, asked, still watches over this master.
+
+        Raises:
+            BusError: If it does not answer.
+        """
+
+    def restore(self, node: int) -> None:
+        """Put a node's watchdog back as it was found. Whoever calls has proved that its axes are off.
+
+        Raises:
+            BusError: If the node did not take all of it.
+        """
+
+    def forget(self, node: int) -> None:
+        """Forget what was found: the node was reset."""
+
+    def take_rival(self) -> str:
+        """Return, once, which other program keeps the nodes from noticing this one's death; "" if none does."""
+
+
+class OtherMastersHeard(Protocol):
+    """Tells whether another master commands the nodes."""
+
+    def check(self) -> None:
+        """Raise BusError, with what was heard, if one does."""
+
+
+class Link(Protocol):
+    """A fieldbus with the nodes of some drives.
+
+    Time passes by the clock, or by cycles alone (lockstep), as the drives' pace says: the link sends a cycle whenever
+    it is told to.
+    """
+
+    @property
+    def nodes(self) -> tuple[int, ...]:
+        """The nodes' addresses."""
+
+    @property
+    def is_dry(self) -> bool:
+        """Whether what would be sent is printed, and nobody is there."""
+
+    @property
+    def wording(self) -> Wording:
+        """What messages call things here."""
+
+    @property
+    def process(self) -> ProcessData:
+        """The nodes' process data."""
+
+    @property
+    def watch(self) -> MasterWatch:
+        """The nodes' watch over this master."""
+
+    def hear(self, alive: Callable[[], None], restarted: Callable[[int], None]) -> None:
+        """Take whom to tell.
+
+        Args:
+            alive: Called again and again while an answer is waited for.
+            restarted: Called with a node that has booted though nobody here has reset it.
+        """
+
+    # --- objects and states -----------------------------------------------------------------------------------------
+    def sdo(self, node: int) -> ObjectClient:
+        """Return the client for a node's objects."""
+
+    def wake(self, node: int) -> None:
+        """Have a node answer about its objects that may be stopped, as it is after a master died."""
+
+    def welcome(self, node: int) -> None:
+        """Take note that a node is there and is what it was taken for; read what the link must know of it."""
+
+    def start(self) -> None:
+        """Take the nodes to where they exchange process data."""
+
+    def reset(self, nodes: Sequence[int]) -> None:
+        """Restart nodes as after power-on, and wait until they are back.
+
+        Raises:
+            NoAnswerError: If one does not come back.
+        """
+
+    def take_emergencies(self) -> list[ReceivedEmergency]:
+        """Return and forget the emergencies that came, in their order."""
+
+    def time_passes(self) -> bool | None:
+        """Look whether time passes in the nodes while no cycle is sent, as it must not in lockstep.
+
+        Returns:
+            None where nothing tells it.
+
+        Raises:
+            BusError: If a node does not answer.
+        """
+
+    def other_masters(self) -> OtherMastersHeard:
+        """Begin to listen for other masters."""
+
+    # --- cycles -----------------------------------------------------------------------------------------------------
+    def sync(self) -> None:
+        """Begin a cycle: the drives take what was handed out since the one before, and sample.
+
+        Raises:
+            BusError: If the bus does not take it.
+        """
+
+    def receive(self, timeout: float = 0.0) -> bool:
+        """Wait up to `timeout` [s] for something to come, and take it; return whether something did.
+
+        Raises:
+            BusError: If the bus is gone.
+        """
+
+    def wait(self, done: Callable[[], bool], timeout: float) -> bool:
+        """Receive until `done()` or until `timeout` [s] has passed; return done()."""
+
+    def drain(self) -> None:
+        """Take what has arrived, without waiting."""
+
+    def close(self) -> None:
+        """Let go of the bus."""
