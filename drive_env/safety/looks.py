@@ -24,13 +24,13 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 UNSAMPLED = 0.010  # s between two looks at what no PDO carries
-ASK = 0.015  # s for an answer to a look, where time passes
+ASK, ASK_AGAIN = 0.015, 0.010  # s for an answer to a look, where time passes, and of one that was silent before
 SILENT = 0.05  # s for which one that did not answer is not asked again: it must not hold up the others
 
 
-def answer_time(drives: BusDrives) -> float:
+def answer_time(drives: BusDrives, usual: float = ASK) -> float:
     """Return how long to wait for an answer to a look [s]: where time waits, nothing runs on meanwhile."""
-    return drives.description.answer_timeout if drives.time_waits else ASK
+    return drives.description.answer_timeout if drives.time_waits else usual
 
 
 class Looks:
@@ -106,27 +106,46 @@ class Looks:
         return {**asked, **rows}
 
     def ask(self, entries: Sequence[Entry]) -> bool:
-        """Read objects of every axis; return whether all came. Beyond a limit the drives are stopped."""
-        epoch, per_node = self._axes.epoch, self._drives.description.num_axes
-        complete = True
-        for axis in range(self._drives.num_axes):
-            node, part = divmod(axis, per_node)
-            if node in self._silent and self._axes.now() < self._silent[node]:
-                complete = False
-                continue
-            rows = {}
-            for entry in entries:
-                index, sub = self._drives.description.key(entry, part)
-                data = self._drives.sdo(node).ask(index, sub, answer_time(self._drives))
-                if data is None:
-                    complete = False
-                    self._silent[node] = self._axes.now() + SILENT
-                    break
-                row = np.zeros((1, self._drives.num_axes), np.int64)
-                row[0, axis] = self._drives.description.decode(entry, data)
-                rows[entry.index, entry.sub] = row
+        """Read objects of every axis; return whether all came. Beyond a limit the drives are stopped.
+
+        Nodes that have not answered come last, one of them at a time: nobody else waits for them.
+        """
+        now = self._axes.now()
+        due = [node for node, until in self._silent.items() if until <= now][:1]
+        answering = [node for node in range(len(self._drives.nodes)) if node not in self._silent]
+        complete = len(answering) == len(self._drives.nodes)
+        for node in answering:
+            complete &= self._ask_node(node, entries, answer_time(self._drives))
+        for node in due:
+            self._ask_node(node, entries, answer_time(self._drives, ASK_AGAIN))
+        return complete
+
+    def _ask_node(self, node: int, entries: Sequence[Entry], timeout: float) -> bool:
+        """Read objects of a node's axes, each within `timeout` [s]; return whether all came."""
+        per_node = self._drives.description.num_axes
+        for axis in range(node * per_node, (node + 1) * per_node):
+            epoch = self._axes.epoch
+            rows = self._ask_axis(node, axis, entries, timeout)
             where = np.zeros(self._drives.num_axes, bool)
             where[axis] = True
             if rows:
                 self._observe(rows, epoch, where)
-        return complete
+            if len(rows) < len(entries):
+                self._silent.pop(node, None)  # it goes to the end of those that are asked again
+                self._silent[node] = self._axes.now() + SILENT
+                return False
+        self._silent.pop(node, None)
+        return True
+
+    def _ask_axis(self, node: int, axis: int, entries: Sequence[Entry], timeout: float) -> dict[Key, Integers]:
+        """Return what came of objects of an axis, up to the first that did not."""
+        rows: dict[Key, Integers] = {}
+        for entry in entries:
+            index, sub = self._drives.description.key(entry, axis % self._drives.description.num_axes)
+            data = self._drives.sdo(node).ask(index, sub, timeout)
+            if data is None:
+                break
+            row = np.zeros((1, self._drives.num_axes), np.int64)
+            row[0, axis] = self._drives.description.decode(entry, data)
+            rows[entry.index, entry.sub] = row
+        return rows
