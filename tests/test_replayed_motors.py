@@ -304,10 +304,76 @@ def test_who_may_obey(frames, nodes):
     assert nodes_spoken_to(can.Message(arbitration_id=one, data=data) for one, data in frames) == nodes
 
 
+# --- what stops them when the program itself is killed ------------------------------------------------------------
+def test_a_drive_watches_over_the_program_meanwhile_and_gets_back_what_it_had(bus, tmp_path):
+    drive = Turning()
+    drive.values |= {(0x1029, 1): (1, 1), (0x6007, 0): (0, 2)}
+    changed = []
+    plain = drive.set
+
+    def note(index, value, sub=0):
+        if index in (0x1016, 0x1029, 0x6007, 0x6040):
+            changed.append((index, value))
+        plain(index, value, sub)
+
+    drive.set = note
+    bus.drives.append(drive)
+    assert replay(recorded(tmp_path / "a.log", enabled_by_sdo()))[0] == DONE
+    watch = changed[0][1]
+    assert changed[:3] == [(0x1016, watch), (0x1029, 0), (0x6007, 3)]  # before the first frame
+    assert watch & 0xFFFF == 500 and watch >> 16 in range(96, 128)
+    assert changed[3:6] == [(0x6040, 6), (0x6040, 7), (0x6040, 15)]
+    assert changed[-3:] == [(0x6007, 0), (0x1029, 1), (0x1016, 0)]  # when it is off
+    assert changed[-4] == (0x6040, 0)
+    beats = bus.sent(0x700 + (watch >> 16))
+    assert beats and set(beats) == {b"\5"}
+
+
+@pytest.mark.parametrize(
+    ("values", "frames", "why"),
+    [
+        ({}, [], "no heartbeat consumer (1016h) that is free"),
+        ({(0x1016, 1): (0x0005_01F4, 4)}, [], "no heartbeat consumer (1016h) that is free"),
+        ({(0x1016, 1): (0, 4)}, [(0x000, b"\x82\1")], "the frames reset it"),
+        ({(0x1016, 1): (0, 4)}, [(0x000, b"\x81\0")], "the frames reset it"),
+    ],
+)
+def test_what_cannot_watch_over_the_program_is_said(bus, tmp_path, values, frames, why):
+    drive = Turning()
+    del drive.values[0x1016, 1]
+    drive.values |= values
+    bus.drives.append(drive)
+    code, _, error = replay(recorded(tmp_path / "a.log", [*frames, *enabled_by_sdo()]))
+    assert code == DONE
+    assert "drive-env: node 1 would run on if this program were killed: " in error and why in error
+
+
+def test_a_watchdog_that_the_frames_set_is_theirs(bus, tmp_path):
+    drive = Turning()
+    bus.drives.append(drive)
+    theirs = (0x601, bytes.fromhex("23 16 10 01 F4 01 7F 00"))
+    code, _, error = replay(recorded(tmp_path / "a.log", [theirs, *enabled_by_sdo()]))
+    assert code == DONE and "would run on" not in error
+    assert drive.get(0x1016, 1) == 0x007F01F4
+
+
+def test_a_drive_that_is_not_proved_off_keeps_its_watchdog(bus, tmp_path, monkeypatch):
+    monkeypatch.setattr(replayed_motors, "OFF_TIME", 0.1)
+    drive = Turning()
+    bus.drives.append(drive)
+    plain = drive.set
+    drive.set = lambda index, value, sub=0: (
+        plain(index, value or 15, sub) if index == 0x6040 else plain(index, value, sub)
+    )
+    code, _, error = replay(recorded(tmp_path / "a.log", enabled_by_sdo()))
+    assert code == REFUSED and "its motor may run" in error
+    assert drive.get(0x1016, 1) & 0xFFFF == 500  # and no heartbeat comes any more
+
+
 # --- an emulated drive in real time, and the program that a user starts -------------------------------------------
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-@pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "SIGHUP", "SIGKILL"])
 def test_a_motor_that_runs_by_replayed_frames_is_at_rest_and_off_after_a_signal(tmp_path, how):
     velocity = 1_092_267
     frames = [
@@ -329,6 +395,11 @@ def test_a_motor_that_runs_by_replayed_frames_is_at_rest_and_off_after_a_signal(
             if process.poll() is None:
                 process.kill()
                 process.communicate()
+        if how == "SIGKILL":
+            wait_until(lambda: not int(machine.read(0x6041)[0]) & 0x04)  # its own watchdog: off
+            assert process.returncode == -signal.SIGKILL
+            assert abs(int(machine.read(0x606C)[0])) < 16384
+            return
         assert process.returncode == INTERRUPTED, said
         assert "node 1 was left enabled by the frames: stopped by its quick stop, at rest; off" in said
         assert int(machine.read(0x6041)[0]) & 0x4F == 0x40

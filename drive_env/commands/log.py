@@ -112,7 +112,8 @@ def replay(
     """Send the recorded frames of a master again, in their time: NMT, SYNC, SDO requests, RPDOs, its heartbeat.
 
     Drives obey them as they did then, and no envelope watches: keep the emergency stop at hand. What is live at the
-    end, after Ctrl-C or an error, gets a quick stop and is switched off at rest. --dry-run shows the frames.
+    end, after Ctrl-C or an error, gets a quick stop and is switched off at rest. Drives whose recorded master set no
+    watchdog watch over this program meanwhile (1016h), and stop when it is killed. --dry-run shows the frames.
     """
     with errors_as_exit_codes():
         import can
@@ -163,21 +164,26 @@ def _check_stamps(file: Path, frames: list[Any], speed: float) -> None:
 
 def _replay(port: Any, frames: list[Any], speed: float, timeout: float, json: bool) -> None:
     """Send frames, stop what they leave live, and say so; a signal ends the sending, never the stop."""
+    from drive_env.commands.replay_watchdog import ReplayWatchdog
     from drive_env.commands.replayed_motors import ReplayedMotors
     from drive_env.held_signals import held_signals
 
-    motors = ReplayedMotors(port, frames, timeout)
+    motors, watchdog = ReplayedMotors(port, frames, timeout), ReplayWatchdog(port, frames, timeout)
     problem: Exception | None = None
     sent = 0
     with held_signals() as noted:
         motors.check_none_is_live()
         try:
+            for warning in watchdog.arm(motors.drives()):
+                print(f"drive-env: {warning}", file=sys.stderr)
+            motors.listen()
             for frame in _in_time(port, frames, speed, noted):
                 port.send(frame.arbitration_id, bytes(frame.data), remote=frame.is_remote_frame, length=frame.dlc)
                 sent += 1
         except Exception as error:
             problem = error
         stopped, unproven = motors.stop()
+        unproven += watchdog.give_up(() if unproven else motors.drives())
     for axis in stopped:
         print(f"drive-env: {axis}", file=sys.stderr)
     if unproven:

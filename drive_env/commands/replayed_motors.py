@@ -71,17 +71,24 @@ class ReplayedMotors:
         self._no_drives: set[int] = set()  # they answer, and have no statusword
 
     def check_none_is_live(self) -> None:
-        """Raise BusError for a node that somebody else runs; from now on, note which nodes are heard."""
+        """Raise BusError for a node that somebody else runs."""
         status = self._statuswords(self._nodes)
-        for node in self._nodes:
-            for base in (EMCY, *TPDO, SDO_RESPONSE, ERROR_CONTROL):
-                self._port.subscribe(base + node, partial(self._hear, node))
         live = [f"{name(axis)} ({word:04X}h)" for axis, word in status.items() if cia402.is_live(word)]
         if live:
             raise BusError(
                 f"{', '.join(live)} is live already: somebody else runs it, and no frame was sent. End that, or stop "
                 f"it: drive-env set 6040 2 --node {live[0].split()[1]}, then 0"
             )
+
+    def listen(self) -> None:
+        """From now on, note which nodes are heard."""
+        for node in self._nodes:
+            for base in (EMCY, *TPDO, SDO_RESPONSE, ERROR_CONTROL):
+                self._port.subscribe(base + node, partial(self._hear, node))
+
+    def drives(self) -> list[int]:
+        """Return the nodes that were heard of and have a statusword."""
+        return sorted(self._there - self._no_drives)
 
     def stop(self) -> tuple[list[Stopped], list[str]]:
         """Stop what is live: quick stop, off when it is at rest, and a look at the statusword.

@@ -1,0 +1,153 @@
+"""What stops the drives when `drive-env replay` itself dies: their heartbeat consumers, set for as long as it runs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Sequence
+from functools import partial
+from typing import Any
+
+from drive_env import cia402
+from drive_env.canopen.frames import NMT, SDO_REQUEST
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.master.can.error_control import STAYS, Heartbeats
+from drive_env.master.can.port import Port
+from drive_env.master.can.sdo import SdoClient
+from drive_env.master.errors import BusError
+from drive_env.master.tidying import Tidying
+
+SILENCE = 0.5  # s after which a drive acts
+PERIOD = SILENCE / 3.0  # two heartbeats may be lost
+MOST_CONSUMERS = 8  # entries of 1016h that are looked at
+MAX_AXES = 8
+CONSUMERS, GUARD_TIME, LIFE_FACTOR, ERROR_BEHAVIOUR = 0x1016, 0x100C, 0x100D, (0x1029, 1)
+QUICK_STOP, NO_ACTION = 3, 0  # of 6007h
+RESETS = (0x81, 0x82)  # NMT commands after which nothing of 1016h is left
+
+Key = tuple[int, int]
+
+
+class ReplayWatchdog:
+    """Heartbeats of this process, and the consumers of the nodes that frames are sent to.
+
+    Args:
+        port: The bus.
+        frames: What is to be sent (python-can messages).
+        timeout: Longest wait for an answer [s].
+    """
+
+    def __init__(self, port: Port, frames: Iterable[Any], timeout: float) -> None:
+        self._port = port
+        self._timeout = timeout
+        self._heartbeats: Heartbeats | None = None
+        self._before: dict[int, dict[Key, bytes]] = {}  # node -> what its objects had
+        self._own, self._reset = nodes_watched_by(frames)
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def arm(self, nodes: Sequence[int]) -> list[str]:
+        """Have nodes watch over this process; return in words which cannot."""
+        without = []
+        self._heartbeats = Heartbeats(self._port, nodes)
+        self._heartbeats.choose()
+        self._thread = threading.Thread(target=self._beat, name="heartbeats of replay", daemon=True)
+        self._thread.start()  # before a drive begins to wait for them
+        for node in nodes:
+            if node in self._own:
+                continue  # the recorded master's own, whose heartbeats are among the frames
+            if node in self._reset or 0 in self._reset:
+                why = "the frames reset it, after which it watches nobody"
+            else:
+                why = self._arm_node(node)
+            if why:
+                without.append(
+                    f"node {node} would run on if this program were killed: {why}; keep the emergency stop at hand"
+                )
+        return without
+
+    def give_up(self, nodes: Iterable[int]) -> list[str]:
+        """Give nodes whose motors are proved off what they had; the others stop by themselves.
+
+        Returns:
+            What could not be put back, in words.
+        """
+        problems: list[str] = []
+        for node in nodes:
+            objects, tidying = SdoClient(self._port, node), Tidying()
+            for (index, sub), data in reversed(self._before.pop(node, {}).items()):
+                label = f"{index:04X}h:{sub:02X}"
+                tidying.step(partial(objects.put_back, index, sub, data, label, self._timeout))
+            try:
+                tidying.end()
+            except (BusError, ObjectAccessError) as error:
+                problems.append(f"node {node} still watches over this program: {error}")
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+        return problems
+
+    def _beat(self) -> None:
+        assert self._heartbeats is not None
+        while not self._ended.wait(PERIOD):
+            try:
+                self._heartbeats.send()
+            except BusError:
+                return  # the drives notice
+
+    def _arm_node(self, node: int) -> str:
+        """Set a node's consumer and its reaction; return why not."""
+        objects = SdoClient(self._port, node)
+        try:
+            consumer = self._free_consumer(objects)
+            if consumer is None:
+                return "it has no heartbeat consumer (1016h) that is free"
+            assert self._heartbeats is not None
+            self._heartbeats.send()
+            watch = self._heartbeats.node_id << 16 | round(1e3 * SILENCE)
+            self._change(node, objects, consumer, watch.to_bytes(4, "little"))
+            if self._read(objects, ERROR_BEHAVIOUR) == bytes((STAYS,)):
+                self._change(node, objects, ERROR_BEHAVIOUR, b"\0")
+            for axis in range(MAX_AXES):
+                option = (cia402.ABORT_CONNECTION_OPTION + cia402.AXIS_OFFSET * axis, 0)
+                if self._read(objects, option) == NO_ACTION.to_bytes(2, "little"):
+                    self._change(node, objects, option, QUICK_STOP.to_bytes(2, "little"))
+        except (BusError, ObjectAccessError) as error:
+            return str(error)
+        return ""
+
+    def _free_consumer(self, objects: SdoClient) -> Key | None:
+        for sub in range(1, MOST_CONSUMERS + 1):
+            found = self._read(objects, (CONSUMERS, sub))
+            if found is None:
+                return None
+            if int.from_bytes(found[:2], "little") == 0 or found[2] & 0x7F == 0:
+                return CONSUMERS, sub
+        return None
+
+    def _read(self, objects: SdoClient, key: Key) -> bytes | None:
+        """Return an object's bytes, None where the node has none such."""
+        try:
+            return objects.read(*key, f"{key[0]:04X}h:{key[1]:02X}", self._timeout)
+        except ObjectAccessError:
+            return None
+
+    def _change(self, node: int, objects: SdoClient, key: Key, data: bytes) -> None:
+        label = f"{key[0]:04X}h:{key[1]:02X}"
+        before = objects.read(*key, label, self._timeout)[: len(data)]
+        # Remembered first: an answer that is lost says nothing of whether it was taken.
+        self._before.setdefault(node, {})[key] = before
+        objects.write(*key, data, label, self._timeout)
+
+
+def nodes_watched_by(frames: Iterable[Any]) -> tuple[set[int], set[int]]:
+    """Return the nodes whose watch over a master frames set themselves, and those that they reset (0: all)."""
+    own, reset = set(), set()
+    for frame in frames:
+        can_id, data = frame.arbitration_id, bytes(frame.data)
+        if can_id == NMT and len(data) == 2 and data[0] in RESETS:
+            reset.add(data[1])
+            continue
+        is_download = SDO_REQUEST < can_id < SDO_REQUEST + 0x80 and len(data) == 8 and data[0] & 0xE0 == 0x20
+        if is_download and int.from_bytes(data[1:3], "little") in (CONSUMERS, GUARD_TIME, LIFE_FACTOR):
+            own.add(can_id - SDO_REQUEST)
+    return own, reset
