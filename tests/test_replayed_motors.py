@@ -325,6 +325,7 @@ def test_a_drive_watches_over_the_program_meanwhile_and_gets_back_what_it_had(bu
     assert changed[3:6] == [(0x6040, 6), (0x6040, 7), (0x6040, 15)]
     assert changed[-3:] == [(0x6007, 0), (0x1029, 1), (0x1016, 0)]  # when it is off
     assert changed[-4] == (0x6040, 0)
+    assert bus.sent(0x000) == [b"\1\1"]  # in pre-operational it may watch nobody
     beats = bus.sent(0x700 + (watch >> 16))
     assert beats and set(beats) == {b"\5"}
 
@@ -336,6 +337,7 @@ def test_a_drive_watches_over_the_program_meanwhile_and_gets_back_what_it_had(bu
         ({(0x1016, 1): (0x0005_01F4, 4)}, [], "no heartbeat consumer (1016h) that is free"),
         ({(0x1016, 1): (0, 4)}, [(0x000, b"\x82\1")], "the frames reset it"),
         ({(0x1016, 1): (0, 4)}, [(0x000, b"\x81\0")], "the frames reset it"),
+        ({(0x1016, 1): (0, 4)}, [(0x000, b"\x80\1")], "the frames take it out of NMT operational"),
     ],
 )
 def test_what_cannot_watch_over_the_program_is_said(bus, tmp_path, values, frames, why):

@@ -22,7 +22,8 @@ MOST_CONSUMERS = 8  # entries of 1016h that are looked at
 MAX_AXES = 8
 CONSUMERS, GUARD_TIME, LIFE_FACTOR, ERROR_BEHAVIOUR = 0x1016, 0x100C, 0x100D, (0x1029, 1)
 QUICK_STOP, NO_ACTION = 3, 0  # of 6007h
-RESETS = (0x81, 0x82)  # NMT commands after which nothing of 1016h is left
+# NMT commands; nothing of 1016h is left after the resets.
+START, RESETS = 0x01, (0x81, 0x82)
 
 Key = tuple[int, int]
 
@@ -41,7 +42,7 @@ class ReplayWatchdog:
         self._timeout = timeout
         self._heartbeats: Heartbeats | None = None
         self._before: dict[int, dict[Key, bytes]] = {}  # node -> what its objects had
-        self._own, self._reset = nodes_watched_by(frames)
+        self._own, self._left = nodes_watched_by(frames)
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -55,10 +56,7 @@ class ReplayWatchdog:
         for node in nodes:
             if node in self._own:
                 continue  # the recorded master's own, whose heartbeats are among the frames
-            if node in self._reset or 0 in self._reset:
-                why = "the frames reset it, after which it watches nobody"
-            else:
-                why = self._arm_node(node)
+            why = self._left.get(node) or self._left.get(0) or self._arm_node(node)
             if why:
                 without.append(
                     f"node {node} would run on if this program were killed: {why}; keep the emergency stop at hand"
@@ -98,6 +96,8 @@ class ReplayWatchdog:
         """Set a node's consumer and its reaction; return why not."""
         objects = SdoClient(self._port, node)
         try:
+            # A drive may watch its master in NMT operational alone, as the TMCM-1636 does.
+            self._port.send(NMT, bytes((START, node)))
             consumer = self._free_consumer(objects)
             if consumer is None:
                 return "it has no heartbeat consumer (1016h) that is free"
@@ -139,15 +139,21 @@ class ReplayWatchdog:
         objects.write(*key, data, label, self._timeout)
 
 
-def nodes_watched_by(frames: Iterable[Any]) -> tuple[set[int], set[int]]:
-    """Return the nodes whose watch over a master frames set themselves, and those that they reset (0: all)."""
-    own, reset = set(), set()
+def nodes_watched_by(frames: Iterable[Any]) -> tuple[set[int], dict[int, str]]:
+    """Return the nodes whose watch over a master frames set themselves, and of which there is none, why (0: all)."""
+    own: set[int] = set()
+    left: dict[int, str] = {}
     for frame in frames:
         can_id, data = frame.arbitration_id, bytes(frame.data)
-        if can_id == NMT and len(data) == 2 and data[0] in RESETS:
-            reset.add(data[1])
+        if can_id == NMT and len(data) == 2:
+            if data[0] in RESETS:
+                left[data[1]] = "the frames reset it, after which it watches nobody"
+            elif data[0] != START:
+                left.setdefault(data[1], "the frames take it out of NMT operational, where it may watch nobody")
+            elif "operational" in left.get(data[1], ""):
+                del left[data[1]]
             continue
         is_download = SDO_REQUEST < can_id < SDO_REQUEST + 0x80 and len(data) == 8 and data[0] & 0xE0 == 0x20
         if is_download and int.from_bytes(data[1:3], "little") in (CONSUMERS, GUARD_TIME, LIFE_FACTOR):
             own.add(can_id - SDO_REQUEST)
-    return own, reset
+    return own, left
