@@ -358,7 +358,7 @@ class MemoryLink:
         self.nodes = tuple(range(FIRST_ADDRESS, FIRST_ADDRESS + len(bus.nodes)))
         self.num_axes = bus.drives.num_axes
         self.is_dry = False
-        self.wording = Wording("OP", "check the cable")
+        self.wording = Wording("OP", "check the cable", "images")
         self.alive = lambda: None
         self.next_outputs = None
         self.exchanged_at = -math.inf

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import logging
 import re
 import time
@@ -11,12 +12,32 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from in_memory_link import FIRST_ADDRESS, WATCHDOG_STEP, MemoryBus, MemoryDrives, State
+from in_memory_link import (
+    FIRST_ADDRESS,
+    WATCHDOG_STEP,
+    Images,
+    ImageWatch,
+    InputRows,
+    Mailbox,
+    MemoryBus,
+    MemoryDrives,
+    MemoryLink,
+    NoOtherMasters,
+    OutputRows,
+    State,
+)  # fmt: skip
 from test_parity import SCRIPTS, TURN, assert_equal, emulated, run, served
 
 from drive_env import EmulatedDrives, Limits, ObjectAccessError, SafetyError, cia402, motion
 from drive_env.devices import find_device
-from drive_env.master import parameters
+from drive_env.master import link, parameters
+from drive_env.master.can.can_link import CanLink
+from drive_env.master.can.dry_run import DrySdoClient
+from drive_env.master.can.error_control import ErrorControls
+from drive_env.master.can.other_masters import OtherMasters
+from drive_env.master.can.process_data import PdoProcessData, RpdoRows
+from drive_env.master.can.samples import PdoSamples
+from drive_env.master.can.sdo import SdoClient
 from drive_env.master.errors import NoAnswerError, RefusedError
 from drive_env.master.identity import read_identity
 from drive_env.motors import find_motor
@@ -50,6 +71,22 @@ def test_what_is_common_imports_nothing_of_can():
             if isinstance(node, ast.ImportFrom):
                 assert not (node.module or "").startswith(("drive_env.canopen", "drive_env.master.can.")), path
     assert len(common) > 30
+
+
+@pytest.mark.parametrize(("protocol", "kinds"), [
+    (link.Link, (CanLink, MemoryLink)), (link.ObjectClient, (SdoClient, DrySdoClient, Mailbox)),
+    (link.ProcessData, (PdoProcessData, Images)), (link.Samples, (PdoSamples, InputRows)),
+    (link.Outputs, (RpdoRows, OutputRows)), (link.MasterWatch, (ErrorControls, ImageWatch)),
+    (link.OtherMastersHeard, (OtherMasters, NoOtherMasters)),
+], ids=lambda one: getattr(one, "__name__", ""))  # fmt: skip
+def test_links_have_what_is_asked_of_them(protocol, kinds):
+    asked = {name: one for name, one in vars(protocol).items() if inspect.isfunction(one) and name[0] != "_"}
+    assert asked
+    for kind in kinds:
+        for name, one in asked.items():
+            found = inspect.signature(getattr(kind, name)).parameters.values()
+            wanted = inspect.signature(one).parameters.values()
+            assert [(p.name, p.default) for p in found] == [(p.name, p.default) for p in wanted], (kind, name)
 
 
 # --- the interface ----------------------------------------------------------------------------------------------------

@@ -240,12 +240,12 @@ def on_bus(
     """
     if axes not in AXES:
         raise ValueError(f"--axes {axes} must be one of {', '.join(AXES)}")
-    from drive_env import CanDrives
+    from drive_env.master.open_drives import open_drives
     from drive_env.motors import find_motor
 
     row = find_motor(motor)
     numbers = tuple(nodes)
-    drives = CanDrives(device, interface=interface, channel=channel, nodes=numbers, **options)
+    drives = open_drives(device, interface=interface, channel=channel, nodes=numbers, **options)
     try:
         low, high = _ways(travel, drives.num_axes)
         assert drives.device is not None, "a device of a name is known"

@@ -52,7 +52,7 @@ def target_for(
         BusError: If the bus cannot be opened or a node does not answer.
     """
     from drive_env.drives.speeds import per_increment
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.open_drives import open_drives
     from drive_env.safety.limits import Limits
     from tuning.target import FREE, LOCKSTEP_PATIENCE, on_bus
 
@@ -65,7 +65,7 @@ def target_for(
         lanes = make_lanes(environment, 1, _emulated(configuration))
         amplitude, speed = lanes.config.amplitude, lanes.config.speed  # type: ignore[attr-defined]
         lanes.close()
-        with CanDrives(**more) as drives:
+        with open_drives(**more) as drives:
             turn, at = drives.read(Role.POSITION_SCALE), drives.read(cia402.POSITION_ACTUAL)
             speed_turn = turn * per_increment(drives, cia402.VELOCITY_ACTUAL)
         reach = POSITION_SLACK * amplitude * turn

@@ -18,7 +18,6 @@ from drive_env.programs import CLOSED, output_is_closed
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
     from drive_env.master.bus_drives import BusDrives
-    from drive_env.master.can_drives import CanDrives
 
 REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
 
@@ -85,14 +84,14 @@ def connect(
     device: str,
     eds: Path | None,
     **others: Any,
-) -> CanDrives:
+) -> BusDrives:
     """Open drives with a command's options."""
-    from drive_env.master.can_drives import CanDrives
+    from drive_env.master.open_drives import open_drives
 
     bitrate = others.pop("bitrate", None)
     if bitrate is not None:
         others["bitrate"] = bitrate
-    return CanDrives(device, eds=eds, interface=interface, channel=channel, nodes=nodes or (1,), **others)
+    return open_drives(device, eds=eds, interface=interface, channel=channel, nodes=nodes or (1,), **others)
 
 
 def look_first(

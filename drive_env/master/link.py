@@ -40,10 +40,12 @@ class Wording(NamedTuple):
     Attributes:
         operational: The state in which nodes exchange process data.
         check_samples: What to check where a node was started and sends none.
+        sign_of_life: What the nodes hear of their master, in the plural.
     """
 
     operational: str
     check_samples: str
+    sign_of_life: str
 
 
 class ObjectClient(Protocol):

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from drive_env import cia402
-from drive_env.canopen.communication import ModuleObjects
 from drive_env.devices import Device
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.node.axis import Axis, ObjectPort
+
+
+class OwnObjects(Protocol):
+    """Objects that a node has once, whatever its axes: those of communication.
+
+    Attributes:
+        commands: Those whose write commands something, by index and sub-index.
+    """
+
+    commands: dict[tuple[int, int], Callable[[int], None]]
+
+    def owns(self, entry: Entry) -> bool:
+        """Return whether an object is one of them."""
+
+    def port(self, entry: Entry) -> ObjectPort:
+        """Return the way to one."""
 
 
 class NodeDictionary:
@@ -21,7 +37,7 @@ class NodeDictionary:
         axes: The axes, in order.
     """
 
-    def __init__(self, device: Device, entries: ObjectDictionary, module: ModuleObjects, axes: Sequence[Axis]) -> None:
+    def __init__(self, device: Device, entries: ObjectDictionary, module: OwnObjects, axes: Sequence[Axis]) -> None:
         self.entries = entries
         self._device = device
         self._module = module

@@ -2,7 +2,7 @@
 
 While the program runs communication cycles, their samples are what is watched, and this thread only looks at the
 clock. While it computes, sleeps, reads or writes, this thread asks the drives itself. A program that takes the
-interpreter from it takes the heartbeats away, too, and the drives stop by themselves.
+interpreter from it takes the master's signs of life away, too, and the drives stop by themselves.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Supervisor:
     """Runs a turn every few milliseconds.
 
     Args:
-        turn: What to do; a BusError is told once, anything else ends the heartbeats.
+        turn: What to do; a BusError is told once, anything else ends it for good.
         fail: Called when a turn failed for good.
     """
 
@@ -67,7 +67,7 @@ class Supervisor:
                 self._turn()
                 told = ""
             except BusError as error:
-                # Heartbeats that do not get out are what the drives wait for to stop by themselves.
+                # Signs of life that do not get out are what the drives wait for to stop by themselves.
                 if str(error) != told:
                     told = str(error)
                     logger.error("%s", told)

@@ -37,7 +37,7 @@ Mask = NDArray[np.bool_]
 
 STALE, STALE_OFF = 0.008, 0.015  # s after which drives that are live, or off, are looked at
 BLIND = 0.2  # s for which a live axis cannot be seen, however it is asked, until it is stopped
-MISSED = 3  # SYNCs in a row to which a node that answers otherwise sends no TPDO: it is not operational
+MISSED = 3  # SYNCs in a row to which a node that answers otherwise sends no samples: it is not operational
 MOST_STOP_CYCLES = 5000  # in lockstep
 SILENT_CYCLE = 0.1  # s of lockstep that count as passed where nobody answers
 LONGEST_STOP = RAMP_TIMEOUT + BLIND_TIMEOUT + LOST + 2.0  # s, all grades together
@@ -281,7 +281,7 @@ class Watch:
 
     # --- the supervisor's thread -------------------------------------------------------------------------------------
     def _turn(self) -> None:
-        """Do what is due: heartbeats, a look at the drives, a step of a stop, the program's pulse.
+        """Do what is due: a sign of life, a look at the drives, a step of a stop, the program's pulse.
 
         Raises:
             BusError: If the bus failed in one of them; the others are done all the same.

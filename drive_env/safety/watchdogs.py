@@ -157,7 +157,7 @@ class Watchdogs:
 
     def give_up(self) -> None:
         """Give drives back what they had and their watchdogs; what is not proved off keeps them and hears no more."""
-        per_node = self._drives.description.num_axes
+        per_node, heard = self._drives.description.num_axes, self._drives.link.wording.sign_of_life
         for k, node in enumerate(self._drives.nodes):
             axes = range(k * per_node, (k + 1) * per_node)
             is_untouched = not self._watch.is_set(k) and not self._lending.has_lent(set(axes))
@@ -175,7 +175,7 @@ class Watchdogs:
             logger.error(
                 "node %d could not be proved to be off: %s. Look at the machine, and keep the emergency stop at hand",
                 node,
-                "its watchdog stays, and it hears no more heartbeats, so that it stops by itself"
+                f"its watchdog stays, and it hears no more {heard}, so that it stops by itself"
                 if self._watch.is_set(k)
                 else "it has no watchdog",
             )

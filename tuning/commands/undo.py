@@ -73,18 +73,18 @@ def _restore(
     file: Path, snapshot: Snapshot, address: dict[str, Any], store: bool, *, other_drive: bool
 ) -> tuple[list[tuple[int, Any]], int]:
     """Return what was changed as (axis, difference), and how many parameters another connection has read anew."""
-    from drive_env import CanDrives
+    from drive_env.master.open_drives import open_drives
     from drive_env.master.parameters import compare, list_differences, restorable
     from tuning import snapshot as snapshots
 
     # Nothing turns: the envelope would only add its own limits.
-    with CanDrives(snapshot.device, safety=False, **address) as drives:
+    with open_drives(snapshot.device, safety=False, **address) as drives:
         snapshots.check_same_drives(file, snapshot, drives, other_drive=other_drive)
         changed = snapshots.restore(drives, snapshot)
         if store:
             snapshots.store(drives)
     verified = 0
-    with CanDrives(snapshot.device, safety=False, **address) as drives:
+    with open_drives(snapshot.device, safety=False, **address) as drives:
         for axis, values in enumerate(snapshot.axes):
             wanted = restorable(values, drives.description.hints)
             verified += len(wanted)

@@ -37,7 +37,9 @@ class CanLink:
         self.port = port
         self.nodes = tuple(nodes)
         self.is_dry = isinstance(port, DryPort)
-        self.wording = Wording("NMT operational", "check 1005h and 18xxh, and whether another master is on the bus")
+        self.wording = Wording(
+            "NMT operational", "check 1005h and 18xxh, and whether another master is on the bus", "heartbeats"
+        )
         self._description = description
         self._alive: Callable[[], None] = lambda: None
         self._restarted: Callable[[int], None] = lambda node: None
