@@ -24,8 +24,10 @@ PAGES = {
         "Motion",
         "Enable, move, home and stop, on any drives: `from drive_env import motion`.",
         (
-            ("drive_env.drives.motion", "enable disable quick_stop reset_fault select_mode wait_for start_move move_to "
-             "home"),
+            (
+                "drive_env.drives.motion",
+                "enable disable quick_stop reset_fault select_mode wait_for start_move move_to home",
+            ),
         ),
     ),
     "machines": (

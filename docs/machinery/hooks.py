@@ -36,15 +36,17 @@ def pages() -> dict[str, str]:
 
 
 def expanded(entries: list[Any], known: list[str]) -> list[Any]:
-    """Return navigation entries with each `folder/*` replaced by the pages of that folder that no entry names."""
+    """Return navigation entries with each `folder/*` replaced by the pages right in that folder that no entry names."""
     named = set(_named(entries))
 
     def expand(entry: Any) -> list[Any]:
         if isinstance(entry, dict):
-            return [{title: _flat(value) if isinstance(value, list) else value for title, value in entry.items()}]
+            ((title, value),) = entry.items()
+            inner = _flat(value) if isinstance(value, list) else value
+            return [{title: inner}] if inner else []  # a section without pages is none
         if isinstance(entry, str) and entry.endswith("/*"):
             folder = entry[:-1]
-            return [page for page in known if page.startswith(folder) and page not in named]
+            return [page for page in known if page.rpartition("/")[0] + "/" == folder and page not in named]
         return [entry]
 
     def _flat(some: list[Any]) -> list[Any]:

@@ -16,8 +16,8 @@ PICTURES = Path(__file__).resolve().parent.parent / "assets" / "loads"
 INDEX = """# Loads
 
 `load="belt"` in Python and `--load belt` of the commands take a name of this page. Each is a MuJoCo model
-(`mechanics/models/`) with a row of data (`mechanics/loads.py`); they are sized for a motor of 50 W. A load of your own is
-the path of an MJCF file: `load="my_machine.xml"`.
+(`mechanics/models/`) with a row of data (`mechanics/loads.py`); they are sized for a motor of 50 W. A load of your own
+is the path of an MJCF file: `load="my_machine.xml"`.
 
 All have friction, of the kind that is asked for: `friction="stribeck"` (the default), `"none"`, `"coulomb_viscous"` or
 `"lugre"`.

@@ -16,8 +16,8 @@ prints them. A motor of your own is a file of the same form (`drive-env motor ne
 writes it): `--motor my_motor.toml`.
 
 All numbers are SI; resistance, inductance and currents are those of one phase, currents are peak i_q. The torque
-constant is the torque per ampere of peak i_q. What a data sheet gives otherwise (between two terminals, RMS, per rpm) is
-converted when the file is read; the tables below show the numbers as the files have them, each with its source.
+constant is the torque per ampere of peak i_q. What a data sheet gives otherwise (between two terminals, RMS, per rpm)
+is converted when the file is read; the tables below show the numbers as the files have them, each with its source.
 
 {table}
 With `randomise=True` each machine's motor differs from its row, by these factors:

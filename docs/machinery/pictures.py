@@ -36,8 +36,8 @@ QUALITY = 82  # of WebP
 LOAD_PICTURE = PictureFormat(width=960, height=420)  # of which the machine is the left half
 # The film: a belt axis, all trials of the tuner that ships, and then its answer once more.
 FILM = PictureFormat(width=800, height=450, frames_per_second=12.5)
-SLOW, MOVE, ANSWER = 5.0, 32_768, 5  # slow motion; half a turn [inc]; frames for which the answer's end is held
-TRIAL = 0.30  # s of a trial that are shown: the move, and how it settles
+SLOW, MOVE, ANSWER = 5.0, 131_072, 8  # slow motion; two turns [inc]; frames for which the answer's end is held
+TRIAL = 0.32  # s of a trial that are shown: the move, and how it settles
 
 
 class Row(NamedTuple):
@@ -82,9 +82,9 @@ def film_tuning() -> None:
     trials: list[TrialShown] = []
     with emulated(load="belt") as target:
         tuned = tune_target(target, open_policy(TUNER).policy, show=trials.append)
-        names = target.device.gains.names
+        titles = target.device.gains.titles
     answer = int(tuned.answers.ravel()[0])
-    rows = [(trial_title(k, trial, names), trial.gains) for k, trial in enumerate(trials)]
+    rows = [(trial_title(k, trial, titles), trial.gains) for k, trial in enumerate(trials)]
     rows.append((f"answer: trial {trials[answer].number}", tuned.gains))
     pictures = [Image.fromarray(frame) for title, gains in rows for frame in trial_frames(title, gains)]
     pictures += [pictures[-1]] * ANSWER
@@ -95,11 +95,10 @@ def film_tuning() -> None:
     pictures[-1].save(ASSETS / "tuning_still.webp", quality=QUALITY, method=6)
 
 
-def trial_title(number: int, trial: TrialShown, names: tuple[str, ...]) -> str:
-    """Return what stands above a trial."""
-    gains = dict(zip(names, trial.gains[0], strict=True))
-    text = ", ".join(f"{name.replace('_', ' ')} {gains[name]}" for name in ("velocity_p", "velocity_i", "position_p"))
-    return f"trial {number}: {text}"
+def trial_title(number: int, trial: TrialShown, titles: tuple[str, ...]) -> str:
+    """Return what stands above a trial: the gains that the tuner changes."""
+    gains = zip(titles, trial.gains[0], strict=True)
+    return f"trial {number}: " + ", ".join(f"{title} {gain}" for title, gain in gains if "torque" not in title)
 
 
 def trial_frames(title: str, gains: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
