@@ -67,7 +67,8 @@ def facts(device: Device) -> str:
         "## Figures\n\n"
         + table(("", "value", "unit"), rows)
         + "\nThe power stage and its measurement have imperfections, each of which can be set for each machine "
-        "(`drives.machine.set`). *Range* is what `randomise=True` draws from.\n\n"
+        "(`drives.machine.set`). *Range* is what `randomise=True` draws from. Sources: M is the maker's manual, C a "
+        "value usual for drives of this class, D our own decision where the manual is silent.\n\n"
         + table(("parameter", "default", "range", "unit", "source"), stage)
     )
 

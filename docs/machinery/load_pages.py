@@ -90,9 +90,8 @@ def parameters(load: Load) -> str:
     rows = []
     for row in load.parameters:
         value = float(alone.get(row.name)[0])
-        rows.append(
-            (f"`load.{row.name}`", row.meaning, value, f"{row.low * value:g} to {row.high * value:g}", unit(row.unit))
-        )
+        what = f"{row.name.replace('_', ' ')} {row.meaning}" if row.meaning.startswith("of ") else row.meaning
+        rows.append((f"`load.{row.name}`", what, value, f"{row.low * value:g} to {row.high * value:g}", unit(row.unit)))
     return (
         "## Parameters\n\nEach can be set for each machine, at any time: "
         f"`drives.machine.set({{{rows[0][0].replace('`', chr(34))}: ...}})`. *Range* is what `randomise=True` draws "

@@ -17,7 +17,9 @@ def cell(value: object) -> str:
         return ""
     if isinstance(value, float):
         return f"{value:g}"
-    return str(value).replace("|", "\\|").replace("\n", " ")
+    parts = str(value).replace("\n", " ").split("`")
+    parts[::2] = [one.replace("|", "\\|") for one in parts[::2]]  # within `code` it divides no cells
+    return "`".join(parts)
 
 
 def unit(text: str) -> str:
