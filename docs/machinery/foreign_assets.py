@@ -35,6 +35,8 @@ class _Assets(HTMLParser):
         self._in_style = tag == "style"
         if tag == "link" and HINTS & set(values.get("rel", "").split()):
             return
+        if "mermaid" in values.get("class", "").split():  # the theme's script fetches what draws it
+            self.found.append("mermaid (draw the diagram as a picture instead)")
         self.found += [values[name] for name in LOADING.get(tag, ()) if FOREIGN.match(values.get(name, ""))]
         self.found += IN_STYLES.findall(values.get("style", ""))
 
