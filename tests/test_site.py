@@ -10,6 +10,7 @@ import pytest
 from agents.shipped import shipped_names
 from drive_env.devices import device_names, find_device
 from drive_env.envs import ENVIRONMENTS
+from drive_env.envs.randomisation import shipped
 from drive_env.motors import MOTORS
 from mechanics.loads import LOADS
 
@@ -20,6 +21,7 @@ try:  # they import one another by name, as MkDocs has them do
     import api_pages
     import command_pages
     import device_pages
+    import distribution_pages
     import environment_pages
     import foreign_assets
     import load_pages
@@ -80,6 +82,15 @@ def test_every_environment_has_its_spaces_and_configuration():
             assert f"## {heading}\n" in text, (module, heading)
         assert "| `num_threads` |" in text and "- `num_envs`: " in text
         assert (MACHINERY.parent / "assets" / "environments" / f"{module}.webp").is_file()
+
+
+def test_every_set_of_random_machines_has_its_laws():
+    text = distribution_pages.pages()["reference/environments/distributions.md"]
+    for name in shipped():
+        assert f"## {name}\n" in text
+    assert "| `load.mass` | loguniform | 0.3 to 4 | the default |" in text
+    assert "| `stage.supply_sinks` | choice | 0, 1, weights 3, 1 |  |" in text
+    assert "| `motor.R_s` | normal | 1.05 ± 0.1, cut off at 0.85 to 1.4 | the default |" in text
 
 
 def test_every_agent_that_ships_has_its_figures():

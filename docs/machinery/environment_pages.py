@@ -35,8 +35,8 @@ for _ in range(100):
 Every environment takes
 
 - `config=`, a dataclass, a table or a TOML file, and each of its fields as an option;
-- `distributions=`, a set from which the machine of each episode is drawn: a name of `drive_env/envs/distributions/`, or
-  a TOML file of your own;
+- `distributions=`, a set from which the machine of each episode is drawn: [a name](distributions.md), or a TOML file of
+  your own;
 - `drives=`, a `CanDrives`, to act on real drives in place of emulated ones;
 - `render_mode=`, `"rgb_array"` for pictures of machine and scope (Gymnasium's `RecordVideo` films them), `"human"` for
   a window;

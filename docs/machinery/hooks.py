@@ -13,6 +13,7 @@ import agent_pages
 import api_pages
 import command_pages
 import device_pages
+import distribution_pages
 import environment_pages
 import load_pages
 import motor_pages
@@ -24,7 +25,9 @@ import drive_env.faults.page
 ROOT = Path(__file__).resolve().parent.parent.parent
 # Pages that lie at the root of the repository, where people and tools look for them.
 COPIED = {"contributing.md": "CONTRIBUTING.md", "changelog.md": "CHANGELOG.md"}
-MAKERS = (device_pages, motor_pages, load_pages, environment_pages, agent_pages, command_pages, api_pages)
+MAKERS = (
+    device_pages, motor_pages, load_pages, environment_pages, distribution_pages, agent_pages, command_pages, api_pages,
+)  # fmt: skip
 
 
 def pages() -> dict[str, str]:
@@ -36,7 +39,7 @@ def pages() -> dict[str, str]:
 
 
 def expanded(entries: list[Any], known: list[str]) -> list[Any]:
-    """Return navigation entries with each `folder/*` replaced by the pages right in that folder that no entry names."""
+    """Return navigation entries with each `folder/*` replaced by the pages right in it that no entry names."""
     named = set(_named(entries))
 
     def expand(entry: Any) -> list[Any]:

@@ -53,7 +53,8 @@ def page(load: Load) -> str:
         f"# {load.name}\n",
         f"{load.meaning[0].upper()}{load.meaning[1:]}.\n",
         f"![{load.name}](../../assets/loads/{load.name}.webp){{ width=480 }}\n",
-        f"Film it: `drive-env render --load {load.name} --out {load.name}.gif`.\n",
+        f"Film it: `drive-env render --load {load.name} --out {load.name}.gif`. Environments draw it from "
+        f"[these ranges](../environments/distributions.md#{load.name}).\n",
         "## Drives\n",
         drives(load),
         parameters(load),
