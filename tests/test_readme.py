@@ -89,7 +89,15 @@ def test_the_commands_of_a_bus_do_what_they_say_one_after_the_other(folder, serv
         run(["bash", "-ec", f"{export}\n{line}"], folder)
     (program,) = [text for text in PROGRAMS if "CanDrives(" in text]
     run([sys.executable, "-c", program], folder)
-    assert {"move.csv", "move.png", "tuned"} <= {path.name for path in folder.iterdir()}
+    assert {"move.csv", "move.png", "drive.toml"} <= {path.name for path in folder.iterdir()}
+
+
+@pytest.mark.slow
+def test_the_commands_that_tune_an_emulated_drive_do_what_they_say(folder):
+    (block,) = [text for text in SHELLS if text.startswith("drive-tune")]
+    for line in lines(block):
+        run(["bash", "-ec", line], folder)
+    assert (folder / "tuned" / "report.html").is_file()
 
 
 @pytest.mark.slow

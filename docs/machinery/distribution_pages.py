@@ -18,7 +18,8 @@ PAGE = """# Random machines
 a TOML file like these (`drive_env/envs/distributions/`), which may `include` them. A parameter that has no law stays at
 its default. `stage`, from 0 to 1, widens all laws from the defaults to their whole ranges during training.
 
-Most sets include `common`, what belongs to every machine, and `bus`, what a CAN bus does to set-points and measurements.
+Most sets include `common`, what belongs to every machine, and `bus`, what a CAN bus does to set-points and
+measurements.
 
 """
 
