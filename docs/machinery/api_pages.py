@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 FOLDER = "reference/api"
-# Page -> title, what it is for, and what it has: a module's members are named after it, separated by blanks.
+# Page -> title, what it is for, and what it has: the module that users import from, and names in it.
 PAGES = {
     "drives": (
         "Drives",
         "A set of drives, emulated or on a bus, reached by objects in the drive's units. Whatever acts on drives takes "
         "either.",
         (
-            ("drive_env.emulator.emulated_drives", "EmulatedDrives"),
-            ("drive_env.master.can_drives", "CanDrives"),
+            ("drive_env", "EmulatedDrives CanDrives Trace ObjectAccessError"),
             ("drive_env.drives.interface", "Drives BasicDrives"),
-            ("drive_env.drives.trace", "Trace"),
             ("drive_env.drives.emergency", "EmergencyMessage"),
-            ("drive_env.dictionary.aborts", "ObjectAccessError"),
             ("drive_env.dictionary.entries", "ObjectDictionary Entry"),
             ("drive_env.dictionary.roles", "Role"),
         ),
@@ -35,7 +32,7 @@ PAGES = {
         "What drives turn, and what they are: parameters of emulated machines, faults, loads and motors of your own.",
         (
             ("drive_env.emulator.machine", "Machines"),
-            ("mechanics.load", "Load Parameter Friction Contact Switch Roll"),
+            ("mechanics", "Load Parameter Friction Contact Switch Roll"),
             ("mechanics.loads", "find_load"),
             ("drive_env.motors", "Motor find_motor MotorError"),
             ("drive_env.devices", "Device find_device device_names"),
@@ -46,7 +43,7 @@ PAGES = {
         "Safety envelope",
         "The limits around whatever acts on drives on a bus. What they protect, and what they cannot, is in "
         "[Safety](../../safety.md).",
-        (("drive_env.safety.limits", "Limits"), ("drive_env.safety.errors", "SafetyError")),
+        (("drive_env", "Limits SafetyError"),),
     ),
     "environments": (
         "Environments",
