@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from drive_env.safety.envelope import SafetyError as SafetyError
     from drive_env.safety.limits import Limits as Limits
 
+__version__ = "0.2.0"  # the one home of the version: the package and all three programs take it from here
+
 __all__ = ["CanDrives", "EmulatedDrives", "Limits", "ObjectAccessError", "SafetyError", "Trace", "motion"]
 
 _HOMES = {

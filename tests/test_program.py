@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import io
 import json
 import logging
@@ -38,7 +37,7 @@ APPS = {
 @pytest.mark.parametrize("name", APPS)
 def test_the_version_is_that_of_the_package(name):
     result = CliRunner().invoke(APPS[name], ["--version"], prog_name=name)
-    assert (result.exit_code, result.stdout) == (0, f"{name} {importlib.metadata.version('drive-env')}\n")
+    assert (result.exit_code, result.stdout) == (0, f"{name} {drive_env.__version__}\n")
 
 
 @pytest.mark.parametrize("name", APPS)

@@ -17,8 +17,8 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```$", README, re.M | re.S)
 PROGRAMS = [text for kind, text in BLOCKS if kind == "python"]
 SHELLS = [text for kind, text in BLOCKS if not kind]
-# What wants hardware, another place, or more time than a test has; every other line of the shell is run.
-LEFT_OUT = ("pip install", "socketcan", "drive-agent train", "runs/…", "chrt ")
+# Commands within the text that are complete: with an option, and without a name that the reader chooses.
+INLINE = [text for text in re.findall(r"`(drive-\w+ [^`]+)`", README) if " --" in text and "socketcan" not in text]
 PORT = 29636  # that of `serve`
 
 
@@ -51,7 +51,16 @@ def run(command, folder, wanted=0):
 
 
 def lines(text):
-    return [line for line in text.splitlines() if line and not any(word in line for word in LEFT_OUT)]
+    return [line for line in text.splitlines() if line and "pip install" not in line]
+
+
+def test_it_is_short_and_begins_with_the_two_commands_and_a_picture():
+    assert len(README.splitlines()) <= 150
+    first, second = SHELLS[:2]
+    assert "pip install" in first and "drive-agent tune" in first
+    assert "pip install" in second and "pytest" in second
+    (picture,) = re.findall(r"!\[.+\]\((.+)\)", README)
+    assert (ROOT / picture).is_file()
 
 
 @pytest.fixture(scope="module")
@@ -73,31 +82,31 @@ def served(folder):
 
 @pytest.mark.slow
 def test_the_commands_of_a_bus_do_what_they_say_one_after_the_other(folder, served):
-    (export,) = [line for text in SHELLS for line in lines(text) if line.startswith("export ")]
-    on_the_bus = [text for text in SHELLS if "DRIVE_ENV_CHANNEL" in text]
-    assert len(on_the_bus) == 2
-    for text in on_the_bus:
-        for line in lines(text):
-            if line != export:
-                run(["bash", "-ec", f"{export}\n{line}"], folder)
+    (block,) = [text for text in SHELLS if "DRIVE_ENV_CHANNEL" in text]
+    export, *others = lines(block)
+    assert export.startswith("export ") and len(others) >= 4
+    for line in others:
+        run(["bash", "-ec", f"{export}\n{line}"], folder)
     (program,) = [text for text in PROGRAMS if "CanDrives(" in text]
     run([sys.executable, "-c", program], folder)
-    assert {"scope.csv", "scope.png", "move.csv", "move.png", "drive.toml"} <= {path.name for path in folder.iterdir()}
+    assert {"move.csv", "move.png", "drive.toml"} <= {path.name for path in folder.iterdir()}
 
 
 @pytest.mark.slow
-def test_the_commands_of_emulated_drives_do_what_they_say(folder):
-    left = [line for text in SHELLS for line in lines(text) if "DRIVE_ENV_CHANNEL" not in line and "serve" not in line
-            and not line.startswith(("drive-env", "python", "drive-tune verify", "drive-tune undo"))]  # fmt: skip
-    assert len(left) >= 2, left
-    for line in left:
+def test_the_commands_that_tune_an_emulated_drive_do_what_they_say(folder):
+    (block,) = [text for text in SHELLS if text.startswith("drive-tune")]
+    for line in lines(block):
         run(["bash", "-ec", line], folder)
+    assert (folder / "tuned" / "report.html").is_file()
 
 
 @pytest.mark.slow
-def test_the_programs_run(folder):
+def test_the_programs_run_and_so_do_the_commands_within_the_text(folder):
     """Those before and after the bus, in one file each; what a program goes on with stands before it."""
     (first,) = [text for text in PROGRAMS if "EmulatedDrives(" in text and "num_machines=64" in text]
     for text in PROGRAMS:
         if "CanDrives(" not in text:
             run([sys.executable, "-c", text if "import" in text and "Load(" not in text else first + text], folder)
+    assert INLINE
+    for line in INLINE:
+        run(["bash", "-ec", line], folder)

@@ -50,8 +50,9 @@ class Target:
         device: What the drives are.
         motor: Data sheet values of what turns, of every axis.
         supply: Supply voltage as the user enters it [V], shape (num_axes,).
-        low, high: How far each rotor may turn from where it stood when the target was made [rad], shape (num_axes,),
-            low <= 0 <= high; infinite where it turns freely.
+        low: How far each rotor may turn backwards from where it stood when the target was made [rad], shape
+            (num_axes,), 0 or less; -infinity where it turns freely.
+        high: The same forwards, 0 or more.
         speed: Fastest that an excitation may turn a rotor [rad/s].
         current: Most that an excitation may ask for [A, peak i_q].
         axes_per_machine: Axes that one machine couples; axes are machine-major.

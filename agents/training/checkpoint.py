@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.training.algorithms import algorithm_class
+from agents.training.algorithms import algorithm_class, need
 from mechanics.untrusted import MOST_TEXT, parse_json, read_member
 
 MOST_UNPACKED = 16_000_000_000  # bytes of a replay buffer: a million observations of a thousand entries, twice
@@ -95,9 +95,11 @@ def load_plain(path: Path, *, trust: bool = False) -> Any:
     """Return the model of a file of Stable-Baselines3's alone, whichever algorithm of its packages it is of.
 
     Raises:
-        CheckpointError: If none of them has the policy's class; UntrustedError without `trust`.
+        CheckpointError: If none of them has the policy's class; UntrustedError without `trust`; MissingPackageError
+            without Stable-Baselines3.
     """
     check_trust(path, trust)
+    need("stable_baselines3")
     try:
         said: Any = parse_json(_read(path, PLAIN))
         module = said["policy_class"]["__module__"]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
 import warnings
 from typing import Annotated
 
 import typer
 
+from drive_env import __version__
 from drive_env.commands.compile_bar import show_compiling
 
 PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
@@ -16,7 +16,7 @@ PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
 
 def _tell_version(context: typer.Context, asked: bool) -> None:
     if asked:
-        print(f"{context.find_root().info_name} {importlib.metadata.version('drive-env')}")
+        print(f"{context.find_root().info_name} {__version__}")
         raise typer.Exit
 
 

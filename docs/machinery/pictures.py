@@ -1,0 +1,130 @@
+"""Draw the site's pictures of loads and environments, and film a machine while it is tuned, into docs/assets.
+
+python docs/machinery/pictures.py             # all; or the names of some: loads environments film
+
+Pictures are committed: they need OpenGL (as `drive-env render` does), which not every computer that builds the site
+has. Run it again after a load or an environment has changed.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from agents.policies.open_policy import open_policy
+from agents.shipped import TUNER
+from agents.tuner.tune_target import TrialShown, tune_target
+from drive_env import EmulatedDrives, motion
+from drive_env.envs import ENVIRONMENTS
+from drive_env.gains import write_gains
+from drive_env.pictures.demonstration import PictureFormat
+from drive_env.pictures.recording import CYCLE, Recorder
+from drive_env.pictures.render import Picture
+from mechanics.loads import LOADS
+from mechanics.shaft import one
+from tuning.target import emulated
+
+ASSETS = Path(__file__).resolve().parent.parent / "assets"
+QUALITY = 82  # of WebP
+LOAD_PICTURE = PictureFormat(width=960, height=420)  # of which the machine is the left half
+# The film: a belt axis, all trials of the tuner that ships, and then its answer once more.
+FILM = PictureFormat(width=800, height=450, frames_per_second=12.5)
+SLOW, MOVE, ANSWER = 5.0, 131_072, 8  # slow motion; two turns [inc]; frames for which the answer's end is held
+TRIAL = 0.32  # s of a trial that are shown: the move, and how it settles
+
+
+class Row(NamedTuple):
+    """How an environment's picture comes about: options, the policy that acts, and after how many steps it is taken."""
+
+    policy: str
+    steps: int
+    options: dict[str, Any]
+
+
+ENVIRONMENT_ROWS = {
+    "gain_tuning": Row(TUNER, 6, {"load": "belt"}),
+    "gain_scheduling": Row("", 90, {"load": "gantry"}),
+    "tracking": Row("tracking_inverted_pendulum", 700, {"load": "inverted_pendulum", "mode": "cst"}),
+}
+
+
+def draw_loads() -> None:
+    """Draw every load at rest."""
+    for load in LOADS.values():
+        with Picture(load, LOAD_PICTURE) as picture:
+            save(picture.scene.draw(one(load).start), ASSETS / "loads" / f"{load.name}.webp")
+
+
+def draw_environments() -> None:
+    """Draw every environment after some steps, with an agent that ships at work where there is one."""
+    for name, (module, _) in ENVIRONMENTS.items():
+        row = ENVIRONMENT_ROWS[module]
+        with gymnasium.make(name, render_mode="rgb_array", **row.options) as env:
+            policy = open_policy(row.policy).policy if row.policy else None
+            observation, _ = env.reset(seed=0)
+            for _ in range(row.steps):
+                action = np.zeros(env.action_space.shape)
+                if policy is not None:
+                    action = np.asarray(policy.act(observation[None]))[0]
+                observation, *_ = env.step(action)
+            save(np.asarray(env.render()), ASSETS / "environments" / f"{module}.webp")
+
+
+def film_tuning() -> None:
+    """Film the trials with which the tuner that ships tunes a belt axis: each trial's gains, on the same machine."""
+    trials: list[TrialShown] = []
+    with emulated(load="belt") as target:
+        tuned = tune_target(target, open_policy(TUNER).policy, show=trials.append)
+        titles = target.device.gains.titles
+    answer = int(tuned.answers.ravel()[0])
+    rows = [(trial_title(k, trial, titles), trial.gains) for k, trial in enumerate(trials)]
+    rows.append((f"answer: trial {trials[answer].number}", tuned.gains))
+    pictures = [Image.fromarray(frame) for title, gains in rows for frame in trial_frames(title, gains)]
+    pictures += [pictures[-1]] * ANSWER
+    pictures[0].save(
+        ASSETS / "tuning.webp", save_all=True, append_images=pictures[1:], quality=60, method=6, loop=0,
+        duration=round(1e3 / FILM.frames_per_second),
+    )  # fmt: skip
+    pictures[-1].save(ASSETS / "tuning_still.webp", quality=QUALITY, method=6)
+
+
+def trial_title(number: int, trial: TrialShown, titles: tuple[str, ...]) -> str:
+    """Return what stands above a trial: the gains that the tuner changes."""
+    gains = zip(titles, trial.gains[0], strict=True)
+    return f"trial {number}: " + ", ".join(f"{title} {gain}" for title, gain in gains if "torque" not in title)
+
+
+def trial_frames(title: str, gains: NDArray[np.int64]) -> Iterator[NDArray[np.uint8]]:
+    """Move the axis once with some gains, and draw it as it moves."""
+    with EmulatedDrives(load="belt") as drives:
+        write_gains(drives, gains)
+        motion.enable(drives, mode="pp")
+        recorder = Recorder(drives)
+        motion.start_move(recorder, MOVE, relative=True)
+        recorder.advance(TRIAL)
+        recording = recorder.recording(title)
+    step = round(1.0 / (FILM.frames_per_second * SLOW * CYCLE))
+    with Picture(drives.load, FILM) as picture:
+        for k in range(step - 1, len(recording.t), step):
+            yield picture.frame(recording, k, SLOW)
+
+
+def save(image: NDArray[np.uint8], path: Path) -> None:
+    """Write a picture."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).save(path, quality=QUALITY, method=6)
+    print(f"{path.relative_to(ASSETS.parent)}: {path.stat().st_size} bytes")
+
+
+JOBS: dict[str, Callable[[], None]] = {"loads": draw_loads, "environments": draw_environments, "film": film_tuning}
+
+if __name__ == "__main__":
+    for wanted in sys.argv[1:] or JOBS:
+        JOBS[wanted]()
