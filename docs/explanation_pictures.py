@@ -43,12 +43,13 @@ class Drawing:
 
     def text(
         self, x: float, y: float, text: str, *, bold: bool = False, small: bool = False, anchor: str = "middle",
-        colour: str = INK,
+        colour: str = INK, upwards: bool = False,
     ) -> None:  # fmt: skip
-        """Write a line."""
+        """Write a line, from below upwards if so asked."""
+        turn = f' transform="rotate(-90 {x} {y})"' if upwards else ""
         weight = ' font-weight="bold"' if bold else ""
         self.parts.append(
-            f'<text x="{x}" y="{y}" text-anchor="{anchor}" font-size="{12 if small else 13.5}" fill="{colour}"'
+            f'<text{turn} x="{x}" y="{y}" text-anchor="{anchor}" font-size="{12 if small else 13.5}" fill="{colour}"'
             f"{weight}>{escape(text)}</text>"
         )
 
@@ -104,10 +105,8 @@ def emulator_path() -> str:
     drawing.arrow((296, 538), (336, 538), (336, 250), (296, 250), colour=ORANGE)
     drawing.arrow((336, 322), (296, 322), colour=ORANGE)
     drawing.arrow((64, 538), (24, 538), (24, 106), (64, 106), colour=ORANGE)
-    drawing.text(16, 330, "actual values", small=True, colour=GREY)
-    drawing.parts[-1] = drawing.parts[-1].replace("<text", '<text transform="rotate(-90 16 330)"')
-    drawing.text(352, 420, "feedback", small=True, colour=GREY)
-    drawing.parts[-1] = drawing.parts[-1].replace("<text", '<text transform="rotate(-90 352 420)"')
+    drawing.text(16, 330, "actual values", small=True, colour=GREY, upwards=True)
+    drawing.text(352, 420, "feedback", small=True, colour=GREY, upwards=True)
     return drawing.svg()
 
 
@@ -116,8 +115,8 @@ def emulator_cascade() -> str:
     drawing = Drawing("The cascade: position, velocity and current loop", 470)
     rows = [
         ("Position controller\nP", "velocity demand", BLUE),
-        ("Velocity controller\nPI, 5 kHz", "current demand, limited", BLUE),
-        ("Current controller\nPI, 25 kHz", "voltage, limited by the supply", BLUE),
+        ("Velocity controller\nPI, 5 kHz, limit of current", "current demand", BLUE),
+        ("Current controller\nPI, 25 kHz, limit of voltage", "voltage", BLUE),
         ("Winding and motor\ntorque = Kt × current", "torque", ORANGE),
         ("Load", "", GREEN),
     ]
@@ -125,12 +124,11 @@ def emulator_cascade() -> str:
     drawing.arrow((140, 26), (140, 44))
     column(drawing, rows, 40, 200, 44, 46, 34, 148)
     drawing.arrow((240, 387), (340, 387), (340, 67), (240, 67), colour=GREEN)
-    drawing.text(334, 150, "position", small=True, anchor="end", colour=GREEN)
+    drawing.text(354, 227, "position", small=True, colour=GREEN, upwards=True)
     drawing.arrow((240, 377), (306, 377), (306, 147), (240, 147), colour=BLUE)
-    drawing.text(300, 192, "speed,", small=True, anchor="end", colour=BLUE)
-    drawing.text(300, 268, "filtered", small=True, anchor="end", colour=BLUE)
+    drawing.text(322, 262, "speed, filtered", small=True, colour=BLUE, upwards=True)
     drawing.arrow((240, 307), (272, 307), (272, 227), (240, 227), colour=ORANGE)
-    drawing.text(266, 286, "current", small=True, anchor="end", colour=ORANGE)
+    drawing.text(288, 267, "current", small=True, colour=ORANGE, upwards=True)
     drawing.text(180, 440, "Each loop must be several times faster", small=True, colour=GREY)
     drawing.text(180, 456, "than the one around it.", small=True, colour=GREY)
     return drawing.svg()
@@ -165,21 +163,19 @@ def certificate_steps() -> str:
         ("Watch at rest\nand after a load step (emulated)", "", BLUE),
     ]
     drawing = Drawing("How a certificate comes about", 560)
-    end = column(drawing, rows, 30, 230, 10, 46, 18, 0)
-    drawing.arrow((260, end - 23), (318, end - 23), (318, 161), (260, 161), colour=AMBER)
-    drawing.text(348, 262, "too near to oscillation:", small=True, colour=AMBER)
-    drawing.parts[-1] = drawing.parts[-1].replace("<text", '<text transform="rotate(-90 348 262)"')
-    drawing.text(333, 262, "calmer gains, verify again", small=True, colour=AMBER)
-    drawing.parts[-1] = drawing.parts[-1].replace("<text", '<text transform="rotate(-90 333 262)"')
+    end = column(drawing, rows, 10, 264, 10, 46, 18, 0)
+    drawing.arrow((274, end - 23), (318, end - 23), (318, 161), (274, 161), colour=AMBER)
+    drawing.text(348, 262, "too near to oscillation:", small=True, colour=AMBER, upwards=True)
+    drawing.text(333, 262, "calmer gains, verify again", small=True, colour=AMBER, upwards=True)
     for x, lines, colour in (
         (6, "green\naccepted", GREEN),
         (124, "amber\nwith reservations", AMBER),
         (242, "red\nrejected", RED),
     ):
         drawing.box(x, end + 42, 112, 44, lines, colour)
-        drawing.arrow((145, end), (145, end + 18), (x + 56, end + 18), (x + 56, end + 42), colour=colour)
+        drawing.arrow((142, end), (142, end + 18), (x + 56, end + 18), (x + 56, end + 42), colour=colour)
     drawing.text(62, end + 106, "new gains stay", small=True, colour=GREY)
-    drawing.text(180, end + 106, "they stay; read why", small=True, colour=GREY)
+    drawing.text(180, end + 106, "new gains stay", small=True, colour=GREY)
     drawing.text(298, end + 106, "old gains are back", small=True, colour=GREY)
     drawing.height = end + 122
     return drawing.svg()
@@ -200,7 +196,7 @@ def score_parts() -> str:
     drawing.arrow((180, 122), (180, 150))
     drawing.box(60, 150, 240, 46, "J of one machine\nproduct of the four, at most 30", GREY)
     drawing.arrow((180, 196), (180, 224))
-    drawing.text(190, 215, "the machine and four variants", small=True, anchor="start", colour=GREY)
+    drawing.text(190, 215, "machine, 4 variants", small=True, anchor="start", colour=GREY)
     drawing.box(40, 224, 280, 46, "robust cost\n½ · J of the machine + ½ · worst J", AMBER)
     drawing.text(180, 296, "Variants: inertia × 1.3 and × 0.7,", small=True, colour=GREY)
     drawing.text(180, 314, "stiffness × 0.8, velocity P × 1.5", small=True, colour=GREY)
@@ -438,7 +434,7 @@ def certificate_rest(path: Path) -> None:
 
     _, rule = _score()
     figure, ((axes,),) = _axes(2.6)
-    for factor, colour, name in ((2.5, RED, "velocity P × 2.5"), (1.0, GREEN, "baseline rule")):
+    for factor, colour, name in ((3.0, RED, "velocity P × 3"), (1.0, GREEN, "baseline rule")):
         with EmulatedDrives("tmcm1636", load="belt", num_threads=1) as drives:
             write_gains(drives, np.rint(rule * np.array([1, 1, factor, 1, 1])).astype(np.int64))
             motion.enable(drives, mode="pp")
@@ -499,8 +495,8 @@ def safety_stop(path: Path) -> None:
                                     arrowprops={"arrowstyle": "->", "color": GREEN})  # fmt: skip
     speeds.axvspan(0, 20, color=AMBER, alpha=0.2)
     speeds.axvspan(20, 60, color=GREY, alpha=0.15)
-    speeds.text(1, -180, "grace", fontsize=7, color=AMBER)
-    speeds.text(22, -180, "two checks", fontsize=7, color=GREY)
+    speeds.text(3, 60, "bus and drive", fontsize=7, color=AMBER, rotation=90)
+    speeds.text(23, 60, "two measurements\nof 20 ms each", fontsize=7, color=GREY, rotation=90)
     speeds.set(ylabel="speed [rpm]", ylim=(-250, 1700))
     speeds.legend(fontsize=8, loc="upper right")
     currents.set(xlabel="time after the stop begins [ms]", ylabel="current [A]")
