@@ -453,6 +453,7 @@ def safety_stop(path: Path) -> None:
     Both are judged by the stop's own code (drive_env/safety/stopping.py), sample by sample.
     """
     from drive_env import EmulatedDrives, cia402, motion
+    from drive_env.safety.bounds import REST_TURNS
     from drive_env.safety.stopping import AxisStop, Phase, Sample
 
     figure, ((speeds,), (currents,)) = _axes(4.6, 2)
@@ -463,12 +464,13 @@ def safety_stop(path: Path) -> None:
             drives.write("Profile acceleration", "200 rev/s^2")
             drives.write("Quick stop deceleration", "200 rev/s^2")
             drives.write("Target velocity", "1500 rpm")
+            drives.write((0x605A, 0), 6)  # hold after the quick stop, as the envelope has it
             drives.advance(0.4)
             if share == 0.0:
                 drives.write((0x2042, 1), 0)
                 drives.write((0x2042, 2), 0)
             per_second = 200.0 * 65536
-            stop = AxisStop(0.0, 25.0 * 65536, per_second, 0.1 * 65536, holds=True)
+            stop = AxisStop(0.0, 25.0 * 65536, per_second, REST_TURNS * 65536, holds=True)
             t, speed, current, marks = [], [], [], []
             for ms in range(260):
                 now = ms * 1e-3
