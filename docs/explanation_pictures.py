@@ -117,7 +117,7 @@ def emulator_cascade() -> str:
         ("Position controller\nP", "velocity demand", BLUE),
         ("Velocity controller\nPI, 5 kHz, limit of current", "current demand", BLUE),
         ("Current controller\nPI, 25 kHz, limit of voltage", "voltage", BLUE),
-        ("Winding and motor\ntorque = Kt × current", "torque", ORANGE),
+        ("Winding and motor\ntorque = Kt x current", "torque", ORANGE),
         ("Load", "", GREEN),
     ]
     drawing.text(150, 20, "position demand (profile) + velocity offset", small=True, colour=GREY)
@@ -158,7 +158,7 @@ def certificate_steps() -> str:
         ("Look and back up\nwiring, current parameters → before.toml", "", GREY),
         ("Identify\ntwo short moves, with 95 % intervals", "", BLUE),
         ("Choose gains\ntrials on models, then on the drive", "", BLUE),
-        ("Verify by moves\nmove, reversal, 1.5 × velocity P", "", BLUE),
+        ("Verify by moves\nmove, reversal, 1.5 x velocity P", "", BLUE),
         ("Measure the loops\nphase and gain margin, Ms", "", BLUE),
         ("Watch at rest\nand after a load step (emulated)", "", BLUE),
     ]
@@ -198,8 +198,8 @@ def score_parts() -> str:
     drawing.arrow((180, 196), (180, 224))
     drawing.text(190, 215, "machine, 4 variants", small=True, anchor="start", colour=GREY)
     drawing.box(40, 224, 280, 46, "robust cost\n½ · J of the machine + ½ · worst J", AMBER)
-    drawing.text(180, 296, "Variants: inertia × 1.3 and × 0.7,", small=True, colour=GREY)
-    drawing.text(180, 314, "stiffness × 0.8, velocity P × 1.5", small=True, colour=GREY)
+    drawing.text(180, 296, "Variants: inertia x 1.3 and x 0.7,", small=True, colour=GREY)
+    drawing.text(180, 314, "stiffness x 0.8, velocity P x 1.5", small=True, colour=GREY)
     return drawing.svg()
 
 
@@ -213,8 +213,8 @@ class Examples(NamedTuple):
 
 EXAMPLES = (
     Examples("baseline rule", (1.0, 1.0, 1.0, 1.0, 1.0)),
-    Examples("velocity P × 2.5", (1.0, 1.0, 2.5, 1.0, 1.0)),
-    Examples("velocity P × 1.4, position P × 2", (1.0, 1.0, 1.4, 1.0, 2.0)),
+    Examples("velocity P x 2.5", (1.0, 1.0, 2.5, 1.0, 1.0)),
+    Examples("velocity P x 1.4, position P x 2", (1.0, 1.0, 1.4, 1.0, 2.0)),
 )
 BELT_INERTIA = 2.34e-5  # kg*m^2 at the rotor, as `drive-tune identify --load belt` finds it
 
@@ -380,7 +380,7 @@ def score_variants(path: Path) -> None:
     figure, ((axes,),) = _axes(3.4)
     rows = worked_example()
     names = [name for name in rows[0][2] if name == "nominal" or " x " in name]
-    labels = ["the machine" if name == "nominal" else name.replace(" x ", " × ") for name in names] + ["robust cost"]
+    labels = ["the machine" if name == "nominal" else name for name in names] + ["robust cost"]
     place = np.arange(len(labels))
     for number, ((name, _, figures), colour) in enumerate(zip(rows, (GREY, RED, GREEN), strict=True)):
         values = [figures[variant] for variant in names] + [figures["robust"]]
@@ -434,7 +434,7 @@ def certificate_rest(path: Path) -> None:
 
     _, rule = _score()
     figure, ((axes,),) = _axes(2.6)
-    for factor, colour, name in ((3.0, RED, "velocity P × 3"), (1.0, GREEN, "baseline rule")):
+    for factor, colour, name in ((3.0, RED, "velocity P x 3"), (1.0, GREEN, "baseline rule")):
         with EmulatedDrives("tmcm1636", load="belt", num_threads=1) as drives:
             write_gains(drives, np.rint(rule * np.array([1, 1, factor, 1, 1])).astype(np.int64))
             motion.enable(drives, mode="pp")
