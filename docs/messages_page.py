@@ -21,6 +21,7 @@ for some words of your message that are no values: with the browser's search on 
 | 1 | the drive, the bus or the safety envelope refused, a tuning was rejected, or you declined |
 | 2 | a mistake in the command, a file, or the way to the bus: nothing was sent |
 | 130 | interrupted by Ctrl-C; drives were stopped first |
+| 141 | whoever read the output has closed it, as `head` does |
 
 Every message is one line on standard error and names the value, the limit and what to do. A traceback is a mistake of
 this program: please report it with the line above it.
@@ -54,7 +55,7 @@ def page() -> str:
 
 
 def _message(row: dict[str, Any]) -> str:
-    said = "<br>\n".join(f"`{text}`" for text in row["says"])
+    said = "<br>\n".join(f"`` {text} ``" if "`" in text else f"`{text}`" for text in row["says"])
     return f"{said}\n\n- *From:* {row['from']}\n- *Cause:* {row['cause']}\n- *Remedy:* {row['remedy']}\n"
 
 
