@@ -56,7 +56,8 @@ def test_figures_of_the_worked_example_are_those_of_the_page():
         "t_s / t_0": ("settling", "{:.2f}"), "E_d / E_0": ("disturbance", "{:.2f}"), "n": ("noise", "{:.2%}"),
         "os": ("overshoot", "{:.2%}"), "J of the machine": ("nominal", "{:.2f}"), "robust cost": ("robust", "{:.2f}"),
         "J, load inertia x 1.3": ("load inertia x 1.3", "{:.2f}"), "J, stiffness x 0.8": ("stiffness x 0.8", "{:.2f}"),
-        "J, load inertia x 0.7": ("load inertia x 0.7", "{:.2f}"), "J, velocity P x 1.5": ("velocity P x 1.5", "{:.2f}"),
+        "J, load inertia x 0.7": ("load inertia x 0.7", "{:.2f}"),
+        "J, velocity P x 1.5": ("velocity P x 1.5", "{:.2f}"),
     }  # fmt: skip
     for label, (name, form) in digits.items():
         assert rows[label] == [form.format(one[2][name]).replace("%", " %") for one in found], label
