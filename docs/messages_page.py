@@ -55,7 +55,7 @@ def page() -> str:
 
 
 def _message(row: dict[str, Any]) -> str:
-    said = "<br>\n".join(f"`` {text} ``" if "`" in text else f"`{text}`" for text in row["says"])
+    said = "\n>\n".join(f"> `` {text} ``" if "`" in text else f"> `{text}`" for text in row["says"])
     return f"{said}\n\n- *From:* {row['from']}\n- *Cause:* {row['cause']}\n- *Remedy:* {row['remedy']}\n"
 
 

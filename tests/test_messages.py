@@ -24,6 +24,7 @@ SAID = (
     "tuning/stop_causes.py",
 )
 PASSED_ON = {"ObjectAccessError", "KeyboardInterrupt", "NotImplementedError", "typer.Exit"}  # these may carry no text
+TELLING = r"(^|\.)_?fail$|^warnings\.warn$|logger\.(warning|error)$"
 FEWEST_LETTERS = 5  # of a pattern, or it would fit anything
 
 
@@ -54,7 +55,7 @@ def text_of(node):
     """Return the text of an expression with … for each value, "" for none."""
     match node:
         case ast.Constant(value=str(text)):
-            return re.sub(r"%(\.\d+)?[a-z]", "…", text)
+            return re.sub(r"%[0-9.]*[a-zA-Z]", "…", text)
         case ast.JoinedStr(values=values):
             return "".join(v.value if isinstance(v, ast.Constant) else "…" for v in values)
         case ast.BinOp(op=ast.Add()):
@@ -84,6 +85,18 @@ def raised():
                 error = ast.unparse(node.exc.func).rsplit(".", 1)[-1]
                 found += [Message(f"{place}:{node.lineno}", error, text) for text in texts]
     return found
+
+
+@cache
+def told():
+    """Return every text by which a command ends, and every warning and error of a log."""
+    return [
+        Message(f"{place}:{node.lineno}", "", text)
+        for place, tree in trees().items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and node.args and re.search(TELLING, ast.unparse(node.func))
+        if re.search(r"[a-z]{3}", text := text_of(node.args[0]))
+    ]
 
 
 def literals(tree):
@@ -147,6 +160,11 @@ def test_every_message_that_is_raised_has_a_row_or_a_family():
     assert without_a_row(messages) == []
 
 
+def test_every_end_of_a_command_and_every_warning_has_a_row_or_a_family():
+    assert len(told()) > 40
+    assert without_a_row(told()) == []
+
+
 def test_every_refusal_of_a_dictionary_has_a_row():
     messages = [message for message in raised() if message.error == "ObjectAccessError"]
     assert len(messages) > 30
@@ -160,9 +178,7 @@ def test_every_verdict_and_every_stop_has_a_row_or_a_family():
 
 def test_every_emergency_has_a_row():
     rows = {row["emcy"] for row in ROWS if "emcy" in row}
-    for device in ("tmcm1636",):
-        table = tomllib.loads((ROOT / "drive_env" / "devices" / device / "device.toml").read_text(encoding="utf-8"))
-        assert rows == set(table["emergencies"])
+    assert rows == set(tomllib.loads(PAGE.DEVICE.read_text(encoding="utf-8"))["emergencies"])
 
 
 def test_every_abort_code_has_a_row():
