@@ -1,0 +1,206 @@
+"""docs/reference/file-formats.md has the fields of files that are really written, no more and no fewer."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scripted_drive import ScriptedBus, ScriptedDrive
+from typer.testing import CliRunner
+
+from agents.evaluation import episode_log
+from agents.evaluation.evaluation import Evaluation
+from agents.evaluation.scores import Episode
+from agents.policies.agent_file import AgentFile
+from agents.shipped import find_agent
+from drive_env.bus.config import Bus, Machine
+from drive_env.bus.faults import Faults
+from drive_env.commands.cli import app as drive_env_app
+from drive_env.commands.log import FORMATS, WRITTEN
+from drive_env.envs import randomisation
+from drive_env.master.identity import Identity
+from drive_env.motors import MOTORS, NUMBERS
+from tuning.certificate.certificate import (
+    AxisCertificate,
+    Certificate,
+    FrequencyResponse,
+    StatedParameter,
+    StepResponse,
+)
+from tuning.certificate.certificate_files import save_certificate
+from tuning.commands.cli import app
+from tuning.snapshot import take
+from tuning.target import emulated
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "reference" / "file-formats.md").read_text(encoding="utf-8")
+DEVICE = ROOT / "drive_env" / "devices" / "tmcm1636"
+
+
+def fields(name, kind="keys"):
+    """Return the names in backticks in the first column of the table that is marked with a name."""
+    after = PAGE.split(f"<!-- {kind}: {name} -->\n", 1)[1].split("\n\n", 1)[0]
+    return [found for row in after.splitlines()[2:] for found in re.findall(r"`([^`]+)`", row.split(" | ")[0])]
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
+
+
+def header(path):
+    with path.open(encoding="utf-8", newline="") as file:
+        return next(csv.reader(file))
+
+
+def test_every_table_is_compared_here():
+    marked = set(re.findall(r"<!-- (?:keys|files): ([a-z ]+) -->", PAGE))
+    compared = set(re.findall(r'(?:fields\(|\(")"?([a-z ]+)"', Path(__file__).read_text(encoding="utf-8")))
+    assert marked - {"distributions"} <= compared and "distributions" in marked
+
+
+# --- tuning -----------------------------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory):
+    row = np.linspace(1.0, 2.0, 9)
+    axis = AxisCertificate(
+        0, True, "", (), {"inertia": StatedParameter(1.0, 0.9, 1.1, "kg*m^2")}, (1,) * 5, (1,) * 5, {}, {},
+        (StepResponse("move", True, "rad", row, row, row, row),),
+        (FrequencyResponse("velocity loop", True, row, row, row, row),),
+    )  # fmt: skip
+    made = Certificate("auto", "tmcm1636", "qbl4208", "belt", 24.0, 0, {}, (axis,), {})
+    folder = tmp_path_factory.mktemp("certificate")
+    save_certificate(made, folder)
+    return json.loads((folder / "certificate.json").read_text(encoding="utf-8"))
+
+
+def test_certificate(certificate):
+    assert fields("certificate") == list(certificate)
+    (axis,) = certificate["axes"]
+    assert fields("certificate axis") == list(axis)
+    assert fields("certificate identified") == list(axis["identified"]["inertia"])
+    assert fields("certificate step") == list(axis["steps"][0])
+    assert fields("certificate response") == list(axis["frequency_responses"][0])
+
+
+def test_state_before_a_change(tmp_path):
+    with emulated(load="inertia", num_machines=1) as target:
+        take(target).save(tmp_path / "before.toml")
+    written = tomllib.loads((tmp_path / "before.toml").read_text(encoding="utf-8"))
+    of_a_bus = {"bus", "node"}
+    assert [name for name in fields("snapshot") if name not in of_a_bus] == list(written)
+    assert of_a_bus < set(fields("snapshot"))
+
+
+def test_sweep(tmp_path):
+    text = re.sub(r"count = \d+", "count = 2", (ROOT / "tuning" / "runs" / "sweep.toml").read_text(encoding="utf-8"))
+    (tmp_path / "small.toml").write_text(text, encoding="utf-8")
+    run("sweep", "--config", tmp_path / "small.toml", "--out", tmp_path / "out")
+    settings = tomllib.loads((tmp_path / "out" / "settings.toml").read_text(encoding="utf-8"))
+    assert fields("sweep settings") == list(settings)
+    assert fields("sweep") == list(settings["sweep"][0])
+    assert sorted(fields("excitation")) == sorted(settings["excitation"])
+    columns = header(tmp_path / "out" / "results.csv")
+    assert fields("sweep results") == [name for name in columns if not re.match("[0-9A-F]{4}h:", name)]
+
+
+def test_search(tmp_path):
+    run("optimise", "--trials", 1, "--load", "inertia", "--out", tmp_path / "out")
+    settings = tomllib.loads((tmp_path / "out" / "settings.toml").read_text(encoding="utf-8"))
+    assert fields("search settings") == list(settings)
+    assert fields("trials") == header(tmp_path / "out" / "trials.csv")
+
+
+def test_comparison(tmp_path):
+    run("rank", "-t", "fitted", "--count", 1, "--out", tmp_path / "out")
+    assert fields("tuners") == header(tmp_path / "out" / "tuners.csv")
+
+
+def test_response(tmp_path):
+    run("response", "--load", "inertia", "--out", tmp_path / "out")
+    assert fields("response") == header(tmp_path / "out" / "velocity_axis0.csv")
+
+
+def test_machines_for_comparisons():
+    suite = tomllib.loads((ROOT / "tuning" / "compare" / "suites" / "public.toml").read_text(encoding="utf-8"))
+    assert fields("suite") == list(suite)
+    found = dict.fromkeys(name for group in suite["group"] for name in group)
+    assert sorted(fields("suite group")) == sorted(found)
+
+
+# --- drives -----------------------------------------------------------------------------------------------------------
+def test_backup(tmp_path, monkeypatch):
+    drive = ScriptedDrive(values={(0x1018, 4): (4711, 4), (0x6081, 0): (1000, 4)})
+    monkeypatch.setattr("drive_env.master.can_drives.open_bus", lambda *_, **__: ScriptedBus(drive))
+    monkeypatch.setattr("drive_env.master.port.open_bus", lambda *_, **__: ScriptedBus(drive))
+    file = tmp_path / "drive.toml"
+    result = CliRunner().invoke(drive_env_app, ["backup", str(file), "--channel", "any", "--interface", "virtual"])
+    assert result.exit_code == 0, result.output
+    written = tomllib.loads(file.read_text(encoding="utf-8"))
+    assert fields("backup") == list(written)
+    assert set(written["identity"]) < set(fields("identity"))
+    assert fields("identity") == [*Identity._fields, "axis"]
+
+
+def test_bus():
+    plain = {field.name for field in dataclasses.fields(Bus)}
+    assert set(fields("bus")) == plain
+    assert set(fields("bus machine")) == {field.name for field in dataclasses.fields(Machine)}
+    assert set(fields("bus faults")) == {field.name for field in dataclasses.fields(Faults)}
+
+
+def test_motor():
+    for name in MOTORS:
+        file = ROOT / "drive_env" / "motors" / f"{name}.toml"
+        assert set(tomllib.loads(file.read_text(encoding="utf-8"))) <= set(fields("motor"))
+    assert fields("motor numbers") == list(NUMBERS)
+    for name, row in NUMBERS.items():
+        assert f"| `{name}` |" in PAGE and f"| {row.unit or '1'} | {row.meaning} |" in PAGE, name
+
+
+def test_device():
+    data = tomllib.loads((DEVICE / "device.toml").read_text(encoding="utf-8"))
+    assert set(fields("device")) == set(data)
+    own = {path.name for path in (ROOT / "tests" / "invented_drive").iterdir() if not path.name.startswith("_")}
+    assert {name.replace("*", "invented") for name in fields("device", "files")} == own
+
+
+def test_recorded_frames():
+    rows = re.findall(r"^\| ((?:`\.[a-z]+`(?:, )?)+) \|.*\|( reads)? \|$", PAGE, re.M)
+    endings = {ending: bool(reads) for names, reads in rows for ending in re.findall(r"`(\.[a-z]+)`", names)}
+    assert set(endings) == set(WRITTEN)
+    assert {ending for ending, reads in endings.items() if reads} == set(FORMATS)
+
+
+# --- environments and agents ------------------------------------------------------------------------------------------
+def test_distributions():
+    rows = {}
+    for line in PAGE.split("<!-- keys: distributions -->\n", 1)[1].split("\n\n", 1)[0].splitlines()[2:]:
+        laws, needs, may = (re.findall(r"`([^`]+)`", cell) for cell in line.strip("|").split("|"))
+        rows |= {law: (tuple(needs), tuple(may)) for law in laws}
+    assert rows == {law: (randomisation._KEYS[law], randomisation._OPTIONAL[law]) for law in randomisation.LAWS}
+
+
+def test_agent():
+    with np.load(find_agent("tracking_two_mass")) as stored:
+        about = json.loads(bytes(stored["about"]))
+        assert set(fields("agent")) == set(about)
+        for name in ("weight_0", "bias_0", "observation_mean", "observation_scale", "action_low", "action_high"):
+            assert name in stored and f"`{name}`" in PAGE
+    assert AgentFile.load(find_agent("tracking_two_mass")).kind in PAGE
+
+
+def test_report_and_episodes(tmp_path):
+    episode = Episode(0, np.zeros((3, 2)), np.zeros((2, 1)), np.zeros(2), {}, False, "", {}, {})
+    report = Evaluation("p", "e", {}, "emulator", [0], {"return": [1.0]}, {"return": False}, {})
+    report.save(tmp_path / "report.json")
+    assert set(fields("evaluation report")) == set(json.loads((tmp_path / "report.json").read_text(encoding="utf-8")))
+    episode_log.save(tmp_path / "episodes.npz", "e", {}, [episode])
+    with np.load(tmp_path / "episodes.npz") as stored:
+        assert fields("episodes") == list(stored)

@@ -1,0 +1,219 @@
+"""docs/messages.md names every message that a user may meet, and none that the code has no more."""
+
+from __future__ import annotations
+
+import ast
+import fnmatch
+import importlib.util
+import re
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+from drive_env.dictionary import aborts
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("drive_env", "mechanics", "tuning", "agents")
+# What is said without being raised: verdicts of certificates, reasons of identification, what the envelope tells.
+SAID = (
+    "tuning/auto/*.py",
+    "tuning/identify/*.py",
+    "tuning/response/*.py",
+    "drive_env/safety/*.py",
+    "tuning/stop_causes.py",
+)
+PASSED_ON = {"ObjectAccessError", "KeyboardInterrupt", "NotImplementedError", "typer.Exit"}  # these may carry no text
+TELLING = r"(^|\.)_?fail$|^warnings\.warn$|logger\.(warning|error)$"
+FEWEST_LETTERS = 5  # of a pattern, or it would fit anything
+
+
+class Message(NamedTuple):
+    """A text of the code, with … for each value."""
+
+    place: str
+    error: str
+    text: str
+
+
+def load_page():
+    spec = importlib.util.spec_from_file_location("messages_page", ROOT / "docs" / "messages_page.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+PAGE = load_page()
+DATA = PAGE.load()
+ROWS = [row for topic in DATA["topic"] for row in topic["message"]]
+PATTERNS = [text for row in ROWS for text in row.get("says", ()) if not text.startswith("abort ")]
+ABORTS = [text for row in ROWS for text in row.get("says", ()) if text.startswith("abort ")]
+
+
+# --- what the code says -----------------------------------------------------------------------------------------------
+def text_of(node):
+    """Return the text of an expression with … for each value, "" for none."""
+    match node:
+        case ast.Constant(value=str(text)):
+            return re.sub(r"%[0-9.]*[a-zA-Z]", "…", text)
+        case ast.JoinedStr(values=values):
+            return "".join(v.value if isinstance(v, ast.Constant) else "…" for v in values)
+        case ast.BinOp(op=ast.Add()):
+            return (text_of(node.left) or "…") + (text_of(node.right) or "…")
+        case ast.IfExp():
+            return text_of(node.body) or text_of(node.orelse)
+    return ""
+
+
+@cache
+def trees():
+    return {
+        str(path.relative_to(ROOT)): ast.parse(path.read_text(encoding="utf-8"))
+        for package in PACKAGES
+        for path in sorted((ROOT / package).rglob("*.py"))
+    }
+
+
+@cache
+def raised():
+    """Return every message that is raised with a text of its own."""
+    found = []
+    for place, tree in trees().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+                texts = [text for one in node.exc.args if (text := text_of(one)) and re.search(r"[a-z]{3}", text)]
+                error = ast.unparse(node.exc.func).rsplit(".", 1)[-1]
+                found += [Message(f"{place}:{node.lineno}", error, text) for text in texts]
+    return found
+
+
+@cache
+def told():
+    """Return every text by which a command ends, and every warning and error of a log."""
+    return [
+        Message(f"{place}:{node.lineno}", "", text)
+        for place, tree in trees().items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and node.args and re.search(TELLING, ast.unparse(node.func))
+        if re.search(r"[a-z]{3}", text := text_of(node.args[0]))
+    ]
+
+
+def literals(tree):
+    """Return the texts of a module that are no docstrings and no assertions, with … for each value."""
+    docstrings = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
+    docstrings |= {id(n.msg) for n in ast.walk(tree) if isinstance(n, ast.Assert)}
+    inner = {id(v) for n in ast.walk(tree) if isinstance(n, ast.JoinedStr) for v in n.values}
+    for node in ast.walk(tree):
+        if id(node) not in docstrings | inner and isinstance(node, ast.Constant | ast.JoinedStr) and text_of(node):
+            yield node.lineno, text_of(node)
+
+
+@cache
+def said():
+    """Return what verdicts, identification and envelope say: texts of four words or more."""
+    own = {message.text for message in raised()}
+    return [
+        Message(f"{place}:{line}", "", text)
+        for place, tree in trees().items()
+        if any(fnmatch.fnmatch(place, one) for one in SAID) and "/model/" not in place
+        for line, text in literals(tree)
+        if len(re.findall(r"[A-Za-z]{2,}", text)) >= 4 and " " in text.strip() and text not in own
+    ]
+
+
+@cache
+def everything():
+    """Return every text of the code."""
+    return "\n".join(text for tree in trees().values() for _, text in literals(tree))
+
+
+# --- patterns ---------------------------------------------------------------------------------------------------------
+@cache
+def expression(pattern):
+    """Return a pattern of the page as a regular expression: its … stands for anything on one line."""
+    return re.compile(r"[^\n]*?".join(re.escape(part) for part in pattern.strip("… ").split("…")))
+
+
+def has_a_row(text):
+    return any(expression(pattern).search(text) for pattern in PATTERNS)
+
+
+def family_of(message):
+    for family in DATA["family"]:
+        place = message.place.rsplit(":", 1)[0]
+        if message.error in family.get("errors", ()) and any(fnmatch.fnmatch(place, one) for one in family["where"]):
+            return family["title"]
+        if any(expression(text).search(message.text) for text in family.get("texts", ())):
+            return family["title"]
+    return None
+
+
+def without_a_row(messages):
+    return [f"{m.place} {m.error}: {m.text}" for m in messages if not has_a_row(m.text) and family_of(m) is None]
+
+
+# --- the page has what the code says ----------------------------------------------------------------------------------
+def test_every_message_that_is_raised_has_a_row_or_a_family():
+    messages = [message for message in raised() if message.error not in PASSED_ON]
+    assert len(messages) > 500
+    assert without_a_row(messages) == []
+
+
+def test_every_end_of_a_command_and_every_warning_has_a_row_or_a_family():
+    assert len(told()) > 40
+    assert without_a_row(told()) == []
+
+
+def test_every_refusal_of_a_dictionary_has_a_row():
+    messages = [message for message in raised() if message.error == "ObjectAccessError"]
+    assert len(messages) > 30
+    assert [f"{m.place}: {m.text}" for m in messages if not has_a_row(m.text)] == []
+
+
+def test_every_verdict_and_every_stop_has_a_row_or_a_family():
+    assert len(said()) > 100
+    assert without_a_row(said()) == []
+
+
+def test_every_emergency_has_a_row():
+    rows = {row["emcy"] for row in ROWS if "emcy" in row}
+    assert rows == set(tomllib.loads(PAGE.DEVICE.read_text(encoding="utf-8"))["emergencies"])
+
+
+def test_every_abort_code_has_a_row():
+    codes = {value for name, value in vars(aborts).items() if name.isupper()}
+    assert {int(text[6:].rstrip("h").replace(" ", ""), 16) for text in ABORTS} == codes
+    assert len(ABORTS) == len(codes)
+
+
+# --- the code has what the page says ----------------------------------------------------------------------------------
+def test_every_row_is_still_said():
+    patterns = PATTERNS + [text for one in DATA["family"] for text in one.get("texts", ())]
+    assert [p for p in patterns if len(re.findall("[A-Za-z]", p)) < FEWEST_LETTERS] == []  # they would fit anything
+    assert [p for p in patterns if not expression(p).search(everything())] == []
+
+
+def test_no_pattern_stands_twice():
+    assert sorted(set(PATTERNS)) == sorted(PATTERNS)
+
+
+def test_rows_are_whole():
+    for row in ROWS:
+        if "same" in row:
+            assert any(other.get("emcy") == row["same"] and "same" not in other for other in ROWS)
+        else:
+            assert row["cause"].endswith((".", "?")), row
+            assert row["remedy"].strip(), row
+            assert "emcy" in row or (row["says"] and row["from"]), row
+
+
+def test_the_page_is_current():
+    assert (ROOT / "docs" / "messages.md").read_text(encoding="utf-8") == PAGE.page(), "python docs/messages_page.py"
+
+
+# --- the test itself --------------------------------------------------------------------------------------------------
+def test_a_message_that_is_new_is_found():
+    new = Message("drive_env/commands/new.py:1", "ValueError", "the frobnicator … has no grommet")
+    assert without_a_row([new]) != []
+    assert not expression("cannot open interface …").search("cannot close the interface x")
