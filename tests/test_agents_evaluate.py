@@ -138,7 +138,7 @@ def test_a_fall_is_a_violation_and_the_score_is_the_time_that_it_stood():
 @pytest.mark.parametrize(
     ("environment", "options", "figure"),
     [
-        ("gain_tuning", {"trials": 2}, "hidden J over the rule's (emulator)"),
+        ("gain_tuning", {"trials": 2}, "robust cost over the rule's (emulator)"),
         ("gain_scheduling", {"duration": 0.05}, "tracking term [0...1]"),
     ],
 )
@@ -186,7 +186,7 @@ def test_a_tuner_is_judged_by_its_own_answer_not_by_the_incumbent(trial):
         patch.setattr("drive_env.envs.gain_tuning.GainTuning", Listening)
         found = evaluate(Bold(trial), "gain_tuning", {"trials": 3}, episodes=2)
     for lane, episode in enumerate(found.episodes):
-        names = {"hidden": "trial_hidden", "measured": "trial_measured", "gains": "trial_gains"}
+        names = {"robust_cost": "trial_robust_cost", "measured": "trial_measured", "gains": "trial_gains"}
         for own, name in names.items():
             expected = episode.first[own] if trial == 0 else told[trial - 1][name][lane]
             assert np.array_equal(episode.last[own], expected), own

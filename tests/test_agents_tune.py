@@ -77,7 +77,7 @@ def test_it_tunes_an_emulated_drive_over_its_bus_and_certifies_it(tmp_path):
     assert axis.accepted and axis.after != axis.before
     tried = [tuple(map(int, row.split()[1:4])) for row in table]
     # Proving may calm what the agent found, and says so.
-    calmed = any(word in note for note in axis.notes for word in ("calmed", "slowed", "second best", "fitted rule"))
+    calmed = any(word in note for note in axis.notes for word in ("calmed", "slowed", "second best", "baseline rule"))
     assert tuple(axis.after[2:]) in tried or calmed
     assert axis.identified["inertia"].low < axis.identified["inertia"].value < axis.identified["inertia"].high
     assert axis.frequency_responses[0].margins["phase margin [deg]"] > 10.0
@@ -222,7 +222,7 @@ def test_where_every_trial_was_stopped_the_drive_has_what_it_had(tmp_path, monke
     with emulated("tmcm1636", "inertia", "qbl4208") as target:
         before, set_before = gains(target), settings(target)
         done = run_agent(target, Reckless(), tmp_path / "before.toml", name="reckless")
-        assert done.result.axes[0].reason == "every trial was stopped, the fitted rule's too"
+        assert done.result.axes[0].reason == "every trial was stopped, the baseline rule's too"
         assert not done.result.kept and not done.certificate.axes[0].accepted
         assert np.array_equal(gains(target), before) and np.array_equal(settings(target), set_before)
         assert not is_enabled(target).any()

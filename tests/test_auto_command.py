@@ -104,7 +104,7 @@ def test_auto_ends_with_1_and_says_why_where_it_changed_nothing(tmp_path, monkey
 
 def test_rules_write_one_of_them_and_leave_the_way_back(tmp_path):
     file = tmp_path / "before.toml"
-    done = drive_tune("rules", "chain", "--load", "inertia", "--apply", "chain", "--snapshot", file, "--yes")
+    done = drive_tune("rules", "cascade", "--load", "inertia", "--apply", "cascade", "--snapshot", file, "--yes")
     assert done.exit_code == 0, done.output
     assert "written" in done.stdout
     assert load_snapshot(file).axes[0][0x2042, 1] == 445

@@ -390,7 +390,7 @@ def test_syncs_that_were_late_are_told(late, told):
 RULE, FOUND, SLOW = [4000, 1500, 700, 1800, 700], [4000, 1000, 2000, 4800, 2000], [4000, 1000, 900, 2000, 900]
 
 
-RULES = "the gains of the fitted rule: with faster ones it shook"
+RULES = "the gains of the baseline rule: with faster ones it shook"
 
 
 @pytest.mark.parametrize(("had", "eased", "swing", "gains_now", "said"), [

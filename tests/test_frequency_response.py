@@ -9,7 +9,7 @@ import pytest
 from test_parity import served
 
 from drive_env.devices import find_device
-from drive_env.gains import FITTED_RULE, rule_gains, write_gains
+from drive_env.gains import BASELINE_RULE, rule_gains, write_gains
 from drive_env.motors import find_motor
 from tuning.identify.true_plant import true_plant
 from tuning.response.frequency_response import measure
@@ -20,7 +20,7 @@ from tuning.response.measured_loop import COHERENT
 from tuning.response.plant_fit import Seen, fit_plant
 from tuning.target import Target, emulated
 
-SOFT = FITTED_RULE._replace(speed=0.1)  # crossover at about 20 Hz
+SOFT = BASELINE_RULE._replace(speed=0.1)  # crossover at about 20 Hz
 FINE = {"motor.encoder_interpolation": 16.0}  # 65,536 counts per turn
 GRID = np.geomspace(5.0, 1000.0, 4000)
 

@@ -237,7 +237,7 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
             return
         mark = "better" if trial.better[0] else ""
         if trial.number == 0:
-            mark = "the fitted rule's gains, from which the agent sets out"
+            mark = "the baseline rule's gains, from which the agent sets out"
         if trial.aborted[0]:
             mark = f"stopped: it oscillated or tripped{f'; {mark}' if trial.number == 0 else ''}"
         figures = "".join(f" {value:>{width}}" for value, width in zip(trial.gains[0, outer], widths, strict=True))
@@ -298,7 +298,7 @@ def _print(done: TunerRun, refused: list[str], rule: float | None) -> None:
         lines.append(said)
     if axis.accepted and rule is not None:
         lines.append(
-            f"J {axis.proof:.3f}, {100.0 * axis.proof / rule:.0f} % of the fitted rule's {rule:.3f}; "
+            f"J {axis.proof:.3f}, {100.0 * axis.proof / rule:.0f} % of the baseline rule's {rule:.3f}; "
             f"{certified.hardware_seconds:.1f} s of drive time, trials stopped: {certified.aborts}"
         )
     for loop in certified.frequency_responses:
@@ -326,7 +326,7 @@ def _answer(done: TunerRun) -> str:
     own = next((trial for trial in done.trials if tuple(trial.gains[0]) == after), None)
     if own is None:
         return ""
-    which = f"trial {own.number}" if own.number else "the fitted rule's gains"
+    which = f"trial {own.number}" if own.number else "the baseline rule's gains"
     best = best_unstopped(done.trials, 0)
     if best is None or best.measured[0] >= own.measured[0]:
         return f"the agent stays with {which}, the best"

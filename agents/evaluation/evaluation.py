@@ -32,7 +32,11 @@ TOLD = 0.5  # s between two looks at a progress bar, which takes a millisecond
 STEP_SECONDS: dict[str, Callable[[Any], float]] = {"ServoDrive/Tracking-v0": lambda config: 1.0 / config.rate,
                 "ServoDrive/GainScheduling-v0": lambda config: config.step,
                 "ServoDrive/GainTuning-v0": lambda config: TRIAL_SECONDS}  # fmt: skip
-TRIAL_OF = {"gains": "trial_gains", "measured": "trial_measured", "hidden": "trial_hidden"}  # of incumbent, of trial
+TRIAL_OF = {
+    "gains": "trial_gains",
+    "measured": "trial_measured",
+    "robust_cost": "trial_robust_cost",
+}  # of incumbent, of trial
 FIXED_STEPS = ("ServoDrive/Tracking-v0", "ServoDrive/GainScheduling-v0")  # a trial takes what clearing up takes besides
 
 

@@ -126,7 +126,7 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
         RETURN,
     ),
     "ServoDrive/GainTuning-v0": (
-        Figure("hidden J over the rule's (emulator)", _told("hidden", ratio=True)),
+        Figure("robust cost over the rule's (emulator)", _told("robust_cost", ratio=True)),
         Figure("J by measured terms over the rule's", _told("measured", ratio=True)),
         Figure("J by measured terms", _told("measured", ratio=False)),
         Figure("stopped trials [share]", stopped),

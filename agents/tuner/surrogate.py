@@ -1,9 +1,9 @@
-"""A tuner that has learnt what gains are worth: a network for hidden J that reads all trials of the machine so far.
+"""A learnt tuner: a network predicts the robust cost of gains from all trials of the machine so far.
 
 It acts in `ServoDrive/GainTuning-v0`. Of every machine it keeps the context c (what was identified, and what the trial
 at the rule's gains showed) and its trials (log gains over the rule's x_i, what they showed y_i). A conditional neural
-process with attention (Kim et al., "Attentive Neural Processes", 2019), trained on emulated machines whose hidden J is
-known, says of any gains x what ln of hidden J over the rule's is, as a Laplace law:
+process with attention (Kim et al., "Attentive Neural Processes", 2019), trained on emulated machines whose robust cost
+is known, predicts for any gains x the logarithm of the robust cost over the rule's, as a Laplace distribution:
 
     v_i, p_i, k_i = trial(c, x_i, y_i)                      value, share of the summary, keys
     u   = silu(mean of p_i)                                 what kind of machine this is

@@ -29,7 +29,7 @@ PATIENCE = 2  # windows of 25 ms for which an axis may shake; what it does with 
 class TrialShown(NamedTuple):
     """A trial of every machine of a target.
 
-    number: 0 is the fitted rule's gains.
+    number: 0 is the baseline rule's gains.
     gains: Raw integers, (num_axes, count) in the order of the device's gain set.
     measured: J by measured terms of the machine's worst axis, (num_machines,).
     aborted, better: Whether it was stopped; whether it became the incumbent, (num_machines,).
@@ -48,7 +48,7 @@ class Tuned(NamedTuple):
     """What came of it: the answer's gains, raw (num_axes, count), all trials, and each machine's answer among them.
 
     The answer is the policy's own choice (`answer`) where it makes one that was not stopped, else the best trial by
-    measured terms that was not; of a machine all of whose trials were stopped it is the first one, the fitted rule's.
+    measured terms that was not; of a machine all of whose trials were stopped it is the first one, the baseline rule's.
     overruled: Machines whose policy would have stayed with gains that were stopped.
     """
 
@@ -161,7 +161,7 @@ def tune_target(
 def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ...]:
     """Return the names that a device has for the gains which an agent changes.
 
-    An agent sees and changes gains over those of the fitted rule, so that neither names nor scales matter to it, but
+    An agent sees and changes gains over those of the baseline rule, so that neither names nor scales matter to it, but
     the part that each plays in the cascade does.
 
     Raises:

@@ -118,7 +118,7 @@ def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
         own = slice(machine * lanes, (machine + 1) * lanes)
         answer = tuned.trials[int(tuned.answers[machine])]
         if answer.aborted[machine]:
-            run.stop(np.arange(target.num_axes) // lanes == machine, "every trial was stopped, the fitted rule's too")
+            run.stop(np.arange(target.num_axes) // lanes == machine, "every trial was stopped, the baseline rule's too")
             continue
         others = [trial for trial in tuned.trials if not np.array_equal(trial.gains[own], tuned.gains[own])]
         second = best_unstopped(others, machine)

@@ -83,7 +83,7 @@ def softness(known: GainSet, gains: Integers) -> Floats:
 
 
 def measured_cost(costs: Floats) -> Floats:
-    """Return what a trial is worth: half of move and reversal's mean, half of the worst phase; hidden J's likeness."""
+    """Return the cost of a trial: half the mean of move and reversal, half the worst phase, as in the robust cost."""
     return np.asarray(0.5 * costs[:2].mean(axis=0) + 0.5 * costs.max(axis=0))
 
 

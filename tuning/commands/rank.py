@@ -50,12 +50,12 @@ def rank(
     resume: Resume = False,
     json: Json = False,
 ) -> None:
-    """Have every tuner tune the same emulated machines, and score what it finds by hidden J.
+    """Have every tuner tune the same emulated machines, and score what it finds by the robust cost.
 
-    Hidden J counts speed, stiffness, noise, overshoot and robustness; it is given relative to that of the fitted rule
-    with the true inertia, and machine by machine to that of the best other tuner. Writes tuners.csv, rivals.csv,
-    machines.csv, comparison.png and settings.toml. Stopped at any point, it goes on with --out and --resume, to the
-    same digits; with --workers and --cluster, too.
+    The robust cost counts speed, stiffness, noise, overshoot and robustness; it is given relative to that of the
+    baseline rule with the true inertia, and machine by machine to that of the best other tuner. Writes tuners.csv,
+    rivals.csv, machines.csv, comparison.png and settings.toml. Stopped at any point, it goes on with --out and
+    --resume, to the same digits; with --workers and --cluster, too.
     """
     with errors_as_exit_codes():
         if show:
@@ -148,12 +148,12 @@ def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
          f"{row.moves:.0f}", str(row.aborts), str(row.violations), str(row.failed))
         for row in comparison.tuners
     ]  # fmt: skip
-    title = f"Hidden J over the fitted rule's on {machines} machines"
+    title = f"The robust cost over the baseline rule's on {machines} machines"
     print_table([Column("tuner", "name"), *map(Column, titles)], rows, title)
     lines = ["Drive time and moves: median of a machine; stops, violations, gave up: all machines."]
     for row in all_rivals(comparison):
         lines.append(
-            f"{row.tuner}: machine by machine {row.median:.3f} of the best other's hidden J (median, 95 % of "
+            f"{row.tuner}: machine by machine {row.median:.3f} of the best other's robust cost (median, 95 % of "
             f"{row.low:.3f} to {row.high:.3f}), better than all on {row.better} of {row.machines}"
         )
     lines += [f"left out: {text}" for text in left_out]

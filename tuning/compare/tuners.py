@@ -84,8 +84,8 @@ def _factory(target: Target, rng: np.random.Generator) -> Outcome:
     return _outcome(target, read_gains(target))
 
 
-def _fitted(target: Target, rng: np.random.Generator) -> Outcome:
-    """Take the fitted rule's gains for the inertia that two moves show."""
+def _baseline(target: Target, rng: np.random.Generator) -> Outcome:
+    """Take the baseline rule's gains for the inertia that two moves show."""
     with timed(target) as (watched, clock):
         bench = TrialBench(watched)
         bench.identify()
@@ -178,12 +178,12 @@ def _load(entry: importlib.metadata.EntryPoint) -> Tuner:
 
 _OWN = (
     TunerKind("factory", "the gains that the drive comes with for its motor", lambda: _factory),
-    TunerKind("fitted", "the fitted rule, for the inertia that two moves show", lambda: _fitted),
+    TunerKind("baseline", "the baseline rule, for the inertia that two moves show", lambda: _baseline),
 )
 _AFTER = (
     TunerKind("auto", "one button: identify, compute, verify, refine", _auto),
     TunerKind("random", "20 trials drawn at random", partial(_search, "random", trials=20), searches=True),
-    TunerKind("grid", "the fitted rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
+    TunerKind("grid", "the baseline rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
     TunerKind("tpe", "20 trials by tree-structured Parzen estimators",
         partial(_search, "tpe", trials=20), searches=True),
     TunerKind("tpe-safe", "20 trials by TPE from safe gains, in small steps",

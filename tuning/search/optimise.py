@@ -1,6 +1,6 @@
 """Optimisation of gains on drives: a generation of trials at a time, costed from what a drive shows.
 
-Optimisers search the logarithms of gains about the fitted rule's, each machine by itself or, where the lanes are one
+Optimisers search the logarithms of gains about the baseline rule's, each machine by itself or, where the lanes are one
 and the same emulated machine, one search whose generation fills them. The safe search starts at gains that are slow and
 proved, goes on from what has been proved in small steps, and never beyond what oscillated.
 """
@@ -100,7 +100,7 @@ class Optimised:
 
     Attributes:
         gains: The best of every machine, raw integers, (num_axes, count); that of the safe search was never stopped.
-        rule: The fitted rule's, from what was identified, (num_axes, count).
+        rule: The baseline rule's, from what was identified, (num_axes, count).
         cost: ln J by measured terms of the best, (num_machines,).
         rows: Every trial, in the order in which they were told.
         drive_seconds: Time that passed on the drives [s].
