@@ -249,7 +249,7 @@ DOUBT = "no margins <yet>"
 @pytest.mark.parametrize(("accepted", "reservations", "verdict", "colour", "words"), [
     (True, (), "accepted", "accepted", "new gains in the drive"),
     (True, (DOUBT,), "accepted with reservations", "reserved", "new gains in the drive, with reservations"),
-    (False, (DOUBT,), "rejected", "rejected", "gains as before"),
+    (False, (DOUBT,), "rejected", "rejected", "rejected; the drive has its gains from before"),
 ])  # fmt: skip
 def test_a_verdict_has_three_colours_and_names_each_reservation(
     certificate, accepted, reservations, verdict, colour, words

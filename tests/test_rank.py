@@ -336,7 +336,7 @@ def test_the_command_prints_the_table_and_writes_the_folder(tmp_path):
     folder = tmp_path / "out"
     result = run("rank", "-t", "factory", "-t", "baseline", "--count", 3, "--out", folder)
     assert result.exit_code == 0
-    assert "The robust cost over the baseline rule's on 3 machines" in result.output
+    assert "Robust cost relative to the baseline rule on 3 machines" in result.output
     names = {path.name for path in folder.iterdir()}
     assert names == {"tuners.csv", "rivals.csv", "machines.csv", "comparison.png", "settings.toml"}
     told = run("rank", "-t", "baseline", "--count", 3, "--json", "--out", tmp_path / "again")

@@ -151,7 +151,7 @@ def test_what_ends_with_an_error_is_put_back_and_says_where_the_file_is(target, 
         change(target.drives)
         raise ValueError("no")
     assert take(target) == before == load_snapshot(file)
-    said = f"the drives have what they had before; if ever not, drive-tune undo {file} brings it back"
+    said = f"the drives have their state from before; if not, drive-tune undo {file} restores it"
     assert capsys.readouterr().err == f"drive-tune: {said}\n"
 
 
@@ -161,7 +161,7 @@ def test_an_error_after_a_commit_says_that_the_drives_are_others(target, tmp_pat
         change(target.drives)
         transaction.commit()
         raise ValueError("no")
-    assert capsys.readouterr().err == f"drive-tune: drive-tune undo {file} brings back what was\n"
+    assert capsys.readouterr().err == f"drive-tune: drive-tune undo {file} restores the state before\n"
 
 
 # --- the file -----------------------------------------------------------------------------------------------------
@@ -383,8 +383,8 @@ def test_a_disk_that_is_full_when_drives_are_to_keep_a_change_gives_them_back_wh
             transaction.store()
         assert caught.value.filename == str(file)
         assert caught.value.strerror == (
-            "the state before cannot be written: No space left on device; choose another place; the drives have what "
-            f"they had before; if ever not, drive-tune undo {file} brings it back"
+            "the state before cannot be written: No space left on device; choose another place; the drives have their "
+            f"state from before; if not, drive-tune undo {file} restores it"
         )
         assert [gains(machine).tolist() for machine in machines] == before
         target.drives.reset_node()

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from tuning.auto.result import AxisRun, Result
     from tuning.target import Target
 
-SETTLED = 0.01  # of the move: what counts as there
+SETTLED = 0.01  # of the move: the band of settling
+# Counted from the end of the profile.
+SETTLING = "settling time after the set-point's arrival, to within 1 % of the move [s]"
 
 
 def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") -> Certificate:
@@ -92,8 +94,8 @@ def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
     there = np.flatnonzero(demand != demand[-1])
     settled = len(actual) - 1 not in late
     figures = {
-        # After the profile's end; less than nothing is nothing.
-        "settling [s]": max(float(shown.t[late[-1]] - shown.t[there[-1]]), 0.0) if settled and late.size else np.nan,
+        # Of an actual position that is inside the band before the profile's end, 0.
+        SETTLING: max(float(shown.t[late[-1]] - shown.t[there[-1]]), 0.0) if settled and late.size else np.nan,
         "overshoot [%]": 100.0 * max(float(beyond.max()), 0.0) / size,
         "largest following error [rad]": float(np.abs(demand - actual).max()),
         "error at the end [rad]": float(demand[-1] - actual[-1]),
@@ -113,7 +115,7 @@ def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple
     changed = not np.array_equal(response.gains[axis], run.after)
     sources = {
         "velocity": "multisine, 1 kHz samples"
-        + ("with other gains, converted to the new gains by the linear model" if changed else ""),
+        + (", with other gains, converted to the new gains by the linear model" if changed else ""),
         "position": "computed from the measured velocity loop and position P",
     }
     known = device.gains
@@ -121,9 +123,9 @@ def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple
     shown = []
     for name, L in (("velocity", loops.velocity), ("position", loops.position)):
         if name == "position" and name not in run.margins:
-            continue  # too little was seen, or an axis alone that never goes alone
+            continue  # too few coherent lines, or one of linked axes
         if closed and not known.opens(run.before, name) and not run.is_kept:
-            assert run.plant is not None, "it was looked for"
+            assert run.plant is not None, "it was identified"
             before = OPEN_LOOPS[name](device, run.plant, run.before, response.f)
             shown.append(
                 frequency_response(

@@ -39,7 +39,7 @@ def unsafe_gains(device: Device, plant: Plant, gains: Sequence[int]) -> str:
             return (
                 f"they are too near to instability: by the model, the {name} loop has {found.gain_db:.0f} dB of gain "
                 f"margin and {found.phase_deg:.0f} degrees of phase margin; {SAFE_GAIN_DB:g} dB and {SAFE_PHASE:g} "
-                f"degrees are needed"
+                "degrees are needed"
             )
     return ""
 

@@ -133,7 +133,7 @@ def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
             names = " and ".join(known.titles[column] for column in calmed)
             axis.notes.append(
                 f"{names} lowered to {100.0 * factor:.0f} %: the measured {loop} loop was too near to instability; "
-                f"the margins with the lower gains are computed from that measurement"
+                "the margins with the lower gains are computed from that measurement"
             )
         gains = softer
     if np.array_equal(gains, run.gains[k]):
@@ -197,12 +197,12 @@ def _tell(axis: AxisRun, loop: str, found: Margins, least: AtLeast) -> None:
         if math.isnan(bound):
             axis.reservations.append(
                 f"the {loop} loop's {name} margin was not measured: too few frequencies are coherent, and the "
-                f"response fits no model"
+                "response fits no model"
             )
         elif not math.isinf(bound):
             (axis.reservations if bound < CLOSE[name] else axis.notes).append(
                 f"the {loop} loop's {name} margin was not measured; it is at least {bound:.0f} {unit} by the model "
-                f"fitted to the response, with its 95 % intervals"
+                "fitted to the response, with its 95 % intervals"
             )
 
 

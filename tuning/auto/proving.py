@@ -422,12 +422,12 @@ class ProvingGround:
             elif overshoot[axis] > OVERSHOOT:
                 reason = (
                     f"its overshoot was {100.0 * overshoot[axis]:.0f} % of the move; {100.0 * OVERSHOOT:.0f} % is "
-                    f"allowed"
+                    "allowed"
                 )
             elif left[axis] > max(ASTRAY, 5.0 / counts[axis]):
                 reason = (
                     f"its error at the end was {100.0 * left[axis]:.0f} % of the move; {100.0 * ASTRAY:.0f} % is "
-                    f"allowed"
+                    "allowed"
                 )
             else:
                 reason = ""

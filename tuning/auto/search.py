@@ -15,6 +15,7 @@ from drive_env.safety.envelope import SafetyError, swinging_allowed
 from tuning.auto.checks import sound_gains, unsafe_gains, wrong_wiring
 from tuning.auto.trial_order import BOLD, SLIPPERY
 from tuning.auto.twin import WORLDS, Known, Optimum, Twins, known_of, search
+from tuning.identify.estimate import TITLES
 from tuning.identify.working_state import cautious_bandwidth
 from tuning.response.linear_model import Plant
 from tuning.rules.rules_by_name import RULES, propose
@@ -61,7 +62,7 @@ def identify(run: AutoRun, experiments: Identify) -> None:
             except ValueError as error:
                 axis.reason = str(error)
         axis.notes += [
-            f"{name} not identified: {estimate.reason}"
+            f"{TITLES[name]} not identified: {estimate.reason}"
             for name, estimate in identified.estimates.items()
             if estimate.reason and name not in ("inertia",)
         ]

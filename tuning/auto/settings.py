@@ -32,7 +32,7 @@ def begin(run: AutoRun) -> None:
         turns, least = (0.5 * x / np.pi for x in (way[axis], LEAST_WAY))
         run.axes[axis].reason = (
             f"the travel is too short: {way[axis]:.2g} rad ({turns:.2g} turns), and {LEAST_WAY:g} rad ({least:.2g} "
-            f"turns) are needed; allow more with --travel"
+            "turns) are needed; allow more with --travel"
         )
     on = cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     if on.any():

@@ -1,7 +1,7 @@
 """Tuners machine by machine: robust cost over that of the best other tuner on the same machine.
 
-A median over machines hides who wins where; whoever had the choice of all others, knowing the outcome, would take the
-best of them on each machine. That is what a tuner is held against here.
+A median over machines hides which tuner wins where. Here a tuner is compared with the best of the others on each
+machine, chosen with knowledge of the outcome.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tuners compared on the same machines: what their gains are worth by the robust cost, and what it took to find them.
+"""Tuners compared on the same machines: the robust cost of their gains, and the drive time and moves they took.
 
 Every tuner gets every machine as it comes from the box, under an audit that counts time, moves and violations. Gains
 are scored in the emulator by the robust cost (drive_env/trials/score.py), relative to that of the baseline rule which
@@ -48,7 +48,7 @@ WORSE = 1.05  # times the baseline rule's robust cost: from here on a tuning cou
 
 @dataclass(frozen=True)
 class MachineRow:
-    """What a tuner made of a machine.
+    """The result of a tuner on a machine.
 
     robust_cost, relative: The robust cost, and over that of the baseline rule. rule: That of the baseline rule.
     drive_seconds: Until the drive was last written to or moved [s], waits for the machines beside it included.
@@ -74,7 +74,7 @@ class MachineRow:
 
 @dataclass(frozen=True)
 class TunerRow:
-    """What a tuner is worth over all machines.
+    """The result of a tuner over all machines.
 
     median, p95: Of the robust cost over the baseline rule's. worse: Share of machines that are more than 5 % worse.
     drive_seconds, moves: Median of a machine. aborts, violations: Of all machines together. failed: Machines on which

@@ -34,8 +34,8 @@ def cascade_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     quiet = NOISE * motor.rated_current / velocity_noise(device, plant)
     if wanted > quiet:
         bench.note(
-            f"velocity loop held to {quiet * slope / (2.0 * math.pi):.0f} Hz, where the encoder's {plant.counts} "
-            f"counts shake the current by {100.0 * NOISE:.0f} % of rated; the lags alone would allow "
+            f"velocity loop limited to {quiet * slope / (2.0 * math.pi):.0f} Hz, where the encoder's {plant.counts} "
+            f"counts cause current noise of {100.0 * NOISE:.0f} % of rated; the lags alone would allow "
             f"{wanted * slope / (2.0 * math.pi):.0f} Hz"
         )
         wanted = quiet

@@ -83,7 +83,7 @@ class TrialBench:
             and its number alone; drives on a bus go on from where they are.
 
     Attributes:
-        t_0: What settling times are told over [s].
+        t_0: Settling times are relative to this [s].
     """
 
     def __init__(self, target: Target, *, anew: bool = False) -> None:
