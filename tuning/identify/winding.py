@@ -153,9 +153,10 @@ def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats,
     """
     if pulses.step > CYCLE:
         return [_none(
-            f"the current regulator's integrator can only be read by SDO, and a cycle with its reads took "
-            f"{1e3 * pulses.step:.1f} ms instead of {1e3 * CYCLE:g}: in real time they are not in step with the current; the inductance "
-            "needs an emulator in lockstep (--lockstep) or a faster bus, or take the data sheet's"
+            "the current regulator's integrator can only be read by SDO, and a cycle with its reads took "
+            f"{1e3 * pulses.step:.1f} ms instead of {1e3 * CYCLE:g}: in real time they are not in step with the "
+            "current; the inductance needs an emulator in lockstep (--lockstep) or a faster bus, or take the data "
+            "sheet's"
         )] * working.target.num_axes  # fmt: skip
     able = working.where & pulses.alive
     causes = [] if able.all() else stop_causes(working.target.drives)
