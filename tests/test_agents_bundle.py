@@ -231,7 +231,7 @@ def test_no_number_goes_in_or_comes_out(kind, wrong):
     arrays = dict(bundle(kind).arrays)
     arrays["weight_1"] = np.full_like(arrays["weight_1"], 3e38)
     arrays["weight_2"] = np.full_like(arrays["weight_2"], 3e38)
-    with pytest.raises(PolicyError, match="the policy's output is no number"):
+    with pytest.raises(PolicyError, match="the policy's output is not a number"):
         policy_of(bundle(kind, arrays=arrays, activation="relu")).act(observations()[0] + 10.0)
 
 

@@ -138,7 +138,7 @@ def test_a_fall_is_a_violation_and_the_score_is_the_time_that_it_stood():
 @pytest.mark.parametrize(
     ("environment", "options", "figure"),
     [
-        ("gain_tuning", {"trials": 2}, "robust cost over the rule's (emulator)"),
+        ("gain_tuning", {"trials": 2}, "robust cost relative to the rule's (emulator)"),
         ("gain_scheduling", {"duration": 0.05}, "tracking term [0...1]"),
     ],
 )
@@ -431,11 +431,11 @@ def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
             ("nothing", "-e", "tracking", "--channel", "socket://127.0.0.1:9", "--yes"),
             "nobody answers at socket://127.0.0",
         ),
-        (("nothing", "-e", "tracking", "--lockstep"), "--lockstep is of a bus; give its --channel, or --gap"),
+        (("nothing", "-e", "tracking", "--lockstep"), "--lockstep is for a bus; give its --channel, or --gap"),
         (("nothing", "-e", "tracking", "--gap", "0"), "--gap 0 is too small"),
         (("nothing", "-e", "tracking", "--gap", "2", "--node", "1"), "leave --node out"),
         (("tracking_inverted_pendulum", "--gap", "2"), "judge it with --lockstep"),
-        (("nothing", "-e", "tracking", "--stall", "-1"), "--stall -1 must be a time [s], 0 for any"),
+        (("nothing", "-e", "tracking", "--stall", "-1"), "--stall -1 must be a time [s], 0 for no limit"),
         (("nothing", "-e", "tracking", "--seed", "-3"), "--seed -3 is too small"),
         (("gain_tuning", "-e", "tracking"), "acts in ServoDrive/GainTuning-v0, not in ServoDrive/Tracking-v0"),
         (("nobody",), "give an agent that ships (gain_tuning, tracking_"),
@@ -587,9 +587,9 @@ def test_the_command_writes_the_same_bytes_on_processes(tmp_path):
 
 
 @pytest.mark.parametrize(("more", "message"), [
-    (("--bitrate", 500_000), "--bitrate is of a bus; give its --channel, or leave --bitrate out"),
-    (("--device", "tmcm6212"), "--device is of a bus; give its --channel, or leave --device out"),
-    (("--sensor", "a:b"), "--sensor is of a bus; give its --channel, or leave --sensor out"),
+    (("--bitrate", 500_000), "--bitrate is for a bus; give its --channel, or leave --bitrate out"),
+    (("--device", "tmcm6212"), "--device is for a bus; give its --channel, or leave --device out"),
+    (("--sensor", "a:b"), "--sensor is for a bus; give its --channel, or leave --sensor out"),
     (("--workers", 2, "--bus"), "--workers runs episodes of the emulator; leave it out on a bus, with --gap"),
     (("--cluster", "tcp://x:1", "--gap", 2), "--cluster runs episodes of the emulator; leave it out on a bus"),
     (("--workers", 0), "--workers 0 is below 1; give the number of processes"),

@@ -60,7 +60,7 @@ def test_trials_that_were_stopped_are_counted_where_they_cost_something():
 
 def test_the_hidden_score_is_told_over_the_rule_s_with_which_the_episode_began():
     figures = {figure.name: figure for figure in scores.FIGURES["ServoDrive/GainTuning-v0"]}
-    cost = figures["robust cost over the rule's (emulator)"]
+    cost = figures["robust cost relative to the rule's (emulator)"]
     assert cost.compute(episode(tracking(), {}, {"robust_cost": 4.0}, {"robust_cost": 1.0}), None) == pytest.approx(
         0.25
     )

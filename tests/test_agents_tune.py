@@ -88,7 +88,7 @@ def test_it_tunes_an_emulated_drive_over_its_bus_and_certifies_it(tmp_path):
     assert after < 0.5 * before  # the commissioned gains are slow
     assert "agent gain_tuning tunes tmcm1636 with qbl4208: two_mass, emulated" in lines[0]
     assert any(line.startswith("velocity loop: phase margin") for line in lines)
-    assert "the drive keeps the new gains over a power cycle" in lines
+    assert "the new gains are stored in the drive" in lines
     before = load_snapshot(tmp_path / "run" / "before.toml")
     assert tuple(before.axes[0][key] for key in GAIN_OBJECTS) == axis.before
     assert (tmp_path / "run" / "report.html").is_file()

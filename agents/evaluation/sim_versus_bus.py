@@ -24,13 +24,13 @@ from drive_env.safety.envelope import SafetyError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-ROBUST_COST = "robust cost over the baseline rule's"
+ROBUST_COST = "robust cost relative to the baseline rule's"
 PATIENCE = 30.0  # s, for a node that waits for us: a late answer says that the computer is busy, not that it is gone
 OTHER_NOISE = 1_000_003  # added to the seed of the drives' noise
 
 
 class BothSides(NamedTuple):
-    """What came of it.
+    """The results.
 
     inside, bus: The evaluations, an episode of each machine that was judged on both sides, in the same order.
     again: In this process once more, with other noise: what the gap may be without any bus; None in lockstep.
@@ -80,7 +80,8 @@ def on_both_sides(
     joint = getattr(getattr(config, "task", None), "joint", None)
     if joint is not None and not lockstep:
         raise ValueError(
-            f"{config.load} needs the pendulum's angle, which no drive on a bus shows; judge it with --lockstep"
+            f"{config.load} needs the pendulum's angle, which a drive on a bus does not have; evaluate it with "
+            "--lockstep"
         )
     rows = draw_machines(config, machines, seed)
     options: dict[str, Any] = {"name": name, "episodes": 1}
@@ -109,7 +110,7 @@ def on_both_sides(
                 missing[k] = str(error)
         told((k + 1) / machines)
     if not found:
-        raise BusError(f"no machine could be judged over the bus; of the first: {missing[0]}")
+        raise BusError(f"no machine could be evaluated over the bus; the reason for the first: {missing[0]}")
     bus, *inside = (joined([sides[number] for sides in found.values()]) for number in range(1 + len(noises)))
     if environment == "ServoDrive/GainTuning-v0":
         _add_robust_cost([rows[k] for k in found], [bus, *inside])
