@@ -55,7 +55,7 @@ class Bandwidths(NamedTuple):
 
 
 class SiGains(NamedTuple):
-    """What raw gains are, whatever they act on; nan for one that a drive does not have.
+    """Raw gains in SI units; nan for one that a drive does not have.
 
     torque_p [V/A], torque_integration [s], velocity_p [A s/rad], velocity_integration [s], position_p [1/s].
     """

@@ -236,7 +236,7 @@ def test_no_number_goes_in_or_comes_out(kind, wrong):
 
 
 def test_an_observation_of_another_shape_is_told():
-    with pytest.raises(PolicyError, match=r"takes 6 entries, .* not \(5,\); is it of this environment"):
+    with pytest.raises(PolicyError, match=r"takes 6 entries, .* not \(5,\); check that it is for this environment"):
         policy_of(bundle()).act(np.zeros(5))
 
 

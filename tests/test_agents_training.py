@@ -491,7 +491,7 @@ def test_trials_that_an_error_ends_are_over_for_the_next_search(tmp_path, monkey
 
 
 def test_there_is_nothing_to_resume(tmp_path):
-    with pytest.raises(ValueError, match=r"no file .*checkpoint\.zip to go on with: a run writes its first"):
+    with pytest.raises(ValueError, match=r"no file .*checkpoint\.zip to continue from: a run writes its first"):
         train(tiny(), tmp_path, resume=True, trust=True)
     (tmp_path / CHECKPOINT).write_bytes(b"no")
     with pytest.raises(ValueError, match="is no checkpoint"):

@@ -106,7 +106,8 @@ def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkey
     monkeypatch.setattr("agents.commands.tune._on_bus", lambda *_: nullcontext())
     code, _, error = command("--interface", "virtual", "--channel", "none", "--node", 3, "--travel", "-1:1")
     assert code == 2
-    assert error == "drive-agent: The motor of node 3 will turn. Is its way clear? Nobody is there to ask; say --yes\n"
+    assert error == "drive-agent: The motor of node 3 will turn. Is its way clear? There is no terminal to ask; "
+                    "confirm with --yes\n"
     assert not any(tmp_path.iterdir())
 
 
@@ -126,9 +127,9 @@ def test_json_for_programs(tmp_path):
     (["--channel", "can0", "--travel", "-1:1"], "channel 'can0' needs an interface"),
     (["--node", "1", "--travel", "-1:1"], "no CAN channel is given"),
     (["--interface", "virtual", "--channel", "none", "--seed", "1"], "--seed draws an emulated machine"),
-    (["--interface", "virtual", "--channel", "none"], "--travel is missing: how far may the motor turn?"),
+    (["--interface", "virtual", "--channel", "none"], "--travel is missing: give how far the motor may turn"),
     (["--trials", "0"], "--trials 0 must be 1 or more"),
-    (["--load", "gantry"], "load 'gantry' has 2 drives; an agent tunes one"),
+    (["--load", "gantry"], "load 'gantry' has 2 axes; an agent tunes one axis"),
     (["--load", "nothing"], "no load is named 'nothing'"),
 ])  # fmt: skip
 def test_a_mistake_ends_with_code_2_and_one_line(tmp_path, monkeypatch, arguments, message):
@@ -159,7 +160,8 @@ def test_a_tuner_that_never_returns_ends_the_run_and_leaves_the_drive_of_a_bus_a
 
     with _emulated_node("tmcm1636", "qbl4208", "inertia", None, None, None) as target:
         before = gains(target)
-        with pytest.raises(PolicyStoppedError, match="no answer for 1000 ms: it is too slow, or never returns"):
+        with pytest.raises(PolicyStoppedError, match="no answer for 1000 ms: it is too slow, or does not return at "
+                                                     "all"):
             run_agent(target, Hanging(1), tmp_path / "before.toml", name="hanging")
         assert np.array_equal(gains(target), before) and not is_enabled(target).any()
 
@@ -210,7 +212,7 @@ def test_gains_that_were_stopped_are_no_answer(tmp_path):
         done = run_agent(target, Reckless(), tmp_path / "before.toml", name="reckless")
         assert all(trial.aborted.all() for trial in done.trials[1:]) and not done.trials[0].aborted.any()
         (axis,) = done.result.axes
-        assert axis.accepted and any("own answer was stopped" in note for note in axis.notes)
+        assert axis.accepted and any("own choice was stopped" in note for note in axis.notes)
         assert tuple(axis.after) == tuple(done.trials[0].gains[0]) == tuple(gains(target)[0])
         assert done.result.aborts[0] == len(done.trials) - 1
 
@@ -248,12 +250,12 @@ def test_a_wrong_wiring_ends_the_run_before_any_trial_with_code_1_and_the_reason
         target.drives.write((0x2080, 3), 2)  # its halls align the encoder once: it is not set right under way
         before = gains(target)
         done = run_agent(target, Contrary(), tmp_path / "before.toml", name="contrary")
-        assert done.trials == () and "encoder counts against the motor" in done.result.axes[0].reason
+        assert done.trials == () and "encoder counts in the wrong direction" in done.result.axes[0].reason
         assert np.array_equal(gains(target), before) and not is_enabled(target).any()
     monkeypatch.setattr("agents.tuner.tuning_run.run", lambda *_, **__: done)
     code, out, _ = command("--load", "inertia", "--out", tmp_path / "run")
-    assert code == 1 and "axis 0 was rolled back: the encoder counts against the motor" in out
-    assert "keeps the new gains" not in out
+    assert code == 1 and "axis 0 was rolled back: the encoder counts in the wrong direction" in out
+    assert "the new gains are" not in out
 
 
 @pytest.mark.slow

@@ -161,7 +161,7 @@ def test_the_certificate_says_what_was_done(five):
 @pytest.mark.parametrize(("axis", "words"), [(EMPTY, "a P gain is 0, so that a loop is open"), (WILD, "dB and")])
 def test_gains_before_that_are_not_safe_are_not_moved_with_and_why_is_said(five, axis, words):
     target, result, *_ = five
-    (note,) = [note for note in result.axes[axis].notes if note.startswith("no move with the gains before")]
+    (note,) = [note for note in result.axes[axis].notes if note.startswith("no comparison move with the gains before")]
     assert words in note
     steps = certificate(target, result, seed=1).axes[axis].steps
     assert [step.tuned for step in steps if step.name == "move"] == [True]
@@ -172,9 +172,9 @@ def test_gains_before_that_are_not_safe_are_not_moved_with_and_why_is_said(five,
     [
         ((4021, 1573, 445, 329, 118), ""),  # the commissioning presets
         ((4021, 1573, 445, 329, 0), "a P gain is 0"),
-        ((4021, 1573, 32767, 329, 118), "by the model the velocity loop has"),
-        ((4021, 1573, 445, 329, 2000), "by the model the position loop has"),
-        ((32767, 1573, 445, 329, 118), "by the model the current loop has"),
+        ((4021, 1573, 32767, 329, 118), "by the model, the velocity loop has"),
+        ((4021, 1573, 445, 329, 2000), "by the model, the position loop has"),
+        ((32767, 1573, 445, 329, 118), "by the model, the current loop has"),
     ],
 )
 def test_gains_are_safe_to_move_with_if_every_loop_has_its_margins(gains_before, words):
@@ -260,7 +260,10 @@ def test_gains_that_fail_every_trial_are_rolled_back_with_the_last_reason(quick,
         result = auto(target, tmp_path / "before.toml", experiments=standing_in)
         np.testing.assert_array_equal(gains(target.drives), before)
     assert not result.accepted.any()
-    assert "no gains passed the trial: with the last ones it oscillated or tripped in the move" in result.axes[0].reason
+    assert (
+        "no gains passed the trial; the last ones: stopped in the move: it oscillated or went into fault"
+        in result.axes[0].reason
+    )
     assert result.aborts[0] >= 3
 
 
@@ -337,7 +340,7 @@ def test_too_few_coherent_lines_are_said_and_what_was_verified_instead(quick, mo
     (axis,) = result.axes
     assert axis.accepted, axis.reason
     assert axis.verdict == "accepted with reservations"
-    (note,) = [note for note in axis.reservations if note.startswith("no margins were measured: 0 of its lines")]
+    (note,) = [note for note in axis.reservations if note.startswith("margins not measured: only 0 frequencies")]
     assert "verified by a move, its reversal" in note
     assert "frequency response" not in axis.verified
     (_, shown) = paper.axes[0].frequency_responses
@@ -369,10 +372,12 @@ def test_a_drive_that_is_shaken_into_a_fault_moves_again_or_is_rolled_back(quick
     (axis,) = result.axes
     assert axis.accepted != stays
     if stays:
-        assert axis.reason.startswith("the drive went into fault while its frequency response was measured, and stays")
+        assert axis.reason.startswith(
+            "the drive went into fault while its frequency response was measured, and the fault cannot be reset"
+        )
         np.testing.assert_array_equal(after, before)
         return
-    (note,) = [n for n in axis.reservations if n.startswith("no margins were measured: the drive went into fault")]
+    (note,) = [n for n in axis.reservations if n.startswith("margins not measured: the drive went into fault")]
     assert "voltage" in note
     assert "frequency response" not in axis.verified
     np.testing.assert_array_equal(after[0], axis.after)
@@ -383,7 +388,7 @@ def test_a_response_that_the_time_does_not_allow_is_said(quick, tmp_path):
         result = auto(target, tmp_path / "before.toml", experiments=standing_in, budget=2.5)
     (axis,) = result.axes
     assert axis.accepted, axis.reason
-    assert any("no margins were measured: the drive time of the run was used up" in one for one in axis.reservations)
+    assert any("margins not measured: the drive time of the run was used up" in one for one in axis.reservations)
 
 
 # --- trials -----------------------------------------------------------------------------------------------------------

@@ -195,11 +195,11 @@ def test_what_rules_apply_stays_and_is_undone_by_the_file(tmp_path):
             drive_tune, ["rules", "cascade", *TUNING, *bus, "--apply", "cascade", "--snapshot", "mine.toml"]
         )
         assert done.exit_code == 0, done.output
-        assert "written; drive-tune undo mine.toml brings back what was" in done.stdout
+        assert "written; drive-tune undo mine.toml restores the state before" in done.stdout
         assert set() < differences(machine, "mine.toml") <= set(GAIN_OBJECTS)
         again = CliRunner().invoke(drive_tune, ["rules", "cascade", *TUNING, *bus, "--snapshot", "mine.toml"])
         assert again.exit_code == 2
-        assert "mine.toml is there already, and may hold the state before an earlier run" in again.stderr
+        assert "mine.toml exists already, and may be the state before an earlier run" in again.stderr
         CliRunner().invoke(drive_tune, ["undo", "mine.toml", "--yes"])
         assert differences(machine, "mine.toml") == set()
 

@@ -30,7 +30,7 @@ def actions(env, steps, seed=0):
 
 
 def episode(env, seed, lanes=None):
-    """Return observations and rewards of an episode, (steps, lanes, ...)."""
+    """Return observations and rewards of an episode, (steps, environments, ...)."""
     observation, _ = env.reset(seed=seed)
     observations, rewards = [observation], []
     for action in actions(env, env.config.trials) if lanes is None else lanes:

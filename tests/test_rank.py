@@ -288,7 +288,7 @@ def test_a_registered_tuner_that_cannot_be_loaded_is_said(monkeypatch):
     register(monkeypatch, Entry("agent", missing), Entry("number", lambda: 3))
     with pytest.raises(MissingTunerError, match=r"'agent' of somewhere:tune cannot be loaded: no module named onnx"):
         find_tuner("agent")
-    with pytest.raises(MissingTunerError, match=r"'number' of somewhere:tune is no function but 3"):
+    with pytest.raises(MissingTunerError, match=r"'number' of somewhere:tune is not a function but 3"):
         find_tuner("number")
 
 
@@ -364,7 +364,7 @@ def test_the_command_lists_tuners_and_suites():
         (("optimise", "--bus"), "--travel is missing"),
         (("optimise", "--lockstep"), "--travel is missing"),
         (("optimise", "--channel", "can0"), "--travel is missing"),
-        (("optimise", "--bus", "--travel", "-1:1"), "will turn. Is its way clear? Nobody is there to ask"),
+        (("optimise", "--bus", "--travel", "-1:1"), "will turn. Is its way clear? There is no terminal to ask"),
         (("optimise", "--config", "nosuch.toml"), "cannot read nosuch.toml"),
         (("optimise", "--cluster", "here"), "--cluster here must be the address of a Dask scheduler"),
     ],

@@ -280,5 +280,5 @@ def test_noise_of_counts_is_that_of_a_turning_encoder(counts, corner):
 def test_the_cascade_rule_counts_the_encoder():
     fine, coarse = (propose("cascade", DEVICE, MOTOR, plant(counts=counts)) for counts in (4096, 200))
     assert Gains(*coarse.gains).velocity_p < 0.5 * Gains(*fine.gains).velocity_p
-    assert any("where the encoder's 200 counts shake the current by 10 % of rated" in note for note in coarse.notes)
+    assert any("where the encoder's 200 counts cause current noise of 10 % of rated" in note for note in coarse.notes)
     assert not any("counts" in note for note in fine.notes)

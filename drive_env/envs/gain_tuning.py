@@ -99,12 +99,12 @@ class GainTuningConfig:
 
 
 class GainTuning(Lanes):
-    """Lanes of `ServoDrive/GainTuning-v0`: find the gains of an unknown machine in a few trials.
+    """`ServoDrive/GainTuning-v0`: find the gains of an unknown machine in a few trials.
 
     An episode identifies the machine, starts at the baseline rule's gains and tries them; each step tries others: a
-    positioning move, the reversal and the gain probe (the move with velocity P x 1.5), 250 ms each. What oscillates or
-    trips is stopped within 50 ms, the drive is cleared, and the incumbent returns. The incumbent is the trial with the
-    least J by measured terms, the rule's included; it is the answer (`info["gains"]`).
+    positioning move, the reversal and the gain probe (the move with velocity P x 1.5), 250 ms each. An axis that
+    oscillates or goes into fault is stopped within 50 ms, the fault is reset, and the incumbent returns. The incumbent
+    is the trial with the least J by measured terms, the rule's included; it is the answer (`info["gains"]`).
 
     All axes of a machine move at once: what is identified is the inertia that an axis sees in that motion, coupling
     included. The pole of the inverted pendulum falls meanwhile, and shakes its cart.
@@ -210,7 +210,7 @@ class GainTuning(Lanes):
                 if reach is not None:
                     raise ValueError("reach is of given drives; give travel in the configuration, or leave it out")
             elif self.config.distributions is not None or self.config.privileged:
-                raise ValueError("given drives are taken as they are: leave distributions and privileged out")
+                raise ValueError("leave distributions and privileged out for given drives, whose machine is not known")
             super().__init__(
                 num_envs, *self._spaces(), autoreset_mode=autoreset_mode, render_mode=render_mode, reward=reward
             )
@@ -399,7 +399,7 @@ class GainTuning(Lanes):
         return np.asarray(costs.reshape(self.num_envs, -1).max(axis=1))
 
     def _stopped(self, tried: Trial) -> Mask:
-        """Return in which lanes a trial was stopped, on any axis."""
+        """Return in which environments a trial was stopped, on any axis."""
         return np.asarray(tried.aborted.any(axis=0).reshape(self.num_envs, -1).any(axis=1))
 
     def _take(self, mask: Mask, gains: Integers, tried: Trial, measured: Floats, better: Mask | None = None) -> None:

@@ -1,8 +1,8 @@
-"""What a tuning is worth: J of a positioning move and a load step, and the robust cost, which counts robustness.
+"""The cost of a tuning: J of a positioning move and a load step, and the robust cost over variants of the machine.
 
 Lower is better. Every machine is judged on its own scales:
 
-    J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 (1 + (n/3 %)^2)^0.2 (1 + max(0, os - 2 %)/10 %), at most 30; a trip scores 30
+    J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 (1 + (n/3 %)^2)^0.2 (1 + max(0, os - 2 %)/10 %), at most 30; a fault scores 30
 
     t_s = t_0 + integral of min(1, |e|/w) dt from the profile's end to the load step; w = max(1 % of the move, 3 counts)
     t_0 = four times the sum of the small time constants
@@ -61,7 +61,7 @@ _STIFFNESS = ("jnt_stiffness", "contact_stiffness")
 
 
 class Variant(NamedTuple):
-    """A machine a little other than the nominal one: factors of its inertia and stiffness, and of velocity P."""
+    """A variant of the machine: factors of its inertia and stiffness, and of velocity P."""
 
     name: str
     inertia: float = 1.0
@@ -79,7 +79,7 @@ VARIANTS = (
 
 
 class Terms(NamedTuple):
-    """What J is made of, each of one shape: t_s/t_0, E_d/E_0, n and os as fractions, and whether the drive tripped."""
+    """The terms of J, each of one shape: t_s/t_0, E_d/E_0, n and os as fractions, and whether there was a fault."""
 
     settling: Floats
     disturbance: Floats
@@ -99,7 +99,7 @@ class Terms(NamedTuple):
 
 
 def cost(terms: Terms) -> Floats:
-    """Return J of its terms, in their shape."""
+    """Return J from its terms, in their shape."""
     raw = (
         terms.settling**0.4
         * terms.disturbance**0.4
@@ -119,7 +119,7 @@ def robust_cost(j: Floats) -> Floats:
 class Scores(NamedTuple):
     """Of every machine: the robust cost (num_machines,), and J and its terms, (num_machines, variants).
 
-    A machine with several axes is as good as its worst. swing: What a trial's watch would see of it, the largest RMS
+    A machine with several axes is as good as its worst. swing: What a trial would measure, the largest RMS
     increment of the current over 25 ms until the load step, over the rated one, likewise; J does not count it.
     """
 
@@ -207,7 +207,7 @@ class RobustScore:
         self._t_0 = np.repeat(t_0, self._axes[2])
 
     def set_constant_load(self, torque: Floats) -> None:
-        """Take what pulls at the machines all the while [N*m], (num_machines,), signed as `machine.load_torque`."""
+        """Set a constant load [N*m], (num_machines,), signed as `machine.load_torque`."""
         self._constant = np.repeat(np.asarray(torque, float), len(self.variants))
 
     def set_moves(self, move: Move, where: Mask | None = None) -> None:
@@ -235,7 +235,7 @@ class RobustScore:
         return self._scores(*self._run(gains))
 
     def close(self) -> None:
-        """Give the drives back."""
+        """Close the drives."""
         self._drives.close()
 
     def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
