@@ -131,7 +131,7 @@ def turn(drives):
         (lambda d: d.write(0x2056, 7), "no    motor: 2056h:00 (pole pairs) is 7, and 4 is needed for qbl4208"),
         (lambda d: d.write((0x2080, 2), 8192), "2080h:02 (encoder counts) is 8192, and 4096 is needed"),
         (lambda d: d.write(0x2055, 1), "2055h:00 (commutation by the encoder) is 1, and 3 is needed"),
-        (lambda d: d.write(0x2050, 0), "no    motor: the drive knows no motor (2050h is 0)"),
+        (lambda d: d.write(0x2050, 0), "no    motor: the drive is not commissioned for a motor"),
         (lambda d: d.write(0x2003, 0), "no    limits: "),
         (lambda d: (d.write((0x2006, 2), 200), d.write((0x2006, 1), 1)), "the brake chopper acts from 20 V"),
         (lambda d: d.write((0x607D, 2), TURN), "no    travel: -12.6 to 12.6 rad from here"),

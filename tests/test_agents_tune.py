@@ -106,8 +106,8 @@ def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkey
     monkeypatch.setattr("agents.commands.tune._on_bus", lambda *_: nullcontext())
     code, _, error = command("--interface", "virtual", "--channel", "none", "--node", 3, "--travel", "-1:1")
     assert code == 2
-    assert error == "drive-agent: The motor of node 3 will turn. Is its way clear? There is no terminal to ask; "
-                    "confirm with --yes\n"
+    question = "drive-agent: The motor of node 3 will turn. Is its way clear?"
+    assert error == f"{question} There is no terminal to ask; confirm with --yes\n"
     assert not any(tmp_path.iterdir())
 
 
@@ -160,8 +160,9 @@ def test_a_tuner_that_never_returns_ends_the_run_and_leaves_the_drive_of_a_bus_a
 
     with _emulated_node("tmcm1636", "qbl4208", "inertia", None, None, None) as target:
         before = gains(target)
-        with pytest.raises(PolicyStoppedError, match="no answer for 1000 ms: it is too slow, or does not return at "
-                                                     "all"):
+        with pytest.raises(
+            PolicyStoppedError, match="no answer for 1000 ms: it is too slow, or does not return at all"
+        ):
             run_agent(target, Hanging(1), tmp_path / "before.toml", name="hanging")
         assert np.array_equal(gains(target), before) and not is_enabled(target).any()
 

@@ -232,7 +232,7 @@ def test_a_dry_run_reads_what_is_says_what_would_be_and_changes_nothing(run, sha
     }  # fmt: skip
     code, out, _ = run("jog", "60 rpm", "--for", "2", "--dry-run")
     assert code == DONE
-    assert "would be enabled, turn at 60 rpm for 2 s, and be switched off again \(dry run: nothing was done\)" in out
+    assert "would be enabled, turn at 60 rpm for 2 s, and be switched off again (dry run: nothing was done)" in out
     assert "moved" not in out
     assert {name: machine.read(name).tolist() for name in before} == before
 
