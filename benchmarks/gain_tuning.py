@@ -1,4 +1,4 @@
-"""Figure of GainTuning: trials of 250 ms per second and core, hidden J's variants counted as trials."""
+"""Figure of GainTuning: trials of 250 ms per second and core, the robust cost's variants counted as trials."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def trials_per_second(load: str = "two_mass", lanes: int = LANES) -> float:
     rng = np.random.default_rng(0)
     try:
         env.reset(seed=0)
-        assert env._hidden is not None
-        # A step runs the phases of one machine after another, the variants of hidden J side by side.
-        trials = lanes * (len(PHASES) + len(env._hidden.variants))
+        assert env._score is not None
+        # A step runs the phases of one machine after another, the variants of the robust cost side by side.
+        trials = lanes * (len(PHASES) + len(env._score.variants))
         best = float("inf")  # as everywhere here: the fastest is the one least disturbed
         for _ in range(STEPS):
             action = rng.uniform(-0.7, 0.7, env.action_space.shape).astype(np.float32)

@@ -1,6 +1,6 @@
 """Tune a drive: identify it, let a rule compute its gains, write them with a way back, record a move.
 
-python examples/tune_a_drive.py --load belt --rule chain
+python examples/tune_a_drive.py --load belt --rule cascade
 """
 
 import argparse

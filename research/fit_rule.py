@@ -1,7 +1,7 @@
 """Fit the rule of drive_env/gains.py: `python -m research.fit_rule` tries sets of constants on random machines.
 
-Every set of constants is scored by the mean of ln hidden J over all machines of all loads: the mean of a logarithm, so
-that a machine's own scale does not count, nor E_0, which no set of constants has a say in.
+Every set of constants is scored by the mean of ln robust cost over all machines of all loads: the mean of a logarithm,
+so that a machine's own scale does not count, nor E_0, which no set of constants has a say in.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.envs.randomisation import Distributions, RandomMachines
-from drive_env.gains import FITTED_RULE, Rule, rule_gains
+from drive_env.gains import BASELINE_RULE, Rule, rule_gains
 from drive_env.trials.positioning import plan_move, reach
-from drive_env.trials.score import HiddenScore, Scores
+from drive_env.trials.score import RobustScore, Scores
 from mechanics.shaft import shaft_load
 
 Floats = NDArray[np.float64]
@@ -32,7 +32,7 @@ SPREAD = 0.12  # of a local draw, as a share of the range
 
 
 class RuleFit(NamedTuple):
-    """A set of constants and its mean of ln hidden J."""
+    """A set of constants and its mean of ln robust cost."""
 
     rule: Rule
     score: float
@@ -49,19 +49,19 @@ class Bench:
             loads = [shaft_load(group.load).inertia + group.load.armature for group in drives.inside.groups]
             self.inertia: Floats = np.concatenate(loads).reshape(-1)
             axes = drives.load.num_axes
-            self.hidden = HiddenScore("tmcm1636", load, motor, machines, num_threads=num_threads)
-            self.hidden.set_machines(drives.machine.parameters, drives.machine.supply.reshape(machines, axes)[:, 0])
+            self.score_of = RobustScore("tmcm1636", load, motor, machines, num_threads=num_threads)
+            self.score_of.set_machines(drives.machine.parameters, drives.machine.supply.reshape(machines, axes)[:, 0])
             scaler = drives.read(Role.POSITION_SCALE)
-            self.hidden.set_moves(plan_move(self.motor, self.inertia, scaler, np.tile(reach(load), machines)))
-        self.set_reference(FITTED_RULE)
+            self.score_of.set_moves(plan_move(self.motor, self.inertia, scaler, np.tile(reach(load), machines)))
+        self.set_reference(BASELINE_RULE)
 
     def set_reference(self, rule: Rule) -> None:
         """Take E_0 from a rule."""
-        self.hidden.set_reference(rule_gains(self.device, self.motor, self.inertia, rule))
+        self.score_of.set_reference(rule_gains(self.device, self.motor, self.inertia, rule))
 
     def score(self, rule: Rule) -> Scores:
         """Return the scores of a rule's gains on these machines."""
-        return self.hidden.score(rule_gains(self.device, self.motor, self.inertia, rule))
+        return self.score_of.score(rule_gains(self.device, self.motor, self.inertia, rule))
 
 
 def candidates(seed: int, best: list[RuleFit]) -> Iterator[Rule]:
@@ -70,7 +70,7 @@ def candidates(seed: int, best: list[RuleFit]) -> Iterator[Rule]:
     The constants in force come first, so that a fit never ends worse.
     """
     rng = np.random.default_rng(seed)
-    yield FITTED_RULE
+    yield BASELINE_RULE
     for k in range(1, SETS):
         constants = {}
         for name, (low, high) in RANGES.items():
@@ -83,14 +83,14 @@ def candidates(seed: int, best: list[RuleFit]) -> Iterator[Rule]:
                 value = (math.log(now) if log else now) + SPREAD * (b - a) * rng.standard_normal()
                 value = min(max(value, a), b)
             constants[name] = math.exp(value) if log else value
-        yield FITTED_RULE._replace(**constants)
+        yield BASELINE_RULE._replace(**constants)
 
 
 def fit(benches: list[Bench], seed: int = 0) -> list[RuleFit]:
     """Return all sets that were tried, the best first."""
     best: list[RuleFit] = []
     for rule in candidates(seed, best):
-        logs = np.concatenate([np.log(bench.score(rule).hidden) for bench in benches])
+        logs = np.concatenate([np.log(bench.score(rule).robust_cost) for bench in benches])
         best.append(RuleFit(rule, float(logs.mean())))
         best.sort(key=lambda one: one.score)
     return best
@@ -105,13 +105,13 @@ def main() -> None:
     options = parser.parse_args()
     found = fit([Bench(load, options.motor, options.machines, options.seed) for load in LOADS], options.seed)
     best = found[0]
-    print(best.rule, f"mean ln hidden J {best.score:.3f}; before {dict(found)[FITTED_RULE]:.3f}")
+    print(best.rule, f"mean ln robust cost {best.score:.3f}; before {dict(found)[BASELINE_RULE]:.3f}")
     for load in LOADS:
         bench = Bench(load, options.motor, options.machines, options.seed + 1)
         bench.set_reference(best.rule)
         scores = bench.score(best.rule)
-        low, middle, high = np.percentile(scores.hidden, (5, 50, 95))
-        print(f"{load}: hidden J {middle:.2f} ({low:.2f} ... {high:.2f}) on {options.machines} unseen machines")
+        low, middle, high = np.percentile(scores.robust_cost, (5, 50, 95))
+        print(f"{load}: robust cost {middle:.2f} ({low:.2f} ... {high:.2f}) on {options.machines} unseen machines")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ Array = NDArray[np.float32]
 
 HEADS, VALUE, SUMMARY, HIDDEN, HIDDEN_OF_TRIAL = 4, 24, 64, 96, 128
 REACH = (0.8, 1.0, 1.0)  # of velocity P and I and position P: gains are normalised with it
-WORST = 2.0  # of ln of hidden J over the rule's: how bad bad gains are is nobody's business
+WORST = 2.0  # of ln of the robust cost over the rule's; how much worse bad gains are does not matter
 EPOCHS, BATCH, RATE, DECAY = 30, 128, 4e-3, 2e-3  # BATCH is of machines
 
 
@@ -27,7 +27,7 @@ class TrialData(NamedTuple):
     """Trials of machines.
 
     context: Shape (n, 20). gains: ln over the rule's, (n, trials, gains). shown: What they showed, (n, trials, 16).
-    worth: ln of hidden J over the rule's, (n, trials); NaN where a machine had fewer trials than others.
+    worth: ln of the robust cost over the rule's, (n, trials); NaN where a machine had fewer trials than others.
     """
 
     context: Array

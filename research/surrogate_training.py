@@ -73,8 +73,8 @@ ROUNDS = (Round(sets=4, trials=8), *(Round(sets=1, trials=10) for _ in range(4))
 class Answers(NamedTuple):
     """What a tuner left machines with, (rows, machines) each.
 
-    ratio: Hidden J of its answer over the rule's. incumbent: That of the best trial by measured terms. best: That of
-    the best trial by hidden J. aborted: Share of the trials that were stopped.
+    ratio: The robust cost of its answer over the rule's. incumbent: That of the best trial by measured terms. best:
+    That of the best trial by the robust cost. aborted: Share of the trials that were stopped.
     """
 
     ratio: Floats
@@ -106,7 +106,7 @@ def collect(load: str, motor: str, machines: int, trials: int, seed: int, policy
     columns: tuple[list[Array], ...] = ([], [], [])
     with machines_of(load, motor, machines, trials=trials, step=2.0 * FARTHEST) as env:
         observation, info = env.reset(seed=seed)
-        rule = info["hidden"].astype(np.float32)
+        rule = info["robust_cost"].astype(np.float32)
         context = np.concatenate([observation[:, :IDENTIFIED], _shown(observation)], axis=1)
         if policy is not None:
             policy.reset()
@@ -118,7 +118,7 @@ def collect(load: str, motor: str, machines: int, trials: int, seed: int, policy
                 shake = SHAKE * rng.choice(SHAKES, (machines, 1))
                 action = policy.act(observation) + shake * rng.standard_normal((machines, G))
             observation, _, _, _, info = env.step(action.astype(np.float32))
-            worth = np.log(info["trial_hidden"].astype(np.float32) / rule)
+            worth = np.log(info["trial_robust_cost"].astype(np.float32) / rule)
             found = (observation[:, IDENTIFIED : IDENTIFIED + G], _shown(observation), worth)
             for column, value in zip(columns, found, strict=True):
                 column.append(np.asarray(value, np.float32))
@@ -181,7 +181,7 @@ def train(
         arrays = fit(join(parts), seed, networks, partial(progress, f"{what}: networks"))
         policy = SurrogatePolicy(bundle_of(arrays, {}))
     card = {
-        "trained": f"{len(rounds)} rounds of trials on emulated machines, hidden J known; networks by torch",
+        "trained": f"{len(rounds)} rounds of trials on emulated machines, the robust cost known; networks by torch",
         "distribution": [f"{load} on {motor}" for load, motor in rows],
         "machines": sum(len(part.worth) for part in parts),
         "trials": sum(part.worth.size for part in parts),
@@ -214,25 +214,25 @@ def judge(policy: Any, machines: int, seed: int, rows: Sequence[tuple[str, str]]
     for load, motor in rows:
         with machines_of(load, motor, machines) as env:
             observation, info = env.reset(seed=seed)
-            tried, hidden, aborted = [info["gains"]], [info["hidden"]], []
+            tried, costs, aborted = [info["gains"]], [info["robust_cost"]], []
             policy.reset()
             for _ in range(env.config.trials):
                 observation, _, _, _, info = env.step(policy.act(observation))
                 tried.append(info["trial_gains"])
-                hidden.append(info["trial_hidden"])
+                costs.append(info["trial_robust_cost"])
                 aborted.append(info["aborted"])
             answer = env.gains_of(policy.answer(observation))
-            ratio = np.array(hidden) / hidden[0]
+            ratio = np.array(costs) / costs[0]
             same = np.all(np.array(tried) == answer, axis=(2, 3))  # (trials, machines)
             if not same.any(axis=0).all():
                 raise RuntimeError("the tuner answered gains that it had not tried")
             of_answer = ratio[same.argmax(axis=0), np.arange(machines)]
-            found.append((of_answer, info["hidden"] / hidden[0], ratio.min(axis=0), np.mean(aborted, axis=0)))
+            found.append((of_answer, info["robust_cost"] / costs[0], ratio.min(axis=0), np.mean(aborted, axis=0)))
     return Answers(*(np.array(column) for column in zip(*found, strict=True)))
 
 
 def figures_of(ratios: Floats) -> dict[str, Any]:
-    """Return what a card says of hidden J over the rule's, each with its 95 % interval (bootstrap over machines)."""
+    """Return the card's figures: robust cost over the rule's, with 95 % intervals (bootstrap over machines)."""
     flat = ratios.ravel()
     figures: dict[str, Any] = {}
     for name, of in (
@@ -249,7 +249,7 @@ def judged(made: AgentFile) -> AgentFile:
     """Return the agent with figures in its card, of machines that it was not trained on."""
     answers = judge(SurrogatePolicy(made), MACHINES, UNSEEN)
     figures = {
-        "what": "hidden J of the answer over the fitted rule's, 10 trials, machines not trained on",
+        "what": "robust cost of the answer over the baseline rule's, 10 trials, machines not trained on",
         "machines": answers.ratio.size,
         "seed": UNSEEN,
         **figures_of(answers.ratio),
@@ -281,7 +281,8 @@ def main() -> None:
         )
     made = judged(made)
     print(
-        f"{made.card['figures']['median']} of the rule's hidden J in the median, written to {made.save(arguments.out)}"
+        f"{made.card['figures']['median']} of the rule's robust cost in the median, written to "
+        f"{made.save(arguments.out)}"
     )
 
 

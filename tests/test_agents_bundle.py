@@ -231,12 +231,12 @@ def test_no_number_goes_in_or_comes_out(kind, wrong):
     arrays = dict(bundle(kind).arrays)
     arrays["weight_1"] = np.full_like(arrays["weight_1"], 3e38)
     arrays["weight_2"] = np.full_like(arrays["weight_2"], 3e38)
-    with pytest.raises(PolicyError, match="the policy's output is no number"):
+    with pytest.raises(PolicyError, match="the policy's output is not a number"):
         policy_of(bundle(kind, arrays=arrays, activation="relu")).act(observations()[0] + 10.0)
 
 
 def test_an_observation_of_another_shape_is_told():
-    with pytest.raises(PolicyError, match=r"takes 6 entries, .* not \(5,\); is it of this environment"):
+    with pytest.raises(PolicyError, match=r"takes 6 entries, .* not \(5,\); check that it is for this environment"):
         policy_of(bundle()).act(np.zeros(5))
 
 

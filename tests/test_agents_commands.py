@@ -83,13 +83,16 @@ def test_a_search_on_processes_is_the_same_search(tmp_path, shrunk):
         (("train", "tracking", "--preset", "slow"), "there is no preset 'slow'"),
         (("train", "tracking", "--steps", "0"), "--steps 0 must be 1 or more"),
         (("train", "tracking", "--config", "no.yaml"), "there is no file no.yaml"),
-        (("train", "--resume", "nowhere"), "there is no file nowhere/checkpoint.zip to go on with"),
-        (("train", "--resume", "nowhere", "--steps", "5", "--seed", "0"), "as it began; leave --seed, --steps out"),
-        (("train", "tracking", "--resume", "nowhere"), "as it began; leave environment out"),
+        (("train", "--resume", "nowhere"), "there is no file nowhere/checkpoint.zip to continue from"),
+        (
+            ("train", "--resume", "nowhere", "--steps", "5", "--seed", "0"),
+            "with its own options; leave --seed, --steps out",
+        ),
+        (("train", "tracking", "--resume", "nowhere"), "with its own options; leave environment out"),
         (("train", "tracking", "--seed", "-1"), "the seed must be 0 or more, not -1"),
         (("search", "tracking", "--trials", "0"), "--trials 0 must be 1 or more"),
         (("export", "agent.txt"), "must be an agent (.npz), a checkpoint (.zip), or one that ships: gain_tuning"),
-        (("export", "gain_tuning"), "an agent of kind 'surrogate' has no ONNX form"),
+        (("export", "gain_tuning"), "an agent of kind 'surrogate' cannot be written as ONNX"),
         (("export", "no.npz"), "there is no file no.npz"),
     ],
 )
@@ -100,7 +103,7 @@ def test_a_mistake_is_told_in_one_line(arguments, message):
 
 def test_a_folder_with_something_in_it_is_left_alone(tmp_path, shrunk):
     found = run("train", "tracking", "--config", shrunk, "--out", tmp_path)
-    assert found.exit_code == 2 and "holds something already; choose a new folder" in found.output
+    assert found.exit_code == 2 and "is not empty; choose a new folder" in found.output
 
 
 @pytest.mark.parametrize("package", ["onnx", "onnxruntime"])

@@ -20,7 +20,7 @@ from agents.evaluation.evaluation_shards import Written, evaluate_elsewhere
 from agents.evaluation.on_the_bus import target_for
 from agents.evaluation.scores import interval
 from agents.evaluation.served import draw_machines, emulated
-from agents.evaluation.sim_versus_bus import HIDDEN, on_both_sides
+from agents.evaluation.sim_versus_bus import ROBUST_COST, on_both_sides
 from agents.policies.agent_file import AgentFile, BundleError
 from agents.policies.guard import GuardLimits
 from agents.policies.open_policy import PolicyNotFoundError, open_policy, opened
@@ -138,7 +138,7 @@ def test_a_fall_is_a_violation_and_the_score_is_the_time_that_it_stood():
 @pytest.mark.parametrize(
     ("environment", "options", "figure"),
     [
-        ("gain_tuning", {"trials": 2}, "hidden J over the rule's (emulator)"),
+        ("gain_tuning", {"trials": 2}, "robust cost relative to the rule's (emulator)"),
         ("gain_scheduling", {"duration": 0.05}, "tracking term [0...1]"),
     ],
 )
@@ -186,7 +186,7 @@ def test_a_tuner_is_judged_by_its_own_answer_not_by_the_incumbent(trial):
         patch.setattr("drive_env.envs.gain_tuning.GainTuning", Listening)
         found = evaluate(Bold(trial), "gain_tuning", {"trials": 3}, episodes=2)
     for lane, episode in enumerate(found.episodes):
-        names = {"hidden": "trial_hidden", "measured": "trial_measured", "gains": "trial_gains"}
+        names = {"robust_cost": "trial_robust_cost", "measured": "trial_measured", "gains": "trial_gains"}
         for own, name in names.items():
             expected = episode.first[own] if trial == 0 else told[trial - 1][name][lane]
             assert np.array_equal(episode.last[own], expected), own
@@ -215,7 +215,8 @@ def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     found = run("evaluate", "tracking_two_mass", "--channel", "socket://127.0.0.1:1", "--node", 3)
     assert (found.exit_code, found.stderr) == (
-        2, "drive-agent: The motor of node 3 will turn. Is its way clear? Nobody is there to ask; say --yes\n",
+        2, "drive-agent: The motor of node 3 will turn. Is its way clear? There is no terminal to ask; confirm with "
+           "--yes\n",
     )  # fmt: skip
     monkeypatch.setattr("drive_env.commands.options.sys", SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True)))
     monkeypatch.setattr("typer.confirm", lambda question: False)
@@ -229,7 +230,7 @@ def test_a_report_is_saved_and_loaded(tmp_path):
     again = Evaluation.load(found.save(tmp_path / "report.json"))
     assert again.values == found.values and again.seeds == found.seeds and again.side == "emulator"
     (tmp_path / "no.json").write_text("{}")
-    with pytest.raises(ValueError, match="is no report of `drive-agent evaluate`"):
+    with pytest.raises(ValueError, match="is not a report of `drive-agent evaluate`"):
         Evaluation.load(tmp_path / "no.json")
 
 
@@ -272,7 +273,7 @@ class Acting(Gentle):
         ("gain_scheduling", {"load": "belt", "duration": 0.1}, 3, "tracking term [0...1]"),
         ("gain_scheduling", {"load": "two_mass", "mode": "csv", "excitation": "sine", "duration": 0.1}, 3,
          "tracking term [0...1]"),
-        ("gain_tuning", {"trials": 2}, 3, HIDDEN),
+        ("gain_tuning", {"trials": 2}, 3, ROBUST_COST),
     ],
 )  # fmt: skip
 def test_on_the_same_drawn_machines_the_gap_in_lockstep_is_nothing(environment, options, actions, score):
@@ -411,17 +412,17 @@ def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
     policy = agent(tmp_path / "agent.npz")
     told = run("evaluate", policy, "--replay", path, "--json")
     assert told.exit_code == 0 and json.loads(told.output)["6064h"]["nrmse"] < 1e-3  # the same machine
-    assert "6064h: the emulator lies 0.0" in run("evaluate", policy, "--replay", path).output
+    assert "6064h: deviation of the emulator 0.0" in run("evaluate", policy, "--replay", path).output
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("nowhere.npz",), "there is no file nowhere.npz"),
-        (("agent.tflite",), "is no policy; give an agent"),
+        (("agent.tflite",), "is not a policy; give an agent"),
         (("nowhere:policy",), "module 'nowhere' cannot be imported"),
         (("json:nothing",), "json has no 'nothing'; it has"),
-        (("test_agents_evaluate:gentle",), "does not say its environment; give --environment"),
+        (("test_agents_evaluate:gentle",), "does not name its environment; give --environment"),
         (("nothing", "-e", "walking"), "there is no environment 'walking'"),
         (("feed_forward", "-e", "gain_tuning"), "has no baseline 'feed_forward'; it has nothing"),
         (("nothing", "-e", "tracking", "--episodes", "0"), "--episodes 0 is too small"),
@@ -431,11 +432,11 @@ def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
             ("nothing", "-e", "tracking", "--channel", "socket://127.0.0.1:9", "--yes"),
             "nobody answers at socket://127.0.0",
         ),
-        (("nothing", "-e", "tracking", "--lockstep"), "--lockstep is of a bus; give its --channel, or --gap"),
+        (("nothing", "-e", "tracking", "--lockstep"), "--lockstep is for a bus; give its --channel, or --gap"),
         (("nothing", "-e", "tracking", "--gap", "0"), "--gap 0 is too small"),
         (("nothing", "-e", "tracking", "--gap", "2", "--node", "1"), "leave --node out"),
-        (("tracking_inverted_pendulum", "--gap", "2"), "judge it with --lockstep"),
-        (("nothing", "-e", "tracking", "--stall", "-1"), "--stall -1 must be a time [s], 0 for any"),
+        (("tracking_inverted_pendulum", "--gap", "2"), "evaluate it with --lockstep"),
+        (("nothing", "-e", "tracking", "--stall", "-1"), "--stall -1 must be a time [s], 0 for no limit"),
         (("nothing", "-e", "tracking", "--seed", "-3"), "--seed -3 is too small"),
         (("gain_tuning", "-e", "tracking"), "acts in ServoDrive/GainTuning-v0, not in ServoDrive/Tracking-v0"),
         (("nobody",), "give an agent that ships (gain_tuning, tracking_"),
@@ -521,7 +522,7 @@ def test_an_onnx_policy_refuses_what_is_no_number(tmp_path):
     with pytest.raises(PolicyError, match="does not take this observation"):
         policy.act(np.zeros(ENTRIES + 1))
     (tmp_path / "no.onnx").write_bytes(b"no")
-    with pytest.raises(BundleError, match="is no ONNX model"):
+    with pytest.raises(BundleError, match="is not an ONNX model"):
         OnnxPolicy(tmp_path / "no.onnx")
 
 
@@ -587,11 +588,11 @@ def test_the_command_writes_the_same_bytes_on_processes(tmp_path):
 
 
 @pytest.mark.parametrize(("more", "message"), [
-    (("--bitrate", 500_000), "--bitrate is of a bus; give its --channel, or leave --bitrate out"),
-    (("--device", "tmcm6212"), "--device is of a bus; give its --channel, or leave --device out"),
-    (("--sensor", "a:b"), "--sensor is of a bus; give its --channel, or leave --sensor out"),
-    (("--workers", 2, "--bus"), "--workers runs episodes of the emulator; leave it out on a bus, with --gap"),
-    (("--cluster", "tcp://x:1", "--gap", 2), "--cluster runs episodes of the emulator; leave it out on a bus"),
+    (("--bitrate", 500_000), "--bitrate is for a bus; give its --channel, or leave --bitrate out"),
+    (("--device", "tmcm6212"), "--device is for a bus; give its --channel, or leave --device out"),
+    (("--sensor", "a:b"), "--sensor is for a bus; give its --channel, or leave --sensor out"),
+    (("--workers", 2, "--bus"), "--workers is for episodes on the emulator; leave it out on a bus, with --gap"),
+    (("--cluster", "tcp://x:1", "--gap", 2), "--cluster is for episodes on the emulator; leave it out on a bus"),
     (("--workers", 0), "--workers 0 is below 1; give the number of processes"),
     (("--workers", 1, "--cluster", "tcp://x:1"), "choose --workers or --cluster"),
 ])  # fmt: skip

@@ -50,7 +50,7 @@ class Scripted:
 
 
 def no_number():
-    raise PolicyError("the policy's output is no number")
+    raise PolicyError("the policy's output is not a number")
 
 
 def fail():
@@ -71,12 +71,17 @@ def deadlock():
 WRONGS = {
     "nan": (lambda: np.nan, PATIENT, r"entry 0 of the policy's action is nan, no number"),
     "inf": (lambda: np.inf, PATIENT, r"entry 0 of the policy's action is inf, no number"),
-    "no number inside": (no_number, PATIENT, "the policy's output is no number"),
+    "no number inside": (no_number, PATIENT, "the policy's output is not a number"),
     "fails": (fail, PATIENT, r"the policy failed: IndexError: list index out of range \(.*guard.py, line \d+\)"),
     "saturates": (lambda: 1.0, PATIENT, r"at the end of its range for 100 ms, and the limit is 100 ms; .*--saturation"),
     "saturates below": (lambda: -1.7, PATIENT, r"at the end of its range for 100 ms"),
-    "computes for ever": (compute_for_ever, IMPATIENT, r"no answer for 2000 ms: it is too slow, or never returns"),
-    "deadlock": (deadlock, IMPATIENT, r"no answer for 2000 ms: it is too slow, or never returns; .*--stall"),
+    "computes for ever": (
+        compute_for_ever,
+        IMPATIENT,
+        r"no answer for 2000 ms: it is too slow, or does not return at "
+        r"all",
+    ),
+    "deadlock": (deadlock, IMPATIENT, r"no answer for 2000 ms: it is too slow, or does not return at all; .*--stall"),
 }
 wrong_policies = pytest.mark.parametrize(("wrong", "guard", "message"), WRONGS.values(), ids=WRONGS)
 
@@ -333,10 +338,10 @@ def test_an_answer_that_is_taken_late_is_late_whoever_was_slow(monkeypatch):
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (np.zeros((1, 3)), r"has shape \(1, 3\); 1 lane\(s\) of this environment take \(1, 2\)"),
-        ("left", "is a str, no array of numbers"),
-        (None, "is a NoneType, no array of numbers"),
-        ([[0.1], [0.2, 0.3]], "is a list, no array of numbers"),
+        (np.zeros((1, 3)), r"has shape \(1, 3\); 1 environments take \(1, 2\)"),
+        ("left", "is a str, not an array of numbers"),
+        (None, "is a NoneType, not an array of numbers"),
+        ([[0.1], [0.2, 0.3]], "is a list, not an array of numbers"),
     ],
 )
 def test_an_action_of_another_kind_is_told(answer, message):

@@ -74,7 +74,7 @@ def test_the_drive_is_read_and_nothing_else():
         assert len(frames) > 100
         assert all(frame.can_id == SDO_REQUEST + 1 and frame.data[0] & 0xE0 in UPLOADS for frame in frames)
     for line in ("ok    identity: node 1 is a tmcm1636: TMCM-1636", "ok    state: switch on disabled",
-                 "ok    interface: SDO answers in", "would carry 6064h", "ok    heartbeat: the drive can watch",
+                 "ok    interface: SDO answers in", "would carry 6064h", "ok    heartbeat: the drive can monitor",
                  "pole pairs 4", "24 V entered", "6064h from -131072 to 131072, now 0",
                  "a quick stop for a position beyond", "now torque P 4021", "Nothing was written."):  # fmt: skip
         assert line in found.stdout, line
@@ -131,7 +131,7 @@ def turn(drives):
         (lambda d: d.write(0x2056, 7), "no    motor: 2056h:00 (pole pairs) is 7, and 4 is needed for qbl4208"),
         (lambda d: d.write((0x2080, 2), 8192), "2080h:02 (encoder counts) is 8192, and 4096 is needed"),
         (lambda d: d.write(0x2055, 1), "2055h:00 (commutation by the encoder) is 1, and 3 is needed"),
-        (lambda d: d.write(0x2050, 0), "no    motor: the drive knows no motor (2050h is 0)"),
+        (lambda d: d.write(0x2050, 0), "no    motor: the drive is not commissioned for a motor"),
         (lambda d: d.write(0x2003, 0), "no    limits: "),
         (lambda d: (d.write((0x2006, 2), 200), d.write((0x2006, 1), 1)), "the brake chopper acts from 20 V"),
         (lambda d: d.write((0x607D, 2), TURN), "no    travel: -12.6 to 12.6 rad from here"),
@@ -146,7 +146,7 @@ def test_what_a_run_would_not_begin_for(prepare, line):
         assert dictionary_of(world) == before
         assert all(frame.data[0] & 0xE0 in UPLOADS for frame in frames)
     assert found.exit_code == 1 and line in found.stdout
-    assert found.stderr.startswith("drive-agent: a run would not begin")
+    assert found.stderr.startswith("drive-agent: a run would not start")
 
 
 @pytest.mark.parametrize("patient_masters", [None], ids=["as patient as a user's"])
@@ -157,7 +157,10 @@ def test_a_node_that_is_stopped_stays_so(patient_masters):
         found = dry_run(channel)
         assert world.nodes[1].state is state
         assert {frame.can_id for frame in frames} == {SDO_REQUEST + 1}
-    assert found.exit_code == 1 and "if it is stopped (NMT), a run would take it to pre-operational" in found.stderr
+    assert (
+        found.exit_code == 1
+        and "if it is stopped (NMT), a run without --dry-run takes it to pre-operational" in found.stderr
+    )
 
 
 def test_an_emulated_drive_is_rehearsed_as_well(tmp_path, monkeypatch):

@@ -60,9 +60,11 @@ def test_trials_that_were_stopped_are_counted_where_they_cost_something():
 
 def test_the_hidden_score_is_told_over_the_rule_s_with_which_the_episode_began():
     figures = {figure.name: figure for figure in scores.FIGURES["ServoDrive/GainTuning-v0"]}
-    hidden = figures["hidden J over the rule's (emulator)"]
-    assert hidden.compute(episode(tracking(), {}, {"hidden": 4.0}, {"hidden": 1.0}), None) == pytest.approx(0.25)
-    assert np.isnan(hidden.compute(episode(tracking()), None))
+    cost = figures["robust cost relative to the rule's (emulator)"]
+    assert cost.compute(episode(tracking(), {}, {"robust_cost": 4.0}, {"robust_cost": 1.0}), None) == pytest.approx(
+        0.25
+    )
+    assert np.isnan(cost.compute(episode(tracking()), None))
 
 
 def test_the_return_is_the_sum_of_rewards():

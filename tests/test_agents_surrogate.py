@@ -245,7 +245,7 @@ def test_reset_forgets_the_lanes_of_its_mask(bundle):
 def test_what_is_no_observation_is_told(policy):
     with pytest.raises(PolicyError, match=r"takes 42 entries per axis and one more, not 40"):
         policy.act(np.zeros(40))
-    with pytest.raises(PolicyError, match="holds what is no number"):
+    with pytest.raises(PolicyError, match="holds NaN"):
         policy.act(np.full(ENTRIES + 1, np.nan))
 
 

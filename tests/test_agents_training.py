@@ -220,15 +220,15 @@ def both(environment, options, wrapper):
 
 def test_each_trial_earns_its_own_hidden_j_over_the_rules():
     lanes, (_, told), env, _ = both("gain_tuning", {"trials": 2}, {"agents.training.rewards:EachTrial": {"limit": 0.4}})
-    rng, rule, limited = np.random.default_rng(0), told["hidden"], 0
+    rng, rule, limited = np.random.default_rng(0), told["robust_cost"], 0
     for _ in range(4):  # two episodes: the second one's machines have other rules
         action = rng.uniform(-0.7, 0.7, (4, 3)).astype(np.float32)
         _, _, _, ended, told = lanes.step(action)
-        gained = np.log(rule) - np.log(told.get("final_info", told)["trial_hidden"])
+        gained = np.log(rule) - np.log(told.get("final_info", told)["trial_robust_cost"])
         env.step_async(action)
         assert env.step_wait()[1] == pytest.approx(np.clip(gained, -0.4, 0.4), rel=1e-5)
         limited += np.sum(np.abs(gained) > 0.4)
-        rule = told["hidden"] if ended.all() else rule
+        rule = told["robust_cost"] if ended.all() else rule
     lanes.close(), env.close()
     assert 0 < limited < 16
 
@@ -279,7 +279,7 @@ def test_an_asymmetric_critic_sees_the_machine_and_the_actor_does_not(tmp_path):
     rows = np.random.default_rng(0).standard_normal((3, seen)).astype(np.float32)
     assert np.allclose(loaded.act(rows), policy_of(bundle).act(rows), atol=1e-5)
     found = evaluate(policy_of(bundle), "gain_tuning", bundle.configuration, episodes=2)
-    assert np.isfinite(found.values["hidden J over the rule's (emulator)"]).all()
+    assert np.isfinite(found.values["robust cost relative to the rule's (emulator)"]).all()
 
 
 @pytest.mark.parametrize(
@@ -491,7 +491,7 @@ def test_trials_that_an_error_ends_are_over_for_the_next_search(tmp_path, monkey
 
 
 def test_there_is_nothing_to_resume(tmp_path):
-    with pytest.raises(ValueError, match=r"no file .*checkpoint\.zip to go on with: a run writes its first"):
+    with pytest.raises(ValueError, match=r"no file .*checkpoint\.zip to continue from: a run writes its first"):
         train(tiny(), tmp_path, resume=True, trust=True)
     (tmp_path / CHECKPOINT).write_bytes(b"no")
     with pytest.raises(ValueError, match="is no checkpoint"):

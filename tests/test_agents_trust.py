@@ -58,7 +58,7 @@ def test_a_checkpoint_is_not_loaded_without_trust(arguments, folder):
     (folder / "x.ZIP").write_bytes((folder / "x.zip").read_bytes())
     found = run(*arguments)
     assert found.exit_code == 2, found.output
-    assert re.search(r"holds pickles: to load it runs whatever its writer put there.* say --trust", found.output)
+    assert re.search(r"holds pickles: loading it runs code that its author put there.* say --trust", found.output)
     assert not (folder / MARK).exists()
 
 
@@ -90,7 +90,7 @@ def test_who_is_trusted_runs(folder):
 
 def test_a_new_run_needs_no_trust(folder):
     found = run("train", "--trust")
-    assert found.exit_code == 2 and "--trust is of --resume" in found.output
+    assert found.exit_code == 2 and "--trust is for --resume" in found.output
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def test_it_tunes_an_emulated_drive_over_its_bus_and_certifies_it(tmp_path):
     assert axis.accepted and axis.after != axis.before
     tried = [tuple(map(int, row.split()[1:4])) for row in table]
     # Proving may calm what the agent found, and says so.
-    calmed = any(word in note for note in axis.notes for word in ("calmed", "slowed", "second best", "fitted rule"))
+    calmed = any(word in note for note in axis.notes for word in ("calmed", "slowed", "second best", "baseline rule"))
     assert tuple(axis.after[2:]) in tried or calmed
     assert axis.identified["inertia"].low < axis.identified["inertia"].value < axis.identified["inertia"].high
     assert axis.frequency_responses[0].margins["phase margin [deg]"] > 10.0
@@ -88,7 +88,7 @@ def test_it_tunes_an_emulated_drive_over_its_bus_and_certifies_it(tmp_path):
     assert after < 0.5 * before  # the commissioned gains are slow
     assert "agent gain_tuning tunes tmcm1636 with qbl4208: two_mass, emulated" in lines[0]
     assert any(line.startswith("velocity loop: phase margin") for line in lines)
-    assert "the drive keeps the new gains over a power cycle" in lines
+    assert "the new gains are stored in the drive" in lines
     before = load_snapshot(tmp_path / "run" / "before.toml")
     assert tuple(before.axes[0][key] for key in GAIN_OBJECTS) == axis.before
     assert (tmp_path / "run" / "report.html").is_file()
@@ -106,7 +106,8 @@ def test_a_real_motor_turns_only_if_its_way_is_said_to_be_clear(tmp_path, monkey
     monkeypatch.setattr("agents.commands.tune._on_bus", lambda *_: nullcontext())
     code, _, error = command("--interface", "virtual", "--channel", "none", "--node", 3, "--travel", "-1:1")
     assert code == 2
-    assert error == "drive-agent: The motor of node 3 will turn. Is its way clear? Nobody is there to ask; say --yes\n"
+    question = "drive-agent: The motor of node 3 will turn. Is its way clear?"
+    assert error == f"{question} There is no terminal to ask; confirm with --yes\n"
     assert not any(tmp_path.iterdir())
 
 
@@ -126,9 +127,9 @@ def test_json_for_programs(tmp_path):
     (["--channel", "can0", "--travel", "-1:1"], "channel 'can0' needs an interface"),
     (["--node", "1", "--travel", "-1:1"], "no CAN channel is given"),
     (["--interface", "virtual", "--channel", "none", "--seed", "1"], "--seed draws an emulated machine"),
-    (["--interface", "virtual", "--channel", "none"], "--travel is missing: how far may the motor turn?"),
+    (["--interface", "virtual", "--channel", "none"], "--travel is missing: give how far the motor may turn"),
     (["--trials", "0"], "--trials 0 must be 1 or more"),
-    (["--load", "gantry"], "load 'gantry' has 2 drives; an agent tunes one"),
+    (["--load", "gantry"], "load 'gantry' has 2 axes; an agent tunes one axis"),
     (["--load", "nothing"], "no load is named 'nothing'"),
 ])  # fmt: skip
 def test_a_mistake_ends_with_code_2_and_one_line(tmp_path, monkeypatch, arguments, message):
@@ -159,7 +160,9 @@ def test_a_tuner_that_never_returns_ends_the_run_and_leaves_the_drive_of_a_bus_a
 
     with _emulated_node("tmcm1636", "qbl4208", "inertia", None, None, None) as target:
         before = gains(target)
-        with pytest.raises(PolicyStoppedError, match="no answer for 1000 ms: it is too slow, or never returns"):
+        with pytest.raises(
+            PolicyStoppedError, match="no answer for 1000 ms: it is too slow, or does not return at all"
+        ):
             run_agent(target, Hanging(1), tmp_path / "before.toml", name="hanging")
         assert np.array_equal(gains(target), before) and not is_enabled(target).any()
 
@@ -210,7 +213,7 @@ def test_gains_that_were_stopped_are_no_answer(tmp_path):
         done = run_agent(target, Reckless(), tmp_path / "before.toml", name="reckless")
         assert all(trial.aborted.all() for trial in done.trials[1:]) and not done.trials[0].aborted.any()
         (axis,) = done.result.axes
-        assert axis.accepted and any("own answer was stopped" in note for note in axis.notes)
+        assert axis.accepted and any("own choice was stopped" in note for note in axis.notes)
         assert tuple(axis.after) == tuple(done.trials[0].gains[0]) == tuple(gains(target)[0])
         assert done.result.aborts[0] == len(done.trials) - 1
 
@@ -222,7 +225,7 @@ def test_where_every_trial_was_stopped_the_drive_has_what_it_had(tmp_path, monke
     with emulated("tmcm1636", "inertia", "qbl4208") as target:
         before, set_before = gains(target), settings(target)
         done = run_agent(target, Reckless(), tmp_path / "before.toml", name="reckless")
-        assert done.result.axes[0].reason == "every trial was stopped, the fitted rule's too"
+        assert done.result.axes[0].reason == "every trial was stopped, the baseline rule's too"
         assert not done.result.kept and not done.certificate.axes[0].accepted
         assert np.array_equal(gains(target), before) and np.array_equal(settings(target), set_before)
         assert not is_enabled(target).any()
@@ -248,12 +251,12 @@ def test_a_wrong_wiring_ends_the_run_before_any_trial_with_code_1_and_the_reason
         target.drives.write((0x2080, 3), 2)  # its halls align the encoder once: it is not set right under way
         before = gains(target)
         done = run_agent(target, Contrary(), tmp_path / "before.toml", name="contrary")
-        assert done.trials == () and "encoder counts against the motor" in done.result.axes[0].reason
+        assert done.trials == () and "encoder counts in the wrong direction" in done.result.axes[0].reason
         assert np.array_equal(gains(target), before) and not is_enabled(target).any()
     monkeypatch.setattr("agents.tuner.tuning_run.run", lambda *_, **__: done)
     code, out, _ = command("--load", "inertia", "--out", tmp_path / "run")
-    assert code == 1 and "axis 0 was rolled back: the encoder counts against the motor" in out
-    assert "keeps the new gains" not in out
+    assert code == 1 and "axis 0 was rolled back: the encoder counts in the wrong direction" in out
+    assert "the new gains are" not in out
 
 
 @pytest.mark.slow

@@ -38,7 +38,7 @@ def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
     assert done.exit_code == 0, done.output
     (axis,) = json.loads(done.stdout)
     assert list(axis["proposals"]) == ["simc"]
-    assert "it swings with its load's resonance" in axis["no_relay"]
+    assert "it swings at its load's resonance" in axis["no_relay"]
 
 
 @pytest.mark.parametrize(
@@ -48,13 +48,16 @@ def test_a_relay_that_says_nothing_leaves_the_rules_and_its_reason():
         (("rules", "--apply", "nichols"), "no rule is named 'nichols'"),
         (("rules", "--store"), "add --apply RULE"),
         (("rules", "--snapshot", "before.toml"), "add --apply RULE"),
-        (("rules", "--bus", "--travel", "-1:1"), "will turn. Is its way clear? Nobody is there to ask; say --yes"),
+        (
+            ("rules", "--bus", "--travel", "-1:1"),
+            "will turn. Is its way clear? There is no terminal to ask; confirm with --yes",
+        ),
         (("rules", "--load", "brick"), "no load is named 'brick'"),
         (("auto", "--motor", "brick"), "brick"),
         (("auto", "--node", "1"), "--travel is missing"),
         (("auto", "--channel", "can0"), "--travel is missing"),
         (("auto", "--interface", "pcan", "--yes"), "--travel is missing"),
-        (("identify", "-c", "can0", "--travel", "-1:1"), "will turn. Is its way clear? Nobody is there to ask"),
+        (("identify", "-c", "can0", "--travel", "-1:1"), "will turn. Is its way clear? There is no terminal to ask"),
         (("response", "--lockstep"), "--travel is missing"),
         (("auto", "--axes", "linked"), "add --bus"),
         (("auto", "--bus", "--yes"), "--travel is missing"),
@@ -99,12 +102,12 @@ def test_auto_ends_with_1_and_says_why_where_it_changed_nothing(tmp_path, monkey
     monkeypatch.setattr(auto_settings, "LEAST_WAY", 1e9)
     done = drive_tune("auto", "--load", "belt", "--out", tmp_path / "run")
     assert done.exit_code == 1
-    assert "axis 0 was left as it was: the travel is too short" in " ".join(done.stdout.split())
+    assert "axis 0 was not tuned: the travel is too short" in " ".join(done.stdout.split())
 
 
 def test_rules_write_one_of_them_and_leave_the_way_back(tmp_path):
     file = tmp_path / "before.toml"
-    done = drive_tune("rules", "chain", "--load", "inertia", "--apply", "chain", "--snapshot", file, "--yes")
+    done = drive_tune("rules", "cascade", "--load", "inertia", "--apply", "cascade", "--snapshot", file, "--yes")
     assert done.exit_code == 0, done.output
     assert "written" in done.stdout
     assert load_snapshot(file).axes[0][0x2042, 1] == 445

@@ -66,8 +66,8 @@ def test_the_gains_before_are_kept_where_a_move_is_better_with_them(axes, monkey
     assert (kept.is_kept, tuned.is_kept) == (True, False)
     np.testing.assert_array_equal(gains(target.drives)[0], good)
     assert kept.after == kept.before == Gains(*good)
-    assert any(note.startswith("the gains before are kept: J by the measured terms") for note in kept.notes)
-    assert "they are those before" in kept.verified
+    assert any(note.startswith("the gains before are kept: the measured cost J") for note in kept.notes)
+    assert "the gains before are kept" in kept.verified
     assert tuned.after[VELOCITY_P] >= good[VELOCITY_P] > tuned.before[VELOCITY_P]
     assert not any("are kept" in note for note in tuned.notes)
     paper = certificate(target, result, seed=0)
@@ -103,7 +103,7 @@ def test_a_fault_with_the_gains_before_is_theirs_and_is_reset(axes, monkeypatch,
     monkeypatch.setattr(ProvingGround, "show", trips_the_second)
     result = auto(target, tmp_path / "before.toml", experiments=standing_in)
     assert result.accepted.all(), [axis.reason for axis in result.axes]
-    assert [any("went into fault as it moved with" in n for n in axis.notes) for axis in result.axes] == [False, True]
+    assert [any("went into fault in the move with" in n for n in axis.notes) for axis in result.axes] == [False, True]
     assert np.all(target.drives.read(0x6041) & 0x4F == 0x40)
     assert not any(axis.is_kept for axis in result.axes)
 
@@ -132,7 +132,8 @@ def test_where_one_more_move_fails_the_second_best_of_the_trials_is_taken(axes, 
     assert [gains.tolist() for gains in shown[:2]] == [gains for _, gains in passed[:2]]
     assert list(result.axes[0].after) == passed[1][1]
     assert any(
-        "the second best of the trial: with the best, in one more move it shook" in n for n in result.axes[0].notes
+        "the second best gains of the trial are kept: with the best, in another move, it shook" in n
+        for n in result.axes[0].notes
     )
 
 
@@ -188,14 +189,14 @@ def test_the_axes_of_a_machine_are_tuned_together_and_each_says_why_it_did_not_m
         np.testing.assert_array_equal(gains(target.drives), [axis.after for axis in result.axes])
     assert result.accepted.all(), [axis.reason for axis in result.axes]
     assert all(axis.after != axis.before for axis in result.axes)
-    said = [[note for note in axis.notes if "no move with the gains before" in note] for axis in result.axes]
+    said = [[note for note in axis.notes if "no comparison move with the gains before" in note] for axis in result.axes]
     if not unsafe:
         assert said == [[], []]
         assert result.earlier.where.all()
         return
     assert result.earlier is None
     assert [len(notes) for notes in said] == [1, 1]
-    assert "another axis of its machine could not make it" in said[0][0]
+    assert "another axis of its machine cannot make it" in said[0][0]
     assert "a P gain is 0" in said[1][0]
 
 
@@ -250,7 +251,7 @@ def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tm
         monkeypatch.setattr(ProvingGround, "run", noted)
         result = auto(target, tmp_path / "before.toml", experiments=gantry_known, budget=4.0)
     assert result.accepted.all(), [axis.reason for axis in result.axes]
-    failed = [any(note.startswith("no pass with the gains found") for note in axis.notes) for axis in result.axes]
+    failed = [any(note.startswith("failed trials: the gains found") for note in axis.notes) for axis in result.axes]
     assert failed == [False, False, False, True, False, False]
     # Who is through holds its place with what it keeps, not with what its last trial ended with.
     (idle, having) = holding[-1]
@@ -392,7 +393,7 @@ def test_syncs_that_were_late_are_told(late, told):
 RULE, FOUND, SLOW = [4000, 1500, 700, 1800, 700], [4000, 1000, 2000, 4800, 2000], [4000, 1000, 900, 2000, 900]
 
 
-RULES = "the gains of the fitted rule: with faster ones it shook"
+RULES = "the gains of the baseline rule are kept: with faster ones it shook"
 
 
 @pytest.mark.parametrize(("had", "eased", "swing", "gains_now", "said"), [
@@ -458,5 +459,5 @@ def test_what_shakes_in_spite_of_everything_is_rolled_back(monkeypatch, tmp_path
         result = auto(target, tmp_path / "before.toml", experiments=standing_in)
         np.testing.assert_array_equal(gains(target.drives), before)
     (axis,) = result.axes
-    assert axis.verdict == "rejected" and axis.reason.startswith("it shakes at rest: its current swung by"), axis
+    assert axis.verdict == "rejected" and axis.reason.startswith("it does not come to rest: its current swung by"), axis
     assert axis.eased == auto_moves.EASINGS + 1  # once before the response

@@ -48,7 +48,8 @@ def test_how_axes_belong_together_is_one_of_three_and_of_a_bus(gantry_on_a_bus):
     done = drive_tune("identify", "--axes", "linked")
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr == (
-        "drive-tune: --axes linked is of drives on a bus, an emulated load knows; add --bus, or leave it out\n"
+        "drive-tune: --axes linked is for drives on a bus; add --bus, or leave it out (an emulated load has its own "
+        "coupling)\n"
     )
 
 

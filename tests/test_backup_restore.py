@@ -79,7 +79,9 @@ def test_a_backup_says_of_which_drive_it_is_when_and_ends_with_its_check_sum(fil
 def test_a_file_of_this_drive_is_restored_and_proven_by_another_connection(drive, file):
     code, out, error = run("restore", file, "--yes")
     assert code == DONE, error
-    assert re.search(r"^1 written, \d+ verified by a second reading; they last until a reset", out, re.MULTILINE)
+    assert re.search(
+        r"^1 written, \d+ verified by a second reading; not stored: lost at the next reset", out, re.MULTILINE
+    )
     assert drive.get(PROFILE_VELOCITY) == SPEED
     assert writes(drive) == ["6081"]
     _, second = drive.buses
@@ -91,7 +93,8 @@ def test_a_writer_is_not_believed(drive, file, monkeypatch):
     code, out, error = run("restore", file, "--yes")
     assert (code, "verified" in out) == (REFUSED, False), error
     assert error == (
-        f"drive-env: node 1 does not hold what was written, as a second reading shows: 6081h:00 Profile velocity is "
+        f"drive-env: node 1 does not have the values that were written, by a second reading: 6081h:00 Profile "
+        f"velocity is "
         f"1000, not {SPEED}; is another master writing to it? Look with `drive-env diff`, then restore again\n"
     )
 
@@ -102,7 +105,7 @@ def test_a_writer_is_not_believed(drive, file, monkeypatch):
         (lambda text: text.replace(f"= {SPEED} ", "= 50 "), "was changed since it was written", DONE),
         (lambda text: text.replace("serial = 4711", "serial = 4712"), "was changed since it was written", USER_ERROR),
         (lambda text: text[: text.index('"6083')], "is torn: it ends before its check sum", USER_ERROR),
-        (lambda text: text[: text.index('"6083') + 4], "is no TOML, or is torn", USER_ERROR),
+        (lambda text: text[: text.index('"6083') + 4], "is not TOML, or incomplete", USER_ERROR),
         (lambda text: text[: text.index("[check]")].replace("format = 2\n", ""), "has no check sum", DONE),
         (lambda text: text.replace("# Profile velocity", "# the user's own words").replace("\n", "\r\n"), "", DONE),
     ],
@@ -234,9 +237,7 @@ def test_a_dry_run_says_what_would_be_written_and_that_nothing_was(drive, file, 
     code, out, error = run(*arguments, "--dry-run", "--store")
     assert code == DONE, error
     said = out.splitlines()[-1]
-    assert re.fullmatch(
-        r"\d+ parameters would be written to node 1, and kept over a power cycle; nothing was written", said
-    )
+    assert re.fullmatch(r"\d+ parameters would be written to node 1, and stored (dry run: nothing was written)", said)
     assert "verified" not in out
     assert (writes(drive), drive.get(PROFILE_VELOCITY)) == ([], 1000)
     told = json.loads(run(*arguments, "--dry-run", "--json")[1])

@@ -153,10 +153,10 @@ def test_any_change_shows(certificate, tmp_path, where, value):
 
 @pytest.mark.parametrize(("text", "message"), [
     ("", "is no certificate"),
-    ("[1]", "is no certificate of format 2"),
-    ('{"a": 1}', "is no certificate of format 2"),
+    ("[1]", "is not a certificate of format 2"),
+    ('{"a": 1}', "is not a certificate of format 2"),
     ('{"format": 1, "sha256": "", "x": NaN}', "NaN is no number of JSON"),
-    ('{"format": 2, "sha256": ""}', "is no certificate of this version: 'tuner'"),
+    ('{"format": 2, "sha256": ""}', "is not a certificate of this version: 'tuner'"),
 ])  # fmt: skip
 def test_what_is_no_certificate_is_said_to_be_none(tmp_path, text, message):
     path = tmp_path / "certificate.json"
@@ -179,13 +179,13 @@ def test_verify_tells_by_its_exit_code_whether_a_file_was_changed(certificate, t
     path.write_text(path.read_text(encoding="utf-8").replace("0.3612", "0.3613"), encoding="utf-8")
     done = verify(path)
     assert done.exit_code == 1
-    assert done.stderr == f"drive-tune: {path} was changed since it was written: its hash is not that of its content\n"
+    assert done.stderr == f"drive-tune: {path} was changed since it was written: its hash does not match its content\n"
 
 
 @pytest.mark.parametrize(("name", "message"), [
     ("none.json", "cannot read .*none.json: No such file"),
     ("x.json", "is no certificate"),
-    ("x.html", "is no report of drive-tune"),
+    ("x.html", "is not a report of drive-tune"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line(tmp_path, name, message):
     for made in ("x.json", "x.html"):
@@ -249,7 +249,7 @@ DOUBT = "no margins <yet>"
 @pytest.mark.parametrize(("accepted", "reservations", "verdict", "colour", "words"), [
     (True, (), "accepted", "accepted", "new gains in the drive"),
     (True, (DOUBT,), "accepted with reservations", "reserved", "new gains in the drive, with reservations"),
-    (False, (DOUBT,), "rejected", "rejected", "gains as before"),
+    (False, (DOUBT,), "rejected", "rejected", "rejected; the drive has its gains from before"),
 ])  # fmt: skip
 def test_a_verdict_has_three_colours_and_names_each_reservation(
     certificate, accepted, reservations, verdict, colour, words

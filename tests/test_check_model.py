@@ -48,7 +48,7 @@ def test_a_fit_finds_the_machine_and_writes_laws_that_environments_take(log, tmp
     out = tmp_path / "fitted.toml"
     fitted = [part for name in TRUTH for part in ("--fit", name)]
     code, text, _ = run(log, *fitted, "--machines", 32, "--out", out)
-    assert code == DONE and f"laws written to {out}" in text
+    assert code == DONE and f"distributions written to {out}" in text
     best = {line.split(":")[0]: float(line.split("best ")[1].split(",")[0]) for line in text.splitlines()[4:6]}
     for name, value in TRUTH.items():
         assert best[name] == pytest.approx(value, rel=0.2)
@@ -102,7 +102,8 @@ def test_late_and_early_are_told(capsys, shift, says):
     row = LogDifference(*(np.array([value]) for value in (0.123, shift, 0.0456)))
     _print({POSITION: row}, dictionary, None, None)
     assert capsys.readouterr().out == (
-        "6064h:00 Position actual value: off by 12.30 % of its range (RMS); " + says + ", 4.56 % without that\n"
+        "6064h:00 Position actual value: off by 12.30 % of its range (RMS); " + says + ", 4.56 % with the shift "
+        "removed\n"
     )
 
 
@@ -115,7 +116,7 @@ def test_late_and_early_are_told(capsys, shift, says):
         (["--fit", "load.weight"], "'load.weight' cannot be fitted"),
         (["--fit", "load.inertia", "--machines", "4"], "--machines 4 is too few for a fit; give 16 or more"),
         (["--fit", "load.inertia", "--distributions", "sand"], "no set of distributions is named 'sand'"),
-        (["--out", "laws.toml"], "name what to fit with --fit"),
+        (["--out", "laws.toml"], "name the parameters to fit with --fit"),
         (["--fit", "load.inertia", "--out", "nowhere/laws.toml"], "the folder nowhere does not exist"),
         (["--fit", "load.inertia", "--rounds", "0"], "--rounds 0 must be 1 or more"),
         (["--settings", "none.toml"], "there is no file none.toml"),

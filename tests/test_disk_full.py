@@ -86,7 +86,7 @@ def test_a_tuning_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, 
         assert (done.exit_code, done.stdout.count("{")) == (2, 0), done.output
         said = done.stderr.strip().splitlines()[-1]
         assert f"{out / file}: " in said and SAID in said
-        assert f"; the drives have what they had before; if ever not, drive-tune undo {out / 'before.toml'}" in said
+        assert f"; the drives have their state from before; if not, drive-tune undo {out / 'before.toml'}" in said
         assert status_is(machine, SWITCH_ON_DISABLED)
         assert gains(machine) == before == [load_snapshot(out / "before.toml").axes[0][key] for key in GAIN_OBJECTS]
         with CanDrives(interface="slcan", channel=bus[3], pace="lockstep", safety=False) as drives:
@@ -190,7 +190,7 @@ def test_a_search_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, 
              "random"],
         )  # fmt: skip
         assert done.exit_code == 2, done.output
-        said = f"{out / file}: {SAID}; the drives have what they had before; if ever not, drive-tune undo {way_back}"
+        said = f"{out / file}: {SAID}; the drives have their state from before; if not, drive-tune undo {way_back}"
         assert said in done.stderr
         assert gains(machine) == before
     assert sorted(path.name for path in tmp_path.iterdir()) == [way_back.name]
@@ -280,7 +280,7 @@ def test_a_real_disk_that_holds_the_way_back_and_no_report(tmp_path, monkeypatch
         before = gains(machine)
         done = tune(drive_tune, bus, disk / "run")
         assert (done.exit_code, gains(machine)) == (2, before), done.output
-        assert SAID in done.stderr and "the drives have what they had before" in done.stderr
+        assert SAID in done.stderr and "the drives have their state from before" in done.stderr
         assert [path.name for path in (disk / "run").iterdir()] == ["before.toml"]
         machine.write(GAIN_OBJECTS[2], 77)
         again = CliRunner().invoke(drive_tune, ["undo", str(disk / "run" / "before.toml"), "--yes"])
@@ -299,4 +299,4 @@ def test_a_journal_that_finds_no_room_ends_a_search_and_is_named(tmp_path):
              "60", "--sampler", "random", "--journal", str(disk / "journal")],
         )  # fmt: skip
         assert (done.exit_code, gains(machine)) == (2, before), done.output
-    assert f"{disk / 'journal'}: {SAID}; the drives have what they had before" in done.stderr
+    assert f"{disk / 'journal'}: {SAID}; the drives have their state from before" in done.stderr

@@ -112,10 +112,10 @@ class SilentPort:
         (
             {0x1008, 0x100A},
             "operational",
-            "node 3  unknown device, give its --eds  CiA 402  operational  "
+            "node 3  unknown device; give its EDS with --eds  CiA 402  operational  "
             "no answer to 1008h:00, 100Ah:00 within 0.3 s; try a longer --timeout",
         ),
-        (set(), "", "node 3  unknown device, give its --eds  CiA 402"),
+        (set(), "", "node 3  unknown device; give its EDS with --eds  CiA 402"),
     ],
 )
 def test_scan_shows_a_time_out_as_a_time_out(monkeypatch, capsys, silent, state, line):
@@ -170,7 +170,7 @@ def test_get_raw_several_nodes_texts_and_json(run):
         (["set", "2003", "46 A"], USER_ERROR, "cannot be 46000; its highest is 45000"),
         (["set", "605A", "3"], REFUSED, "node 1 refused the write of 3 to 605Ah:00"),
         (["set", "6081", "1 A"], USER_ERROR, "it takes pps"),
-        (["jog", "0"], USER_ERROR, "a speed of 0 turns nothing"),
+        (["jog", "0"], USER_ERROR, "a speed of 0 does not move the axis"),
         (["set", "6081", "1e400 rpm"], USER_ERROR, "'1e400 rpm' is beyond any number; 6081h:00 Profile velocity takes"),
         (["set", "6081", "1e308 rev/s"], USER_ERROR, "is beyond any number"),
         (["set", "6081", "1 rpm", "--raw"], USER_ERROR, "'1 rpm' is no integer for 6081h:00 Profile velocity"),
@@ -186,7 +186,7 @@ def test_get_raw_several_nodes_texts_and_json(run):
         (["scope", "2003"], USER_ERROR, "2003h:00 Maximum Current cannot be recorded"),
         (["scope", "--trigger", "whenever"], USER_ERROR, "is no condition"),
         (["scope", "--period", "0.0015"], USER_ERROR, "no whole number of milliseconds"),
-        (["scope", "--duration", "0.0004"], USER_ERROR, "--duration 0.0004 s is no whole number of milliseconds"),
+        (["scope", "--duration", "0.0004"], USER_ERROR, "--duration 0.0004 s is not a whole number of milliseconds"),
         (["scope", "--out", "nowhere/file"], USER_ERROR, "there is no folder nowhere"),
         (["diff", "missing.toml"], USER_ERROR, "there is no file missing.toml; write one with"),
         (["commission", "nonsense"], USER_ERROR, "no motor is named 'nonsense'; there are class_1kw"),
@@ -225,14 +225,14 @@ def test_a_dry_run_reads_what_is_says_what_would_be_and_changes_nothing(run, sha
     code, out, _ = run("set", "6081", "4660", "--dry-run")
     assert code == DONE
     assert "6081h:00 Profile velocity is 2184533 pps" in out
-    assert "4660 pps" in out and "would be written; nothing was" in out
+    assert "4660 pps" in out and "would be written (dry run: nothing was written)" in out
     assert run("set", "6081", "-1", "--dry-run")[0] == USER_ERROR
     assert json.loads(run("set", "6081", "4660", "--dry-run", "--json")[1])[0] | {"node": 0} == {
         "node": 0, "object": "6081h:00", "is": 2_184_533, "would be": 4660,
     }  # fmt: skip
     code, out, _ = run("jog", "60 rpm", "--for", "2", "--dry-run")
     assert code == DONE
-    assert "would be enabled, turn at 60 rpm for 2 s, and be switched off again; nothing was done" in out
+    assert "would be enabled, turn at 60 rpm for 2 s, and be switched off again (dry run: nothing was done)" in out
     assert "moved" not in out
     assert {name: machine.read(name).tolist() for name in before} == before
 
@@ -254,7 +254,7 @@ def test_no_command_replaces_a_file(run, tmp_path, monkeypatch, arguments, name,
     file = tmp_path / name
     file.write_text("the only copy", encoding="utf-8")
     code, _, error = run(*arguments)
-    assert (code, error) == (USER_ERROR, f"drive-env: {name} is there already, and would be replaced; {remedy}\n")
+    assert (code, error) == (USER_ERROR, f"drive-env: {name} exists already, and files are not overwritten; {remedy}\n")
     assert file.read_text(encoding="utf-8") == "the only copy"
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
@@ -264,7 +264,7 @@ def test_a_picture_is_no_log_to_compare_with(run, tmp_path):
     path.write_bytes(b"\x89PNG\r\n\x1a\n")
     code, _, error = run("check-model", path)
     assert (code, error) == (
-        USER_ERROR, f"drive-env: {path} is no text; give the CSV that drive-env scope writes\n",
+        USER_ERROR, f"drive-env: {path} is not a text file; give the CSV that drive-env scope writes\n",
     )  # fmt: skip
 
 
@@ -366,7 +366,11 @@ def test_nobody_to_ask_changes_nothing(run, shared, tmp_path):
     file.write_text('[parameters]\n"6081:00" = 77\n')
     code, _, error = run("restore", file, "--unchecked")
     assert code == USER_ERROR
-    assert re.fullmatch(r"drive-env: Write \d+ parameters to node 1\? Nobody is there to ask; say --yes\n", error)
+    assert re.fullmatch(
+        r"drive-env: Write \d+ parameters to node 1\? There is no terminal to ask; confirm with "
+        r"--yes\n",
+        error,
+    )
     assert shared[1][0].read(0x6081) == [2_184_533]
 
 
@@ -560,7 +564,7 @@ def test_scope_keeps_what_came_before_it_was_broken_off(run, tmp_path, monkeypat
     out = tmp_path / "trace"
     got, text, told = run("scope", "6064", "--duration", 10, "--out", out, "--json")
     files = f"{out}.csv and {out}.png"
-    assert (got, told) == (code, f"drive-env: {says}; the 500 samples that came until then are in {files}\n")
+    assert (got, told) == (code, f"drive-env: {says}; the 500 samples received before are in {files}\n")
     assert [json.loads(text)[key] for key in ("samples", "complete")] == [500, False]
     rows = list(csv.reader(out.with_suffix(".csv").open()))
     assert len(rows) == 1 + 500 and rows[-1][0] == "0.499"
@@ -591,7 +595,7 @@ def test_a_log_of_a_bus_that_is_lost_keeps_what_came(run, tmp_path, ending):
     listening.close()
     assert (code, out, error.count("\n")) == (REFUSED, "", 1)
     assert error.startswith("drive-env: the bus was lost: ")
-    assert error.endswith(f"; the 3 frames that came until then are in {file}\n")
+    assert error.endswith(f"; the 3 frames received before are in {file}\n")
     with can.LogReader(str(file)) as frames:
         assert [frame.arbitration_id for frame in frames] == [0x701] * 3
 

@@ -35,7 +35,7 @@ TUNING = ("--travel", "-5:5", "--yes", "--bus")
 COMMANDS = {
     "identify": (drive_tune, ("identify", *TUNING)),
     "response": (drive_tune, ("response", "position", *TUNING)),
-    "rules": (drive_tune, ("rules", "chain", "--relay", *TUNING)),
+    "rules": (drive_tune, ("rules", "cascade", "--relay", *TUNING)),
     "evaluate": (drive_agent, ("evaluate", "gain_tuning", "--episodes", "1", "--stall", "60")),
 }
 
@@ -192,14 +192,14 @@ def test_a_run_that_ends_well_leaves_the_drive_as_the_file_says_and_tells_it(tmp
 def test_what_rules_apply_stays_and_is_undone_by_the_file(tmp_path):
     with node() as (machine, bus):
         done = CliRunner().invoke(
-            drive_tune, ["rules", "chain", *TUNING, *bus, "--apply", "chain", "--snapshot", "mine.toml"]
+            drive_tune, ["rules", "cascade", *TUNING, *bus, "--apply", "cascade", "--snapshot", "mine.toml"]
         )
         assert done.exit_code == 0, done.output
-        assert "written; drive-tune undo mine.toml brings back what was" in done.stdout
+        assert "written; drive-tune undo mine.toml restores the state before" in done.stdout
         assert set() < differences(machine, "mine.toml") <= set(GAIN_OBJECTS)
-        again = CliRunner().invoke(drive_tune, ["rules", "chain", *TUNING, *bus, "--snapshot", "mine.toml"])
+        again = CliRunner().invoke(drive_tune, ["rules", "cascade", *TUNING, *bus, "--snapshot", "mine.toml"])
         assert again.exit_code == 2
-        assert "mine.toml is there already, and may hold the state before an earlier run" in again.stderr
+        assert "mine.toml exists already, and may be the state before an earlier run" in again.stderr
         CliRunner().invoke(drive_tune, ["undo", "mine.toml", "--yes"])
         assert differences(machine, "mine.toml") == set()
 

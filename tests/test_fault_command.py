@@ -209,8 +209,8 @@ def test_all_options_reach_the_server(control):
 
 
 @pytest.mark.parametrize(("arguments", "code", "message"), [
-    ([], 2, "say one of a fault's name, --list, --status and --clear NUMBER"),
-    (["jam", "--list"], 2, "say one of"),
+    ([], 2, "give one of a fault's name, --list, --status and --clear NUMBER"),
+    (["jam", "--list"], 2, "give one of"),
     (["jam", "torque"], 2, "'torque' must be as at=2"),
     (["jam", "torque=much"], 2, "torque must be a number, not 'much'"),
     (["jam", "--node", "9"], 2, "no node has the number 9"),

@@ -9,7 +9,7 @@ import pytest
 from test_parity import served
 
 from drive_env.devices import find_device
-from drive_env.gains import FITTED_RULE, rule_gains, write_gains
+from drive_env.gains import BASELINE_RULE, rule_gains, write_gains
 from drive_env.motors import find_motor
 from tuning.identify.true_plant import true_plant
 from tuning.response.frequency_response import measure
@@ -20,7 +20,7 @@ from tuning.response.measured_loop import COHERENT
 from tuning.response.plant_fit import Seen, fit_plant
 from tuning.target import Target, emulated
 
-SOFT = FITTED_RULE._replace(speed=0.1)  # crossover at about 20 Hz
+SOFT = BASELINE_RULE._replace(speed=0.1)  # crossover at about 20 Hz
 FINE = {"motor.encoder_interpolation": 16.0}  # 65,536 counts per turn
 GRID = np.geomspace(5.0, 1000.0, 4000)
 
@@ -97,7 +97,7 @@ def test_the_position_loop_has_the_model_s_margin():
         expected = margins(f, position_open_loop(target.device, plant, gains[axis], f))
         assert response.margins(axis).phase_deg == pytest.approx(expected.phase_deg, abs=3.0)
         assert response.margins(axis).crossover_hz == pytest.approx(expected.crossover_hz, rel=0.05)
-    with pytest.raises(ValueError, match="position loop says nothing of the plant"):
+    with pytest.raises(ValueError, match="position loop does not give the axis model"):
         response.estimates()
 
 
@@ -160,7 +160,7 @@ def test_a_rigid_axis_has_no_resonance_and_says_so(measured):
     for axis in range(4):
         for name in ("resonance", "anti_resonance"):
             assert math.isnan(response.estimates(axis)[name].value)
-            assert "none shows between 5 and 400 Hz" in response.estimates(axis)[name].reason
+            assert "no resonance between 5 and 400 Hz" in response.estimates(axis)[name].reason
 
 
 # --- over the bus -----------------------------------------------------------------------------------------------------
@@ -197,7 +197,7 @@ def test_a_bus_cannot_be_traced_nor_asked_beyond_400_hz():
     with served("calls", load="inertia") as drives:
         motor, free = find_motor("qbl4208"), np.array([np.inf])
         target = Target(drives, find_device("tmcm1636"), motor, np.array([24.0]), -free, free, 300.0, 3.0)
-        with pytest.raises(ValueError, match="exists on emulated drives only; a bus shows up to 400 Hz"):
+        with pytest.raises(ValueError, match="exists on emulated drives only; on a bus up to 400 Hz can be measured"):
             measure(target, traced=True)
         with pytest.raises(ValueError, match="450 Hz must be at most 400 Hz"):
             measure(target, high=450.0)
@@ -218,7 +218,7 @@ def test_friction_on_a_short_way_is_told_and_is_not_coherent_either():
     # 0.3 turns: the motion reverses, and what dry friction answers depends on the wave.
     target = emulated(load="vertical_screw", travel=(-0.3 * math.pi, 0.3 * math.pi))
     response = measure(target)
-    assert any("way is too short for a steady speed" in note for note in response.notes[0])
+    assert any("travel is too short for a steady speed" in note for note in response.notes[0])
     assert response.trusted.mean() < 0.8
 
 
@@ -328,7 +328,7 @@ def test_a_resonance_that_moves_with_the_strength_of_the_shaking_is_refused(look
     for name in ("resonance", "anti_resonance", "damping"):
         assert not estimates[name].is_known
         assert "backlash" in estimates[name].reason
-    weaker = re.search(r"at ([\d.]+) Hz where the axis is shaken less", estimates["resonance"].reason)
+    weaker = re.search(r"at ([\d.]+) Hz with a weaker excitation", estimates["resonance"].reason)
     assert float(weaker[1]) == pytest.approx(factor * plant.resonance, rel=0.01)
     assert estimates["velocity_filter"].is_known
 

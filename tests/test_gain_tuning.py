@@ -30,7 +30,7 @@ def actions(env, steps, seed=0):
 
 
 def episode(env, seed, lanes=None):
-    """Return observations and rewards of an episode, (steps, lanes, ...)."""
+    """Return observations and rewards of an episode, (steps, environments, ...)."""
     observation, _ = env.reset(seed=seed)
     observations, rewards = [observation], []
     for action in actions(env, env.config.trials) if lanes is None else lanes:
@@ -63,12 +63,12 @@ def test_an_episode_starts_at_the_rule_and_ends_when_its_trials_are_used_up(four
 
 def test_rewards_add_up_to_the_decrease_of_ln_hidden_j(four):
     _, info = four.reset(seed=2)
-    begin, total = info["hidden"], np.zeros(4)
+    begin, total = info["robust_cost"], np.zeros(4)
     for action in actions(four, 3, seed=5):
         _, reward, _, _, info = four.step(action)
         total += info["reward_terms"]["tuning"]
         np.testing.assert_allclose(reward, info["reward_terms"]["tuning"] - 0.05 * info["aborted"])
-    np.testing.assert_allclose(total, np.log(begin / info["hidden"]), atol=1e-12)
+    np.testing.assert_allclose(total, np.log(begin / info["robust_cost"]), atol=1e-12)
 
 
 def test_the_incumbent_never_gets_worse_by_measured_terms_and_changes_only_when_better(four):
@@ -193,12 +193,12 @@ def test_privileged_observation_is_the_true_machine():
 
 
 def test_what_is_hidden_cannot_be_observed(four):
-    # Hidden J and load steps change nothing of what is observed.
+    # The robust cost and load steps change nothing of what is observed.
     observed, _ = episode(four, 40)
-    score = four._hidden.score
-    four._hidden.score = lambda gains: score(gains)._replace(hidden=np.full(4, 3.0))
+    score = four._score.score
+    four._score.score = lambda gains: score(gains)._replace(robust_cost=np.full(4, 3.0))
     again, _ = episode(four, 40)
-    four._hidden.score = score
+    four._score.score = score
     np.testing.assert_array_equal(observed, again)
 
 
@@ -333,7 +333,7 @@ def test_given_drives_are_taken_as_they_are_and_rewarded_by_measured_terms():
         drives.advance(0.005)
         env = GainTuning(2, drives=drives, **FEW)
         _, info = env.reset(seed=0)
-        assert "hidden" not in info and "parameters" not in info
+        assert "robust_cost" not in info and "parameters" not in info
         # They were off: the first move found them enabled, and knows what they turn.
         np.testing.assert_allclose(env._identified.inertia, 3.08 * drives.motor.inertia, rtol=0.1)
         begin, total = info["measured"], np.zeros(2)

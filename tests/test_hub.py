@@ -684,7 +684,7 @@ def guarded():
 
 
 def test_a_hub_that_others_can_reach_needs_a_token():
-    with pytest.raises(ValueError, match=r"0\.0\.0\.0 is no loopback address: it .* needs a token"):
+    with pytest.raises(ValueError, match=r"0\.0\.0\.0 is not a loopback address: it .* needs a token"):
         Hub(host="0.0.0.0")
 
 

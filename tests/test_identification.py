@@ -338,7 +338,7 @@ def test_wrong_pole_pairs_are_found_before_torque_is_commanded():
     target.drives.write("Motor Pole Pairs", 7)
     found = identify(target)[0]
     assert found.value("pole_pairs") == 4.0
-    assert "4 pole pairs and 2056h says 7" in found.estimates["inertia"].reason
+    assert "4 pole pairs and the drive is set to 7" in found.estimates["inertia"].reason
 
 
 @pytest.mark.parametrize("steps", [3584, 4681])  # of 4096: electrical turns of 3.5 and 4.57 per turn that is counted
@@ -350,7 +350,7 @@ def test_a_ratio_that_is_no_whole_number_fails_the_check_and_no_torque_is_comman
     for name in ("pole_pairs", "resistance", "inertia", "resonance"):
         ratio = re.search(r"electrical turns are ([\d.]+) \(", found.estimates[name].reason)
         assert float(ratio[1]) == pytest.approx(4.0 * steps / 4096.0, rel=0.02), name
-        assert "no whole number: check the encoder's steps, 2080h:02" in found.estimates[name].reason, name
+        assert "not a whole number: check the encoder's counts per turn" in found.estimates[name].reason, name
     # The field turned it there and back; torque with half an angle too much would have sent it away.
     assert np.abs(target.drives.machine.rotor_speed[0]) < 1.0
     assert abs(float(target.drives.machine.rotor_angle[0])) < TURN

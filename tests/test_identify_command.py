@@ -44,7 +44,7 @@ def test_values_intervals_and_reasons_are_shown_and_written(tmp_path):
     (("--travel", "0.1"), "--travel 0.1 must be LOW:HIGH"),
     (("--bus",), "--travel is missing"),
     (("--out", "nowhere/found.json"), "there is no folder nowhere"),
-    (("--out", "kept.json"), "kept.json is there already, and would be replaced; choose another --out"),
+    (("--out", "kept.json"), "kept.json exists already, and files are not overwritten; choose another --out"),
     (("--out", "/proc/found.json"), "/proc/found.json cannot be written"),  # nobody writes there, not even root
 ])  # fmt: skip
 def test_a_mistake_is_said_in_one_line(tmp_path, arguments, text):

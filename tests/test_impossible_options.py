@@ -127,7 +127,7 @@ REGULAR = [(f"{k / 1000:.3f}", k) for k in range(20)]
         (move(*REGULAR[:-1], ("0.019", 10**30)), "every line needs a time and 1 whole numbers"),
         (move(*REGULAR[:-1], ("0.019", "nan")), "every line needs a time and 1 whole numbers"),
         (move(*REGULAR) + "\n", "every line needs a time|values each"),
-        (move(*REGULAR[:-1]) + '"' + "x" * 200_000 + '",1\n', "is no CSV: field larger"),
+        (move(*REGULAR[:-1]) + '"' + "x" * 200_000 + '",1\n', "is not CSV: field larger"),
     ],
 )
 def test_a_recorded_move_has_times_and_integers(text, told, tmp_path):
@@ -138,7 +138,7 @@ def test_a_recorded_move_has_times_and_integers(text, told, tmp_path):
 
 def test_a_recorded_move_that_is_no_text(tmp_path):
     (tmp_path / "move.csv").write_bytes(b"t [s],\xff\xfe\n")
-    with pytest.raises(ValueError, match=r"move\.csv is no text; give the CSV"):
+    with pytest.raises(ValueError, match=r"move\.csv is not a text file; give the CSV"):
         read_log(tmp_path / "move.csv")
 
 

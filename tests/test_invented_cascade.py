@@ -158,7 +158,7 @@ def test_it_is_judged_safe_and_sound_by_its_own_columns(device):
     assert unsafe_gains(device, RIGID, raw) == ""
     for name in ("position_gain", "speed_gain", "amplifier_gain"):
         opened = [0 if own_name == name else value for own_name, value in zip(NAMES, raw, strict=True)]
-        assert unsafe_gains(device, RIGID, opened) == "a P gain is 0, and a loop open"
+        assert unsafe_gains(device, RIGID, opened) == "a P gain is 0, so that a loop is open"
     fast = own(device, Gains(4021, 1573, 445, 329, 21595))
     less = sound_gains(device, RIGID, fast)
     assert less[1:] == tuple(fast[1:]) and less[0] < fast[0]
@@ -198,7 +198,7 @@ def test_a_search_on_twins_stays_within_its_ranges_and_names_its_gains(device):
         found = search(twins, start, np.random.default_rng(0), generations=3, free=NAMES[:3])
         with pytest.raises(ValueError, match="no gain is named 'velocity_p'; there are position_gain"):
             search(twins, start, np.random.default_rng(0), free=("velocity_p",))
-    assert found.hidden[0, 0] < found.start[0]
+    assert found.cost[0, 0] < found.start[0]
     assert (found.gains >= least_gains(device)).all() and (found.gains <= device.gains.highest).all()
     np.testing.assert_array_equal(found.gains[0, 0, 3:], start[0, 0, 3:])
 
@@ -267,6 +267,6 @@ def test_a_trained_tuner_tunes_it_over_a_bus(folder, tmp_path):
     line = ["tune", "--device", folder, "--load", "inertia", "--trials", "4", "--out", str(tmp_path / "out")]
     done = CliRunner().invoke(agent_app, line)
     assert done.exit_code == 0, done.output
-    assert "position gain" in done.output and "velocity P " not in done.output.split("oscillation the gains are")[1]
+    assert "position gain" in done.output and "velocity P " not in done.output.split("gains are to oscillation")[1]
     certificate, _ = load_certificate(tmp_path / "out" / "certificate.json")
     assert next(iter(certificate.axes[0].after_si)) == "position gain [1/s]"

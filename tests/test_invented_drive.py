@@ -132,7 +132,7 @@ supply = [24, 26]
 def test_tuners_are_ranked_on_it_under_the_names_of_its_gains(tmp_path):
     suite, out = tmp_path / "suite.toml", tmp_path / "out"
     suite.write_text(SUITE.format(device=json.dumps(INVENTED)), encoding="utf-8")
-    line = ["rank", "--suite", suite, "-t", "factory", "-t", "fitted", "-t", "random", "-t", "simc", "--trials", "2",
+    line = ["rank", "--suite", suite, "-t", "factory", "-t", "baseline", "-t", "random", "-t", "simc", "--trials", "2",
             "--out", out]  # fmt: skip
     done = CliRunner().invoke(app, [str(word) for word in line])
     assert done.exit_code == 0, done.output
@@ -141,10 +141,10 @@ def test_tuners_are_ranked_on_it_under_the_names_of_its_gains(tmp_path):
     factory = [preset[f"Controller.{name}"] for name in ("Speed gain", "Speed integrator", "Position gain")]
     for row in rows:
         gains = [int(row[name]) for name in NAMES]
-        assert np.isfinite(float(row["hidden"]))
+        assert np.isfinite(float(row["robust_cost"]))
         if row["tuner"] == "factory":
             assert gains == factory
-        if row["tuner"] == "fitted":
+        if row["tuner"] == "baseline":
             assert float(row["relative"]) == pytest.approx(1.0, abs=0.3)  # the inertia that moves show is the true one
         assert (row["failed"] == "True") == (row["tuner"] == "simc")
     assert list(rows[0])[-4:] == [*NAMES, "note"]
@@ -168,7 +168,7 @@ def test_an_agent_tunes_them_as_an_episode():
     _, info = env.reset(seed=1)
     assert info["gains"].shape == (2, 1, 3)
     _, reward, *_, info = env.step(np.full((2, 3), 0.2, np.float32))
-    assert np.isfinite(reward).all() and np.isfinite(info["trial_hidden"]).all()
+    assert np.isfinite(reward).all() and np.isfinite(info["trial_robust_cost"]).all()
     assert (info["trial_gains"] > 1).all()
     env.close()
     with pytest.raises(ValueError, match=r"speed_gain.*position_gain"):
@@ -176,7 +176,7 @@ def test_an_agent_tunes_them_as_an_episode():
 
 
 def test_a_trained_tuner_changes_them_by_the_parts_that_they_play():
-    """It was trained on another drive, on gains over those of the fitted rule: names and units are nothing to it."""
+    """It was trained on another drive, on gains over those of the baseline rule: names and units are nothing to it."""
     with emulated(INVENTED, "inertia", num_threads=1) as target:
         found = surrogate(target, np.random.default_rng(0)).gains
         rule = rule_gains(target.device, target.motor, 3.0 * target.motor.inertia)

@@ -41,7 +41,7 @@ def test_a_limit_switch_ends_it_and_is_named(jog, words):
     run, drives = jog
     found = run(*words)
     assert found.exit_code == 1, found.output
-    assert "drive-env: it was stopped: emergency FF01h negative limit switch" in found.stderr
+    assert "drive-env: the movement was stopped: emergency FF01h negative limit switch" in found.stderr
     at_the_switch = drives.read(0x6064)[0]
     assert at_the_switch < -4 * TURN and is_off(drives)
     found = run("300 rpm", "--by", "-1 rev", "--json")
@@ -60,5 +60,5 @@ def test_an_axis_that_does_not_move_is_told(jog):
     assert slow.exit_code == 0, slow.output
     found = run("300 rpm", "--for", "0.2")
     assert found.exit_code == 1, found.output
-    assert "it hardly moved, and the drive names no reason: look for a brake" in found.stderr
+    assert "the axis hardly moved, and the drive reports no cause: check for a closed brake" in found.stderr
     assert "Limits(" not in found.output and is_off(drives)

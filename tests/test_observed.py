@@ -86,7 +86,7 @@ def test_an_observer_may_hide_the_machine_and_nothing_else(drives):
     assert hidden.machine is None and drives.machine is not None
     assert (hidden.num_axes, hidden.device, hidden.time_waits) == (2, drives.device, True)
     assert [observer.name for observer in hidden.observers] == ["a", "b"]
-    with pytest.raises(ValueError, match="these drives show no emulated machine; this takes EmulatedDrives"):
+    with pytest.raises(ValueError, match="these drives have no emulated machine; use EmulatedDrives"):
         machine_of(hidden)
-    with pytest.raises(ValueError, match="these drives are on no bus; this takes CanDrives"):
+    with pytest.raises(ValueError, match="these drives are not on a bus; use CanDrives"):
         bus_of(hidden)

@@ -53,7 +53,7 @@ def test_metadata_of_ours_and_none_are_taken(exported, tmp_path):
 @pytest.mark.parametrize("content", [b"", b"no", bytes(1000)])
 def test_what_is_no_model_is_told(content, tmp_path):
     (tmp_path / "odd.onnx").write_bytes(content)
-    with pytest.raises(BundleError, match=r"odd\.onnx is no ONNX model"):
+    with pytest.raises(BundleError, match=r"odd\.onnx is not an ONNX model"):
         OnnxPolicy(tmp_path / "odd.onnx")
 
 

@@ -491,7 +491,7 @@ def is_interrupted(monkeypatch):
 @pytest.mark.parametrize(
     ("more", "says"),
     [
-        ((), "the trials made are lost: on a bus they are kept only with --journal FILE"),
+        ((), "the trials made so far are lost: on a bus they are kept only with --journal FILE"),
         (("--journal", "kept.log"), "the trials made are in kept.log: the same command goes on from there"),
     ],
 )
@@ -502,8 +502,7 @@ def test_ctrl_c_on_a_bus_says_what_the_drives_have_and_what_is_kept(node, monkey
     code, error = drive_tune(*arguments, *more)
     assert code == 130
     assert error.splitlines() == [
-        "drive-tune: the drives have what they had before; if ever not, drive-tune undo obus-before.toml brings it "
-        "back",
+        "drive-tune: the drives have their state from before; if not, drive-tune undo obus-before.toml restores it",
         f"drive-tune: interrupted; {says}",
     ]
     assert [int(machine.read(key)[0]) for key in GAIN_OBJECTS] == before
@@ -515,7 +514,7 @@ def test_the_way_back_of_an_earlier_search_is_not_replaced(node, monkeypatch, tm
     is_interrupted(monkeypatch)
     (tmp_path / "obus-before.toml").write_text("the only copy", encoding="utf-8")
     _, error = drive_tune(*arguments)
-    assert "drive-tune undo obus-before-2.toml brings it back" in error
+    assert "drive-tune undo obus-before-2.toml restores it" in error
     assert (tmp_path / "obus-before.toml").read_text(encoding="utf-8") == "the only copy"
 
 
@@ -530,7 +529,7 @@ def test_what_there_is_not_is_not_resumed(tmp_path, monkeypatch):
     code, error = drive_tune(*search)
     assert code == 0, error
     assert drive_tune(*search, "--resume") == (
-        2, "drive-tune: the search of run is finished: nothing is left to resume, its results are there",
+        2, "drive-tune: the search of run is finished, and its results are there: nothing is left to resume",
     )  # fmt: skip
 
 

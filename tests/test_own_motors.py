@@ -68,7 +68,7 @@ def test_a_brushed_motor_has_one_winding():
         ({"inertia_kg_m2": "much"}, "inertia_kg_m2 = 'much' is no number"),
         ({"pole_pairs": 3.5}, "pole_pairs = 3.5 must be a whole number"),
         ({"pole_pairs": 500}, "pole_pairs = 500  must be at least 1 and at most 127"),
-        ({"inertia": 1e-5}, "'inertia' is no number of a motor; did you mean 'inertia_kg_m2'"),
+        ({"inertia": 1e-5}, "'inertia' is not a number of a motor; did you mean 'inertia_kg_m2'"),
         (
             {"resistance_line_to_line_ohm": 0.4},
             "resistance_phase_ohm and resistance_line_.* say the same twice",
@@ -159,8 +159,8 @@ def test_a_motor_that_no_drive_of_ours_can_turn_is_told(tmp_path):
     ("words", "message"),
     [
         (["own.txt", "--kind", "pmsm"], "must end with .toml"),
-        (["own.toml", "--kind", "pmsm", "-n", "inertia_kg_m2=much"], "is no number; write it as 4.8e-6"),
-        (["own.toml", "--kind", "pmsm", "-n", "mass=1"], "'mass' is no number of a motor.*--list shows them"),
+        (["own.toml", "--kind", "pmsm", "-n", "inertia_kg_m2=much"], "is not a number; write it as 4.8e-6"),
+        (["own.toml", "--kind", "pmsm", "-n", "mass=1"], "'mass' is not a number of a motor.*--list shows them"),
         (
             ["own.toml", "--kind", "pmsm", "--source", "x"],
             "resistance_.* is missing; give it with --number",

@@ -55,7 +55,7 @@ def test_its_own_file_is_evaluated_if_its_writer_is_trusted(kind, tmp_path):
     observation = env.reset()
     wanted, _ = model.predict(observation, deterministic=True)
     env.close()
-    with pytest.raises(UntrustedError, match="it runs whatever its writer put there"):
+    with pytest.raises(UntrustedError, match="it runs code that its author put there"):
         open_policy(str(file))
     found = open_policy(str(file), trust=True)
     assert found.environment is None  # the file does not say
@@ -68,7 +68,7 @@ def test_its_own_file_is_evaluated_if_its_writer_is_trusted(kind, tmp_path):
     assert told.exit_code == 0, told.output
     assert "RMS following error" in told.output
     told = CliRunner().invoke(app, ["evaluate", str(file), "--trust", "--episodes", "2"])
-    assert told.exit_code == 2 and "does not say its environment; give --environment" in told.output
+    assert told.exit_code == 2 and "does not name its environment; give --environment" in told.output
 
 
 def test_a_zip_of_something_else_is_none(tmp_path):
@@ -199,7 +199,7 @@ def test_a_training_interrupted_before_its_first_checkpoint_leaves_nothing(tmp_p
     out = tmp_path / "run"
     told = CliRunner().invoke(app, ["train", "tracking", "--load", "inertia", "--steps", "100000", "--out", str(out)])
     assert told.exit_code == 130
-    assert "interrupted before the first checkpoint: there is nothing to go on with" in told.output
+    assert "interrupted before the first checkpoint: the run cannot be continued" in told.output
     assert not out.exists()
     told = CliRunner().invoke(app, ["train", "--resume", str(out), "--trust"])
     assert told.exit_code == 2 and "there is no file" in told.output

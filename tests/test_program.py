@@ -156,7 +156,9 @@ def test_kernels_that_cannot_be_kept_are_told(tmp_path, monkeypatch):
     monkeypatch.setenv("DRIVE_ENV_CACHE", str(tmp_path / "none"))
     result = CliRunner().invoke(drive_env.commands.cli.app, ["compile"])
     assert result.exit_code == 2
-    assert f"no kernel could be kept in {tmp_path / 'none'}; name a folder" in result.stderr
+    assert (
+        f"no kernel could be stored in {tmp_path / 'none'}; set DRIVE_ENV_CACHE to a writable folder" in result.stderr
+    )
 
 
 # --- a cold start ---------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Tuners compared: scored by hidden J over the rule's, counted by the meter, whoever wrote them."""
+"""Tuners compared: scored by the robust cost over the rule's, counted by the meter, whoever wrote them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from drive_env.gains import rule_gains, write_gains
 from drive_env.trials.positioning import plan_move
-from drive_env.trials.score import HiddenScore
+from drive_env.trials.score import RobustScore
 from tuning.commands.cli import app
 from tuning.compare import comparison as compare_module
 from tuning.compare import tuners
@@ -79,14 +79,14 @@ def test_the_rule_with_the_true_inertia_is_the_yardstick():
 def test_the_score_is_hidden_j_of_the_machine():
     found = compare(RIGID, {"factory": find_tuner("factory")})
     gains, inertia = true_rule()
-    hidden = HiddenScore("tmcm1636", "inertia", "qbl4208", 4)
+    hidden = RobustScore("tmcm1636", "inertia", "qbl4208", 4)
     with open_group(RIGID) as target:
         hidden.set_machines(target.drives.machine.parameters, target.supply)
         hidden.set_moves(plan_move(target.motor, inertia, target.drives.read((0x2058, 0)), np.full(4, np.inf)))
-        rule = hidden.set_reference(gains).hidden
-        expected = hidden.score(read_gains(target)).hidden
+        rule = hidden.set_reference(gains).robust_cost
+        expected = hidden.score(read_gains(target)).robust_cost
     hidden.close()
-    assert [row.hidden for row in found.rows] == pytest.approx(expected)
+    assert [row.robust_cost for row in found.rows] == pytest.approx(expected)
     assert [row.rule for row in found.rows] == pytest.approx(rule)
     assert [row.relative for row in found.rows] == pytest.approx(expected / rule)
 
@@ -205,7 +205,7 @@ def test_on_processes_it_is_the_same_comparison(tmp_path):
 
 # --- machines of several axes -------------------------------------------------------------------------------------
 @pytest.mark.parametrize("load", ["gantry", pytest.param("robot", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", ["factory", "fitted", "simc", "auto", "random", "tpe-safe"])
+@pytest.mark.parametrize("name", ["factory", "baseline", "simc", "auto", "random", "tpe-safe"])
 def test_machines_of_several_axes_are_tuned_by_everybody(load, name):
     machines = [m for m in load_suite() if m.load == load][:1]
     (row,) = compare(machines, {name: find_tuner(name)}).rows
@@ -213,27 +213,27 @@ def test_machines_of_several_axes_are_tuned_by_everybody(load, name):
     assert not row.failed, row.note
     assert 0.0 < row.relative < 30.0
     assert row.violations == 0 or name in ("random", "factory"), row.kinds
-    if name == "fitted":
+    if name == "baseline":
         assert row.moves == 2 * axes and row.relative < 1.3
     if name == "auto":
         assert row.drive_seconds < 10.0 * axes
-    if name not in ("factory", "fitted"):
+    if name not in ("factory", "baseline"):
         assert 5 * axes <= row.moves <= 100 * axes
 
 
 # --- the registry -------------------------------------------------------------------------------------------------
 def test_the_tuners_of_the_issue_are_there():
     names = set(tuner_rows())
-    assert {"factory", "fitted", "auto", "random", "grid", "tpe", "cmaes", "gp"} <= names
+    assert {"factory", "baseline", "auto", "random", "grid", "tpe", "cmaes", "gp"} <= names
     from tuning.rules.rules_by_name import RULES
 
     assert set(RULES) <= names
 
 
-def test_the_factory_leaves_and_the_fitted_rule_computes():
-    found = compare(RIGID, {name: find_tuner(name) for name in ("factory", "fitted")})
+def test_the_factory_leaves_and_the_baseline_rule_computes():
+    found = compare(RIGID, {name: find_tuner(name) for name in ("factory", "baseline")})
     assert {row.gains["velocity_p"] for row in found.of("factory")} == {445}
-    assert all(0.9 < row.relative < 1.2 and row.moves == 2 for row in found.of("fitted"))
+    assert all(0.9 < row.relative < 1.2 and row.moves == 2 for row in found.of("baseline"))
 
 
 def test_searches_are_better_than_the_rule_and_the_safe_one_is_stopped_less():
@@ -288,7 +288,7 @@ def test_a_registered_tuner_that_cannot_be_loaded_is_said(monkeypatch):
     register(monkeypatch, Entry("agent", missing), Entry("number", lambda: 3))
     with pytest.raises(MissingTunerError, match=r"'agent' of somewhere:tune cannot be loaded: no module named onnx"):
         find_tuner("agent")
-    with pytest.raises(MissingTunerError, match=r"'number' of somewhere:tune is no function but 3"):
+    with pytest.raises(MissingTunerError, match=r"'number' of somewhere:tune is not a function but 3"):
         find_tuner("number")
 
 
@@ -301,7 +301,7 @@ def test_a_registered_name_that_is_taken_is_refused(monkeypatch):
 
 
 def test_unknown_and_incomplete_tuners_are_named_with_the_remedy(monkeypatch):
-    with pytest.raises(MissingTunerError, match=r"no tuner is named 'luck'; there are factory, fitted"):
+    with pytest.raises(MissingTunerError, match=r"no tuner is named 'luck'; there are factory, baseline"):
         find_tuner("luck")
 
     def missing(sampler):
@@ -334,15 +334,15 @@ def run(*arguments):
 @pytest.mark.slow
 def test_the_command_prints_the_table_and_writes_the_folder(tmp_path):
     folder = tmp_path / "out"
-    result = run("rank", "-t", "factory", "-t", "fitted", "--count", 3, "--out", folder)
+    result = run("rank", "-t", "factory", "-t", "baseline", "--count", 3, "--out", folder)
     assert result.exit_code == 0
-    assert "Hidden J over the fitted rule's on 3 machines" in result.output
+    assert "Robust cost relative to the baseline rule on 3 machines" in result.output
     names = {path.name for path in folder.iterdir()}
     assert names == {"tuners.csv", "rivals.csv", "machines.csv", "comparison.png", "settings.toml"}
-    told = run("rank", "-t", "fitted", "--count", 3, "--json", "--out", tmp_path / "again")
+    told = run("rank", "-t", "baseline", "--count", 3, "--json", "--out", tmp_path / "again")
     first = list(csv.DictReader((folder / "tuners.csv").open(encoding="utf-8")))
     (row,) = json.loads(told.stdout)["tuners"]
-    assert f"{row['median']:.6g}" == next(line["median"] for line in first if line["tuner"] == "fitted")
+    assert f"{row['median']:.6g}" == next(line["median"] for line in first if line["tuner"] == "baseline")
 
 
 def test_the_command_lists_tuners_and_suites():
@@ -364,7 +364,7 @@ def test_the_command_lists_tuners_and_suites():
         (("optimise", "--bus"), "--travel is missing"),
         (("optimise", "--lockstep"), "--travel is missing"),
         (("optimise", "--channel", "can0"), "--travel is missing"),
-        (("optimise", "--bus", "--travel", "-1:1"), "will turn. Is its way clear? Nobody is there to ask"),
+        (("optimise", "--bus", "--travel", "-1:1"), "will turn. Is its way clear? There is no terminal to ask"),
         (("optimise", "--config", "nosuch.toml"), "cannot read nosuch.toml"),
         (("optimise", "--cluster", "here"), "--cluster here must be the address of a Dask scheduler"),
     ],

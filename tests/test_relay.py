@@ -80,7 +80,7 @@ def test_gains_of_a_measured_swing_are_those_of_the_rule():
 
 def test_a_swing_with_the_loads_resonance_is_told_from_one_of_the_axis():
     swing, plant, target, _, _ = swung(load="two_mass")
-    with pytest.raises(ValueError, match="it swings with its load's resonance"):
+    with pytest.raises(ValueError, match="it swings at its load's resonance"):
         gains_from_swing(target.device, plant, float(swing.slope[0]), swing.ultimate(0))
 
 

@@ -179,7 +179,7 @@ def test_an_elastic_load_holds_every_rule_to_half_its_anti_resonance_and_says_so
 
 def test_rules_are_known_by_name_and_each_has_a_meaning():
     assert set(RULES) == set(MEANINGS)
-    with pytest.raises(ValueError, match=r"no rule is named 'ziegler'; there are modulus_optimum, .*chain"):
+    with pytest.raises(ValueError, match=r"no rule is named 'ziegler'; there are modulus_optimum, .*cascade"):
         propose("ziegler", DEVICE, MOTOR, plant())
 
 
@@ -277,8 +277,8 @@ def test_noise_of_counts_is_that_of_a_turning_encoder(counts, corner):
     assert velocity_noise(DEVICE, axis) == pytest.approx(noise[1000:].std(), rel=0.25)
 
 
-def test_the_chain_counts_the_encoder():
-    fine, coarse = (propose("chain", DEVICE, MOTOR, plant(counts=counts)) for counts in (4096, 200))
+def test_the_cascade_rule_counts_the_encoder():
+    fine, coarse = (propose("cascade", DEVICE, MOTOR, plant(counts=counts)) for counts in (4096, 200))
     assert Gains(*coarse.gains).velocity_p < 0.5 * Gains(*fine.gains).velocity_p
-    assert any("where the encoder's 200 counts shake the current by 10 % of rated" in note for note in coarse.notes)
+    assert any("where the encoder's 200 counts cause current noise of 10 % of rated" in note for note in coarse.notes)
     assert not any("counts" in note for note in fine.notes)

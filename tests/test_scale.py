@@ -222,7 +222,7 @@ def test_results_of_another_run_are_not_taken(tmp_path):
 def test_an_unfinished_run_is_not_overwritten_and_one_without_results_leaves_nothing(tmp_path):
     with shard_log(tmp_path / "run", "a = 1\n", resume=False) as log:
         log.append(0, {"x": np.zeros(1)})
-    with pytest.raises(ShardLogError, match=r"run\.unfinished holds an unfinished run; go on with it by --resume"), \
+    with pytest.raises(ShardLogError, match=r"run\.unfinished holds an unfinished run; continue it with --resume"), \
             shard_log(tmp_path / "run", "a = 1\n", resume=False):  # fmt: skip
         pass
     with shard_log(tmp_path / "run", "a = 1\n", resume=True) as log:
@@ -244,15 +244,16 @@ def test_a_pool_gives_every_result_with_its_number(workers):
 
 
 def test_a_worker_that_dies_is_told_with_the_remedy():
-    with open_pool(1) as pool, pytest.raises(PoolError, match=r"worker process ended on its own.*--resume"):
+    with open_pool(1) as pool, pytest.raises(PoolError, match=r"worker process ended unexpectedly.*--resume"):
         in_order(pool, dies, [1])
 
 
 @pytest.mark.parametrize(("options", "error", "message"), [
     ({"workers": 0}, ValueError, "--workers 0 is below 1"),
-    ({"workers": 1, "cluster": "tcp://127.0.0.1:1"}, ValueError, "choose --workers or --cluster"),
+    ({"workers": 1, "cluster": "tcp://127.0.0.1:1"}, ValueError, "choose one"),
     ({"cluster": "tcp://127.0.0.1:1"}, PoolError, r"no Dask scheduler answers at tcp://127\.0\.0\.1:1"),
-    ({"cluster": "nonsense"}, ValueError, "--cluster nonsense must be the address of a Dask scheduler, as tcp://host:port"),
+    ({"cluster": "nonsense"}, ValueError, "--cluster nonsense must be the address of a Dask scheduler, as "
+                                          "tcp://host:port"),
 ])  # fmt: skip
 def test_a_pool_that_cannot_be_says_why(options, error, message, monkeypatch):
     monkeypatch.setattr("tuning.runs.pools.CONNECT_TIMEOUT", 0.5)
@@ -542,7 +543,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_bytes(long, tmp_path, more):
     assert "run.unfinished holds an unfinished run" in refused.stderr.replace("\n", "")
     done = run_command(config, out, "--resume")
     assert done.returncode == 0, done.stderr
-    assert "note: goes on from" in done.stdout
+    assert "note: continues a stopped run" in done.stdout
     assert contents(out) == expected
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
@@ -556,7 +557,7 @@ def test_an_interrupt_says_what_is_kept_and_the_run_goes_on_from_its_own_setting
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
-    assert "what is done is kept; go on with --out" in errors
+    assert "the completed part is kept; continue with --out" in errors
     assert "Traceback" not in errors
     done = subprocess.run(
         [sys.executable, "-m", "tuning.commands.cli", "sweep", "--out", str(out), "--resume"],
@@ -577,7 +578,7 @@ def test_a_run_is_not_resumed_with_another_experiment(config, tmp_path):
 
 @pytest.mark.parametrize(("more", "code", "message"), [
     (("--workers", 0), 2, "--workers 0 is below 1"),
-    (("--workers", 1, "--cluster", "tcp://x:1"), 2, "choose --workers or --cluster"),
+    (("--workers", 1, "--cluster", "tcp://x:1"), 2, "choose one"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line(config, tmp_path, more, code, message):
     done = run_command(config, tmp_path / "run", *more)

@@ -1,4 +1,4 @@
-"""J and hidden J, against numbers worked out by hand, and what they must say of gains and machines."""
+"""J and the robust cost, against numbers worked out by hand, and what they must say of gains and machines."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
 from drive_env.gains import (
-    FITTED_RULE,
+    BASELINE_RULE,
     Gains,
     bandwidths_from_gains,
     gains_from_bandwidths,
@@ -17,7 +17,7 @@ from drive_env.gains import (
 )
 from drive_env.motors import MOTORS
 from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, Move, move_terms, plan_move, reach, swing, wrapped
-from drive_env.trials.score import VARIANTS, HiddenScore, Terms, cost, hidden_cost
+from drive_env.trials.score import VARIANTS, RobustScore, Terms, cost, robust_cost
 from research import fit_rule
 
 DEVICE, MOTOR = find_device("tmcm1636"), MOTORS["qbl4208"]
@@ -52,7 +52,7 @@ def test_cost(given, J):
     ([2.0, 2.0, 2.0, 2.0, 30.0], 16.0),  # the probe trips
 ])  # fmt: skip
 def test_hidden_cost_is_half_nominal_and_half_the_worst(j, hidden):
-    assert hidden_cost(np.array([j])) == pytest.approx([hidden])
+    assert robust_cost(np.array([j])) == pytest.approx([hidden])
 
 
 def test_variants_are_those_of_the_score():
@@ -157,14 +157,14 @@ def test_reach_is_the_longer_way():
     assert reach("robot").shape == (6,)
 
 
-# --- the fitted rule --------------------------------------------------------------------------------------------------
+# --- the baseline rule ------------------------------------------------------------------------------------------------
 def test_small_time_constants_of_the_device():
     # 1/(2 pi 1000 Hz) + 1.5 of 40 us + 1.4/(2 pi 400 Hz) + 200 us
     assert small_time_constants(DEVICE, 400.0) == pytest.approx(159.2e-6 + 60e-6 + 557.0e-6 + 200e-6, rel=1e-3)
 
 
 def test_the_rule_is_its_formula_in_bandwidths():
-    rule = FITTED_RULE._replace(inertia=0.5, speed=0.2, integration=5.0, position=0.25)
+    rule = BASELINE_RULE._replace(inertia=0.5, speed=0.2, integration=5.0, position=0.25)
     J = np.array([3.0, 12.0]) * MOTOR.inertia
     gains = rule_gains(DEVICE, MOTOR, J, rule)
     for k, share in ((0, 1.0), (1, 0.5)):  # four times the inertia, half the speed
@@ -181,7 +181,7 @@ def test_the_rule_stays_within_the_registers():
     assert gains.max() <= 32767
 
 
-def test_more_inertia_makes_the_fitted_rule_slower():
+def test_more_inertia_makes_the_baseline_rule_slower():
     J = np.array([2.0, 10.0]) * MOTOR.inertia
     slow, fast = (bandwidths_from_gains(DEVICE, MOTOR, j, Gains(*map(int, row))).velocity_hz
                   for j, row in zip(J[::-1], rule_gains(DEVICE, MOTOR, J)[::-1], strict=True))  # fmt: skip
@@ -193,18 +193,18 @@ def test_a_fit_never_ends_worse_than_the_rule_in_force(monkeypatch):
     monkeypatch.setattr(fit_rule, "LOCAL", 2)
     bench = fit_rule.Bench("two_mass", "qbl4208", 2, 0, num_threads=1)
     found = fit_rule.fit([bench])
-    bench.hidden.close()
+    bench.score_of.close()
     assert len(found) == 4
-    assert FITTED_RULE in dict(found)
+    assert BASELINE_RULE in dict(found)
     assert [one.score for one in found] == sorted(one.score for one in found)
     for rule, _ in found:
         for name, (low, high) in fit_rule.RANGES.items():
             assert low <= getattr(rule, name) <= high
 
 
-# --- hidden J of machines ---------------------------------------------------------------------------------------------
+# --- the robust cost of machines --------------------------------------------------------------------------------------
 def bench(load, machines, **parameters):
-    score = HiddenScore("tmcm1636", load, "qbl4208", machines, num_threads=1)
+    score = RobustScore("tmcm1636", load, "qbl4208", machines, num_threads=1)
     with EmulatedDrives(load=load, num_machines=machines, num_threads=1, parameters=parameters) as drives:
         axes = drives.load.num_axes
         score.set_machines(drives.machine.parameters, drives.machine.supply.reshape(machines, axes)[:, 0])
@@ -233,7 +233,7 @@ def times(factor, machines=4):
 def test_a_load_has_the_variants_that_it_can_have():
     names = {}
     for load in ("inertia", "two_mass", "ball_screw"):
-        score = HiddenScore("tmcm1636", load, "qbl4208", 1, num_threads=1)
+        score = RobustScore("tmcm1636", load, "qbl4208", 1, num_threads=1)
         names[load] = [variant.name for variant in score.variants]
         score.close()
     assert "stiffness x 0.8" not in names["inertia"]  # nothing is elastic
@@ -258,8 +258,8 @@ def test_a_score_depends_on_machine_and_gains_alone(two_mass):
     again = two_mass.score(times(1.0))
     for a, b in zip(first.terms, again.terms, strict=True):
         np.testing.assert_array_equal(a, b)
-    np.testing.assert_array_equal(first.hidden, again.hidden)
-    assert np.ptp(first.hidden) == 0.0  # four equal machines
+    np.testing.assert_array_equal(first.robust_cost, again.robust_cost)
+    assert np.ptp(first.robust_cost) == 0.0  # four equal machines
 
 
 def test_the_probe_is_the_machine_with_velocity_p_times_1_5(two_mass):
@@ -272,7 +272,7 @@ def test_the_probe_is_the_machine_with_velocity_p_times_1_5(two_mass):
 
 def test_too_much_and_too_little_gain_are_worse(two_mass):
     two_mass.set_reference(times(1.0))
-    slow, right, shaking = (float(two_mass.score(times(f)).hidden[0]) for f in (0.2, 1.0, 8.0))
+    slow, right, shaking = (float(two_mass.score(times(f)).robust_cost[0]) for f in (0.2, 1.0, 8.0))
     assert slow > 1.3 * right
     assert shaking > 3.0 * right
 
@@ -281,7 +281,7 @@ def test_a_machine_that_cannot_be_enabled_scores_30():
     score = bench("two_mass", 2)
     with EmulatedDrives(num_machines=2, num_threads=1) as drives:
         score.set_machines(drives.machine.parameters, np.array([24.0, 5.0]))  # under-voltage
-    hidden = score.score(times(1.0, 2)).hidden
+    hidden = score.score(times(1.0, 2)).robust_cost
     score.close()
     assert hidden[1] == 30.0
     assert hidden[0] < 10.0
@@ -291,28 +291,28 @@ def test_a_machine_is_as_good_as_its_worst_axis():
     score = bench("gantry", 1)
     gains = np.repeat(RULE, 2, axis=0)
     score.set_reference(gains)
-    equal = float(score.score(gains).hidden[0])
+    equal = float(score.score(gains).robust_cost[0])
     gains[1, P] *= 20
-    assert float(score.score(gains).hidden[0]) > 2.0 * equal
+    assert float(score.score(gains).robust_cost[0]) > 2.0 * equal
     score.close()
 
 
 def test_a_constant_load_pulls_in_every_variant_and_through_the_load_step():
     """At rest the motor's torque is what pulls at it, whatever holds it: K_t i = -(constant + load step)."""
     torque = np.array([0.03, -0.05])
-    hidden = HiddenScore("tmcm1636", "inertia", "qbl4208", 2, num_threads=1, friction="none")
-    with hidden._drives as drives:
+    score = RobustScore("tmcm1636", "inertia", "qbl4208", 2, num_threads=1, friction="none")
+    with score._drives as drives:
         machine = drives.machine
         parameters = {name: np.full(2, value[0]) for name, value in machine.parameters.items()}
-        hidden.set_machines(parameters | {"motor.cogging_torque": np.zeros(2)}, np.full(2, MOTOR.voltage))
+        score.set_machines(parameters | {"motor.cogging_torque": np.zeros(2)}, np.full(2, MOTOR.voltage))
         inertia = np.full(2, parameters["motor.inertia"] + parameters["load.inertia"])
-        hidden.set_moves(plan_move(MOTOR, inertia, np.full(2, 65536.0), np.full(2, np.inf)))
-        hidden.set_constant_load(torque)
-        hidden.set_reference(rule_gains(DEVICE, MOTOR, inertia))
+        score.set_moves(plan_move(MOTOR, inertia, np.full(2, 65536.0), np.full(2, np.inf)))
+        score.set_constant_load(torque)
+        score.set_reference(rule_gains(DEVICE, MOTOR, inertia))
         at_rest = drives.record([0x6077], 0.25)[0x6077][-100:].mean(axis=0) * 1e-3
     step = -0.3 * MOTOR.rated_torque
     K_t = 1.5 * MOTOR.n_p * parameters["motor.psi_m"][0]
-    expected = np.repeat(-(torque + step) / K_t, len(hidden.variants))
+    expected = np.repeat(-(torque + step) / K_t, len(score.variants))
     assert at_rest == pytest.approx(expected, abs=0.03)
 
 

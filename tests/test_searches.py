@@ -197,11 +197,13 @@ def test_a_single_search_that_is_stopped_goes_on_to_the_same_bytes(undisturbed, 
     assert "Traceback" not in errors
     if how == "interrupt":
         assert process.returncode == 130
-        assert f"interrupted; what is done is kept; go on with --out {out} --resume" in errors.replace("\n", "")
+        assert f"interrupted; the completed part is kept; continue with --out {out} --resume" in errors.replace(
+            "\n", ""
+        )
     assert not out.exists()
     code, _, errors = ended(*SEARCH, "--out", out, "--resume")
     assert code == 0, errors
-    assert "note: goes on from" in errors
+    assert "note: continues a stopped run" in errors
     for name in ("trials.csv", "trials.png", "settings.toml"):
         assert (out / name).read_bytes() == (undisturbed / name).read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -105,7 +105,9 @@ def test_what_is_open_to_the_network_is_said(monkeypatch):
     arguments = ["--port", "0", "--token", "a-token_of_chance", "--duration", "0.05"]
     done = CliRunner(env={"COLUMNS": "100", "NO_COLOR": "1"}).invoke(app, arguments)
     assert done.exit_code == 0, done.output
-    assert "is open to the network: whoever reaches it and has the token may read and move these drives." in done.stdout
+    assert (
+        "is open to the network: whoever can reach it and has the token may read and move these drives." in done.stdout
+    )
     assert "Token and frames travel as plain text; where others listen, serve on 127.0.0.1 and use an" in done.stdout
 
 
@@ -148,13 +150,13 @@ def test_any_interface_serves(tmp_path):
     (["--load", "abc"], "drive-env: no load is named 'abc'; there are "),
     (["--motor", "abc"], "drive-env: no motor is named 'abc'; there are"),
     (["--node", "0"], "drive-env: node 0 is out of range; identifiers are 1 to 127"),
-    (["--node", "1", "--node", "2"], "2 node identifier(s) were given"),
+    (["--node", "1", "--node", "2"], "2 node identifiers were given"),
     (["--port", "70000"], "drive-env: --port 70000 must be 0 to 65535"),
     (["--listen", "no.such.host.invalid"], "drive-env: cannot listen on no.such.host.invalid:29636"),
     (["--listen", "x" * 70], "drive-env: cannot listen on xxx"),
     (["--listen", ""], "drive-env: --listen must be an address, e.g. 127.0.0.1; 0.0.0.0 lets the whole network in"),
-    (["--listen", "0.0.0.0"], "drive-env: 0.0.0.0 is no loopback address: it lets the network in, which needs a token; "
-                              "say --token auto, --token TEXT of 8 characters or more, or --listen 127.0.0.1"),
+    (["--listen", "0.0.0.0"], "drive-env: 0.0.0.0 is not a loopback address: it is open to the network, which needs a "
+                              "token; give --token auto, --token TEXT of 8 characters or more, or --listen 127.0.0.1"),
     (["--token", "short"], "drive-env: a token has 8 to 48 letters, digits, - and _; this one has 5 characters; say "),
     (["--interface", "virtual", "--token", "auto"], "drive-env: --token is for the hub; --interface virtual cannot"),
     (["--host", "127.0.0.1"], "No such option"),

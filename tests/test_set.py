@@ -52,7 +52,7 @@ def test_a_controlword_that_enables_is_refused_with_the_remedy(drive, status, wo
     drive.set(0x6041, status)
     code, out, error = put("6040", word, *options)
     assert (code, "w6040" in requests(drive), drive.get(0x6041), "=" in out) == (USER_ERROR, False, status, False)
-    assert "would enable the axis, and this command ends right after: nobody would watch the motor" in error
+    assert "would enable the axis, and nothing would monitor the motor after this command ends" in error
     assert "`drive-env jog`" in error and "CanDrives" in error
 
 
@@ -90,9 +90,12 @@ def test_any_other_write_to_a_live_axis_asks_first_and_says_why(drive, name, val
     before = drive.get(*key)
     code, _, error = put(name, value)
     assert (code, drive.get(*key)) == (USER_ERROR, before)
-    assert f"node 1 ({status:04X}h) is live by its statusword, and obeys at once (to stop it, set 6040 to 2). " in error
+    assert (
+        f"node 1 ({status:04X}h) is enabled by its statusword, and reacts at once (to stop it, set 6040 to 2). "
+        in error
+    )
     assert f" Write {name[:4]}h:0" in error
-    assert error.endswith(f" = {value}? Nobody is there to ask; say --yes\n")
+    assert error.endswith(f" = {value}? There is no terminal to ask; confirm with --yes\n")
     assert put(name, value, "--yes")[0] == DONE
     assert drive.get(*key) == value
 

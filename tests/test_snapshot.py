@@ -151,7 +151,7 @@ def test_what_ends_with_an_error_is_put_back_and_says_where_the_file_is(target, 
         change(target.drives)
         raise ValueError("no")
     assert take(target) == before == load_snapshot(file)
-    said = f"the drives have what they had before; if ever not, drive-tune undo {file} brings it back"
+    said = f"the drives have their state from before; if not, drive-tune undo {file} restores it"
     assert capsys.readouterr().err == f"drive-tune: {said}\n"
 
 
@@ -161,7 +161,7 @@ def test_an_error_after_a_commit_says_that_the_drives_are_others(target, tmp_pat
         change(target.drives)
         transaction.commit()
         raise ValueError("no")
-    assert capsys.readouterr().err == f"drive-tune: drive-tune undo {file} brings back what was\n"
+    assert capsys.readouterr().err == f"drive-tune: drive-tune undo {file} restores the state before\n"
 
 
 # --- the file -----------------------------------------------------------------------------------------------------
@@ -212,7 +212,7 @@ def test_a_file_that_cannot_be_written_is_one_line_and_nothing_is_left(target, t
 
 def test_a_folder_of_others_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    with pytest.raises(OSError, match=r"cannot be written to .*found-before\.toml: .* is not yours to write"):
+    with pytest.raises(OSError, match=r"cannot be written to .*found-before\.toml: .* is not writable"):
         file_before("identify", tmp_path / "found")
 
 
@@ -223,7 +223,7 @@ def test_a_file_that_is_there_is_never_replaced(tmp_path, monkeypatch):
     assert [first.name, file_before("identify", tmp_path / "found").name] == [
         "found-before.toml", "found-before-2.toml",
     ]  # fmt: skip
-    with pytest.raises(OSError, match="is there already, and may hold the state before an earlier run"):
+    with pytest.raises(OSError, match="exists already, and may be the state before an earlier run"):
         check_place(first)
     assert re.fullmatch(r"runs/\d{8}-\d{6}-identify-before\.toml", file_before("identify").as_posix())
     assert list(tmp_path.iterdir()) == [first]
@@ -383,8 +383,8 @@ def test_a_disk_that_is_full_when_drives_are_to_keep_a_change_gives_them_back_wh
             transaction.store()
         assert caught.value.filename == str(file)
         assert caught.value.strerror == (
-            "the state before cannot be written: No space left on device; choose another place; the drives have what "
-            f"they had before; if ever not, drive-tune undo {file} brings it back"
+            "the state before cannot be written: No space left on device; choose another place; the drives have their "
+            f"state from before; if not, drive-tune undo {file} restores it"
         )
         assert [gains(machine).tolist() for machine in machines] == before
         target.drives.reset_node()
@@ -472,13 +472,13 @@ def test_the_writer_of_a_restore_is_not_believed(tmp_path, monkeypatch):
         machines[1].write(CURRENT_LIMIT, 1234)
         done = drive_tune("undo", path, "--yes")
         assert (done.exit_code, done.stdout) == (1, "")
-        assert "axis 1 does not hold what was written, as a second reading shows: 2003h:00" in done.stderr
+        assert "axis 1 does not have the values that were written, by a second reading: 2003h:00" in done.stderr
 
 
 @pytest.mark.parametrize(("arguments", "code", "message"), [
     (["undo", "none.toml"], 2, "drive-tune: cannot read none.toml: No such file"),
-    (["undo", "emulated.toml"], 2, "was taken from emulated drives, which ended with their program"),
-    (["undo", "bus.toml"], 2, "drive-tune: Restore node 1, 2, 3 on x? Nobody is there to ask; say --yes"),
+    (["undo", "emulated.toml"], 2, "is from emulated drives, which existed in their program only"),
+    (["undo", "bus.toml"], 2, "drive-tune: Restore node 1, 2, 3 on x? There is no terminal to ask; confirm with --yes"),
     (["undo", "bus.toml", "--yes", "--interface", "none"], 2, "cannot open interface 'none'"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line(target, tmp_path, monkeypatch, arguments, code, message):

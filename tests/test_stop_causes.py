@@ -22,7 +22,10 @@ def drives_that_told(*messages):
 def test_each_axis_has_its_causes_once_and_in_their_order():
     drives = drives_that_told((1, 0x3210, "Over voltage"), (1, 0x8611, "Following error"), (1, 0x3210, "Over voltage"),
                               (1, 0, "no error"))  # fmt: skip
-    assert stop_causes(drives) == ["no emergency told why", "Over voltage (3210h), Following error (8611h)"]
+    assert stop_causes(drives) == [
+        "no emergency message with the cause was received",
+        "Over voltage (3210h), Following error (8611h)",
+    ]
 
 
 @pytest.mark.slow
@@ -39,5 +42,5 @@ def test_a_response_names_the_emergency_that_ended_it():
     with emulated(load="two_mass", num_threads=1) as target:
         target.drives.machine.fault("supply_surge", at=1.2, duration=0.1)  # while it is shaken
         found = measure(target)
-    assert any("the drive stopped while it was shaken: overvoltage (3210h)" in note for note in found.notes[0])
+    assert any("the drive stopped during the measurement: overvoltage (3210h)" in note for note in found.notes[0])
     assert np.isnan(found.open_loop).all()

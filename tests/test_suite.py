@@ -174,7 +174,7 @@ def test_a_mistake_in_the_file_is_one_line_with_what_is_right(small, wrong, righ
 
 def test_two_groups_of_one_kind_are_refused(small):
     table = SMALL[SMALL.index("[[group]]") : SMALL.index("[[generated]]")]
-    with pytest.raises(ExperimentError, match=r"two machines are named 'inertia-qbl4208-0'; make one group"):
+    with pytest.raises(ExperimentError, match=r"two machines are named 'inertia-qbl4208-0'; put machines"):
         load_suite(small(SMALL.replace("[[generated]]", table + "[[generated]]")))
 
 

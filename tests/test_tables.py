@@ -100,7 +100,7 @@ SLOW = [
     ("drive-tune", "identify", "--load", "gantry"),
     ("drive-tune", "auto", "--load", "gantry", "--out", "found"),
     ("drive-tune", "sweep", "--out", "found"),
-    ("drive-tune", "rank", "-t", "fitted", "-t", "symmetrical_optimum", "--count", "2", "--out", "found"),
+    ("drive-tune", "rank", "-t", "baseline", "-t", "symmetrical_optimum", "--count", "2", "--out", "found"),
     ("drive-agent", "tune", "--load", "belt", "--out", "found"),
     ("drive-agent", "evaluate", "gain_tuning", "--episodes", "2", "--out", "found"),
 ]

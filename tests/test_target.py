@@ -61,8 +61,8 @@ def test_a_factory_fresh_drive_has_no_gains():
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    ({"low": np.array([0.1])}, "axis 0: travel 0.1 to inf rad must hold 0"),
-    ({"high": np.array([-0.1])}, "axis 0: travel -inf to -0.1 rad must hold 0"),
+    ({"low": np.array([0.1])}, "axis 0: travel 0.1 to inf rad must contain 0"),
+    ({"high": np.array([-0.1])}, "axis 0: travel -inf to -0.1 rad must contain 0"),
     ({"low": np.zeros(1), "high": np.zeros(1)}, "somewhere to go"),
     ({"low": np.full(2, -1.0)}, r"low must have shape \(1,\), not \(2,\)"),
     ({"supply": np.array([0.5])}, r"supply 0.5 V lies outside 8...60 V, with which a tmcm1636 works; give the voltage"),
@@ -159,11 +159,11 @@ def test_without_bus_the_drives_are_emulated_whatever_the_environment_says(monke
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"nodes": [1]}, "--node, --bitrate and --lockstep are of drives on a bus; add --bus"),
+    ({"nodes": [1]}, "--node, --bitrate and --lockstep are for drives on a bus; add --bus"),
     ({"lockstep": True}, "add --bus"),
     ({"seed": -1}, "--seed must be 0 or more, not -1"),
     ({"machines": 0}, "--machines must be 1 or more, not 0"),
-    ({"bus": True}, "--travel is missing: how far may the motor turn"),
+    ({"bus": True}, "--travel is missing: give how far the motor may turn"),
     ({"load": "abc"}, "no load is named 'abc'"),
     ({"motor": "abc"}, "no motor is named 'abc'"),
 ])  # fmt: skip

@@ -224,7 +224,7 @@ def test_a_travel_that_is_too_short_is_told_in_turns_with_its_remedy(tmp_path):
     done = drive_tune("auto", "--load", "inertia", "--travel=-0.01:0.01", "--out", "run", cwd=tmp_path)
     assert done.returncode == 1
     assert (
-        "axis 0 was left as it was: the travel is too short: 0.13 rad, and 0.2 are needed (0.02 and 0.032 turns); "
+        "axis 0 was not tuned: the travel is too short: 0.13 rad (0.02 turns), and 0.2 rad (0.032 turns) are needed; "
         "allow more with --travel"
     ) in done.stdout
     assert "rolled back" not in done.stdout

@@ -73,7 +73,7 @@ def test_the_twin_takes_the_current_that_was_identified(plant):
     coulomb, viscous, offset = 0.2, 4e-3, 0.5
     known = KNOWN._replace(plant=plant, friction=FrictionGuess(coulomb, viscous), offset=offset)
     with Twins(DEVICE, MOTOR, [known], scaler(), 1, worlds=ONE) as twins:
-        pull = float(twins._parts[0]._hidden._constant[0])
+        pull = float(twins._parts[0]._robust._constant[0])
     values = twin_parameters(DEVICE, MOTOR, known) | {"motor.cogging_torque": 0.0}
     load = "two_mass" if plant.is_elastic else "inertia"
     for rpm in (600.0, -600.0, 1500.0):
@@ -90,8 +90,8 @@ def test_friction_is_what_a_rough_world_has_less_of():
 
 def test_a_resonance_too_fast_for_the_physics_is_taken_as_rigid():
     with Twins(DEVICE, MOTOR, [KNOWN._replace(plant=replace(ELASTIC, resonance=900.0))], scaler(), 2) as twins:
-        assert [part._hidden.variants[-1].name for part in twins._parts] == ["velocity P x 1.5"]
-        assert twins._parts[0]._hidden._drives.load.name == "inertia"
+        assert [part._robust.variants[-1].name for part in twins._parts] == ["velocity P x 1.5"]
+        assert twins._parts[0]._robust._drives.load.name == "inertia"
 
 
 def test_a_world_is_as_far_off_as_the_interval_says_but_not_farther_than_makes_sense():
@@ -164,14 +164,14 @@ def test_as_many_worlds_as_there_are_gains_are_worlds_all_the_same():
 
 
 def test_gains_that_a_trial_would_stop_count_for_worse(monkeypatch):
-    """Hidden J looks at the current at rest only; a trial looks at all of the move, and at the probe."""
+    """The robust cost looks at the current at rest only; a trial looks at all of the move, and at the probe."""
     rule = rule_gains(DEVICE, MOTOR, RIGID.inertia, supply=RIGID.supply)[0]
     wild = rule.copy()
     wild[Gains._fields.index("velocity_p")] *= 5
     both = np.array([[rule, wild]])
     worth = {}
     with Twins(DEVICE, MOTOR, [KNOWN], scaler(), 2, worlds=ONE) as twins:
-        swings = twins._parts[0]._hidden.score(both[0]).swing.max(axis=1)
+        swings = twins._parts[0]._robust.score(both[0]).swing.max(axis=1)
         for limit in (0.8 * OSCILLATION, math.inf):
             monkeypatch.setattr(twin, "MOST_SWING", limit)
             worth[limit] = twins.score(both)[0]
@@ -185,12 +185,12 @@ def test_the_search_finds_better_gains_and_what_it_says_of_them_is_what_the_twin
     with Twins(DEVICE, MOTOR, [KNOWN], scaler(), 12, worlds=ONE) as twins:
         found = search(twins, start, np.random.default_rng(3), generations=8, keep=12)
         again = search(twins, start, np.random.default_rng(3), generations=8, keep=12)
-        np.testing.assert_allclose(twins.score(found.gains), found.hidden, rtol=1e-12)
+        np.testing.assert_allclose(twins.score(found.gains), found.cost, rtol=1e-12)
         first = twins.score(np.repeat(start, 12, axis=1))[0, 0]
     np.testing.assert_array_equal(found.gains, again.gains)
     assert found.start[0] == first
-    assert found.hidden[0, 0] < 0.6 * first
-    assert np.all(np.diff(found.hidden[0]) >= 0.0)
+    assert found.cost[0, 0] < 0.6 * first
+    assert np.all(np.diff(found.cost[0]) >= 0.0)
     assert found.gains.min(axis=(0, 1)).tolist()[3] >= least_gains(DEVICE)[3] == 20  # a T_i of 0.65 s
 
 

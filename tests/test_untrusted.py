@@ -186,7 +186,7 @@ def test_arrays_that_are_not_what_they_say(kind, tmp_path, memory):
     assert "\n" not in str(told.value)
     with pytest.raises(BundleError, match=r"agent\.npz is no agent"):
         AgentFile.load(path)
-    with pytest.raises(ValueError, match=r"agent\.npz holds no episodes"):
+    with pytest.raises(ValueError, match=r"agent\.npz has no episodes"):
         episode_log.load(path)
 
 
@@ -248,7 +248,7 @@ def test_episodes_whose_arrays_do_not_fit(change, tmp_path):
     np.savez(tmp_path / "whole.npz", **whole)
     assert [len(one) for one in episode_log.load(tmp_path / "whole.npz").actions] == [2, 3]
     np.savez(tmp_path / "broken.npz", **(whole | change))
-    with pytest.raises(ValueError, match=r"broken\.npz holds no episodes"):
+    with pytest.raises(ValueError, match=r"broken\.npz has no episodes"):
         episode_log.load(tmp_path / "broken.npz")
 
 
@@ -312,7 +312,7 @@ LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("1: {n_envs: 1}", "section 1 must be a table"),
         ("ServoDrive/Tracking-v0: {n_envs: .inf, n_timesteps: 1, policy: x}", "n_envs must be a whole number"),
         ("ServoDrive/Tracking-v0: {n_envs: .nan, n_timesteps: 1, policy: x}", "n_envs must be a whole number"),
-        ("a: b: c", "is no YAML that we read: mapping values are not allowed here"),
+        ("a: b: c", "cannot be read as YAML: mapping values are not allowed here"),
         (f"ServoDrive/Tracking-v0: {{x: '{'[' * 3000}'}}", "nests too deep|cannot be read"),
         ("ServoDrive/Tracking-v0: {x: 'dict(a={[]: 1})'}", "cannot be read: unhashable type"),
     ],
@@ -326,7 +326,7 @@ def test_hyper_parameters_within_limits(text, told, tmp_path):
 
 def test_a_certificate_within_limits(tmp_path):
     (tmp_path / "certificate.json").write_text(DEEP_JSON)
-    with pytest.raises(certificate.CertificateError, match=r"certificate\.json is no certificate: .* 40 deep"):
+    with pytest.raises(certificate.CertificateError, match=r"certificate\.json is not a certificate: .* 40 deep"):
         certificate_files.is_unchanged(tmp_path / "certificate.json")
 
 

@@ -1,4 +1,4 @@
-"""How often an axis was moved: what an engineer beside the machine would count.
+"""Counts the moves of an axis as an engineer beside the machine would.
 
 A move is a commanded motion from standstill to standstill. In pp it is a set-point (bit 4 of the controlword rises). In
 the other modes it is a target that leaves rest, until it has rested for 20 ms: there and back without a stop is one

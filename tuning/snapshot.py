@@ -1,4 +1,4 @@
-"""The parameters of drives before they are changed: a file, and the way back.
+"""The parameters of drives before a change: saved to a file, and restored.
 
 A `Transaction` writes the file before anything else happens, so that even a process that is killed leaves it behind;
 `drive-tune undo FILE` brings the drives back to it. Axes that are not committed are rolled back at the end.
@@ -54,7 +54,7 @@ DEVICE_OBJECTS = 0x2000  # from here on: what lies below is how drives talk, whi
 
 
 class SnapshotError(ValueError):
-    """A file that is no snapshot, or that does not fit these drives: one line with its remedy."""
+    """The file is not a snapshot, or does not fit these drives; the message has the remedy."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Snapshot:
         device: Name of the device.
         axes: Of every axis, (index, sub-index) -> raw integer.
         bus: What opens the drives again, for `CanDrives`; empty for emulated drives.
-        stored: Whether the drives were told to keep what came afterwards: then the way back is to be kept, too.
+        stored: Whether the drives stored the change; undoing it is then stored, too.
         identities: What each node said of itself; empty for emulated drives, and where a file does not say.
     """
 
@@ -92,13 +92,13 @@ class Snapshot:
     def _toml(self, name: str) -> str:
         dictionary = describe(self.device, None).dictionary
         lines = [
-            f"# Parameters of {len(self.axes)} axes before a change: drive-tune undo {name} brings them back.",
+            f"# Parameters of {len(self.axes)} axes before a change: drive-tune undo {name} restores them.",
             "# The check sum at the end shows whether this file was changed.",
             "",
             f"format = {FORMAT}",
             f'written = "{datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC"',
             f"device = {toml(self.device)}",
-            f"stored = {str(self.stored).lower()}  # whether the drives were told to keep what came then",
+            f"stored = {str(self.stored).lower()}  # whether the drives stored the change",
         ]
         if self.bus:
             lines += ["", "[bus]"]
@@ -145,16 +145,16 @@ def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
     except OSError as error:
         raise SnapshotError(f"cannot read {where}: {error.strerror}; give a file that drive-tune left") from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise SnapshotError(f"{where} is no TOML, or is torn: {error}; give a file that drive-tune left") from None
+        raise SnapshotError(f"{where} is not TOML, or incomplete: {error}; give a file that drive-tune left") from None
     tables = data.get("axis")
     if not isinstance(tables, list) or not tables or not isinstance(data.get("device"), str):
-        raise SnapshotError(f"{where} is no snapshot; give a file that drive-tune left before a change")
+        raise SnapshotError(f"{where} is not a file with the state before a change; give one that drive-tune saved")
     known = describe(data["device"], None)
     dictionary = known.dictionary
     axes = []
     for table in tables:
         if not isinstance(table, dict):
-            raise SnapshotError(f"{where}: {table!r} is no axis; give a file that drive-tune left before a change")
+            raise SnapshotError(f"{where}: {table!r} is not an axis; give a file that drive-tune saved before a change")
         values = {}
         for text, value in table.items():
             index, _, sub = text.partition(":")
@@ -267,12 +267,12 @@ def file_before(kind: str, out: Path | None = None) -> Path:
 def check_place(file: Path) -> None:
     """Raise OSError unless a new file can be written there: before a drive is asked for anything."""
     if file.exists():
-        raise OSError(f"{file} is there already, and may hold the state before an earlier run; choose another file")
+        raise OSError(f"{file} exists already, and may be the state before an earlier run; choose another file")
     place, writable = nearest_place(file)
     if not place.is_dir():
         raise OSError(f"the state before cannot be written to {file}: {place} is a file; choose another place")
     if not writable:
-        raise OSError(f"the state before cannot be written to {file}: {place} is not yours to write; choose another")
+        raise OSError(f"the state before cannot be written to {file}: {place} is not writable; choose another")
 
 
 @contextmanager
@@ -292,18 +292,18 @@ def put_back(target: Target, file: Path, program: str) -> Iterator[Transaction]:
             yield transaction
     except BaseException as error:
         if file.exists() and str(file) not in str(error):  # no line for a file that could not be written
-            way = f"drive-tune undo {file} brings back what was" if transaction.changed else what_is_left(file)
+            way = f"drive-tune undo {file} restores the state before" if transaction.changed else what_is_left(file)
             print(f"{program}: {way}", file=sys.stderr)
         raise
 
 
 def what_is_left(file: Path) -> str:
     """Return what a run says that has put everything back."""
-    return f"the drives have what they had before; if ever not, drive-tune undo {file} brings it back"
+    return f"the drives have their state from before; if not, drive-tune undo {file} restores it"
 
 
 class Transaction:
-    """A change of drives that leaves a file and is undone unless committed.
+    """A change of drives that saves the state before to a file, and is undone unless committed.
 
     Entering takes the snapshot and writes the file; leaving rolls back every axis that was not committed, whatever
     ended the block.
@@ -344,7 +344,8 @@ class Transaction:
                     store(self._target.drives, left & self._stored)
         except (BusError, ObjectAccessError, RuntimeError, TimeoutError) as failure:
             raise BusError(
-                f"{failure}; the drives may hold what was tried: drive-tune undo {self.path} brings back what was"
+                f"{failure}; the drives may have the gains that were tried: drive-tune undo {self.path} restores the "
+                "state before"
             ) from (error or failure)
         if isinstance(error, OSError) and error.filename and not self.changed:  # a disk that is full, a folder gone
             raise OSError(error.errno, f"{error.strerror}; {what_is_left(self.path)}", error.filename) from error

@@ -15,4 +15,4 @@ def stop_causes(drives: Drives) -> list[str]:
     for message in drives.emergencies():
         if message.code:
             told[message.axis][f"{message.name} ({message.code:04X}h)"] = None
-    return [", ".join(axis) or "no emergency told why" for axis in told]
+    return [", ".join(axis) or "no emergency message with the cause was received" for axis in told]

@@ -1,4 +1,4 @@
-"""What is tuned: drives, what is known of their motors, and how far and how hard the axes may be moved.
+"""The target of a tuner: drives, their motors, and the limits within which the axes may be moved.
 
 A tuner gets a target and nothing else, so that it works on emulated machines and on a bus alike.
 """
@@ -89,8 +89,8 @@ class Target:
         if wrong.size:
             k = int(wrong[0])
             raise ValueError(
-                f"axis {k}: travel {self.low[k]:g} to {self.high[k]:g} rad must hold 0, where the rotor stands, and "
-                "somewhere to go; give what is free to both sides"
+                f"axis {k}: travel {self.low[k]:g} to {self.high[k]:g} rad must contain 0, where the rotor is now, "
+                "and must not be empty; give the free way to both sides"
             )
         for name, unit in (("speed", "rad/s"), ("current", "A")):
             if not 0.0 < getattr(self, name) < math.inf:
@@ -296,8 +296,8 @@ def _ways(travel: Travel | Iterable[Travel], num_axes: int) -> tuple[Floats, Flo
         )
     if np.any(np.isnan(ways) | (np.isfinite(ways) & (np.abs(ways) > LONGEST_TRAVEL))):
         raise ValueError(
-            f"a travel of {ways.min():g} to {ways.max():g} rad cannot be; an axis has {LONGEST_TRAVEL:g} rad to either "
-            "side at most, or is free"
+            f"a travel of {ways.min():g} to {ways.max():g} rad is impossible; an axis has {LONGEST_TRAVEL:g} rad to "
+            "either side at most, or is free"
         )
     low, high = np.broadcast_to(ways, (num_axes, 2)).T.copy()
     return low, high

@@ -10,7 +10,7 @@ from typing import Any
 
 
 class ExperimentError(ValueError):
-    """An experiment that cannot be: one line with key, value, limit and remedy."""
+    """The experiment is impossible; the message has key, value, limit and remedy."""
 
 
 _KINDS: dict[str, tuple[type, str]] = {"str": (str, "a text"), "int": (int, "a whole number"),
@@ -43,7 +43,7 @@ def as_table(where: str, value: Any) -> dict[str, Any]:
 
 
 def as_value(where: str, value: Any, kind: str) -> Any:
-    """Return a value of the kind; a whole number is a number too, a truth value is none."""
+    """Return a value of the kind; a whole number is a number too, a truth value is not."""
     wanted, meaning = _KINDS[kind]
     if wanted is float and type(value) is int:
         value = float(value)

@@ -29,10 +29,10 @@ for panel, names in PANELS.items():
 
 @app.callback()
 def drive_agent(version: Version = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
-    """Train agents for servo drives, judge them, and let them act: on emulated drives, and on real ones over CAN.
+    """Train and evaluate agents for servo drives, and use them: on emulated drives, and on real ones over CAN.
 
-    Exit codes: 0 done, 1 drive, bus or the watch over the agent said no, 2 a mistake in the command, 130
-    Ctrl-C, 141 nobody takes the output any more.
+    Exit codes: 0 done, 1 stopped by the drive, the bus or the agent's limits, 2 a mistake in the command, 130 Ctrl-C,
+        141 the output was closed.
     """
     say_as_much(quiet, verbose)
 

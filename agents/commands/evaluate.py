@@ -47,29 +47,31 @@ def evaluate(
     policy: Annotated[
         str,
         typer.Argument(
-            help="An agent that ships, by name, agent.npz, checkpoint.zip, agent.onnx, module:function, or a baseline: "
-            "nothing, feed_forward, state_feedback."
+            help="The policy: name of an agent that ships, agent.npz, checkpoint.zip, agent.onnx, module:function, or "
+            "a baseline (nothing, feed_forward, state_feedback)."
         ),
     ],
     environment: Annotated[
-        str | None, typer.Option("--environment", "-e", help="Environment of a policy that does not say its own.")
+        str | None, typer.Option("--environment", "-e", help="Environment, for a policy whose file does not name it.")
     ] = None,
     load: Load = None,
     config: Annotated[
-        Path | None, typer.Option("--config", help="The environment's options (TOML), in place of the policy's own.")
+        Path | None, typer.Option("--config", help="The environment's options (TOML), instead of the policy's own.")
     ] = None,
     episodes: Annotated[
         int | None, typer.Option("--episodes", help="Episodes.", show_default=f"{EPISODES}, on a bus {BUS_EPISODES}")
     ] = None,
     seed: Seed = 1_000_000,
-    bus: Annotated[bool, typer.Option("--bus", help="Act on drives of a bus; so does any of the next three.")] = False,
+    bus: Annotated[
+        bool, typer.Option("--bus", help="Act on drives on a bus; the next three options imply it.")
+    ] = False,
     interface: Interface = None,
     channel: Channel = None,
     node: Nodes = None,
     bitrate: Bitrate = None,
     device: DeviceName = "tmcm1636",
     lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="Of an emulator served so: time passes by SYNC.")
+        bool, typer.Option("--lockstep", help="For an emulator served with --lockstep: time passes by SYNC.")
     ] = False,
     sensor: Annotated[
         str | None, typer.Option("--sensor", help="module:function that returns the pendulum's angles [rad] on a bus.")
@@ -77,33 +79,40 @@ def evaluate(
     stall: Annotated[
         float | None,
         typer.Option(
-            help="On a bus, time without an action [s] after which a policy stalls; 0 for any.",
+            help="On a bus, the longest time without an action [s]; then the policy is stopped. 0 for no limit.",
             show_default="0.1, between trials of gains 1",
         ),
     ] = None,
     saturation: Annotated[
         float | None,
         typer.Option(
-            help="On a bus, time with an action at the end of its range [s] after which a policy sticks; 0 for any.",
-            show_default="0.1, for trials of gains any",
+            help="On a bus, the longest time with an action at the end of its range [s]; then the policy is stopped. "
+            "0 for no limit.",
+            show_default="0.1; no limit for trials of gains",
         ),
     ] = None,
     against: Annotated[
-        str | None, typer.Option("--against", help="Report the gap to this report.json, or to the `emulator`.")
+        str | None,
+        typer.Option("--against", help="Report the difference from this report.json, or from the `emulator`."),
     ] = None,
     gap: Annotated[
         int | None,
         typer.Option(
             "--gap",
-            help="Judge it on so many drawn machines twice, in this process and over CAN, each served by a "
-            "`drive-env serve` of its own in real time (with --lockstep without), and report the gap.",
+            help="Evaluate it on this many drawn machines twice, in this process and over CAN, and report the "
+            "difference. Each machine is served by its own `drive-env serve` in real time, or without real time "
+            "with --lockstep.",
         ),
     ] = None,
     replay: Annotated[
         Path | None,
-        typer.Option("--replay", help="Act on nothing: repeat an episodes.npz, or a CSV of `drive-env scope`."),
+        typer.Option(
+            "--replay", help="Without drives: compare with a recording, an episodes.npz or a CSV of `drive-env scope`."
+        ),
     ] = None,
-    card: Annotated[bool, typer.Option("--card", help="Print the agent's card, and stop.")] = False,
+    card: Annotated[
+        bool, typer.Option("--card", help="Print the agent's card (how it was trained), and stop.")
+    ] = False,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for report, episodes and pictures, new or empty.")
     ] = None,
@@ -113,14 +122,13 @@ def evaluate(
     yes: Yes = False,
     json: Json = False,
 ) -> None:
-    """Run episodes of a policy: score with a 95 % interval, violations, pictures; on both sides the same command.
+    """Run episodes of a policy, on emulated drives or on a bus: score with a 95 % interval, violations, pictures.
 
-    On a bus it acts inside the safety envelope; a policy that gives no number, sticks at its limit, stalls or never
-    returns is stopped, and the drives are left at rest and disabled. Their parameters are in a file for
-    `drive-tune undo` meanwhile, beside --out or in runs/, and back at the end. `--out` keeps report.json,
-    episodes.npz and pictures. On the emulator, 64 episodes at a time are a task of --workers or --cluster, to the same
-    bytes. In real time other programs disturb: on Linux, `chrt -f 10 drive-agent evaluate ...` goes
-    before them.
+    On a bus it acts inside the safety envelope; a policy that returns NaN, stays at its limit or takes too long is
+    stopped, and the drives are brought to rest and disabled. Their parameters are saved to a file for `drive-tune
+    undo`, beside --out or in runs/, and restored at the end. `--out` keeps report.json, episodes.npz and pictures. On
+    the emulator, 64 episodes at a time are a task of --workers or --cluster, to the same bytes. In real time other
+    programs disturb: on Linux, `chrt -f 10 drive-agent evaluate ...` goes before them.
     """
     with errors_as_exit_codes():
         for name, value in (("--episodes", episodes), ("--gap", gap), ("--seed", seed + 1)):
@@ -129,23 +137,23 @@ def evaluate(
                 raise ValueError(f"{name} {value - 1 + least} is too small; give {least} or more")
         for name, limit in (("--stall", stall), ("--saturation", saturation)):
             if limit is not None and not 0.0 <= limit < math.inf:
-                raise ValueError(f"{name} {limit:g} must be a time [s], 0 for any")
+                raise ValueError(f"{name} {limit:g} must be a time [s], 0 for no limit")
         if card:
             _tell_card(policy, json)
             return
         on_bus = any(was_typed(context, one) for one in BUS_OPTIONS)
         if lockstep and not on_bus and gap is None:
-            raise ValueError("--lockstep is of a bus; give its --channel, or --gap")
+            raise ValueError("--lockstep is for a bus; give its --channel, or --gap")
         for name in OF_A_BUS_ALONE:
             if not on_bus and gap is None and was_typed(context, name):
-                raise ValueError(f"--{name} is of a bus; give its --channel, or leave --{name} out")
+                raise ValueError(f"--{name} is for a bus; give its --channel, or leave --{name} out")
         away = [name for name in ELSEWHERE if was_typed(context, name)]
         if away and (on_bus or gap is not None or replay is not None):
             raise ValueError(
-                f"--{away[0]} runs episodes of the emulator; leave it out on a bus, with --gap and with --replay"
+                f"--{away[0]} is for episodes on the emulator; leave it out on a bus, with --gap and with --replay"
             )
         if gap is not None and (extra := [one for one in NOT_OF_A_GAP if was_typed(context, one)]):
-            raise ValueError(f"--gap serves machines of its own, an episode each; leave --{extra[0]} out")
+            raise ValueError(f"--gap serves its own machines, one episode each; leave --{extra[0]} out")
         recording = None if replay is None or replay.suffix.lower() == ".csv" else _recording(replay)
         recorded = None if recording is None else recording.environment
         loaded, configuration = _open(policy, environment, load, config, recorded, trust)
@@ -209,13 +217,13 @@ def _open(
         loaded.environment = wanted
     loaded.environment = loaded.environment or otherwise
     if loaded.environment is None:
-        raise ValueError(f"{text} does not say its environment; give --environment")
+        raise ValueError(f"{text} does not name its environment; give --environment")
     configuration = dict(loaded.configuration)
     if config is not None:
         try:
             configuration = read_toml(config)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"--config {config} is no TOML: {error}") from None
+            raise ValueError(f"--config {config} is not TOML: {error}") from None
     if load is not None:
         if configuration.get("distributions") == configuration.get("load"):  # the old load's own
             configuration["distributions"] = load if load in shipped_distributions() else None
@@ -250,7 +258,7 @@ def _both_sides(
     folder: Path | None,
     json: bool,
 ) -> None:
-    """Judge a policy on machines in this process and over their bus, and tell the gap."""
+    """Evaluate a policy on machines in this process and over their bus, and print the difference."""
     from agents.evaluation import evaluation_plots, gap
     from agents.evaluation.sim_versus_bus import on_both_sides
 
@@ -270,8 +278,8 @@ def _both_sides(
         evaluation_plots.save_gap(both.inside, both.bus, folder)
     if both.missing:
         fail(
-            f"{len(both.missing)} of {machines} machines could not be judged over the bus; of the first: "
-            f"{next(iter(both.missing.values()))}",
+            f"{len(both.missing)} of {machines} machines could not be evaluated over the bus; the reason for the "
+            f"first: {next(iter(both.missing.values()))}",
             REFUSED,
         )
 
@@ -303,7 +311,7 @@ def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, 
             configuration,
             drives=evaluation.as_on_a_bus(drives),
             sensor=sensor,
-            side="emulator as on a bus",
+            side="emulator without access to the machine",
             told=show,
             **options,
         )
@@ -356,7 +364,7 @@ def _recording(path: Path) -> Any:
 
 
 def _replay(loaded: Any, configuration: dict[str, Any], path: Path, recording: Any, json: bool) -> None:
-    """Say what the policy would have done in recorded episodes, or how far the emulator lies from a recorded move."""
+    """Print what the policy would have done in recorded episodes, or the emulator's deviation from a recorded move."""
     if recording is None:
         _replay_move(configuration, path, json)
         return
@@ -391,7 +399,7 @@ def _replay_move(configuration: dict[str, Any], path: Path, json: bool) -> None:
         return
     for name, one in table.items():
         print(
-            f"{name}: the emulator lies {float(one.nrmse[0]):.2%} of the log's range from it (RMS), "
+            f"{name}: deviation of the emulator {float(one.nrmse[0]):.2%} of the log's range (RMS), "
             f"{float(one.shifted[0]):.2%} when shifted by {1e3 * float(one.shift[0]):.1f} ms"
         )
 
@@ -434,7 +442,7 @@ def _tell(
     lines.append(f"violations: {count}{which}")
     if found.pace > SLOW or found.late > LATE:
         lines.append(
-            f"steps took {found.pace:.2f} times the time that they should, {found.late:.1%} of the SYNCs in them were "
+            f"steps took {found.pace:.2f} times their nominal time, {found.late:.1%} of the SYNCs in them were "
             "more than a cycle late: this computer is too slow or too busy, and the figures show that; end other "
             "programs, put `chrt -f 10` before the command (Linux), or take a lower rate or a smaller network"
         )
@@ -466,7 +474,7 @@ def _tell_card(text: str, json: bool) -> None:
     loaded = described_checkpoint(text) if is_checkpoint(text) else open_policy(text)
     about = {"environment": loaded.environment, **loaded.card}
     if not loaded.card:
-        raise ValueError(f"{text} has no card: it was not made by drive-agent")
+        raise ValueError(f"{text} has no card, since it was not made by drive-agent")
     if json:
         print_json(about)
         return

@@ -16,7 +16,7 @@ def export(
     trust: Trust = False,
     json: Json = False,
 ) -> None:
-    """Write an agent as ONNX, its normaliser inside, and check it against the original to 1e-5 of an action's range.
+    """Write an agent as ONNX, with its normaliser, and check it against the original to 1e-5 of an action's range.
 
     Prints the latency of the NumPy runtime (which needs no torch: agents/policies/policy.py) and of onnxruntime. A
     checkpoint is compared with Stable-Baselines3's own network, too, and its .npz is written beside the .onnx.

@@ -1,4 +1,4 @@
-"""What the commands of `drive-agent` have in common: options, result folders, and how they end."""
+"""Options, result folders and exit codes that the commands of `drive-agent` share."""
 
 from __future__ import annotations
 
@@ -36,17 +36,20 @@ EXTRA = "pip install 'drive-env[agents]'"
 Environment = Annotated[str, typer.Argument(help="gain_tuning, gain_scheduling or tracking.")]
 Algorithm = Annotated[str, typer.Option("--algorithm", "-a", help="ppo, sac or recurrent_ppo.")]
 Preset = Annotated[str, typer.Option("--preset", help="quick (minutes) or full (half an hour).")]
-Load = Annotated[str | None, typer.Option("--load", help="Load, in place of the configuration's.")]
-Config = Annotated[Path | None, typer.Option("--config", help="Hyper-parameters (YAML), in place of the shipped ones.")]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random.")]
-Steps = Annotated[int | None, typer.Option("--steps", help="Steps of all lanes together, in place of the preset's.")]
+Load = Annotated[str | None, typer.Option("--load", help="Load, instead of the configuration's.")]
+Config = Annotated[Path | None, typer.Option("--config", help="Hyper-parameters (YAML), instead of the shipped ones.")]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of all random numbers.")]
+Steps = Annotated[
+    int | None, typer.Option("--steps", help="Number of steps in all environments together, instead of the preset's.")
+]
 Out = Annotated[
     Path | None, typer.Option("--out", help="Folder for the results, new or empty.", show_default="a new one in runs/")
 ]
 Trust = Annotated[
     bool,
     typer.Option(
-        "--trust", help="Load a checkpoint (.zip). It holds pickles: loading it runs whatever its writer put there."
+        "--trust",
+        help="Load a checkpoint (.zip) although it holds pickles: loading it runs code that its author put there.",
     ),
 ]
 
@@ -60,7 +63,7 @@ def new_folder(path: Path | None, name: str) -> Path:
     if path is None:
         path = run_folder(name)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise ValueError(f"--out {path} holds something already; choose a new folder")
+        raise ValueError(f"--out {path} is not empty; choose a new folder")
     return path
 
 
@@ -86,7 +89,7 @@ def elsewhere(workers: int | None, cluster: str | None, again: str) -> Iterator[
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
-    """Show a bar on stderr while something long goes on, if that is a terminal; what is given takes the share done."""
+    """Show a progress bar on stderr, if that is a terminal; the function given takes the share done."""
     if not sys.stderr.isatty():
         yield lambda share: None
         return
@@ -98,7 +101,7 @@ def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
 
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
-    """End with one line: 1 for what drive, bus or the watch say, 2 for the user's mistake, 130 for Ctrl-C."""
+    """End with one line: exit code 1 for errors of drive, bus or limits, 2 for the user's mistake, 130 for Ctrl-C."""
     from agents.policies.policy import PolicyError
     from drive_env.master.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError

@@ -34,17 +34,17 @@ def search(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", help="Folder of the study; one that is there is gone on with.", show_default="a new one in runs/"
+            "--out", help="Folder of the study; an existing study is continued.", show_default="a new one in runs/"
         ),
     ] = None,
     workers: Workers = None,
     cluster: Cluster = None,
 ) -> None:
-    """Search hyper-parameters: each trial trains an agent and scores it on machines that it has not seen.
+    """Search hyper-parameters: each trial trains an agent and scores it on machines not used for training.
 
-    Five trials at a time are drawn from what those before have found; with --workers and --cluster they run side by
-    side, to the same agents. The study is a journal that several processes may share. Writes best.yaml, which
-    `drive-agent train --config` takes.
+    Five trials at a time are chosen from the results before; with --workers and --cluster they run in parallel, with
+    the same results. The study is a journal that several processes may share. Writes best.yaml, which `drive-agent
+    train --config` takes.
     """
     with errors_as_exit_codes():
         from agents.commands.train import with_load
@@ -66,6 +66,6 @@ def search(
             so_far = "none yet" if best is None else f"{best.score:.4g} of trial {best.number}"
             print(f"trial {trial.number}: {score}; best {so_far}", flush=True)
 
-        with elsewhere(workers, cluster, "go on with the same --out") as pool:
+        with elsewhere(workers, cluster, "continue with the same --out") as pool:
             run_search(environment, algorithm, given, folder, trials=trials, seed=seed, told=tell, pool=pool)
         print(f"written to {folder / BEST}")

@@ -44,7 +44,7 @@ def train(
     steps: Steps = None,
     out: Out = None,
     resume: Annotated[
-        Path | None, typer.Option("--resume", help="Go on with the run in this folder; needs --trust.")
+        Path | None, typer.Option("--resume", help="Continue the run in this folder; needs --trust.")
     ] = None,
     trust: Trust = False,
 ) -> None:
@@ -61,7 +61,7 @@ def train(
 
         if resume is None:
             if trust:
-                raise ValueError("--trust is of --resume: a new run loads nothing; leave it out")
+                raise ValueError("--trust is for --resume only, since a new run loads nothing; leave it out")
             given = with_load(environment, algorithm, preset, load, config)
             if steps is not None:
                 if steps < 1:
@@ -72,7 +72,7 @@ def train(
         else:
             given_too = [name for name in given_options(context) if name not in ("--resume", "--trust")]
             if given_too:
-                raise ValueError(f"--resume goes on with the run as it began; leave {', '.join(given_too)} out")
+                raise ValueError(f"--resume continues the run with its own options; leave {', '.join(given_too)} out")
             folder = resume
             run = run_to_resume(folder)
         try:
@@ -81,10 +81,10 @@ def train(
         except KeyboardInterrupt:
             if not (folder / CHECKPOINT).is_file():
                 clear(folder)
-                fail("interrupted before the first checkpoint: there is nothing to go on with, and nothing is left",
+                fail("interrupted before the first checkpoint: the run cannot be continued, and its files were removed",
                      INTERRUPTED)  # fmt: skip
-            fail(f"interrupted; go on with: drive-agent train --resume {folder} --trust", INTERRUPTED)
-        print(f"judging it in {EPISODES} episodes with seeds that it has not seen", file=sys.stderr)
+            fail(f"interrupted; to continue: drive-agent train --resume {folder} --trust", INTERRUPTED)
+        print(f"evaluating it in {EPISODES} episodes with seeds not used for training", file=sys.stderr)
         evaluation = judge(bundle)
         figures = {name: evaluation.interval(name)._asdict() for name in evaluation.values}
         seeds = {"evaluation": f"{evaluation.seeds[0]}...{evaluation.seeds[-1]}"}
@@ -172,11 +172,11 @@ def progress(title: str) -> Iterator[Report]:
 def text(state: Progress) -> str:
     """Return speed, share of the environment, mean return and reward terms in words."""
     if state.imitated < 1.0:
-        return f"it learns what its teacher does: {state.imitated:.0%}"
+        return f"imitating its teacher: {state.imitated:.0%}"
     if not state.means:
-        return "it has learnt what its teacher does"
+        return "imitation of its teacher done"
     terms = ", ".join(f"{name} {value:.3g}" for name, value in state.terms.items())
     return (
-        f"{state.speed:,.0f} steps/s ({state.environment_share:.0%} environment), "
-        f"return {state.means['return']:.4g}, {terms}"
+        f"{state.speed:,.0f} steps/s ({state.environment_share:.0%} environment), return {state.means['return']:.4g}, "
+        f"{terms}"
     )

@@ -44,33 +44,36 @@ def tune(
     channel: Channel = None,
     node: Nodes = None,
     bitrate: Bitrate = None,
-    lockstep: Annotated[bool, typer.Option("--lockstep", help="The bus is of emulated drives that wait for SYNC.")] = (
-        False
-    ),
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="For emulated drives served with --lockstep: time passes by SYNC.")
+    ] = (False),
     device: DeviceName = "tmcm1636",
     motor: MotorName = "qbl4208",
     load: Annotated[str, typer.Option(help="Load of the emulated drive, where no --interface is given.")] = "two_mass",
     seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Draw the emulated machine from the load's distributions.", show_default="default"),
+        typer.Option(
+            min=0, help="Draw the emulated machine's parameters at random, with this seed.", show_default="default"
+        ),
     ] = None,
     supply: Supply = None,
     travel: TravelRange = None,
     trials: Annotated[int | None, typer.Option(help="Trials.", show_default="the agent's own, 10")] = None,
     store: Annotated[
-        bool, typer.Option("--store/--no-store", help="Have a drive keep the gains over a power cycle.")
+        bool,
+        typer.Option("--store/--no-store", help="Store the gains in the drive, so that they survive a power cycle."),
     ] = True,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be done with this drive; write nothing, move nothing.")
+        bool, typer.Option("--dry-run", help="Print what would be done with this drive; write nothing, move nothing.")
     ] = False,
     out: Out = None,
     yes: Yes = False,
     json: Json = False,
 ) -> None:
-    """Let a trained agent tune a drive, trial by trial, inside the safety envelope; PyTorch is not needed.
+    """A trained agent tunes a drive, trial by trial, inside the safety envelope; PyTorch is not needed.
 
-    Without an option of a bus an emulated drive is served as a CANopen node and reached as a real one would be.
-    Writes before.toml, from which `drive-tune undo` brings back what was, certificate.json and report.html.
+    Without options for a bus an emulated drive is served as a CANopen node and used like a real one. Writes
+    before.toml, with which `drive-tune undo` restores the state before, certificate.json and report.html.
     """
     with errors_as_exit_codes():
         from agents.policies.policy import load_policy
@@ -100,7 +103,7 @@ def tune(
                                                      travel))  # fmt: skip
             if dry_run:
                 if not _tell_plan(target, policy, store, json):
-                    fail("a run would not begin: see the lines with 'no'", REFUSED)
+                    fail("a run would not start: see the lines with 'no'", REFUSED)
                 return
             if bus:
                 ask_to_turn(node, yes)
@@ -109,7 +112,7 @@ def tune(
 
 
 def _check_gains(policy: Any, device: str) -> None:
-    """Raise ValueError unless the agent, and what proves its gains, know a drive's loops: before anything moves."""
+    """Raise ValueError unless agent and verification support the drive's loops, before anything moves."""
     from agents.tuner.tune_target import gains_for
     from drive_env.devices import find_device
     from drive_env.gains import check_linear_model
@@ -145,7 +148,7 @@ def _emulated_node(
         RandomMachines(drives, Distributions.load(load)).redraw([np.random.default_rng(seed)], np.ones(1, bool), 1.0)
     if drives.num_axes > 1:
         drives.close()
-        raise ValueError(f"load {load!r} has {drives.num_axes} drives; an agent tunes one: take a load with one")
+        raise ValueError(f"load {load!r} has {drives.num_axes} axes; an agent tunes one axis: choose a load with one")
     world = World()
     world.add(drives, [1])
     hub = Hub()
@@ -183,7 +186,7 @@ def _on_bus(
 
 
 def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:
-    """Print what was found and what a run would do; the drive is read, and nothing else. Return whether it would."""
+    """Print the checks and what a run would do; the drive is only read. Return whether a run would start."""
     from agents.tuner.rehearsal import rehearse
 
     found = rehearse(target, keep=keep)
@@ -197,16 +200,16 @@ def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:
             }
         )
         return not found.refused
-    lines = [f"dry run on {target.device.name}, {target.motor.name}, {target.machine}: the drive is read, nothing else"]
+    lines = [f"dry run on {target.device.name}, {target.motor.name}, {target.machine}: the drive is only read"]
     lines += [f"  {check.verdict:<4}  {check.what}: {check.found}" for check in found.checks]
     lines.append(
-        f"a run would identify (about 4 s), make 1 + {trials} trials of 3 moves of 250 ms, what oscillates stopped "
-        "within 50 ms, show a move, measure the frequency response, move with the gains before; then the drive keeps "
-        "what passed, or has again what it had. It would write:"
+        f"a run would identify the axis (about 4 s), make 1 + {trials} trials of 3 moves of 250 ms (stopped within 50 "
+        "ms if it oscillates), record a move, measure the frequency response, and move with the gains before; then "
+        "the drive gets the new gains if they pass, or its gains from before. It would write:"
     )
     lines += [_what_is_written(list(group)) for _, group in groupby(found.writes, key=lambda write: write.why)]
     lines += [
-        "What does not stay is put back at the end, and all of it if something goes wrong.",
+        "Objects not marked 'stays' are restored at the end, and all of them if the run fails.",
         "Nothing was written.",
     ]
     print_lines(lines)
@@ -214,7 +217,7 @@ def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:
 
 
 def _what_is_written(group: list[Any]) -> str:
-    """Return objects that are written for the same thing: which, what they hold now, and to what."""
+    """Return the lines of objects that are written for the same purpose: objects, present values, new values."""
     first = group[0]
     objects = ", ".join(f"{index:04X}h:{sub:02X}" for index, sub in (write.key for write in group))
     values = [value for write in group for value in write.present or ()]
@@ -237,9 +240,9 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
             return
         mark = "better" if trial.better[0] else ""
         if trial.number == 0:
-            mark = "the fitted rule's gains, from which the agent sets out"
+            mark = "the baseline rule's gains, where the agent starts"
         if trial.aborted[0]:
-            mark = f"stopped: it oscillated or tripped{f'; {mark}' if trial.number == 0 else ''}"
+            mark = f"stopped: it oscillated or went into fault{f'; {mark}' if trial.number == 0 else ''}"
         figures = "".join(f" {value:>{width}}" for value, width in zip(trial.gains[0, outer], widths, strict=True))
         print_lines([f"{trial.number or 'rule':>5}{figures} {trial.measured[0]:>8.3f}  {mark}".rstrip()])
 
@@ -247,9 +250,9 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
         if not json:
             print(what, flush=True)
             if what == "trials":
-                print("J, less is better, counts settling time, stiffness, noise and overshoot of a")
-                print("move, its reversal and the move with 1.5 times velocity P, which shows how near")
-                print("to oscillation the gains are.")
+                print("The cost J (less is better) counts settling time, stiffness, noise and overshoot of")
+                print("a move, its reversal and a move with 1.5 times velocity P, which shows how near")
+                print("the gains are to oscillation.")
                 names = (f" {title:>{width}}" for title, width in zip(titles, widths, strict=True))
                 print(f"trial{''.join(names)} {'J':>8}")
 
@@ -298,39 +301,39 @@ def _print(done: TunerRun, refused: list[str], rule: float | None) -> None:
         lines.append(said)
     if axis.accepted and rule is not None:
         lines.append(
-            f"J {axis.proof:.3f}, {100.0 * axis.proof / rule:.0f} % of the fitted rule's {rule:.3f}; "
+            f"J {axis.proof:.3f}, {100.0 * axis.proof / rule:.0f} % of the baseline rule's J of {rule:.3f}; "
             f"{certified.hardware_seconds:.1f} s of drive time, trials stopped: {certified.aborts}"
         )
     for loop in certified.frequency_responses:
         if loop.tuned:
-            margins = {n: f"{value:.3g}" if math.isfinite(value) else "not seen" for n, value in loop.margins.items()}
-            lines.append(f"{loop.name}: {', '.join(f'{name} {text}' for name, text in margins.items())}")
+            margins = (f"{n} {v:.3g}" if math.isfinite(v) else f"{n} not measured" for n, v in loop.margins.items())
+            lines.append(f"{loop.name}: {', '.join(margins)}")
     if axis.accepted:
         lines.append(axis.verdict)
     lines += [f"reservation: {reservation}" for reservation in axis.reservations]
     lines += [*axis.notes, *refused]
     if not refused:
         lines.append(
-            "the drive keeps the new gains over a power cycle"
+            "the new gains are stored in the drive"
             if result.kept
-            else "the drive has the new gains until it is switched off"
+            else "the new gains are not stored: they are lost when the drive is switched off (--store stores them)"
         )
     print_lines(lines)
 
 
 def _answer(done: TunerRun) -> str:
-    """Return which trial the agent stays with, and why where another one measured better; "" if it is none of them."""
+    """Return which trial the agent chooses, and why where another one measured better; "" if it is none of them."""
     from agents.tuner.tune_target import best_unstopped
 
     after = tuple(done.result.axes[0].after)
     own = next((trial for trial in done.trials if tuple(trial.gains[0]) == after), None)
     if own is None:
         return ""
-    which = f"trial {own.number}" if own.number else "the fitted rule's gains"
+    which = f"trial {own.number}" if own.number else "the baseline rule's gains"
     best = best_unstopped(done.trials, 0)
     if best is None or best.measured[0] >= own.measured[0]:
-        return f"the agent stays with {which}, the best"
+        return f"the agent chooses {which}, the best"
     return (
-        f"the agent stays with {which}: it judges each by all of them, and doubts that J {best.measured[0]:.3f} of "
-        f"trial {best.number} would hold"
+        f"the agent chooses {which}: by its estimate from all trials, the J of {best.measured[0]:.3f} of trial "
+        f"{best.number} would not be repeated"
     )

@@ -61,7 +61,7 @@ def load(path: Path) -> EpisodeRecording:
         if not lengths or min(lengths) < 0 or any(one.ndim != 2 or len(one) != sum(lengths) for one in rows):
             raise ValueError("its arrays do not fit each other")
         if not all(np.isfinite(one).all() for one in rows):
-            raise ValueError("it holds values that are no numbers")
+            raise ValueError("it has values that are not numbers")
         observations, actions = (np.split(one, np.cumsum(lengths)[:-1]) for one in rows)
         configuration, seeds = dict(about["configuration"]), [int(seed) for seed in about["seeds"]]
         return EpisodeRecording(str(about["environment"]), configuration, seeds, observations, actions)
@@ -69,7 +69,7 @@ def load(path: Path) -> EpisodeRecording:
         raise ValueError(f"there is no file {path}") from None
     except (OSError, KeyError, ValueError, TypeError, OverflowError) as error:
         raise ValueError(
-            f"{path} holds no episodes ({error}); give the episodes.npz of `drive-agent evaluate --out`"
+            f"{path} has no episodes ({error}); give the episodes.npz of `drive-agent evaluate --out`"
         ) from None
 
 

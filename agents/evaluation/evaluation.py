@@ -1,7 +1,7 @@
-"""Episodes of a policy, on emulated machines or on a bus, and what they say: score, interval, violations.
+"""Evaluate a policy in episodes, on emulated machines or on a bus: score, interval, violations.
 
-On emulated machines many lanes run side by side, each with a machine of its own. On a bus (or `as_on_a_bus`, which
-hides the machine so that the environment acts as it would there) the lanes are those of the drives.
+On emulated machines many environments run at the same time, each with its own machine. On a bus (or `as_on_a_bus`,
+which hides the machine so that the environment acts as it would there) their number is that of the drives.
 """
 
 from __future__ import annotations
@@ -32,13 +32,17 @@ TOLD = 0.5  # s between two looks at a progress bar, which takes a millisecond
 STEP_SECONDS: dict[str, Callable[[Any], float]] = {"ServoDrive/Tracking-v0": lambda config: 1.0 / config.rate,
                 "ServoDrive/GainScheduling-v0": lambda config: config.step,
                 "ServoDrive/GainTuning-v0": lambda config: TRIAL_SECONDS}  # fmt: skip
-TRIAL_OF = {"gains": "trial_gains", "measured": "trial_measured", "hidden": "trial_hidden"}  # of incumbent, of trial
+TRIAL_OF = {
+    "gains": "trial_gains",
+    "measured": "trial_measured",
+    "robust_cost": "trial_robust_cost",
+}  # of incumbent, of trial
 FIXED_STEPS = ("ServoDrive/Tracking-v0", "ServoDrive/GainScheduling-v0")  # a trial takes what clearing up takes besides
 
 
 @dataclass
 class Evaluation:
-    """What episodes said.
+    """The results of episodes.
 
     Attributes:
         policy: Its name.
@@ -48,7 +52,7 @@ class Evaluation:
         seeds: Of the episodes.
         values: Figure -> value of each episode.
         lower_is_better: Figure -> direction.
-        violations: What ended episodes early -> how often.
+        violations: Cause of an early end -> number of episodes.
         pace: Time that steps took over the time that they should; 1 where time waits, or a step has no fixed time.
         late: Share of the SYNCs within a step that were more than a cycle late; 0 where time waits.
         episodes: What was recorded; not saved with the report.
@@ -98,7 +102,7 @@ class Evaluation:
         except OSError as error:
             raise ValueError(f"{path} cannot be read: {error.strerror}") from None
         except (ValueError, KeyError, TypeError, AttributeError):
-            raise ValueError(f"{path} is no report of `drive-agent evaluate`; give its report.json") from None
+            raise ValueError(f"{path} is not a report of `drive-agent evaluate`; give its report.json") from None
 
 
 class _NoMachine(Observer):
@@ -108,7 +112,7 @@ class _NoMachine(Observer):
 
 
 def as_on_a_bus(drives: Drives) -> Drives:
-    """Return emulated drives without their machine: whatever acts on them does as it would on a bus."""
+    """Return emulated drives without their machine, so that environments act as on a bus."""
     return ObservedDrives(drives, _NoMachine())
 
 
@@ -127,10 +131,10 @@ def evaluate(
     told: Callable[[float], None] = lambda share: None,
     at_once: int | None = None,
 ) -> Evaluation:
-    """Run episodes and return what they say.
+    """Run episodes and return the results.
 
     Args:
-        policy: What acts: `act(observations)`, shape (lanes, entries), and `reset(mask)`.
+        policy: What acts: `act(observations)`, shape (environments, entries), and `reset(mask)`.
         environment: Name of the environment.
         configuration: Its options.
         name: Of the policy, for the report.
@@ -203,7 +207,7 @@ def evaluate(
 
 
 def lanes_for(episodes: int) -> int:
-    """Return how many of so many episodes run side by side on emulated machines."""
+    """Return how many of so many episodes run at the same time on emulated machines."""
     return min(episodes, LANES)
 
 
@@ -230,7 +234,7 @@ def joined(parts: Sequence[Evaluation]) -> Evaluation:
 def summary(
     episodes: Sequence[Episode], config: Any, configuration: dict[str, Any], environment: str, policy: str, side: str
 ) -> Evaluation:
-    """Return what recorded episodes say."""
+    """Return the results of recorded episodes."""
     rows = figures(environment, config)
     values = {row.name: [row.compute(episode, config) for episode in episodes] for row in rows}
     values = {name: found for name, found in values.items() if np.isfinite(found).any()}
@@ -249,13 +253,14 @@ def summary(
 def _episodes(
     policy: Any, lanes: Any, seeds: Sequence[int], all_end: bool, told: Callable[[int], None]
 ) -> tuple[list[Episode], float]:
-    """Return an episode of every lane, and the time that its steps took [s].
+    """Return an episode of every environment, and the time that its steps took [s].
 
     Args:
         policy: What acts.
-        lanes: The lanes.
-        seeds: One for each lane.
-        all_end: Whether every lane's episode ends with the first that does: beginning anew would move the others.
+        lanes: The environments.
+        seeds: One for each environment.
+        all_end: Whether every environment's episode ends with the first that does: beginning anew would move the
+            others.
         told: Is told how many steps are done, not more often than every TOLD.
     """
     count = lanes.num_envs
@@ -321,8 +326,8 @@ def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[d
 
     Args:
         gains: The answers, (lanes, axes, count).
-        trials: What was told of every trial of all lanes, by the names of TRIAL_OF.
-        last: What the environment told in the last step of each lane; changed.
+        trials: What was told of every trial of all environments, by the names of TRIAL_OF.
+        last: What the environment told in the last step of each environment; changed.
     """
     for lane, told in enumerate(last):
         for trial in trials:
@@ -339,7 +344,7 @@ def _seen(observation: Any) -> Any:
 
 
 def _of_lane(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
-    """Return the numbers and texts that an info tells of a lane."""
+    """Return the numbers and texts of an info for one environment."""
     found = {}
     for key, value in info.items():
         if key.startswith("_") or isinstance(value, Mapping) or np.ndim(value) < 1:
@@ -349,7 +354,7 @@ def _of_lane(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
 
 
 def _lanes_of(environment: str, drives: Drives, options: Mapping[str, Any]) -> int:
-    """Return how many lanes given drives are: a lane has the axes of the load."""
+    """Return how many environments given drives make: each has the axes of the load."""
     from mechanics.loads import find_load
 
     load = options.get("load")

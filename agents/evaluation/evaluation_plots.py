@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: how the figures are spread, and the best, the median and the worst episode."""
+"""Pictures of an evaluation: the distribution of the figures, and the best, median and worst episode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Episodes of a policy on processes and clusters: the lanes of each round are a task, and give what they do here."""
+"""Episodes of a policy on processes and clusters, with the same results as here: each round is a task."""
 
 from __future__ import annotations
 

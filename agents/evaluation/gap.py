@@ -39,7 +39,7 @@ def compare(first: Evaluation, second: Evaluation) -> list[Gap]:
         ValueError: If they are of different environments.
     """
     if first.environment != second.environment:
-        raise ValueError(f"{first.environment} and {second.environment} have no gap: they are different tasks")
+        raise ValueError(f"{first.environment} and {second.environment} cannot be compared: they are different tasks")
     # Emulated machines are drawn anew for every episode and a bus has its own: their episodes are no pairs.
     paired = first.seeds == second.seeds and "emulator" not in (first.side, second.side)
     found = []

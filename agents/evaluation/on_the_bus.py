@@ -43,7 +43,7 @@ def target_for(
 ) -> Iterator[Target]:
     """Open drives on a bus for a policy; they are at rest and disabled afterwards.
 
-    Of the target nothing counts but the drives and how they are opened again: not motor, supply and travel.
+    Only the drives of the target matter, and how they are opened again: not motor, supply and travel.
 
     The envelope's limits are the task's: about the place where the axes stand now, half as far again as the amplitude,
     and twice the speed; the drive's own limits hold besides. Its watch for stalls is the guard's.

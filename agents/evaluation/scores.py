@@ -1,6 +1,6 @@
-"""What an episode is judged by: figures of each environment, from what a policy sees and is told, on a bus too.
+"""The figures of an episode, for each environment, from observations, rewards and info; on a bus, too.
 
-Nothing here is known on an emulator alone but what says so, so that the figures of both sides can be compared.
+Figures that need the emulator say so; all others can be compared between emulator and bus.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 class Episode(NamedTuple):
-    """An episode of one lane, as recorded.
+    """An episode of one environment, as recorded.
 
     seed: Of the episode.
     observations: Shape (steps + 1, entries); the last one is the final one.
@@ -26,7 +26,7 @@ class Episode(NamedTuple):
     terms: Reward term -> values, shape (steps,).
     terminated: Whether it ended early, which is a violation.
     fault: What ended it; "" if nothing did.
-    first, last: What the environment told at its begin and in its last step, of this lane.
+    first, last: The environment's info at its begin and in its last step, of this lane.
     """
 
     seed: int
@@ -87,7 +87,7 @@ def pole(episode: Episode, config: Any) -> float:
 
 
 def _told(name: str, ratio: bool) -> Callable[[Episode, Any], float]:
-    """Return a figure of what GainTuning tells: at the end, or over that of the rule, with which it begins."""
+    """Return a figure of GainTuning's info: at the end, or relative to that of the rule, with which it begins."""
 
     def compute(episode: Episode, config: Any) -> float:
         if name not in episode.last:
@@ -103,7 +103,7 @@ def _mean_term(name: str) -> Callable[[Episode, Any], float]:
 
 
 def stopped(episode: Episode, config: Any) -> float:
-    """Return the share of trials that were stopped, since they oscillated or tripped; NaN if that costs nothing."""
+    """Return the share of trials stopped for oscillation or fault; NaN if that costs nothing."""
     if not config.abort_cost:
         return float("nan")
     return float(np.mean(np.asarray(episode.terms["abort"]) < 0.0))
@@ -126,8 +126,8 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
         RETURN,
     ),
     "ServoDrive/GainTuning-v0": (
-        Figure("hidden J over the rule's (emulator)", _told("hidden", ratio=True)),
-        Figure("J by measured terms over the rule's", _told("measured", ratio=True)),
+        Figure("robust cost relative to the rule's (emulator)", _told("robust_cost", ratio=True)),
+        Figure("J by measured terms, relative to the rule's", _told("measured", ratio=True)),
         Figure("J by measured terms", _told("measured", ratio=False)),
         Figure("stopped trials [share]", stopped),
         RETURN,

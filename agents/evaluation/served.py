@@ -28,7 +28,7 @@ _CHANNEL = re.compile(r'channel="(socket://[^"]+)"')
 
 
 class ServeError(RuntimeError):
-    """`drive-env serve` did not come up; the message says what it said."""
+    """`drive-env serve` did not start; the message has its output."""
 
 
 class Served(NamedTuple):
@@ -166,7 +166,5 @@ def _channel_of(process: subprocess.Popen[str]) -> str:
     threading.Thread(target=listen, args=(process.stdout,), name="serve", daemon=True).start()
     told.wait(STARTING)
     if not found:
-        raise ServeError(
-            f"drive-env serve did not come up within {STARTING:g} s: {' | '.join(said) or 'it said nothing'}"
-        )
+        raise ServeError(f"drive-env serve did not start within {STARTING:g} s: {' | '.join(said) or 'no output'}")
     return found[0]

@@ -24,13 +24,13 @@ from drive_env.safety.envelope import SafetyError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-HIDDEN = "hidden J over the fitted rule's"
+ROBUST_COST = "robust cost relative to the baseline rule's"
 PATIENCE = 30.0  # s, for a node that waits for us: a late answer says that the computer is busy, not that it is gone
 OTHER_NOISE = 1_000_003  # added to the seed of the drives' noise
 
 
 class BothSides(NamedTuple):
-    """What came of it.
+    """The results.
 
     inside, bus: The evaluations, an episode of each machine that was judged on both sides, in the same order.
     again: In this process once more, with other noise: what the gap may be without any bus; None in lockstep.
@@ -80,7 +80,8 @@ def on_both_sides(
     joint = getattr(getattr(config, "task", None), "joint", None)
     if joint is not None and not lockstep:
         raise ValueError(
-            f"{config.load} needs the pendulum's angle, which no drive on a bus shows; judge it with --lockstep"
+            f"{config.load} needs the pendulum's angle, which a drive on a bus does not have; evaluate it with "
+            "--lockstep"
         )
     rows = draw_machines(config, machines, seed)
     options: dict[str, Any] = {"name": name, "episodes": 1}
@@ -109,10 +110,10 @@ def on_both_sides(
                 missing[k] = str(error)
         told((k + 1) / machines)
     if not found:
-        raise BusError(f"no machine could be judged over the bus; of the first: {missing[0]}")
+        raise BusError(f"no machine could be evaluated over the bus; the reason for the first: {missing[0]}")
     bus, *inside = (joined([sides[number] for sides in found.values()]) for number in range(1 + len(noises)))
     if environment == "ServoDrive/GainTuning-v0":
-        _add_hidden([rows[k] for k in found], [bus, *inside])
+        _add_robust_cost([rows[k] for k in found], [bus, *inside])
     return BothSides(inside[0], bus, None if lockstep else inside[1], missing)
 
 
@@ -144,8 +145,8 @@ def _sensor(drives: Drives | None, joint: int | None) -> Callable[[], Any] | Non
     return lambda: machine.joint_positions[:, joint]
 
 
-def _add_hidden(machines: Sequence[Machine], sides: Sequence[Evaluation]) -> None:
-    """Add hidden J of the answers, which no bus shows: the machines are known here."""
+def _add_robust_cost(machines: Sequence[Machine], sides: Sequence[Evaluation]) -> None:
+    """Add the robust cost of the answers; it needs the true machines, which are known here."""
     from drive_env.motors import find_motor
     from tuning.compare.comparison import Yardstick
     from tuning.compare.suite import SuiteMachine
@@ -157,9 +158,9 @@ def _add_hidden(machines: Sequence[Machine], sides: Sequence[Evaluation]) -> Non
     yardstick = Yardstick(group, num_threads=1)
     try:
         for side in sides:
-            hidden = yardstick.score(np.concatenate([_answer(episode) for episode in side.episodes]))
-            side.values = {HIDDEN: list(map(float, hidden / yardstick.rule)), **side.values}
-            side.lower_is_better = {HIDDEN: True, **side.lower_is_better}
+            costs = yardstick.score(np.concatenate([_answer(episode) for episode in side.episodes]))
+            side.values = {ROBUST_COST: list(map(float, costs / yardstick.rule)), **side.values}
+            side.lower_is_better = {ROBUST_COST: True, **side.lower_is_better}
     finally:
         yardstick.close()
 

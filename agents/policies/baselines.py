@@ -1,6 +1,6 @@
 """What an agent must beat, as policies, by name: `drive-agent evaluate feed_forward --environment tracking`.
 
-`nothing` is the drive's own cascade, or the fitted rule's gains; `surrogate` is the tuner that ships. The others are
+`nothing` is the drive's own cascade, or the baseline rule's gains; `surrogate` is the tuner that ships. The others are
 feed-forward as one identifies it: the constants below gave the least mean following error over 64 machines drawn from
 the load's distribution.
 """

@@ -44,10 +44,10 @@ class PolicyStoppedError(PolicyError):
 
 @dataclass(frozen=True)
 class GuardLimits:
-    """What a policy may do; None for no limit.
+    """Limits of a policy; None for no limit.
 
-    saturation: With an action at the end of its range for so long [s], a policy sticks.
-    stall: Without an action for so long [s], a policy stalls.
+    saturation: Longest time [s] with an action at the end of its range.
+    stall: Longest time [s] without an action.
     """
 
     saturation: float | None = 0.1
@@ -73,7 +73,7 @@ PATIENT = GuardLimits(saturation=None, stall=60.0)
 
 
 class GuardedPolicy:
-    """A policy under watch; it acts as the one that it holds, in a thread of its own if `limits` have a stall.
+    """A policy within limits; it acts as the policy it holds, in a thread of its own if `limits` have a stall time.
 
     Args:
         policy: What acts.
@@ -123,13 +123,13 @@ class GuardedPolicy:
                 entry = int(np.argmax(self._at_limit.max(axis=0)))
                 raise PolicyStoppedError(
                     f"entry {entry} of the policy's action has been at the end of its range for {1e3 * longest:.0f} "
-                    f"ms, and the limit is {1e3 * saturation:.0f} ms; train it on such a machine, or allow more "
-                    "(--saturation)"
+                    f"ms, and the limit is {1e3 * saturation:.0f} ms; train it on such a machine, or allow a longer "
+                    "time (--saturation)"
                 )
         return rows
 
     def answer(self, observation: Any) -> Any:
-        """Return what a tuner would stay with after its last trial, as an action; None of a policy that does not say.
+        """Return a tuner's choice after its last trial, as an action; None of a policy without a choice.
 
         Raises:
             PolicyStoppedError: If it took too long, or is no number.
@@ -144,22 +144,22 @@ class GuardedPolicy:
         self._deadline.close()
 
     def _checked(self, action: Any, lanes: int) -> NDArray[Any]:
-        """Return an action as rows, (lanes, actions)."""
+        """Return an action as rows, (environments, actions)."""
         entries = len(self._middle)
         try:
             rows = np.asarray(action)
             finite = np.isfinite(rows)
         except (TypeError, ValueError):
-            raise PolicyStoppedError(f"the policy's action is a {type(action).__name__}, no array of numbers") from None
+            kind = type(action).__name__
+            raise PolicyStoppedError(f"the policy's action is a {kind}, not an array of numbers") from None
         if rows.size != lanes * entries:
             raise PolicyStoppedError(
-                f"the policy's action has shape {rows.shape}; {lanes} lane(s) of this environment take "
-                f"({lanes}, {entries})"
+                f"the policy's action has shape {rows.shape}; {lanes} environments take ({lanes}, {entries})"
             )
         rows, finite = rows.reshape(lanes, entries), finite.reshape(lanes, entries)
         if not finite.all():
             lane, entry = np.argwhere(~finite)[0]
-            raise PolicyStoppedError(f"entry {entry} of the policy's action is {rows[lane, entry]}, no number")
+            raise PolicyStoppedError(f"entry {entry} of the policy's action is {rows[lane, entry]}, not a number")
         return rows
 
     def _ask(self, function: Callable[[Any], Any], argument: Any, within: float | None) -> Any:
@@ -174,8 +174,8 @@ class GuardedPolicy:
             return answer
         except DeadlineError:
             raise PolicyStoppedError(
-                f"the policy gave no answer for {1e3 * (within or 0.0):.0f} ms: it is too slow, or never returns; use "
-                "a smaller network or a faster computer, or allow more (--stall)"
+                f"the policy gave no answer for {1e3 * (within or 0.0):.0f} ms: it is too slow, or does not return at "
+                "all; use a smaller network or a faster computer, or allow a longer time (--stall)"
             ) from None
         except PolicyError as error:
             raise PolicyStoppedError(str(error)) from error
@@ -202,7 +202,7 @@ def unchanged(drives: Drives) -> Iterator[None]:
                     break
                 except (RuntimeError, ValueError, OSError) as error:
                     if attempt:
-                        logger.error("%04Xh:%02X stays changed: %s", *name, error)
+                        logger.error("%04Xh:%02X could not be restored: %s", *name, error)
 
 
 @contextmanager

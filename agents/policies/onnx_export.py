@@ -1,7 +1,8 @@
-"""A bundle as ONNX: the normaliser and the action's bounds inside, what is known of the agent in its metadata.
+"""A bundle as ONNX: the normaliser and the action's bounds inside, the agent's card in its metadata.
 
-Inputs: `observation` (lanes, entries), float32; of a recurrent agent also `state` and `cell` (lanes, cells), zeros at
-an episode's begin. Outputs: `action` (lanes, actions); of a recurrent agent also `next_state` and `next_cell`.
+Inputs: `observation` (environments, entries), float32; of a recurrent agent also `state` and `cell` (environments,
+cells), zeros at an episode's begin. Outputs: `action` (environments, actions); of a recurrent agent also `next_state`
+and `next_cell`.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ def to_onnx(bundle: AgentFile) -> Any:
 
     if bundle.kind not in _BODIES:
         raise BundleError(
-            f"an agent of kind {bundle.kind!r} has no ONNX form, {', '.join(_BODIES)} have; its file acts with NumPy "
-            "alone: agents.policies.policy.load_policy"
+            f"an agent of kind {bundle.kind!r} cannot be written as ONNX, only {', '.join(_BODIES)}; use its file "
+            "with NumPy alone: agents.policies.policy.load_policy"
         )
     graph = Graph()
     x = _enter(graph, bundle)
@@ -107,7 +108,7 @@ def compare(bundle: AgentFile, path: str | Path, act: Callable[[Any], Any] | Non
         bundle: The agent.
         path: The ONNX model.
         act: What it is compared with; the bundle's own NumPy runtime by default.
-        steps: Steps of 16 lanes, for what remembers.
+        steps: Steps of 16 environments, for policies with a state.
     """
     from agents.policies.onnx_policy import OnnxPolicy
     from agents.policies.policy import policy_of

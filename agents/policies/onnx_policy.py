@@ -40,13 +40,13 @@ class OnnxPolicy:
         try:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime raises what its own library defines
-            raise BundleError(f"{path} is no ONNX model: {str(error).splitlines()[0]}") from None
+            raise BundleError(f"{path} is not an ONNX model: {str(error).splitlines()[0]}") from None
         inputs = {one.name: one.shape for one in self._session.get_inputs()}
         outputs = [one.name for one in self._session.get_outputs()]
         if "observation" not in inputs or "action" not in outputs:
             raise BundleError(
-                f"{path} takes {', '.join(inputs)} and gives {', '.join(outputs)}; a policy takes `observation`, shape "
-                "(lanes, entries), and gives `action`"
+                f"{path} takes {', '.join(inputs)} and gives {', '.join(outputs)}; a policy takes `observation`, "
+                "shape (environments, entries), and gives `action`"
             )
         try:
             about = parse_json(self._session.get_modelmeta().custom_metadata_map.get(METADATA, "{}"))
@@ -54,26 +54,26 @@ class OnnxPolicy:
             self.configuration: dict[str, Any] = dict(about.get("configuration", {}))
             self.card: dict[str, Any] = dict(about.get("card", {}))
         except (ValueError, TypeError, AttributeError) as error:
-            raise BundleError(f"{path}: its metadata {METADATA!r} is not ours: {error}; export it anew") from None
+            raise BundleError(f"{path}: its metadata {METADATA!r} is not ours: {error}; export it again") from None
         if not isinstance(self.environment, str | None):
-            raise BundleError(f"{path}: its metadata names {self.environment!r} as environment; export the agent anew")
+            raise BundleError(f"{path}: its metadata names {self.environment!r} as environment; export the agent again")
         for name in CARRIED:
             if name in inputs and not (len(inputs[name]) == 2 and isinstance(inputs[name][1], int)):
-                raise BundleError(f"{path}: {name} has shape {inputs[name]}; a policy's is (lanes, cells)")
+                raise BundleError(f"{path}: {name} has shape {inputs[name]}; a policy's is (environments, cells)")
         self._outputs = ["action", *(CARRIED[name] for name in CARRIED if name in inputs)]
         self._cells = {name: int(inputs[name][1]) for name in CARRIED if name in inputs}
         self._carried: dict[str, NDArray[np.float32]] = {}
         self._lanes = 0
 
     def act(self, observation: ArrayLike) -> NDArray[np.float32]:
-        """Return the action for one observation, or one for each lane.
+        """Return the action for one observation, or one for each environment.
 
         Raises:
-            PolicyError: If observation or action is no number, or the observation has another shape.
+            PolicyError: If observation or action is not a number, or the observation has another shape.
         """
         rows = np.atleast_2d(np.asarray(observation, np.float32))
         if not np.isfinite(rows).all():
-            raise PolicyError("the observation is no number: the policy was not asked")
+            raise PolicyError("the observation is not a number: the policy was not called")
         if len(rows) != self._lanes:
             self._lanes = len(rows)
             self._carried = {name: np.zeros((self._lanes, cells), np.float32) for name, cells in self._cells.items()}
@@ -83,12 +83,12 @@ class OnnxPolicy:
             raise PolicyError(f"the ONNX model does not take this observation: {str(error).splitlines()[0]}") from None
         self._carried = dict(zip(self._carried, after, strict=True))
         if not np.isfinite(action).all():
-            raise PolicyError("the policy's output is no number")
+            raise PolicyError("the policy's output is not a number")
         found: NDArray[np.float32] = action[0] if np.ndim(observation) == 1 else action
         return found
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
-        """Forget what was, in all lanes or where the mask is true."""
+        """Reset the state, in all environments or where the mask is true."""
         if mask is None:
             self._lanes = 0
         else:

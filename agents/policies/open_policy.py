@@ -1,4 +1,4 @@
-"""Any policy as something that acts: our bundle, a checkpoint of Stable-Baselines3, ONNX, or a Python callable.
+"""Opens any policy: an agent file, a checkpoint of Stable-Baselines3, ONNX, or a Python callable.
 
 How it is written says what it is: the name of an agent that ships, agent.npz, checkpoint.zip (ours, or what
 Stable-Baselines3's `save` writes), agent.onnx, or module:function.
@@ -23,7 +23,7 @@ CHECKPOINT = ".zip"  # ending of a file of Stable-Baselines3, which holds pickle
 
 
 class PolicyNotFoundError(ValueError):
-    """There is no such policy, or it cannot be used; the message says what can."""
+    """There is no such policy, or it cannot be used; the message has the remedy."""
 
 
 @dataclass
@@ -50,8 +50,8 @@ def open_policy(text: str, *, trust: bool = False) -> LoadedPolicy:
 
     Args:
         text: What names it.
-        trust: The writer of a checkpoint is trusted: to load it runs what he put there. The other files run nothing,
-            and a Python function is the user's own.
+        trust: The author of a checkpoint is trusted: loading it runs code that it contains. The other files run no
+            code, and a Python function is the user's own.
 
     Raises:
         PolicyNotFoundError: If it is none; BundleError or CheckpointError if its file is not what it seems;
@@ -67,7 +67,7 @@ def open_policy(text: str, *, trust: bool = False) -> LoadedPolicy:
     if text in shipped_names():
         return replace(_bundle(str(shipped(text))), name=text)
     raise PolicyNotFoundError(
-        f"{text!r} is no policy; give an agent that ships ({', '.join(shipped_names())}), a file "
+        f"{text!r} is not a policy; give an agent that ships ({', '.join(shipped_names())}), a file "
         f"({', '.join((*OPENERS, CHECKPOINT))}) or a Python function (module:function)"
     )
 
@@ -89,7 +89,7 @@ def opened(
     if not is_baseline(text):
         return open_policy(text, trust=trust)
     if environment is None:
-        raise ValueError(f"{text} does not say its environment; give --environment")
+        raise ValueError(f"{text} does not name its environment; give --environment")
     lanes: Any = make_lanes(environment, 1, configuration)
     actions, config = lanes.single_action_space.shape[0], lanes.config
     lanes.close()
@@ -109,7 +109,7 @@ def is_baseline(text: str) -> bool:
 
 
 class CallablePolicy:
-    """A Python function of an observation; it gets all lanes' at once, shape (lanes, entries).
+    """A Python function of an observation; it gets those of all environments at once, shape (environments, entries).
 
     A class, or an object with `act`, is taken as it is.
     """

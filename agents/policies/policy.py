@@ -1,6 +1,6 @@
 """Acting with a bundle, by NumPy alone: for a controller on a small computer, without torch, Gymnasium or MuJoCo.
 
-`load_policy("agent.npz").act(observation)` takes observations of shape (entries,) or (lanes, entries).
+`load_policy("agent.npz").act(observation)` takes observations of shape (entries,) or (environments, entries).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ KINDS: dict[str, str] = {
 
 
 class PolicyError(RuntimeError):
-    """A policy got or gave what is no number; whoever acts with it stops the drives."""
+    """A policy got or returned a value that is not a number; the caller must stop the drives."""
 
 
 def load_policy(path: str | Path) -> Any:
@@ -51,7 +51,9 @@ def policy_of(bundle: AgentFile) -> Any:
     except BundleError:
         raise
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise BundleError(f"the agent's arrays and settings make no {bundle.kind!r}: {error}; get it anew") from None
+        raise BundleError(
+            f"the agent's arrays and settings do not fit {bundle.kind!r}: {error}; get it again"
+        ) from None
 
 
 # --- pieces -----------------------------------------------------------------------------------------------------------
@@ -104,16 +106,16 @@ class Ends:
         self._output = OUTPUTS[_choice("output", settings["output"], OUTPUTS)]
 
     def enter(self, observation: ArrayLike) -> Array:
-        """Return the normalised observations, shape (lanes, entries)."""
+        """Return the normalised observations, shape (environments, entries)."""
         x = np.asarray(observation)
         if x.shape[-1:] != self.mean.shape or x.ndim > 2:
             raise PolicyError(
-                f"the policy takes {len(self.mean)} entries, (entries,) or (lanes, entries), not {x.shape}; "
-                "is it of this environment and configuration?"
+                f"the policy takes {len(self.mean)} entries, (entries,) or (environments, entries), not {x.shape}; "
+                "check that it is for this environment and configuration"
             )
         if not np.isfinite(x).all():
             wrong = int(np.argwhere(~np.isfinite(x))[0][-1])
-            raise PolicyError(f"entry {wrong} of the observation is no number: the policy was not asked")
+            raise PolicyError(f"entry {wrong} of the observation is not a number: the policy was not called")
         if self.clip is not None:
             x = np.minimum(np.maximum((x - self.mean) * self.scale, -self.clip), self.clip)
         return np.atleast_2d(x.astype(np.float32))
@@ -121,7 +123,7 @@ class Ends:
     def leave(self, x: Array, observation: ArrayLike) -> Array:
         """Return the action of a network's output, in the observation's shape."""
         if not np.isfinite(x).all():
-            raise PolicyError("the policy's output is no number")
+            raise PolicyError("the policy's output is not a number")
         action = self._output(x, self.low, self.high)
         return action[0] if np.ndim(observation) == 1 else action
 
@@ -158,10 +160,10 @@ class MlpPolicy:
         self._activation = ACTIVATIONS[_choice("activation", bundle.settings["activation"], ACTIVATIONS)]
 
     def act(self, observation: ArrayLike) -> Array:
-        """Return the action for one observation, or one for each lane.
+        """Return the action for one observation, or one for each environment.
 
         Raises:
-            PolicyError: If observation or action is no number, or the observation has another shape.
+            PolicyError: If observation or action is not a number, or the observation has another shape.
         """
         x = self._ends.enter(observation)
         with np.errstate(over="ignore", invalid="ignore"):  # `leave` tells what comes of it
@@ -171,11 +173,11 @@ class MlpPolicy:
         return self._ends.leave(x, observation)
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
-        """Do nothing: it remembers nothing."""
+        """Do nothing: there is no state."""
 
 
 class LstmPolicy:
-    """A layer of LSTM cells, then fully connected layers; the state of each lane is its own.
+    """A layer of LSTM cells, then fully connected layers; each environment has its own state.
 
     Arrays besides those of `MlpPolicy`: lstm_input (entries, 4 cells), lstm_state (cells, 4 cells), lstm_bias (4
     cells), the gates in torch's order: input, forget, cell, output.
@@ -192,7 +194,7 @@ class LstmPolicy:
         self._state = self._cell = np.zeros((0, len(self._recurrent)), np.float32)
 
     def act(self, observation: ArrayLike) -> Array:
-        """Return the action for one observation, or one for each lane, and remember.
+        """Return the action for one observation, or one for each environment, and update the state.
 
         Raises:
             PolicyError: As `MlpPolicy.act`.
@@ -211,7 +213,7 @@ class LstmPolicy:
         return self._ends.leave(x, observation)
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
-        """Forget what was, in all lanes or where the mask is true."""
+        """Reset the state, in all environments or where the mask is true."""
         keep = np.zeros(len(self._state), bool) if mask is None else ~np.asarray(mask, bool)
         if len(keep) != len(self._state):  # of an earlier number of lanes
             keep = np.zeros(len(self._state), bool)

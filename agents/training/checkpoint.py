@@ -65,11 +65,11 @@ def read_run(path: Path) -> dict[str, Any]:
     try:
         run: Any = parse_json(_read(path, RUN))
     except ValueError as error:
-        raise CheckpointError(f"{path} is no checkpoint of drive-agent: {error}") from None
+        raise CheckpointError(f"{path} is not a checkpoint of drive-agent: {error}") from None
     if not isinstance(run, dict) or any(not isinstance(run.get(name), kind) for name, kind in _OF_A_RUN.items()):
-        raise CheckpointError(f"{path} is no checkpoint of drive-agent: {RUN} lacks {', '.join(_OF_A_RUN)}")
+        raise CheckpointError(f"{path} is not a checkpoint of drive-agent: {RUN} lacks {', '.join(_OF_A_RUN)}")
     if not isinstance(run["run"].get("seed"), int) or not isinstance(run["run"].get("hyperparameters"), dict):
-        raise CheckpointError(f"{path} is no checkpoint of drive-agent: {RUN} says no seed, or no hyper-parameters")
+        raise CheckpointError(f"{path} is not a checkpoint of drive-agent: {RUN} says no seed, or no hyper-parameters")
     return run
 
 
@@ -77,9 +77,9 @@ def check_trust(path: Path, trust: bool) -> None:
     """Raise UntrustedError unless the writer of a checkpoint is trusted."""
     if not trust:
         raise UntrustedError(
-            f"{path} holds pickles: to load it runs whatever its writer put there, with your rights (your files, your "
-            "network, the drives). If it is yours, or of somebody whom you would let run a program here, say --trust "
-            "(in Python trust=True); an agent.npz runs nothing and needs no trust"
+            f"{path} holds pickles: loading it runs code that its author put there, with your rights (your files, "
+            "your network, the drives). If it is yours, or from somebody whose programs you would run here, give "
+            "--trust (in Python trust=True); an agent.npz runs no code and needs no trust"
         )
 
 
@@ -104,7 +104,7 @@ def load_plain(path: Path, *, trust: bool = False) -> Any:
         said: Any = parse_json(_read(path, PLAIN))
         module = said["policy_class"]["__module__"]
     except (ValueError, TypeError, KeyError) as error:
-        raise CheckpointError(f"{path} is no file of Stable-Baselines3: {error}") from None
+        raise CheckpointError(f"{path} is not a file of Stable-Baselines3: {error}") from None
     kinds = [kind for kind in _algorithms() if module in {one.__module__ for one in kind.policy_aliases.values()}]
     if not kinds:
         raise CheckpointError(
@@ -186,9 +186,9 @@ def _read(path: Path, name: str) -> bytes:
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error.strerror}") from None
     except ValueError as error:
-        raise CheckpointError(f"{path} is no checkpoint: it is no .zip, or not whole ({error})") from None
+        raise CheckpointError(f"{path} is not a checkpoint: it is not a .zip, or incomplete ({error})") from None
     except KeyError:
         raise CheckpointError(
-            f"{path} is no checkpoint of drive-agent: it holds no {name}. A bare file of Stable-Baselines3 lacks the "
-            "environment and the normaliser: `drive-agent evaluate` reads it with --environment"
+            f"{path} is not a checkpoint of drive-agent: it holds no {name}. A bare file of Stable-Baselines3 lacks "
+            "the environment and the normaliser: `drive-agent evaluate` reads it with --environment"
         ) from None

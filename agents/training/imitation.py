@@ -36,7 +36,7 @@ def imitate(
     Args:
         model: With its environment, the normaliser included, which learns its statistics here.
         teacher: What acts on the environment's own observations: `act(observations)`, `reset(mask)`.
-        seed: Of the lanes and of the noise.
+        seed: Of the environments and of the noise.
         steps: Of all lanes together.
         updates: Of the network.
         told: Is told how much of it is done, 0...1.
@@ -98,7 +98,7 @@ def _play(
     steps: int,
     told: Callable[[float], None],
 ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return observations, the teacher's actions, rewards and ends, each of shape (steps, lanes, ...)."""
+    """Return observations, the teacher's actions, rewards and ends, each of shape (steps, environments, ...)."""
     seen = env.reset()
     teacher.reset(None)
     observations: list[Any] = []

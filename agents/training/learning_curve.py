@@ -45,7 +45,7 @@ def draw_learning_curve(table: Path, picture: Path, title: str) -> None:
     if terms:
         panels[-1].set_ylabel("terms of the reward, mean per step")
         panels[-1].legend(fontsize=8, ncols=2)
-    panels[-1].set_xlabel("steps of all lanes together")
+    panels[-1].set_xlabel("steps of all environments together")
     for panel in panels:
         panel.grid(color="0.9")
         panel.set_axisbelow(True)

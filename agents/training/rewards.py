@@ -12,9 +12,10 @@ ERROR, CURRENT, LAST_ACTION = 0, 4, 7
 
 
 class EachTrial(VecEnvWrapper):  # type: ignore[misc]
-    """A reward for GainTuning that each trial earns alone, whether it becomes the incumbent or not.
+    """A reward for GainTuning by each trial alone, whether it becomes the incumbent or not.
 
-    It is - ln of the trial's hidden J over the rule's. The environment's own reward is 0 for every trial that is not
+    It is - ln of the trial's robust cost over the rule's. The environment's own reward is 0 for every trial that is
+    not
     better than all before, and a few machines of which the rule was far too cautious earn most of it: the policy that
     it trained left half of the machines at the rule's gains. Meant for a discount of 0, since no trial is paid for what
     others reach.
@@ -27,21 +28,21 @@ class EachTrial(VecEnvWrapper):  # type: ignore[misc]
     def __init__(self, venv: Any, limit: float = 1.5) -> None:
         super().__init__(venv)
         self._limit = limit
-        self._rule = np.ones(self.num_envs)  # hidden J at its gains, of each lane's machine
+        self._rule = np.ones(self.num_envs)  # the robust cost at its gains, of each environment's machine
 
     def reset(self) -> Any:
-        """Begin an episode in every lane."""
+        """Begin an episode in every environment."""
         observation = self.venv.reset()
-        self._rule = self._told()["hidden"]
+        self._rule = self._told()["robust_cost"]
         return observation
 
     def step_wait(self) -> tuple[Any, Any, Any, Any]:
         """Return the step with this reward in place of the environment's."""
         observation, _, ended, infos = self.venv.step_wait()
         told = self._told()
-        trial = told.get("final_info", told)["trial_hidden"]
+        trial = told.get("final_info", told)["trial_robust_cost"]
         reward = np.clip(np.log(self._rule / trial), -self._limit, self._limit)
-        self._rule = np.where(ended, told["hidden"], self._rule)  # where an episode ended, another machine's
+        self._rule = np.where(ended, told["robust_cost"], self._rule)  # where an episode ended, another machine's
         return observation, reward.astype(np.float32), ended, infos
 
     def _told(self) -> Any:
@@ -66,13 +67,13 @@ class SmallErrors(VecEnvWrapper):  # type: ignore[misc]
         self._before = np.zeros((self.num_envs, 1))
 
     def reset(self) -> Any:
-        """Begin an episode in every lane."""
+        """Begin an episode in every environment."""
         observation = self.venv.reset()
         self._before = self._axes(observation)[:, :, LAST_ACTION]
         return observation
 
     def step_wait(self) -> tuple[Any, Any, Any, Any]:
-        """Return the step with this reward in place of the environment's, less 100 where a drive tripped."""
+        """Return the step with this reward in place of the environment's, less 100 where a drive went into fault."""
         observation, _, ended, infos = self.venv.step_wait()
         final = np.array(observation)
         tripped = np.zeros(self.num_envs)

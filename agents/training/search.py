@@ -1,4 +1,4 @@
-"""Search for hyper-parameters with Optuna: every trial trains an agent and scores it on machines that it has not seen.
+"""Search for hyper-parameters with Optuna: every trial trains an agent and scores it on machines not used for training.
 
 The study is a journal file: it can be gone on with after an interruption, and by several processes at once. Trials are
 drawn in rounds, each from what the rounds before have found, so that those of a round may run side by side: where they

@@ -1,4 +1,4 @@
-"""The environments that agents are trained in, and how lanes of them are made."""
+"""The environments that agents are trained in, and how they are made."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def environment_name(text: str) -> str:
 def make_lanes(
     environment: str, num_envs: int, configuration: Mapping[str, Any] | None = None, **options: Any
 ) -> Lanes:
-    """Return lanes of an environment.
+    """Return a vectorised environment.
 
     Args:
         environment: Its name.
-        num_envs: Lanes.
+        num_envs: Number of environments.
         configuration: The environment's own options.
         options: drives, sensor, autoreset_mode, render_mode, as the environment takes them.
 
@@ -67,7 +67,7 @@ def make_lanes(
 
 
 def configuration_of(lanes: Any) -> dict[str, Any]:
-    """Return the options of lanes as JSON has them, every one, defaults too."""
+    """Return all options of an environment for JSON, defaults too."""
     from dataclasses import asdict
 
     from agents.policies.agent_file import plain

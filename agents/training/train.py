@@ -1,9 +1,9 @@
 """Training with Stable-Baselines3: one seed gives the same agent on the same machine, and a run can be resumed.
 
-A run is cut into segments, at whose ends a checkpoint is written and every lane begins a new episode with seeds of the
-segment. So a resumed run equals an uninterrupted one to the last digit: what cannot be saved, the emulated machines in
-the middle of their episodes, is begun anew in both. Not equal are times, and a run with other numbers of threads of
-torch, which may add up in another order.
+A run is cut into segments, at whose ends a checkpoint is written and every environment begins a new episode with seeds
+of the segment. So a resumed run equals an uninterrupted one to the last digit: what cannot be saved, the emulated
+machines in the middle of their episodes, is begun anew in both. Not equal are times, and a run with other numbers of
+threads of torch, which may add up in another order.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ class TrainingRun:
         environment: Name of the environment.
         algorithm: A row of ALGORITHMS.
         hyperparameters: As agents.training.hyperparameters.load returns them.
-        seed: Of everything random.
+        seed: Of all random numbers.
         preset: Which preset the hyper-parameters came from, for the card.
-        segments: Checkpoints over the run, at whose ends lanes begin anew.
+        segments: Checkpoints over the run, at whose ends the environments begin anew.
         torch_threads: Threads of torch; small networks are fastest with 1.
     """
 
@@ -79,12 +79,12 @@ class TrainingRun:
 
     @property
     def total(self) -> int:
-        """Steps of all lanes together."""
+        """Steps of all environments together."""
         return int(self.hyperparameters["n_timesteps"])
 
 
 class Progress(NamedTuple):
-    """How far a training is: means of the last episodes and of each term per step; speed [steps/s]; time's shares.
+    """The progress of a training: means of the last episodes and of each term per step; speed [steps/s]; time's shares.
 
     `imitated` is the share of what comes before it, if the policy begins as a teacher: all else is 0 until that is 1.
     """
@@ -112,7 +112,7 @@ def train(
     Args:
         run: What is trained; with `resume` None of it is used but the folder's own.
         folder: Where results go.
-        report: Is told how far it is, some 200 times.
+        report: Called with the progress, some 200 times.
         resume: Go on from the folder's checkpoint.
         trust: Its writer is trusted; needed to resume, see `agents.training.checkpoint`.
 
@@ -160,7 +160,7 @@ def train(
                     raise
             if not is_sound(model):
                 raise DivergedError(
-                    f"the training diverged: after {model.num_timesteps} steps its networks give no numbers any more. "
+                    f"the training diverged: after {model.num_timesteps} steps its networks return NaN. "
                     "Use a smaller learning_rate or max_grad_norm; the checkpoint, if there is one, is from before"
                 )
             segments.finish()
@@ -190,7 +190,7 @@ def run_to_resume(folder: str | Path) -> TrainingRun:
     path = Path(folder) / CHECKPOINT
     if not path.is_file():
         raise checkpoint.CheckpointError(
-            f"there is no file {path} to go on with: a run writes its first one after a tenth of its steps"
+            f"there is no file {path} to continue from: a run writes its first one after a tenth of its steps"
         )
     return _run_of(checkpoint.read_run(path), path)
 
@@ -224,7 +224,7 @@ def _run_of(table: Mapping[str, Any], path: Path) -> TrainingRun:
     try:
         return TrainingRun(**table["run"])
     except TypeError as error:
-        raise checkpoint.CheckpointError(f"{path} is no checkpoint of this drive-agent: {error}") from None
+        raise checkpoint.CheckpointError(f"{path} is not a checkpoint of this drive-agent: {error}") from None
 
 
 def with_figures(bundle: AgentFile, figures: Mapping[str, Any], seeds: Mapping[str, Any]) -> AgentFile:
@@ -234,7 +234,7 @@ def with_figures(bundle: AgentFile, figures: Mapping[str, Any], seeds: Mapping[s
 
 
 def make_env(run: TrainingRun) -> tuple[CountedLanes, Any]:
-    """Return counted lanes, and the VecEnv of Stable-Baselines3 over them."""
+    """Return counted environments, and the VecEnv of Stable-Baselines3 over them."""
     need("stable_baselines3")
     from drive_env.envs.stable_baselines import LanesVecEnv
 
@@ -285,13 +285,13 @@ def is_sound(model: Any) -> bool:
 
 
 def segment_length(run: TrainingRun, lanes: CountedLanes) -> int:
-    """Return the steps of a segment: a share of the run, but some episodes of every lane, which else never ended."""
+    """Return the steps of a segment: a share of the run, but at least some episodes of every environment."""
     episode: int = ENVIRONMENTS[run.environment].steps(lanes.config) * lanes.num_envs
     return max(int(run.total // run.segments), EPISODES_PER_SEGMENT * episode)
 
 
 def segment_seed(seed: int, segment: int) -> int:
-    """Return the seed of lane 0 in a segment; the other lanes' follow by one."""
+    """Return the seed of environment 0 in a segment; the others' follow by one."""
     return int(np.random.SeedSequence([seed, segment]).generate_state(1)[0]) >> 1
 
 
@@ -308,7 +308,7 @@ def _imitate(run: TrainingRun, model: Any, lanes: CountedLanes, report: Report |
     from agents.training.imitation import imitate
 
     if run.algorithm != "ppo":
-        raise HyperparameterError(f"imitate is of ppo; leave it out with {run.algorithm}")
+        raise HyperparameterError(f"imitate is for ppo only; leave it out with {run.algorithm}")
     name, settings = _named(run.hyperparameters["imitate"])
     teacher = baseline(name, run.environment, lanes.config, int(model.action_space.shape[0]))
 
@@ -352,7 +352,7 @@ def found(name: str) -> Any:
     try:
         return getattr(importlib.import_module(module), kind)
     except (ImportError, AttributeError) as error:
-        raise HyperparameterError(f"{name!r} is no module:name that can be imported: {error}") from None
+        raise HyperparameterError(f"{name!r} is not a module:name that can be imported: {error}") from None
 
 
 def _policy(name: str) -> Any:
@@ -452,7 +452,7 @@ def _segments_class() -> Any:
             )
 
         def _begin_segment(self) -> None:
-            """Begin an episode in every lane, with the segment's seeds."""
+            """Begin an episode in every environment, with the segment's seeds."""
             model = self.model
             env = model.get_env()
             env.seed(segment_seed(self._run.seed, self._segment))

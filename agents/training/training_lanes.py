@@ -1,4 +1,4 @@
-"""Lanes while something trains on them: what episodes brought, reward terms, and the time that they took."""
+"""Environments during a training: returns of episodes, reward terms, and the time that they took."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ EPISODES = 100  # the last ones, of which means are told
 
 
 class CountedLanes:
-    """Lanes that count: they behave as those that they hold.
+    """A vectorised environment that counts; it behaves as the one it holds.
 
     Attributes:
         episodes: Ended since the beginning.
-        steps: Of all lanes.
-        seconds: Spent in the environment.
-        told: The info of the last reset or step, of all lanes: Stable-Baselines3 gets none of it.
+        steps: Of all environments. seconds: Spent in the environment.
+        told: The info of the last reset or step, of all environments: Stable-Baselines3 gets none of it.
     """
 
     def __init__(self, lanes: Lanes) -> None:
@@ -49,7 +48,7 @@ class CountedLanes:
         self.lanes.stage = stage
 
     def reset(self, **options: Any) -> Any:
-        """Begin an episode in every lane; those that were under way do not count."""
+        """Begin an episode in every environment; those that were under way do not count."""
         self._returns[:] = 0.0
         self._lengths[:] = 0
         start = time.perf_counter()
@@ -59,7 +58,7 @@ class CountedLanes:
         return found
 
     def step(self, actions: Any) -> Any:
-        """Act in every lane."""
+        """Act in every environment."""
         start = time.perf_counter()
         stepped = self.lanes.step(actions)
         self.seconds += time.perf_counter() - start

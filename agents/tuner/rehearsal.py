@@ -1,4 +1,4 @@
-"""What a tuning would do to drives of a bus, found out by reading alone: nothing is written, no state is changed.
+"""The checks before a tuning on a bus, by reading only: nothing is written, no state is changed.
 
 Everything that a run needs is looked at: who answers, whether the objects are there, how fast answers come, whether
 the samples fit into PDOs, who watches over the master, what the motor's row says against what the drive was set to.
@@ -35,7 +35,7 @@ SAMPLED, PLAYED = (
 
 
 class Check(NamedTuple):
-    """Something that was looked at: what, OK, NOTE or NO, and what was found, with the remedy where it is a NO."""
+    """A check: what was checked, OK, NOTE or NO, and the result, with the remedy where it is a NO."""
 
     what: str
     verdict: str
@@ -62,19 +62,19 @@ class Write(NamedTuple):
 
 
 class Rehearsal(NamedTuple):
-    """What there is to say before a run."""
+    """The checks, and the objects that a run would write."""
 
     checks: tuple[Check, ...]
     writes: tuple[Write, ...]
 
     @property
     def refused(self) -> list[Check]:
-        """What a run would not begin for."""
+        """Whether a run would not start."""
         return [check for check in self.checks if check.verdict == NO]
 
 
 def rehearse(target: Target, *, keep: bool = True) -> Rehearsal:
-    """Look at drives of a bus without writing, and return what was found and what a run would write.
+    """Check drives on a bus without writing, and return the checks and what a run would write.
 
     Args:
         target: The drives, as `tuning.target.on_bus` opens them.
@@ -132,7 +132,7 @@ def _state(target: Target, axis: int) -> Iterator[Check]:
     )
     text = f"{found} (statusword {status:04X}h)"
     if found == "operation enabled":
-        yield Check("state", NO, f"{text}: another master drives this axis; end that, or disable the axis")
+        yield Check("state", NO, f"{text}: another master controls this axis; stop it, or disable the axis")
     elif found == "fault":
         yield Check("state", NOTE, f"{text}, error register {_read(target, 0x1001, axis):02X}h: a run would reset it "
                                    "once; remove its cause first")  # fmt: skip
@@ -195,22 +195,34 @@ def _error_control(target: Target, axis: int) -> Iterator[Check]:
     drives, description = bus_of(target.drives), bus_of(target.drives).description
     silence = None if drives.safety is None else drives.safety.limits.silence
     if silence is None:
-        yield Check("heartbeat", NOTE, "no silence of this process would stop the drive")
+        yield Check("heartbeat", NOTE, "the drive would not stop if this process ended without stopping it")
     elif description.has((0x1016, 1)):
         value = _read(target, (0x1016, 1), axis)
         now = f"node {value >> 16 & 0x7F}, {value & 0xFFFF} ms" if value else "nobody"
-        yield Check("heartbeat", OK, f"the drive can watch over its master: 1016h, now {now}; in real time it would be "
-                                     f"{1e3 * silence:.0f} ms")  # fmt: skip
+        yield Check("heartbeat", OK, f"the drive can monitor its master by heartbeat: 1016h, now {now}; in real time "
+                                     f"it "
+                                     f"would be set to {1e3 * silence:.0f} ms")  # fmt: skip
     elif description.has((0x100C, 0)) and description.has((0x100D, 0)):
-        yield Check("heartbeat", OK, "the drive can guard its life: 100Ch and 100Dh would be set in real time")
+        yield Check(
+            "heartbeat",
+            OK,
+            "the drive can monitor its master by life guarding: 100Ch and 100Dh would be set in real time",
+        )
     else:
-        yield Check("heartbeat", NO, "the drive would not stop by itself if this process died: no 1016h, no 100Ch")
+        yield Check(
+            "heartbeat", NO, "the drive would not stop by itself if this process ended: it has neither 1016h nor 100Ch"
+        )
 
 
 def _motor(target: Target, axis: int) -> Iterator[Check]:
     motor, kind = target.motor, _read(target, Role.MOTOR_TYPE, axis)
     if kind == 0:
-        yield Check("motor", NO, "the drive knows no motor (2050h is 0): commission it for the one that turns first")
+        yield Check(
+            "motor",
+            NO,
+            "the drive is not commissioned for a motor (its motor type is 0): commission it first (drive-env "
+            "commission)",
+        )
         return
     rows = [("encoder counts", Role.ENCODER_STEPS, motor.encoder_counts)]
     if motor.kind != "dc":
@@ -224,7 +236,9 @@ def _motor(target: Target, axis: int) -> Iterator[Check]:
             index, sub = target.device.roles[key]
             wrong.append(f"{index:04X}h:{sub:02X} ({what}) is {has}, and {wanted} is needed for {motor.name}")
     if wrong:
-        yield Check("motor", NO, f"{'; '.join(wrong)}: give the --motor that turns, or set the drive up for it")
+        yield Check(
+            "motor", NO, f"{'; '.join(wrong)}: give the connected motor by --motor, or commission the drive for it"
+        )
     else:
         facts = ", ".join(f"{what} {wanted}" if wanted > BY_ENCODER else what for what, _, wanted in rows)
         yield Check("motor", OK, f"the drive is set up for {motor.name}: {facts}")
@@ -232,11 +246,11 @@ def _motor(target: Target, axis: int) -> Iterator[Check]:
 
 def _supply(target: Target, axis: int) -> Iterator[Check]:
     volts = float(target.supply[axis])
-    text = f"{volts:g} V entered; the drive does not show it: measure it, the gains scale with it"
+    text = f"{volts:g} V entered; the drive cannot measure it: measure it yourself, since the gains scale with it"
     if _read(target, Role.BRAKE_CHOPPER, axis) and _read(target, Role.BRAKE_CHOPPER_VOLTAGE, axis) * 0.1 <= volts:
         chopper = _read(target, Role.BRAKE_CHOPPER_VOLTAGE, axis) * 0.1
-        yield Check("supply", NO, f"{volts:g} V entered, and the brake chopper acts from {chopper:g} V (2006h:02) on: "
-                                  "it would burn; correct one of them")  # fmt: skip
+        yield Check("supply", NO, f"{volts:g} V entered, and the brake chopper acts from {chopper:g} V on: it would "
+                                  "overheat; correct one of them")  # fmt: skip
     else:
         yield Check("supply", OK, text)
 
@@ -259,7 +273,7 @@ def _travel(target: Target, axis: int) -> Iterator[Check]:
 def _envelope(target: Target, axis: int) -> Iterator[Check]:
     """Say what would stop the drives while a run acts on them."""
     if target.drives.safety is None:
-        yield Check("envelope", NO, "there is none: open the drives with safety")
+        yield Check("envelope", NO, "there is none: open the drives with a safety envelope")
         return
     limits = target.drives.safety.limits
     reasons = [] if limits.position is None else [f"a position beyond {limits.position[0]} to {limits.position[1]}"]
@@ -270,13 +284,13 @@ def _envelope(target: Target, axis: int) -> Iterator[Check]:
 
 def _limits(target: Target, axis: int) -> Iterator[Check]:
     amperes, (index, _) = _read(target, Role.CURRENT_LIMIT, axis) * 1e-3, target.device.roles[Role.CURRENT_LIMIT]
-    text = f"at most {target.speed:.4g} rad/s and {target.current:.3g} A are commanded while it is identified"
+    text = f"at most {target.speed:.4g} rad/s and {target.current:.3g} A are commanded during identification"
     if amperes <= 0.0:
         yield Check("limits", NO, f"{text}; the drive's limit {index:04X}h is 0 A: set it to the motor's peak current")
     else:
         yield Check("limits", OK, f"{text}; trials may take the drive's own limit, {index:04X}h, {amperes:.3g} A")
     window = _read(target, cia402.FOLLOWING_WINDOW, axis)
-    yield Check("following error", OK, f"window 6065h is {window} inc; it is widened while the axis is shaken")
+    yield Check("following error", OK, f"window 6065h is {window} inc; it is widened during the frequency response")
 
 
 def _gains(target: Target, axis: int) -> Iterator[Check]:
@@ -308,25 +322,25 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
     amperes = round(1e3 * target.current)
     for gain in target.device.gains.rows:
         yield gain.key, f"1...{gain.highest}", f"gain on trial, {gain.title}", True
-    yield (cia402.CONTROLWORD, 0), "0, 2, 6, 7, Fh, 1Fh, 80h", "enable, start moves, stop, clear a fault", False
-    yield (cia402.MODE, 0), "0, 1, 8, 9, 10", "pp for moves, csp, csv and cst for what identifies", False
+    yield (cia402.CONTROLWORD, 0), "0, 2, 6, 7, Fh, 1Fh, 80h", "enable, start moves, stop, reset a fault", False
+    yield (cia402.MODE, 0), "0, 1, 8, 9, 10", "pp for moves, csp, csv and cst for identification", False
     yield (cia402.TARGET_POSITION, 0), way, "moves", False
-    yield (cia402.TARGET_VELOCITY, 0), f"{-speed}...{speed}", "speed while it is shaken, in csv", False
-    yield (cia402.TARGET_TORQUE, 0), f"{-amperes}...{amperes}", "current pulses and the shaking, in cst", False
+    yield (cia402.TARGET_VELOCITY, 0), f"{-speed}...{speed}", "speed during the frequency response, in csv", False
+    yield (cia402.TARGET_TORQUE, 0), f"{-amperes}...{amperes}", "current pulses and excitation, in cst", False
     yield (cia402.PROFILE_VELOCITY, 0), f"1...{speed}", "speed of the moves", False
     for index in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         yield (index, 0), "above 0", "ramps of the moves and of a stop", False
-    yield Role.CURRENT_LIMIT, f"up to {amperes}", "current limit while it is identified", False
+    yield Role.CURRENT_LIMIT, f"up to {amperes}", "current limit during identification", False
     yield Role.OPEN_LOOP_CURRENT, f"0...{amperes}", "current of the encoder's check", False
     for role, wrong in FINDINGS.items():
-        yield role, "0, 1", f"where the check finds it wrong: {wrong}", True
+        yield role, "0, 1", f"if the check finds it wrong: {wrong}", True
     yield Role.COMMUTATION, "1, 3", "open loop for the encoder's check, then the encoder again", False
-    yield (cia402.FOLLOWING_WINDOW, 0), "up to 100 turns", "following error while it is shaken", False
+    yield (cia402.FOLLOWING_WINDOW, 0), "up to 100 turns", "following error during the frequency response", False
     for sub, value in ((1, "1"), (2, "-3")):
         yield (cia402.INTERPOLATION_PERIOD, sub), value, "interpolation period of csv and cst, 1 ms", False
     yield from _communication(target)
     if keep and bus_of(target.drives).description.has((0x1010, 1)):
-        yield (0x1010, 1), "65766173h", '"save": the gains outlive a power cycle', True
+        yield (0x1010, 1), "65766173h", '"save": the gains are stored', True
 
 
 def _communication(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
@@ -341,28 +355,28 @@ def _communication(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]
                     why = f"{name} {number + 1} off, mapped as above, on again, with SYNC"
                     yield (entry.index, entry.sub), "", why, False
     for number in slots(bus_of(target.drives).description, OUT_OF_DRIVE, 0).numbers[2:]:
-        yield (0x1800 + number, 1), "", f"TPDO {number + 1} silent meanwhile, if it goes with SYNC", False
+        yield (0x1800 + number, 1), "", f"TPDO {number + 1} off during the run, if it is sent with SYNC", False
     if np.isfinite(target.low).all() and np.isfinite(target.high).all():
         for sub, end in ((1, "lower"), (2, "upper")):
             if bus_of(target.drives).description.has((cia402.POSITION_LIMITS, sub)):
                 yield (
                     (cia402.POSITION_LIMITS, sub),
                     "the travel",
-                    f"{end} software limit, which the drive holds meanwhile",
+                    f"{end} software limit, set in the drive during the run",
                     False,
                 )
     if bus_of(target.drives).description.has(cia402.QUICK_STOP_OPTION):
         yield (
             (cia402.QUICK_STOP_OPTION, 0),
             "5, 6",
-            "an axis that is stopped is held at first, in case a weight pulls it",
+            "an axis that is stopped is held at first, in case of a hanging load",
             False,
         )
     if target.drives.time_waits and bus_of(target.drives).description.has(0x1017):
-        yield (0x1017, 0), "1", "for a hundredth of a second: proof that time waits for SYNC", False
+        yield (0x1017, 0), "1", "for a hundredth of a second: to check that time waits for SYNC", False
     in_real_time = (
-        ((0x1016, 1), "this process, 500 ms", "whom the drive watches, in real time"),
-        ((0x1029, 1), "0", "what it does when that one falls silent, where it was 1"),
+        ((0x1016, 1), "this process, 500 ms", "the node that the drive monitors, in real time"),
+        ((0x1029, 1), "0", "reaction to a missing heartbeat, where it was 1"),
     )
     for key, values, why in in_real_time:
         if bus_of(target.drives).description.has(key):

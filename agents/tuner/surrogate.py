@@ -1,9 +1,9 @@
-"""A tuner that has learnt what gains are worth: a network for hidden J that reads all trials of the machine so far.
+"""A learnt tuner: a network predicts the robust cost of gains from all trials of the machine so far.
 
 It acts in `ServoDrive/GainTuning-v0`. Of every machine it keeps the context c (what was identified, and what the trial
 at the rule's gains showed) and its trials (log gains over the rule's x_i, what they showed y_i). A conditional neural
-process with attention (Kim et al., "Attentive Neural Processes", 2019), trained on emulated machines whose hidden J is
-known, says of any gains x what ln of hidden J over the rule's is, as a Laplace law:
+process with attention (Kim et al., "Attentive Neural Processes", 2019), trained on emulated machines whose robust cost
+is known, predicts for any gains x the logarithm of the robust cost over the rule's, as a Laplace distribution:
 
     v_i, p_i, k_i = trial(c, x_i, y_i)                      value, share of the summary, keys
     u   = silu(mean of p_i)                                 what kind of machine this is
@@ -69,7 +69,7 @@ class Normaliser(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What a network makes of machines and their trials; heads come second.
+    """A network's memory of machines and their trials; heads come second.
 
     shared: What every candidate's first layer gets alike, (machines, hidden). query: The context's part of queries,
     (machines, heads * KEY). gains: (machines, trials, gains). keys: (machines, heads, trials, KEY). values: (machines,
@@ -142,7 +142,7 @@ class SurrogatePolicy:
             self._normal = Normaliser(*(np.asarray(bundle.arrays[name], np.float32) for name in NORMALISER))
             stacked = {name: np.asarray(bundle.arrays[name], np.float32) for name in WEIGHTS}
         except KeyError as error:
-            raise BundleError(f"the agent has no array {error}; it is no surrogate") from None
+            raise BundleError(f"the agent has no array {error}; it is not a surrogate") from None
         count = len(stacked["nearness"])
         self._networks = [EnsembleMember({name: array[k] for name, array in stacked.items()}) for k in range(count)]
         s = bundle.settings
@@ -157,7 +157,7 @@ class SurrogatePolicy:
         self._forget(0)
 
     def reset(self, mask: Mask | None = None) -> None:
-        """Forget the machines, all or those of a mask over the lanes."""
+        """Forget the machines, all or those of a mask over the environments."""
         if mask is None or not len(self._known):
             self._forget(0)
         else:
@@ -167,7 +167,7 @@ class SurrogatePolicy:
         """Return the change of the log gains to try, in the observation's shape.
 
         Raises:
-            PolicyError: If the observation is of another configuration, or holds what is no number.
+            PolicyError: If the observation is of another configuration, or holds NaN.
         """
         each, incumbent = self._take(observation)
         memory = self._read()
@@ -179,9 +179,9 @@ class SurrogatePolicy:
         return self._leave(chosen - incumbent, observation)
 
     def answer(self, observation: ArrayLike) -> Array:
-        """Return the change of the log gains to stay with: it leads to a trial's gains, or to the rule's.
+        """Return the change of the log gains to the final choice: a trial's gains, or the rule's.
 
-        All axes of a lane stay with the same trial: that whose worst axis is best, of those that were not stopped. It
+        All axes of an environment get the same trial: that whose worst axis is best, of those that were not stopped. It
         is asked instead of `act`, with the observation after the last trial, and raises what that does.
         """
         _, incumbent = self._take(observation)
@@ -201,7 +201,7 @@ class SurrogatePolicy:
         self._known = np.zeros((count, 0), bool)
 
     def _take(self, observation: ArrayLike) -> tuple[Array, Array]:
-        """Take note of the trial that was last; return the axes' observations and their incumbents' gains."""
+        """Record the last trial; return the axes' observations and their incumbents' gains."""
         given = np.asarray(observation, np.float32)
         lanes = np.atleast_2d(given)
         axes, rest = divmod(lanes.shape[1] - 1, self._entries)
@@ -211,7 +211,7 @@ class SurrogatePolicy:
                 f"environment with the agent's configuration: {dict(self.bundle.configuration)}"
             )
         if not np.isfinite(lanes).all():
-            raise PolicyError("the observation holds what is no number: the policy was not asked")
+            raise PolicyError("the observation holds NaN: the policy was not called")
         each = lanes[:, :-1].reshape(-1, self._entries)
         if len(self._known) != len(each):
             self._forget(len(each))
@@ -235,7 +235,7 @@ class SurrogatePolicy:
         return [network.read(*seen, self._known) for network in self._networks]
 
     def _ask(self, memory: list[Memory], gains: Array) -> tuple[Array, Array]:
-        """Return median and scale for gains of shape (machines, n, gains): the networks' doubt adds to the scale."""
+        """Return median and scale for gains of shape (machines, n, gains), with the networks' spread in the scale."""
         normal = self._normal.gains(gains)
         told = [network.ask(one, normal) for network, one in zip(self._networks, memory, strict=True)]
         medians, scales = np.stack([one[0] for one in told]), np.exp([one[1] for one in told])

@@ -1,4 +1,4 @@
-"""A trained tuner at work on a target: the environment's trials on given drives, and a policy that chooses them."""
+"""A trained tuner on a target: the environment's trials on given drives, chosen by a policy."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PATIENCE = 2  # windows of 25 ms for which an axis may shake; what it does with 
 class TrialShown(NamedTuple):
     """A trial of every machine of a target.
 
-    number: 0 is the fitted rule's gains.
+    number: 0 is the baseline rule's gains.
     gains: Raw integers, (num_axes, count) in the order of the device's gain set.
     measured: J by measured terms of the machine's worst axis, (num_machines,).
     aborted, better: Whether it was stopped; whether it became the incumbent, (num_machines,).
@@ -45,10 +45,10 @@ class TrialShown(NamedTuple):
 
 
 class Tuned(NamedTuple):
-    """What came of it: the answer's gains, raw (num_axes, count), all trials, and each machine's answer among them.
+    """The result: the answer's gains, raw (num_axes, count), all trials, and each machine's answer among them.
 
     The answer is the policy's own choice (`answer`) where it makes one that was not stopped, else the best trial by
-    measured terms that was not; of a machine all of whose trials were stopped it is the first one, the fitted rule's.
+    measured terms that was not; of a machine all of whose trials were stopped it is the first one, the baseline rule's.
     overruled: Machines whose policy would have stayed with gains that were stopped.
     """
 
@@ -73,7 +73,7 @@ def tune_target(
     trials: int | None = None,
     calm: Integers | None = None,
 ) -> Tuned:
-    """Let a policy for GainTuning tune a target; the drives have the answer's gains and are disabled afterwards.
+    """Tune a target with a policy for GainTuning; the drives have the answer's gains and are disabled afterwards.
 
     Args:
         target: The drives; they may have any gains, also none.
@@ -143,7 +143,7 @@ def tune_target(
                 show(shown[-1])
                 if terminated.all():
                     names = ", ".join(shown[-1].faults[0]) or "it stays disabled"
-                    raise RuntimeError(f"the drive cannot be cleared after trial {number}: {names}")
+                    raise RuntimeError(f"the drive's fault cannot be reset after trial {number}: {names}")
             answer = watched.answer(observation)
             wanted = None if answer is None else _flat(env.gains_of(answer))
             answers = np.array([_answer(shown, machine, axes, wanted) for machine in range(env.num_envs)])
@@ -161,7 +161,7 @@ def tune_target(
 def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ...]:
     """Return the names that a device has for the gains which an agent changes.
 
-    An agent sees and changes gains over those of the fitted rule, so that neither names nor scales matter to it, but
+    An agent sees and changes gains over those of the baseline rule, so that neither names nor scales matter to it, but
     the part that each plays in the cascade does.
 
     Raises:
@@ -178,7 +178,7 @@ def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ..
     missing = [f"no {gain.part} of the {gain.loop} loop" for gain, k in zip(parts, columns, strict=True) if k is None]
     if missing:
         raise ValueError(
-            f"{device.name} has {', '.join(missing)} among its gains, which the agent changes; train an agent on it "
+            f"{device.name} has {', '.join(missing)} among its gains, which the agent changes; train an agent for it "
             "(drive-agent train gain-tuning), or use drive-tune optimise"
         )
     per_chip(device)  # without a cascade there is no rule to begin with
@@ -207,7 +207,7 @@ NOT_OF_DRIVES = ("distributions", "privileged", "stage", "load", "motor", "devic
 
 
 def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
-    """Tune a target with the agent that ships, as `drive-tune rank` wants it (entry point `drive_env.tuners`)."""
+    """Tune a target with the agent that ships, as a tuner of `drive-tune rank` (entry point `drive_env.tuners`)."""
     from tuning.outcome import Outcome
     from tuning.target import timed
 
@@ -227,7 +227,7 @@ def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
 
 
 def _limits_of(drives: Drives) -> GuardLimits:
-    """Return what a policy may do: it may stay at an end of its range, and think while an axis holds its position."""
+    """Return a policy's limits: it may stay at an end of its range, and compute for long at standstill."""
     from agents.policies.guard import PATIENT, GuardLimits
 
     envelope = drives.safety

@@ -1,4 +1,4 @@
-"""A whole run of a trained tuner on a drive: auto's, with the agent's trials in place of its search."""
+"""A run of a trained tuner on a drive: that of auto, with the agent's trials instead of its search."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Integers = NDArray[np.int64]
 
 
 class TunerRun(NamedTuple):
-    """What became of a target: the result, its certificate, and the agent's trials."""
+    """The result of a run, its certificate, and the agent's trials."""
 
     result: Result
     certificate: Certificate
@@ -87,7 +87,7 @@ def run(
 
 
 def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
-    """Have the policy make its trials; leave its answer, what was second best, and where moves go on from."""
+    """Make the policy's trials; keep its answer, the second best gains, and where moves start."""
     from dataclasses import replace
 
     from drive_env.safety.envelope import SafetyError, swinging_allowed
@@ -96,7 +96,7 @@ def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
 
     target, going = run.target, run.going
     if not going.all():
-        run.stop(going, "another axis was refused, and an agent tunes all of them or none")
+        run.stop(going, "another axis was rejected, and an agent tunes all of them or none")
         return
     low, high = run.room()
     try:
@@ -118,7 +118,7 @@ def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
         own = slice(machine * lanes, (machine + 1) * lanes)
         answer = tuned.trials[int(tuned.answers[machine])]
         if answer.aborted[machine]:
-            run.stop(np.arange(target.num_axes) // lanes == machine, "every trial was stopped, the fitted rule's too")
+            run.stop(np.arange(target.num_axes) // lanes == machine, "every trial was stopped, the baseline rule's too")
             continue
         others = [trial for trial in tuned.trials if not np.array_equal(trial.gains[own], tuned.gains[own])]
         second = best_unstopped(others, machine)
@@ -127,4 +127,6 @@ def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
         for axis in run.axes[own]:
             axis.proof, axis.verified = float(answer.measured[machine]), BY_TRIAL
             if tuned.overruled[machine]:
-                axis.notes.append("the agent's own answer was stopped when it was tried: the best trial that was not")
+                axis.notes.append(
+                    "the agent's own choice was stopped in its trial; the best trial that was not stopped is kept"
+                )

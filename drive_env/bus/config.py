@@ -17,7 +17,7 @@ FACTORY = "none"  # as a motor: the drive is not commissioned
 
 
 class BusConfigError(ValueError):
-    """A bus that cannot be: one line with key, value, limit and remedy."""
+    """The bus is impossible; the message has key, value, limit and remedy."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def load_bus(path: Path) -> Bus:
     except OSError as error:
         raise BusConfigError(f"cannot read the bus {path}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BusConfigError(f"{path} is no TOML file: {error}") from None
+        raise BusConfigError(f"{path} is not a TOML file: {error}") from None
     values = _values(str(path), data, Bus)
     if not values.get("machines"):
         raise BusConfigError(f"{path}: there are no machines; add a table [[machines]] as in examples/bus.toml")
@@ -106,7 +106,7 @@ def _folder(path: Path) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise BusConfigError(f"the store {path} cannot be: {error.strerror}; choose another folder") from None
+        raise BusConfigError(f"the store {path} cannot be made: {error.strerror}; choose another folder") from None
     return path
 
 

@@ -131,7 +131,7 @@ class Hub:
             self._listener.bind((host, port))
             self.host, self.port = self._listener.getsockname()[:2]
             if self.is_public and token is None:
-                raise ValueError(f"{host} is no loopback address: it lets the network in, which needs a token")
+                raise ValueError(f"{host} is not a loopback address: it is open to the network, which needs a token")
             if self._too_high(self._listener):
                 raise OSError(errno.EMFILE, "this program has too many files open")
             self._listener.listen(MAX_CLIENTS)
@@ -238,7 +238,7 @@ class Hub:
             connection.close()
             return
         client = _Client(connection, address, Channel(self._bit_rate, self._token), now)
-        logger.info("client %s has come", client.name)
+        logger.info("client %s connected", client.name)
         if self._token is None:
             self._admit(client, now)
             return
@@ -314,7 +314,7 @@ class Hub:
             if client.dropped or not (client.frames or wire.waiting(client)):
                 self._clients.remove(client)
                 wire.forget(client)
-                logger.info("client %s has gone", client.name)
+                logger.info("client %s disconnected", client.name)
 
     @staticmethod
     def _too_high(one: socket.socket) -> bool:

@@ -97,8 +97,9 @@ class World:
         needed = drives.num_axes // per_node
         if len(node_ids) != needed:
             raise ValueError(
-                f"{drives.num_machines} machine(s) with load {drives.load.name!r} and {drives.device.name} have "
-                f"{needed} node(s); {len(node_ids)} node identifier(s) were given"
+                f"{drives.num_axes} axes ({drives.num_machines} x load {drives.load.name!r}) take "
+                f"{drives.num_axes / per_node:g} nodes of {drives.device.name}, which drives {per_node} axes; "
+                f"{len(node_ids)} node identifiers were given"
             )
         nodes: list[Node] = []
         for k, node_id in enumerate(node_ids):

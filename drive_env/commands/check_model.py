@@ -1,4 +1,4 @@
-"""`drive-env check-model`: a recorded move against emulated machines, and the machines that would respond like it."""
+"""`drive-env check-model`: compare a recorded move with emulated machines, and fit machines to it."""
 
 from __future__ import annotations
 
@@ -21,38 +21,41 @@ LEAST = 16  # machines that a fit needs
 def check_model(
     log: Annotated[Path, typer.Argument(help="Log of a move from rest, as `scope` writes it (CSV).")],
     device: DeviceName = "tmcm1636",
-    motor: Annotated[str, typer.Option(help="Motor by name.")] = "qbl4208",
-    load: Annotated[str, typer.Option(help="Load: a name, or the path of an MJCF.")] = "two_mass",
+    motor: Annotated[str, typer.Option(help="Motor: a name of the catalogue, or the path of a TOML file.")] = "qbl4208",
+    load: Annotated[str, typer.Option(help="Load: a name, or the path of an MJCF file.")] = "two_mass",
     settings: Annotated[
-        Path | None, typer.Option(help="Parameters of the real drive, as `backup` writes them (TOML); give them.")
+        Path | None, typer.Option(help="Parameters of the real drive, as `backup` writes them (TOML).")
     ] = None,
     fit: Annotated[
         list[str] | None,
         typer.Option(
             "--fit",
             "-f",
-            help="Parameter to fit to the log: load.inertia, motor.coulomb, ...; may be repeated. '?' lists "
-            "those that the load has.",
+            help="Parameter to fit to the log: load.inertia, motor.coulomb, ...; may be repeated. '?' lists the "
+            "load's parameters.",
         ),
     ] = None,
     distributions: Annotated[
         str | None,
-        typer.Option(help="Set of laws (a name, or a TOML file) in which to look for it.", show_default="the load's"),
+        typer.Option(
+            help="Set of distributions (a name, or a TOML file) from which machines are drawn for the fit.",
+            show_default="the load's",
+        ),
     ] = None,
-    machines: Annotated[int, typer.Option(help=f"Machines tried at a time in a fit, {LEAST} or more.")] = 64,
+    machines: Annotated[int, typer.Option(help=f"Number of machines in a round of a fit, {LEAST} or more.")] = 64,
     rounds: Annotated[int, typer.Option(help="Rounds of a fit.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of a fit, and of the machines' noise.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="New file for the fitted set of laws (TOML).")] = None,
+    out: Annotated[Path | None, typer.Option(help="New file for the fitted set of distributions (TOML).")] = None,
     json: Json = False,
 ) -> None:
-    """Repeat a recorded move on the emulated machine and tell how far its response lies from the log.
+    """Repeat a recorded move on the emulated machine and print the deviation of its response from the log.
 
-    With --fit the parameters are drawn from their laws until machines respond like the log; --out writes their range as
-    a set of laws that environments take.
+    With --fit the parameters are drawn from their distributions until machines respond like the log; --out writes their
+    range as a set of distributions for environments.
     """
     with errors_as_exit_codes():
         if out is not None and not fit:
-            raise ValueError("--out is for the fitted laws; name what to fit with --fit")
+            raise ValueError("--out is for the fitted distributions; name the parameters to fit with --fit")
         if fit and machines < LEAST:
             raise ValueError(f"--machines {machines} is too few for a fit; give {LEAST} or more")
         if rounds < 1:
@@ -100,20 +103,20 @@ def _print(
         late = float(row.shift[0]) * 1e3
         how = "in time" if abs(late) < 0.05 else f"{abs(late):.1f} ms {'late' if late > 0.0 else 'early'}"
         print(
-            f"{dictionary.find(key).label}: off by {100.0 * row.nrmse[0]:.2f} % of its range (RMS); {how}, "
-            f"{100.0 * row.shifted[0]:.2f} % without that"
+            f"{dictionary.find(key).label}: deviation {100.0 * row.nrmse[0]:.2f} % of its range (RMS); {how}, "
+            f"{100.0 * row.shifted[0]:.2f} % with the shift removed"
         )
     if found is None:
         return
     print(
-        f"fitted: {100.0 * found.distance[0]:.2f} % on average with the best machine, "
-        f"{100.0 * found.nominal:.2f} % with the nominal one; {len(found.distance)} machines respond alike"
+        f"fitted: {100.0 * found.distance[0]:.2f} % on average with the best machine, {100.0 * found.nominal:.2f} % "
+        f"with the nominal one; {len(found.distance)} machines respond alike"
     )
     for name, values in found.accepted.items():
-        unseen = "" if found.is_seen(name) else ": the log does not show it"
+        unseen = "" if found.is_seen(name) else ": the log does not determine it"
         print(f"{name}: best {values[0]:.4g}, {values.min():.4g} to {values.max():.4g}{unseen}")
     if out is not None:
-        print(f"laws written to {out}")
+        print(f"distributions written to {out}")
 
 
 def _as_json(

@@ -54,11 +54,11 @@ for panel, commands in PANELS.items():
 
 @app.callback()
 def drive_env(version: Version = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
-    """Servo drives: real ones and emulated ones, over CAN.
+    """Servo drives on CAN, real and emulated.
 
-    Interface, channel and time-out may stand in DRIVE_ENV_INTERFACE, DRIVE_ENV_CHANNEL and DRIVE_ENV_TIMEOUT, the token
-    of a hub that asks for one in DRIVE_ENV_TOKEN. Exit codes: 0 done, 1 the drive or the bus said no (or differs), 2 a
-    mistake in the command, 130 Ctrl-C, 141 nobody takes the output any more.
+    Interface, channel and time-out may be set by DRIVE_ENV_INTERFACE, DRIVE_ENV_CHANNEL and DRIVE_ENV_TIMEOUT, and the
+    token of a hub that needs one by DRIVE_ENV_TOKEN. Exit codes: 0 done, 1 error of the drive or the bus (or a
+    difference), 2 a mistake in the command, 130 Ctrl-C, 141 the output was closed.
     """
     say_as_much(quiet, verbose)
 

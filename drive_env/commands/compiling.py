@@ -1,4 +1,4 @@
-"""`drive-env compile`: compile the kernels ahead, for a computer on which the first result is not to wait for that."""
+"""`drive-env compile`: compile the kernels in advance, so that the first run does not wait for it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from drive_env.commands.progress import progress_on
 
 
 def compile_kernels(json: Json = False) -> None:
-    """Compile the kernels and keep them, so that no program waits half a minute for its first result.
+    """Compile the kernels and store them, so that no program waits half a minute for its first result.
 
     Once is enough for an installation: kernels are kept in the user's cache, or in DRIVE_ENV_CACHE, under a hash of
-    the sources that they are made from. Workers of a cluster, and a container's image, want it done ahead.
+    the sources that they are made from. Do it in advance for workers of a cluster, and in a container's image.
     """
     from rich.console import Console
 
@@ -30,13 +30,13 @@ def compile_kernels(json: Json = False) -> None:
                 progress.advance(task)
         after = set(folder.rglob("*.kernel"))
         if not after:
-            raise OSError(f"no kernel could be kept in {folder}; name a folder that can be written in DRIVE_ENV_CACHE")
+            raise OSError(f"no kernel could be stored in {folder}; set DRIVE_ENV_CACHE to a writable folder")
         compiled = len(after - before)
         seconds = time.monotonic() - began
     if json:
         print_json({"compiled": compiled, "seconds": round(seconds, 1), "folder": str(folder)})
     elif compiled:
-        print(f"compiled {compiled} kernels in {seconds:.0f} s; they are kept in {folder}")
+        print(f"compiled {compiled} kernels in {seconds:.0f} s; they are stored in {folder}")
     else:
         print(f"nothing to compile: the kernels of these sources are in {folder}")
 
@@ -52,7 +52,7 @@ def _use_drives() -> None:
 
 
 def _use_environments() -> None:
-    """Take a step in lanes whose bus is late."""
+    """Take a step in environments whose bus has delays."""
     import gymnasium
     import numpy as np
 

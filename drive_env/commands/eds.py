@@ -1,4 +1,4 @@
-"""`drive-env eds`: the electronic data sheet of an emulated device, for masters of other makers."""
+"""`drive-env eds`: the electronic data sheet of an emulated device, for other CANopen masters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`drive-env fault`: let something fail on a bus that `drive-env serve` serves."""
+"""`drive-env fault`: inject a fault on a bus that `drive-env serve` serves."""
 
 from __future__ import annotations
 
@@ -17,32 +17,31 @@ CONTROL_PORT = 29637  # of faults/control.py, whose import takes long
 
 
 def fault(
-    name: Annotated[str | None, typer.Argument(help="Fault by name; --list tells which there are.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Fault by name; --list lists them.")] = None,
     numbers: Annotated[
-        list[str] | None, typer.Argument(metavar="[PARAMETER=VALUE]...", help="Numbers of the fault, as share=0.2.")
+        list[str] | None,
+        typer.Argument(metavar="[PARAMETER=VALUE]...", help="Parameters of the fault, e.g. share=0.2."),
     ] = None,
     at: Annotated[float, typer.Option(help="Time from now, or from when the condition holds [s].")] = 0.0,
     when: Annotated[
-        str, typer.Option(help="Condition: enabled, or as 'speed > 100' [rad/s], 'position < -3' [rad] of the rotor.")
+        str, typer.Option(help="Condition: enabled, 'speed > 100' [rad/s] or 'position < -3' [rad] of the rotor.")
     ] = "",
     duration: Annotated[
         float | None, typer.Option(help="How long it lasts [s].", show_default="until it is cleared")
     ] = None,
     node: Annotated[
-        int | None, typer.Option("--node", "-n", help="Node that it is of.", show_default="the only one")
+        int | None, typer.Option("--node", "-n", help="Node that has the fault.", show_default="the only one")
     ] = None,
     control: Annotated[int, typer.Option(help="Port of serve's --control.")] = CONTROL_PORT,
-    table: Annotated[bool, typer.Option("--list", help="Print the table of faults, and end.")] = False,
-    status: Annotated[
-        bool, typer.Option("--status", help="Print the faults that are still to come or are there.")
-    ] = False,
+    table: Annotated[bool, typer.Option("--list", help="Print the table of faults, and stop.")] = False,
+    status: Annotated[bool, typer.Option("--status", help="Print the faults that are active or scheduled.")] = False,
     clear: Annotated[str | None, typer.Option(help="End the fault of this number, or all.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Let something fail on emulated drives: sensor, motor, supply, load, bus or node.
+    """Inject a fault on emulated drives: sensor, motor, supply, load, bus or node.
 
     They are served with --control; `drive-env fault encoder_stuck --at 2 --duration 0.1` prints the fault's number.
-    What each does, what the drive and its master make of it, and the way back are in docs/faults.md.
+    docs/faults.md has the effect of each fault, the reaction of drive and master, and how to recover.
     """
     from drive_env.faults.control import ControlError, ask
     from drive_env.faults.schedule import parse_order
@@ -50,7 +49,7 @@ def fault(
 
     with ending_by(fail, refused=(ControlError,)):
         if sum((name is not None, table, status, clear is not None)) != 1:
-            raise ValueError("say one of a fault's name, --list, --status and --clear NUMBER")
+            raise ValueError("give one of a fault's name, --list, --status and --clear NUMBER")
         if table:
             _print_table(as_json)
         elif status:
@@ -101,6 +100,6 @@ def _print_status(faults: list[dict[str, Any]], as_json: bool) -> None:
     for one in faults:
         where = "" if one["node"] is None else f" node {one['node']}"
         given = "".join(f" {key}={value:g}" for key, value in one["parameters"].items())
-        lasts = "for ever" if one["duration"] is None else f"for {one['duration']:g} s"
-        state = "is there" if one["active"] else "is to come"
+        lasts = "permanent" if one["duration"] is None else f"for {one['duration']:g} s"
+        state = "active" if one["active"] else "scheduled"
         print_lines([f"{one['number']}: {one['name']}{where}{given}, {lasts}, {state}"])

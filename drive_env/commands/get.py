@@ -84,10 +84,10 @@ def set_object(
     json: Json = False,
     dry_run: WouldDo = False,
 ) -> None:
-    """Write an object over SDO, read it back and show what it is now.
+    """Write an object over SDO, read it back and show its value.
 
-    Put -- before a negative value: drive-env set 60FF -- -1000. Where an axis is live it asks first. A controlword that
-    enables is refused, since nobody would watch the motor; one that stops (0, 2, 6, 7) always goes through.
+    Put -- before a negative value: drive-env set 60FF -- -1000. If an axis is enabled it asks first. A controlword that
+    enables is refused, since nothing would monitor the motor; one that stops (0, 2, 6, 7) is always sent.
     """
     from drive_env.master import quantities
     from drive_env.master.parameters import command
@@ -128,7 +128,7 @@ def set_object(
         differs = readable and any(a != b for a, b in zip(found, wanted, strict=True))
         # Stores and the like take a signature and read something else.
         if differs and not command(entry.index, drives.description.hints).endswith("a service"):
-            fail(f"{entry.label} does not read back as it was written ({wanted[0]})", REFUSED)
+            fail(f"{entry.label} was written, but reads back another value than {wanted[0]}", REFUSED)
 
 
 def _tell_plan(
@@ -153,15 +153,15 @@ def _tell_plan(
     for axis, scale in enumerate(increments):
         now = "" if found[axis] is None else f" is {_text(found[axis], entry, scale, raw)};"
         then = _text(wanted[axis], entry, scale, raw) if is_number else text
-        print(f"{axis_name(drives, axis)}  {entry.label}{now} {then} would be written; nothing was")
+        print(f"{axis_name(drives, axis)}  {entry.label}{now} {then} would be written (dry run: nothing was written)")
 
 
 def _refuse_to_enable(entry: Any, controlword: int) -> None:
     """Raise ValueError for a controlword that would enable: this command ends, and nothing watches then."""
     if cia402.may_enable(controlword):
         raise ValueError(
-            f"{entry.label} = {controlword} would enable the axis, and this command ends right after: nobody would "
-            "watch the motor. Turn it with `drive-env jog`, or from Python with CanDrives; to stop it, set 2 or 0"
+            f"{entry.label} = {controlword} would enable the axis, and nothing would monitor the motor after this "
+            "command ends. Turn it with `drive-env jog`, or from Python with CanDrives; to stop it, set 2 or 0"
         )
 
 
@@ -171,7 +171,7 @@ def _ask_where_live(drives: BusDrives, what: str, yes: bool) -> None:
     live = [f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if cia402.is_live(word)]
     if live:
         who = ", ".join(live)
-        ask(f"{who} is live by its statusword, and obeys at once (to stop it, set 6040 to 2). Write {what}?", yes)
+        ask(f"{who} is enabled by its statusword, and reacts at once (to stop it, set 6040 to 2). Write {what}?", yes)
 
 
 def _row(entry: Any, value: Any, increments: float | None) -> dict[str, Any]:

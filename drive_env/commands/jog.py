@@ -1,4 +1,4 @@
-"""`drive-env jog`: turn an axis, by hand so to speak."""
+"""`drive-env jog`: turn an axis at a speed, for a time or by a distance."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ LEAST, ENOUGH = 0.01, 0.9  # of the way asked for: less is no movement, and less
 
 def jog(
     speed: Annotated[str, typer.Argument(help="Speed: '100 rpm', '1 rev/s', or an integer of the drive's unit.")],
-    duration: Annotated[float, typer.Option("--for", help="How long, without --by [s].")] = 1.0,
-    by: Annotated[str | None, typer.Option(help="How far: '1 rev', '-90 deg', or increments; then it stops.")] = None,
+    duration: Annotated[float, typer.Option("--for", help="Duration, without --by [s].")] = 1.0,
+    by: Annotated[str | None, typer.Option(help="Distance: '1 rev', '-90 deg', or increments.")] = None,
     interface: Interface = None,
     channel: Channel = None,
     node: Node = 1,
@@ -55,7 +55,7 @@ def jog(
     bitrate: Bitrate = None,
     timeout: Timeout = None,
     max_current: Annotated[
-        str | None, typer.Option(help="Limit of the current, which the drive holds; by default the drive's own.")
+        str | None, typer.Option(help="Current limit, set in the drive for the movement; by default the drive's own.")
     ] = None,
     out: Annotated[
         Path | None,
@@ -66,8 +66,9 @@ def jog(
 ) -> None:
     """Enable an axis, turn it for a while or by a distance, and switch it off again.
 
-    The safety envelope is on: Ctrl-C, a passed limit and a dead process all end in a quick stop. A negative speed
-    turns back: drive-env jog -- '-100 rpm'. Ends with 1 where something stopped it, or nothing moved.
+    The safety envelope is on: Ctrl-C, an exceeded limit and the end of this process all cause a quick stop. A negative
+        speed turns the other way: drive-env jog -- '-100 rpm'. Exit code 1 if the movement was stopped, or the axis did
+            not move.
     """
     with errors_as_exit_codes():
         from drive_env import motion
@@ -90,7 +91,7 @@ def jog(
             scale = increments_per_revolution(drives)[0]
             velocity = quantities.parse(speed, known.find(cia402.TARGET_VELOCITY), scale)
             if velocity == 0:
-                raise ValueError("a speed of 0 turns nothing; give one, e.g. '60 rpm'")
+                raise ValueError("a speed of 0 does not move the axis; give one, e.g. '60 rpm'")
             distance = None if by is None else quantities.parse(by, known.find(cia402.TARGET_POSITION), scale)
             # Told before the axis is enabled.
             check_limits(known.find(cia402.TARGET_VELOCITY), velocity)
@@ -154,17 +155,20 @@ def _what_stops(reasons: list[str]) -> Iterator[None]:
 
 
 def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dict[str, Any]]) -> str:
-    """Return why a movement was not what was asked for; "" where it was."""
+    """Return why a movement failed; "" if it did not."""
     share = moved / asked
     told = [_told(message) for message in emergencies if message["code"]]
     if told and (reasons or share < ENOUGH):
-        return f"it was stopped: emergency {', '.join(dict.fromkeys(told))}{''.join(f'; {one}' for one in reasons)}"
+        return (
+            "the movement was stopped: emergency "
+            f"{', '.join(dict.fromkeys(told))}{''.join(f'; {one}' for one in reasons)}"
+        )
     if reasons:
         return "; ".join(reasons)
     if share < LEAST:
         return (
-            "it hardly moved, and the drive names no reason: look for a brake, a load that is stuck, a limit of "
-            "current (--max-current, 2003h) or a small profile acceleration (6083h)"
+            "the axis hardly moved, and the drive reports no cause: check for a closed brake, a blocked load, a low "
+            "current limit (--max-current) or a small profile acceleration (6083h)"
         )
     return ""
 
@@ -196,8 +200,8 @@ def _tell_plan(
         return
     here = quantities.show(start, drives.description.dictionary.find(cia402.POSITION_ACTUAL), scale)
     print(
-        f"node {drives.nodes[0]} is at {here} ({status:04X}h) and would be enabled, {what}, and be switched off again; "
-        "nothing was done"
+        f"node {drives.nodes[0]} is at {here} ({status:04X}h) and would be enabled, {what}, and be switched off again "
+        "(dry run: nothing was done)"
     )
 
 
@@ -253,9 +257,9 @@ def _arrive(motion: Any, drives: BusDrives, velocity: int, timeout: float) -> No
             here = int(drives.read(cia402.POSITION_ACTUAL)[0])
             is_still = abs(here - before) < STANDS * velocity * LOOK
             if is_still and int(drives.read(cia402.STATUSWORD)[0]) & INTERNAL_LIMIT:
-                raise RuntimeError("it stands at a limit switch, or at a limit of position") from None
+                raise RuntimeError("it is at a limit switch, or at a position limit") from None
             if waited >= timeout:
-                raise TimeoutError(f"it was not where it should be after {waited:.1f} s") from None
+                raise TimeoutError(f"it did not reach its target within {waited:.1f} s") from None
             before = here
         else:
             return

@@ -47,10 +47,12 @@ def log(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
-    duration: Annotated[float | None, typer.Option(help="End after this time [s]; else by Ctrl-C.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Stop after this time [s]; otherwise stop with Ctrl-C.")
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Write every frame of the bus to a file; nothing is sent. Where the bus is lost, what came until then is kept."""
+    """Write every frame of the bus to a file; nothing is sent. If the bus is lost, the frames so far are kept."""
     with errors_as_exit_codes():
         import can
         from can.util import channel2int
@@ -92,7 +94,7 @@ def log(
         if lost is not None:
             if json:
                 print_json({"frames": count, "file": str(file), "lost": str(lost)})
-            fail(f"the bus was lost: {lost}; the {count} frames that came until then are in {file}", REFUSED)
+            fail(f"the bus was lost: {lost}; the {count} frames received before are in {file}", REFUSED)
         _say(f"{count} frames written to {file}", {"frames": count, "file": str(file)}, json)
 
 
@@ -101,19 +103,20 @@ def replay(
     interface: Interface = None,
     channel: Channel = None,
     bitrate: Bitrate = None,
-    speed: Annotated[float, typer.Option(help="How many times as fast as it was recorded.")] = 1.0,
+    speed: Annotated[float, typer.Option(help="Speed factor; 1 is as recorded.")] = 1.0,
     everything: Annotated[
-        bool, typer.Option("--all", help="Send the drives' frames, too; only onto a bus without these drives.")
+        bool, typer.Option("--all", help="Send the drives' frames, too; only on a bus without these drives.")
     ] = False,
     timeout: Timeout = None,
     json: Json = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Send the recorded frames of a master again, in their time: NMT, SYNC, SDO requests, RPDOs, its heartbeat.
+    """Send the recorded frames of a master again, with their timing: NMT, SYNC, SDO requests, RPDOs, its heartbeat.
 
-    Drives obey them as they did then, and no envelope watches: keep the emergency stop at hand. What is live at the
-    end, after Ctrl-C or an error, gets a quick stop and is switched off at rest. Drives whose recorded master set no
-    watchdog watch over this program meanwhile (1016h), and stop when it is killed. --dry-run shows the frames.
+    Drives execute them as they did then, without a safety envelope: keep the emergency stop at hand. Axes that are
+    enabled at the end, also after Ctrl-C or an error, get a quick stop and are switched off at rest. Drives whose
+    recorded master set no watchdog watch over this program meanwhile (1016h), and stop when it is killed. --dry-run
+    shows the frames.
     """
     with errors_as_exit_codes():
         import can
@@ -157,8 +160,8 @@ def _check_stamps(file: Path, frames: list[Any], speed: float) -> None:
         after = (frame.timestamp - frames[0].timestamp) / speed
         if not -LONGEST <= after <= LONGEST:
             raise ValueError(
-                f"{file}: frame {number} of a master has the stamp {frame.timestamp:g} s, {after:g} s after the first "
-                f"at this speed; at most {LONGEST:g} s are waited: take the frame out, or give a higher --speed"
+                f"{file}: frame {number} of a master has the time stamp {frame.timestamp:g} s, {after:g} s after the "
+                f"first at this speed; the longest wait is {LONGEST:g} s: take the frame out, or give a higher --speed"
             )
 
 
@@ -231,7 +234,7 @@ def _take_interrupts() -> Any:
 
 def _check_format(file: Path, formats: tuple[str, ...]) -> None:
     if file.suffix.lower() not in formats:
-        raise ValueError(f"{file}: the ending says the format, and {file.suffix!r} is none of {', '.join(formats)}")
+        raise ValueError(f"{file}: the ending gives the format, and {file.suffix!r} is not one of {', '.join(formats)}")
 
 
 def _say(text: str, value: dict[str, Any], json: bool) -> None:

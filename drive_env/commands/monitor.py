@@ -44,13 +44,15 @@ def monitor(
     eds: Eds = None,
     bitrate: Bitrate = None,
     timeout: Timeout = None,
-    period: Annotated[float, typer.Option(help="Time between two looks [s].")] = 0.2,
-    duration: Annotated[float | None, typer.Option(help="End after this time [s]; else by Ctrl-C.")] = None,
+    period: Annotated[float, typer.Option(help="Time between two readings [s].")] = 0.2,
+    duration: Annotated[
+        float | None, typer.Option(help="Stop after this time [s]; otherwise stop with Ctrl-C.")
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Show objects in a table that refreshes, with the emergencies that come; reads only, over SDO.
+    """Show objects in a table that refreshes, with emergencies as they come; it only reads, over SDO.
 
-    With --json a line for each look.
+    With --json a line for each reading.
     """
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
     with errors_as_exit_codes():

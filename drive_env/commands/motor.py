@@ -1,4 +1,4 @@
-"""`drive-env motor`: a motor of one's own, from the numbers of its data sheet to the file that describes it."""
+"""`drive-env motor`: describe your own motor in a file, from the numbers of its data sheet."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ def motor() -> None:
 
 @motor_app.command("new")
 def new_motor(
-    file: Annotated[Path, typer.Argument(help="TOML file to write; there must be none yet.")],
+    file: Annotated[Path, typer.Argument(help="New TOML file to write.")],
     kind: Annotated[str | None, typer.Option("--kind", help="pmsm (brushless) or dc (brushed).")] = None,
-    title: Annotated[str, typer.Option("--title", help="What the motor is called.")] = "",
+    title: Annotated[str, typer.Option("--title", help="Name of the motor.")] = "",
     numbers: Annotated[
         list[str] | None,
-        typer.Option("--number", "-n", help="A number of the data sheet, e.g. inertia_kg_m2=4.8e-6; again for others."),
+        typer.Option("--number", "-n", help="A number of the data sheet, e.g. inertia_kg_m2=4.8e-6; may be repeated."),
     ] = None,
     source: Annotated[str, typer.Option("--source", help="Where the numbers come from.")] = "",
-    list_numbers: Annotated[bool, typer.Option("--list", help="List the numbers that there are, and stop.")] = False,
+    list_numbers: Annotated[bool, typer.Option("--list", help="List the numbers that can be given, and stop.")] = False,
 ) -> None:
-    """Write a motor's file from its data sheet: what is not given is asked for, at a terminal.
+    """Write a motor's file from its data sheet; in a terminal, missing numbers are asked for.
 
     A data sheet gives resistance and inductance of a phase or between two terminals, the torque constant per ampere
-    peak or RMS, or a back-EMF; each has a number of its own, and is converted. What it does not give (friction,
-    cogging) is taken from motors of its class, and can be corrected in the file.
+    peak or RMS, or a back-EMF; each has a number of its own, and is converted. Friction and cogging, which data sheets
+    do not give, are taken from motors of its class; correct them in the file.
     """
     from drive_env.motors import NUMBERS, MotorError, load_motor, motor_of
 
@@ -52,7 +52,7 @@ def new_motor(
             return
         check_free(file)
         if file.suffix != ".toml":
-            raise ValueError(f"{file} must end with .toml: so it is told from a motor's name")
+            raise ValueError(f"{file} must end with .toml, which distinguishes it from a motor's name")
         given = _given(numbers or [])
         if kind is None:
             kind = _asked("kind of motor, pmsm (brushless) or dc (brushed)", "pmsm")
@@ -82,7 +82,7 @@ def _given(texts: list[str]) -> dict[str, float]:
     for text in texts:
         name, _, value = (part.strip() for part in text.partition("="))
         if name not in NUMBERS:
-            raise ValueError(f"{name!r} is no number of a motor{did_you_mean(name, NUMBERS)}; --list shows them")
+            raise ValueError(f"{name!r} is not a number of a motor{did_you_mean(name, NUMBERS)}; --list shows them")
         found[name] = _number(name, value)
     return found
 
@@ -93,7 +93,7 @@ def _number(name: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise ValueError(f"{name} = {text!r} is no number; write it as 4.8e-6") from None
+        raise ValueError(f"{name} = {text!r} is not a number; write it as 4.8e-6") from None
     return int(value) if name in WHOLE and value == int(value) else value
 
 
@@ -122,7 +122,7 @@ def _ask_for(choice: tuple[str, ...]) -> tuple[str, float]:
             typer.echo(f"  {number}: {NUMBERS[each].meaning} [{NUMBERS[each].unit}]", err=True)
         which = _asked(f"which of these does the data sheet give (1 to {len(choice)})", "1")
         if not which.isdigit() or not 1 <= int(which) <= len(choice):
-            raise ValueError(f"{which!r} is none of 1 to {len(choice)}")
+            raise ValueError(f"{which!r} is not one of 1 to {len(choice)}")
         name = choice[int(which) - 1]
     row = NUMBERS[name]
     return name, _number(name, _asked(f"{row.meaning}{f' [{row.unit}]' if row.unit else ''}", ""))

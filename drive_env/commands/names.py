@@ -1,4 +1,4 @@
-"""`drive-env list`: the devices, motors and loads there are."""
+"""`drive-env list`: list devices, motors and loads."""
 
 from __future__ import annotations
 

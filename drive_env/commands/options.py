@@ -1,4 +1,4 @@
-"""What the commands of `drive-env` have in common: their options, how they connect, and how they end."""
+"""Options, connection and exit codes that the commands of `drive-env` share."""
 
 from __future__ import annotations
 
@@ -36,20 +36,22 @@ Channel = Annotated[
         help="Channel: can0, or socket://127.0.0.1:PORT of `drive-env serve` (its token, if any, in DRIVE_ENV_TOKEN).",
     ),
 ]
-Bitrate = Annotated[int | None, typer.Option(help="Bit rate [bit/s], where the interface sets it.")]
+Bitrate = Annotated[int | None, typer.Option(help="Bit rate [bit/s], if the interface sets it.")]
 Nodes = Annotated[list[int] | None, typer.Option("--node", "-n", help="Node-ID; may be repeated.", show_default="1")]
 DeviceName = Annotated[
-    str, typer.Option("--device", help="Drive by name, or one of your own by its path: a folder, or a variant's .toml.")
+    str, typer.Option("--device", help="Device by name, or your own by its path: a folder, or a variant's .toml.")
 ]
-Eds = Annotated[Path | None, typer.Option("--eds", help="EDS of any other CiA 402 drive, in place of --device.")]
+Eds = Annotated[Path | None, typer.Option("--eds", help="EDS of any other CiA 402 drive, instead of --device.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the frames and send none.")]
-WouldDo = Annotated[bool, typer.Option("--dry-run", help="Read the drive and say what would be done; change nothing.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the frames instead of sending them.")]
+WouldDo = Annotated[
+    bool, typer.Option("--dry-run", help="Read the drive and print what would be done; change nothing.")
+]
 Timeout = Annotated[
     float | None,
     typer.Option(envvar="DRIVE_ENV_TIMEOUT", help="Longest wait for an answer [s].", show_default="the device's, 0.5"),
 ]
-Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")]
 
 _INDEX = re.compile(r"^(?:0x)?([0-9a-f]{4})h?(?:[:.]([0-9a-f]{1,2})h?)?$", re.IGNORECASE)
 
@@ -115,7 +117,9 @@ def look_first(
         for node in nodes:
             SdoClient(port, node).read(0x1000, 0, "1000h:00 Device type", patience)
     except NoAnswerError as error:
-        raise NoAnswerError(f"{error}; if it is stopped (NMT), a run would take it to pre-operational") from None
+        raise NoAnswerError(
+            f"{error}; if it is in the NMT state stopped, a run without --dry-run takes it to pre-operational"
+        ) from None
     finally:
         port.close()
 
@@ -196,7 +200,7 @@ def check_free(file: Path, remedy: str = "choose another file") -> None:
     Call it before anything takes long, or is asked of a drive.
     """
     if file.is_file():
-        raise ValueError(f"{file} is there already, and would be replaced; {remedy}")
+        raise ValueError(f"{file} exists already, and files are not overwritten; {remedy}")
 
 
 def check_writable(file: Path) -> None:
@@ -221,7 +225,7 @@ def ask(question: str, yes: bool) -> None:
     if yes:
         return
     if not sys.stdin.isatty():
-        raise ValueError(f"{question} Nobody is there to ask; say --yes")
+        raise ValueError(f"{question} There is no terminal to ask; confirm with --yes")
     if not typer.confirm(question):
         raise RuntimeError("nothing was changed")
 

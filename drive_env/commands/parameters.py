@@ -41,12 +41,15 @@ if TYPE_CHECKING:
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 Axis = Annotated[int, typer.Option(help="Axis of a node with several, from 0.")]
 File = Annotated[Path, typer.Argument(help="Parameters (TOML), as `backup` writes them.")]
-Store = Annotated[bool, typer.Option("--store", help="Have the drive keep them over a power cycle (1010h:01, 'save').")]
+Store = Annotated[
+    bool,
+    typer.Option("--store", help="Store them in the drive (1010h:01, 'save'), so that they survive a power cycle."),
+]
 OtherDrive = Annotated[
-    bool, typer.Option("--other-drive", help="Write it also to another drive than the one it was read from.")
+    bool, typer.Option("--other-drive", help="Allow writing to another drive than the one it was read from.")
 ]
 Unchecked = Annotated[
-    bool, typer.Option("--unchecked", help="Take a file that was changed, or that has no check sum: you have read it.")
+    bool, typer.Option("--unchecked", help="Accept a file that was changed, or that has no check sum; read it first.")
 ]
 SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 
@@ -63,7 +66,7 @@ def backup(
     timeout: Timeout = None,
     json: Json = False,
 ) -> None:
-    """Read all parameters of a drive into a file; commands and services are none."""
+    """Read all parameters of a drive into a file, without commands and services."""
     from drive_env.master.parameters import read_parameters
     from drive_env.whole_file import sealed, write_whole
 
@@ -86,7 +89,7 @@ def backup(
 
 def diff(
     file: File,
-    other: Annotated[Path | None, typer.Argument(help="Another file, to compare with in place of the drive.")] = None,
+    other: Annotated[Path | None, typer.Argument(help="Another file to compare with, instead of the drive.")] = None,
     interface: Interface = None,
     channel: Channel = None,
     node: Node = 1,
@@ -141,10 +144,10 @@ def restore(
     json: Json = False,
     dry_run: WouldDo = False,
 ) -> None:
-    """Write a file's parameters to a drive, all or none: what was written is read back, or else taken back.
+    """Write a file's parameters to a drive, all or none: they are read back, and undone if one fails.
 
-    The file must be as `backup` wrote it, and of this drive. Bit rate and node-ID are left alone; commands and services
-    are refused. The axis must not be enabled.
+    The file must be unchanged since `backup` wrote it, and belong to this drive. Bit rate and node-ID are not changed;
+    commands and services are refused. The axis must be disabled.
     """
     from drive_env.master.description import describe
     from drive_env.master.identity import check_same_drive, read_identity
@@ -161,8 +164,8 @@ def restore(
             check_same_drive(file, written, read_identity(drives), other_drive=other_drive)
             if axis_then not in (None, axis) and not other_drive:
                 raise ValueError(
-                    f"{file} was read from axis {axis_then}, and --axis says {axis}; nothing was written. If it is "
-                    "meant for this axis all the same, say --other-drive"
+                    f"{file} was read from axis {axis_then}, and --axis is {axis}; nothing was written. To write it "
+                    "to this axis all the same, add --other-drive"
                 )
 
         _exchange(bus, wanted, axis, file.name, check, store=store, yes=yes, json=json, dry_run=dry_run)
@@ -266,15 +269,17 @@ def _exchange(
         left = compare(drives, wanted, axis)
     if left:
         fail(
-            f"node {bus.node} does not hold what was written, as a second reading shows: {list_differences(left)}; "
-            "is another master writing to it? Look with `drive-env diff`, then restore again",
+            f"node {bus.node} does not have the values that were written, by a second reading: "
+            f"{list_differences(left)}; is another master writing to it? Look with `drive-env diff`, then restore "
+            "again",
             REFUSED,
         )
     if json:
         rows = [_row(change, scale) for change in changes]
         print_json({"changed": rows, "verified": len(wanted), "stored": store})
     else:
-        kept = "; the drive keeps them" if store else "" if not changes else "; they last until a reset (--store)"
+        lost = "; not stored: lost at the next reset (--store stores them)" if changes else ""
+        kept = "; stored in the drive" if store else lost
         print(f"{len(changes)} written, {len(wanted)} verified by a second reading{kept}")
 
 
@@ -284,8 +289,8 @@ def _tell_plan(differences: list[Any], scale: float | None, node: int, *, store:
         rows = [_row(difference, scale) for difference in differences]
         print_json({"would change": rows, "would store": store, "written": 0})
         return
-    kept = ", and kept over a power cycle" if store else ""
-    print(f"{len(differences)} parameters would be written to node {node}{kept}; nothing was written")
+    kept = ", and stored" if store else ""
+    print(f"{len(differences)} parameters would be written to node {node}{kept} (dry run: nothing was written)")
 
 
 def _check_file(file: Path, *, unchecked: bool) -> tuple[Identity | None, int | None]:
@@ -337,7 +342,8 @@ def _toml(drives: BusDrives, axis: int, values: Mapping[tuple[int, int], int]) -
 
     known = drives.description
     lines = [
-        f"# Parameters of node {drives.nodes[0]}. The check sum at the end shows a change: restore refuses it.",
+        f"# Parameters of node {drives.nodes[0]}. The check sum at the end shows a change, and restore refuses a "
+        "changed file.",
         f"format = {FORMAT}",
         f'read = "{datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC"',
         "",
@@ -368,7 +374,7 @@ def load_parameters(path: Path, dictionary: Any) -> dict[tuple[int, int], int]:
         try:
             key = int(index, 16), int(sub or "0", 16)
         except ValueError:
-            raise ValueError(f"{path}: {text!r} is no index:sub-index; write it as 607D:01") from None
+            raise ValueError(f"{path}: {text!r} is not an index:sub-index; write it as 607D:01") from None
         entry = dictionary.find(key)
         check_writable(entry)
         check_in_range(entry, np.asarray(value))
@@ -383,7 +389,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     try:
         return read_toml(path)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no TOML, or is torn: {error}; take another copy") from error
+        raise ValueError(f"{path} is not TOML, or incomplete: {error}; take another copy") from error
 
 
 def _print(differences: Iterable[Any], found: str, wanted: str, scale: float | None, json: bool) -> None:

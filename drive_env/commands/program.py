@@ -23,8 +23,8 @@ def _tell_version(context: typer.Context, asked: bool) -> None:
 Version = Annotated[
     bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version and stop.")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Results and errors alone: no progress, no warnings.")]
-Verbose = Annotated[bool, typer.Option("--verbose", help="Say what goes on besides.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print results and errors only: no progress, no warnings.")]
+Verbose = Annotated[bool, typer.Option("--verbose", help="Print more about what is done.")]
 
 
 def say_as_much(quiet: bool, verbose: bool) -> None:

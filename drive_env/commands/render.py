@@ -1,4 +1,4 @@
-"""`drive-env render`: films an emulated run, the machine beside the scope."""
+"""`drive-env render`: film an emulated run, the machine beside the scope."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mechanics.untrusted import read_text
 
 
 def render(
-    config: Annotated[Path | None, typer.Option(help="Run (TOML); by default the one that ships.")] = None,
-    device: Annotated[str | None, typer.Option(help="Drive, in place of the run's.")] = None,
-    motor: Annotated[str | None, typer.Option(help="Motor, in place of the run's.")] = None,
-    load: Annotated[str | None, typer.Option(help="Load, in place of the run's.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed, in place of the run's.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Run (TOML file); the one that ships by default.")] = None,
+    device: Annotated[str | None, typer.Option(help="Device, instead of the run's.")] = None,
+    motor: Annotated[str | None, typer.Option(help="Motor, instead of the run's.")] = None,
+    load: Annotated[str | None, typer.Option(help="Load, instead of the run's.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed, instead of the run's.")] = None,
     slow: Annotated[
         float | None,
         typer.Option(help="Seconds of film per second of run; 1 is real time. [default: a film of about 8 s]"),
@@ -55,7 +55,7 @@ def render(
             return
         film = None if view and out is None else check_out(out or Path(f"{Path(row.load).stem}.gif"))
         if film is not None and film.is_file():
-            raise PictureFileError(f"{film} is there already, and would be replaced; choose another --out")
+            raise PictureFileError(f"{film} exists already, and files are not overwritten; choose another --out")
         if view and not has_display():
             raise OpenGLError(
                 "--view needs a display and there is none (DISPLAY and WAYLAND_DISPLAY are unset); leave it out, and "

@@ -50,7 +50,9 @@ class Stopped(NamedTuple):
     cut: str
 
     def __str__(self) -> str:
-        how = f"its voltage was cut while it turned: {self.cut}" if self.cut else "stopped by its quick stop, at rest"
+        how = "stopped by its quick stop, at rest"
+        if self.cut:
+            how = f"its voltage was switched off while it turned: {self.cut}"
         return f"{name((self.node, self.axis))} was left enabled by the frames: {how}; off ({self.statusword:04X}h)"
 
 
@@ -76,8 +78,8 @@ class ReplayedMotors:
         live = [f"{name(axis)} ({word:04X}h)" for axis, word in status.items() if cia402.is_live(word)]
         if live:
             raise BusError(
-                f"{', '.join(live)} is live already: somebody else runs it, and no frame was sent. End that, or stop "
-                f"it: drive-env set 6040 2 --node {live[0].split()[1]}, then 0"
+                f"{', '.join(live)} is enabled already, so another master controls it; no frame was sent. Stop that "
+                f"master, or stop the axis: drive-env set 6040 2 --node {live[0].split()[1]}, then 0"
             )
 
     def listen(self) -> None:
@@ -108,10 +110,10 @@ class ReplayedMotors:
                         self._port.send(NMT, bytes((PRE_OPERATIONAL, node)))
                     status |= self._statuswords(silent)
             except BusError as error:
-                unproven += [f"{error}: whether the motors of node {_list(nodes)} run cannot be told"] if known else []
+                unproven += [f"{error}: the motors of node {_list(nodes)} may be running"] if known else []
                 continue
             unproven += [
-                f"node {node} does not answer any more: whether its motor runs cannot be told"
+                f"node {node} does not answer any more: its motor may be running"
                 for node in nodes
                 if known and (node, 0) not in status and node not in self._no_drives
             ]
@@ -215,7 +217,7 @@ class _Stop:
                 self.outcome = (
                     f"{name(self._axis)} is not off: "
                     + (self._error if word is None else f"its statusword stays {word:04X}h")
-                    + "; its motor may run: use the emergency stop"
+                    + "; its motor may be running: use the emergency stop"
                 )
                 return
             self._write(cia402.DISABLE_VOLTAGE)

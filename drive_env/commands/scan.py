@@ -1,4 +1,4 @@
-"""`drive-env scan`: which nodes are on the bus, and what they are."""
+"""`drive-env scan`: find the nodes on the bus, and what they are."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def scan(
     timeout: Annotated[float, typer.Option(help="Longest wait for an answer [s].")] = 0.3,
     json: Json = False,
 ) -> None:
-    """Find nodes and read what they say of themselves: 1000h, 1008h to 100Ah, 1018h. Nothing is written."""
+    """Find nodes and read their identification: 1000h, 1008h to 100Ah, 1018h. Nothing is written."""
     with errors_as_exit_codes():
         from drive_env.master.can.port import Port, open_bus
 
         check_time("--timeout", timeout)
         if last < first:
-            raise ValueError(f"--last {last} lies before --first {first}")
+            raise ValueError(f"--last {last} is below --first {first}")
         options = {"bitrate": bitrate} if bitrate else {}
         port = Port(open_bus(interface, channel, **options))
         try:
@@ -127,7 +127,7 @@ def _print(found: list[dict[str, Any]], timeout: float) -> None:
             print_lines([f"node {row['node']}  {why}" + (f" ({row['state']})" if row["state"] else "")])
             continue
         profile = row["device type"] & 0xFFFF
-        facts = [row["device"] or "unknown device, give its --eds", row.get("name", "")]
+        facts = [row["device"] or "unknown device; give its EDS with --eds", row.get("name", "")]
         facts += [f"{name} {row[name]}" for name in ("hardware", "software") if name in row]
         facts += [f"{name} {row[name]:X}h" for name in ("vendor", "product", "revision", "serial") if name in row]
         facts += [f"CiA {profile}" if profile else "no profile", row["state"], late]

@@ -1,4 +1,4 @@
-"""`drive-env scope`: objects at every SYNC, from a trigger on, as CSV and picture."""
+"""`drive-env scope`: record objects at every SYNC, from a trigger on, as CSV and picture."""
 
 from __future__ import annotations
 
@@ -62,20 +62,20 @@ def scope(
     eds: Eds = None,
     bitrate: Bitrate = None,
     timeout: Timeout = None,
-    duration: Annotated[float, typer.Option(help="How long to record from the trigger on [s].")] = 1.0,
+    duration: Annotated[float, typer.Option(help="Duration of the recording after the trigger [s].")] = 1.0,
     trigger: Annotated[
-        str | None, typer.Option(help="Begin when this becomes true: '606C > 100 rpm', 'Statusword == 0x1637'.")
+        str | None, typer.Option(help="Start condition: '606C > 100 rpm', 'Statusword == 0x1637'.")
     ] = None,
-    before: Annotated[float, typer.Option(help="How much to keep from before the trigger [s].")] = 0.05,
-    wait: Annotated[float, typer.Option(help="How long to wait for the trigger [s].")] = 30.0,
+    before: Annotated[float, typer.Option(help="Time to keep before the trigger [s].")] = 0.05,
+    wait: Annotated[float, typer.Option(help="Longest wait for the trigger [s].")] = 30.0,
     period: Annotated[float, typer.Option(help="Time between samples [s], whole milliseconds.")] = 0.001,
     out: Annotated[Path, typer.Option(help="New files, without ending: OUT.csv and OUT.png.")] = Path("scope"),
     json: Json = False,
 ) -> None:
     """Sample objects with SYNC, one sample per millisecond, and write CSV (raw integers) and PNG (in units).
 
-    After Ctrl-C, or where the bus is lost, what came until then is written, and told.
-    It sends SYNC and maps TPDOs, which it puts back. Where another master commands the drive it refuses, or ends with
+    After Ctrl-C, or if the bus is lost, the samples received so far are written, with a message.
+    It sends SYNC and maps TPDOs, which it restores. Where another master commands the drive it refuses, or ends with
     what came until then: samples of two masters would be wrong.
     """
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
@@ -103,10 +103,13 @@ def scope(
         elif broken is None:
             print(f"{len(t)} samples written to {table} and {picture}")
         if late and not json:
-            print(f"{late} SYNCs were late, the worst by {1e3 * worst:.1f} ms: times are those of the SYNCs' grid")
+            print(
+                f"{late} SYNCs were late, the worst by {1e3 * worst:.1f} ms: the times given are the nominal times "
+                f"of the SYNCs"
+            )
         if broken is not None:
             why, code = (str(broken), REFUSED) if isinstance(broken, Exception) else ("interrupted", INTERRUPTED)
-            fail(f"{why}; the {len(t)} samples that came until then are in {table} and {picture}", code)
+            fail(f"{why}; the {len(t)} samples received before are in {table} and {picture}", code)
 
 
 def new_files(out: Path) -> tuple[Path, Path]:
@@ -137,13 +140,13 @@ def _check_times(**times: float) -> None:
         if not 0.0 <= value <= 3600.0 or (value == 0.0 and name in ("duration", "period")):
             raise ValueError(f"--{name} {value:g} s must be above 0 s and at most an hour")
         if name != "wait" and abs(value / 0.001 - round(value / 0.001)) > 1e-6:
-            raise ValueError(f"--{name} {value:g} s is no whole number of milliseconds; use {round(value, 3):g}")
+            raise ValueError(f"--{name} {value:g} s is not a whole number of milliseconds; use {round(value, 3):g}")
 
 
 def _parse(text: str, known: Any) -> Trigger:
     found = _TRIGGER.match(text)
     if found is None:
-        raise ValueError(f"--trigger {text!r} is no condition; write it as '606C > 100 rpm'")
+        raise ValueError(f"--trigger {text!r} is not a condition; write it as '606C > 100 rpm'")
     return Trigger(known.find(object_name(found[1])), found[2], found[3])
 
 

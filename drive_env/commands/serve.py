@@ -34,10 +34,11 @@ WARM_UP_REQUESTS = tuple(
 
 
 def serve(
-    device: Annotated[str | None, typer.Argument(help="Drive, e.g. tmcm1636 (the default).")] = None,
-    load: Annotated[str | None, typer.Option(help="Load that it turns; two_mass by default.")] = None,
+    device: Annotated[str | None, typer.Argument(help="Device, e.g. tmcm1636 (the default).")] = None,
+    load: Annotated[str | None, typer.Option(help="Load on the motor; two_mass by default.")] = None,
     motor: Annotated[
-        str | None, typer.Option(help="Motor; qbl4208 by default. none: factory values, not commissioned.")
+        str | None,
+        typer.Option(help="Motor, a name or a TOML file; qbl4208 by default. none: factory values, not commissioned."),
     ] = None,
     node: Annotated[
         list[int] | None,
@@ -60,25 +61,27 @@ def serve(
     ] = None,
     bitrate: Annotated[int | None, typer.Option(help="Bit rate of the bus [bit/s]; 1,000,000 by default.")] = None,
     real_time: Annotated[
-        bool, typer.Option("--real-time/--lockstep", help="Time passes by the clock, or 1 ms with each SYNC.")
+        bool,
+        typer.Option("--real-time/--lockstep", help="Time passes in real time, or by 1 ms with each SYNC (lockstep)."),
     ] = True,
     store: Annotated[
-        Path | None, typer.Option(help="Folder in which the nodes keep what is saved in them; without it, nowhere.")
+        Path | None,
+        typer.Option(help="Folder for the values stored in the nodes; without it they are lost at the end."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of everything random.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
     stats: Annotated[
-        bool, typer.Option("--stats", help="Say at the end how late cycles were and how full the bus.")
+        bool, typer.Option("--stats", help="Print at the end how late cycles were and how busy the bus was.")
     ] = False,
-    duration: Annotated[float | None, typer.Option(help="End after this time [s]; else by Ctrl-C.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="Stop after this time [s]; otherwise stop with Ctrl-C.")
+    ] = None,
     fault: Annotated[
         list[str] | None,
-        typer.Option(help="Let something fail: 'encoder_stuck at=2 duration=0.1 node=1'; may be repeated."),
+        typer.Option(help="Inject a fault: 'encoder_stuck at=2 duration=0.1 node=1'; may be repeated."),
     ] = None,
-    control: Annotated[
-        int | None, typer.Option(help="Port on loopback at which `drive-env fault` reaches it; 0 for a free one.")
-    ] = None,
+    control: Annotated[int | None, typer.Option(help="Loopback port for `drive-env fault`; 0 for a free one.")] = None,
 ) -> None:
-    """Put emulated drives on a CAN bus that python-can, python-canopen and drive-env itself can join."""
+    """Put emulated drives on a CAN bus for python-can, python-canopen and drive-env itself."""
     server: list[Server] = []
     previous = [(number, signal.signal(number, _ender(server))) for number in (signal.SIGINT, signal.SIGTERM)]
     logging.basicConfig(format="drive-env: %(message)s", level=logging.WARNING)
@@ -103,7 +106,7 @@ def serve(
             made.world.close()
         if stats:
             print(_statistics(made), flush=True)
-        print("drive-env: ended", flush=True)
+        print("drive-env: stopped", flush=True)
     finally:
         for number, handler in previous:
             signal.signal(number, handler)
@@ -156,7 +159,7 @@ def _server(
     if interface is None and channel is not None:
         _fail(f"--channel {channel} needs --interface, e.g. --interface socketcan")
     if interface is not None and token is not None:
-        _fail(f"--token is for the hub; --interface {interface} cannot ask for one")
+        _fail(f"--token is for the hub; --interface {interface} has no tokens")
     if not listen:  # the system would take it for every address
         _fail(f"--listen must be an address, e.g. {LOOPBACK}; 0.0.0.0 lets the whole network in")
     if not 0 <= port <= 65_535:
@@ -173,7 +176,7 @@ def _server(
             reason = getattr(error, "strerror", None) or error
             _fail(f"cannot listen on {listen}:{port}: {reason}; choose another --port (0: a free one) or --listen")
         except ValueError as error:
-            _fail(f"{error}; say --token auto, --token TEXT of 8 characters or more, or --listen {LOOPBACK}")
+            _fail(f"{error}; give --token auto, --token TEXT of 8 characters or more, or --listen {LOOPBACK}")
     else:
         transport = _can_port(interface, channel, bus.bit_rate)
     _warm_up(bus)
@@ -204,7 +207,7 @@ def _faults(server: Server, orders: list[str], port: int | None) -> list[Control
             why = os.strerror(error.errno or 0)
             _fail(f"cannot listen on {LOOPBACK}:{port}: {why}; choose another --control (0: a free one)")
         _fail(f"--fault: {error}" if orders else str(error))
-    print(f"drive-env: drive-env fault NAME --control {control.port} lets something fail")
+    print(f"drive-env: inject faults with: drive-env fault NAME --control {control.port}")
     return [control]
 
 
@@ -214,7 +217,7 @@ def _can_port(interface: str, channel: str | None, bit_rate: int) -> Any:
     from drive_env.bus.can_port import CanPort
 
     if interface in NEEDS_CHANNEL and not (channel or can.util.load_config(config={"interface": interface})["channel"]):
-        _fail(f"--interface {interface} needs --channel, e.g. --channel vcan0; without one it would serve nobody")
+        _fail(f"--interface {interface} needs --channel, e.g. --channel vcan0; without one no master could reach it")
     try:
         return CanPort(can.Bus(interface=interface, channel=channel, bitrate=bit_rate))
     except (can.CanError, OSError, ValueError, TypeError, NotImplementedError, ImportError) as error:
@@ -246,12 +249,12 @@ def _announce(
         f"node {', '.join(map(str, row.nodes))} ({row.device}, {row.motor}, {row.load})" for row in bus.machines
     )
     pace = "in real time" if real_time else "in lockstep: each SYNC is 1 ms"
-    print(f"drive-env: {nodes}, {bus.bit_rate / 1e3:g} kbit/s, {pace}; Ctrl-C ends it")
+    print(f"drive-env: {nodes}, {bus.bit_rate / 1e3:g} kbit/s, {pace}; stop with Ctrl-C")
     hub = server.transport
     if isinstance(hub, Hub):
         if hub.is_public:
             print(
-                f"drive-env: {hub.host}:{hub.port} is open to the network: whoever reaches it and has the token may "
+                f"drive-env: {hub.host}:{hub.port} is open to the network: whoever can reach it and has the token may "
                 "read and move these drives. Token and frames travel as plain text; where others listen, serve on "
                 f"{LOOPBACK} and use an SSH tunnel."
             )
@@ -293,7 +296,7 @@ def _ender(server: list[Server]) -> Any:
         if server:
             server[0].stop()
         else:  # not by an exception: raised while the compiler calls back into Python it would be lost
-            print("drive-env: ended before it began to serve", flush=True)
+            print("drive-env: stopped before it began to serve", flush=True)
             os._exit(0)
 
     return end

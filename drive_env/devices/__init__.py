@@ -268,7 +268,7 @@ def _own_device(folder: Path) -> Device:
     with naming(folder / "gains.toml"):
         gains = load_gain_set(folder / "gains.toml")
         if missing := [f"{index:04X}h:{sub:02X}" for index, sub in gains.keys if (index, sub) not in bindings]:
-            raise ValueError(f"{', '.join(missing)} is no gain: {BINDINGS} binds it to nothing")
+            raise ValueError(f"{', '.join(missing)} is not a gain: {BINDINGS} binds it to nothing")
     with naming(folder / "device.toml"):
         device = _device(data, folder, eds, bindings, roles, gains)
     with naming(eds):

@@ -105,7 +105,7 @@ class GainSet:
         column = self.column("velocity", "P")
         if column is None:
             raise ValueError(
-                "this drive has no velocity P, by which trials tell how far its gains are from oscillation"
+                "this drive has no velocity P gain, with which trials measure the distance from oscillation"
             )
         changed = raw.copy()
         changed[:, column] = np.clip(np.rint(raw[:, column] * np.asarray(factor, float)), 1, self.rows[column].highest)

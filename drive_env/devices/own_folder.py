@@ -69,7 +69,7 @@ def naming(path: Path) -> Iterator[None]:
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror or error}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no TOML file: {error}") from None
+        raise ValueError(f"{path} is not a TOML file: {error}") from None
     except KeyError as error:
         raise ValueError(
             f"{path} lacks or does not know {error}; every key is explained where the TMCM-1636 has it, in "

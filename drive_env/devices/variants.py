@@ -70,7 +70,7 @@ def own_variant(path: Path, devices: Mapping[str, Mapping[str, Any]]) -> dict[st
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no TOML file: {error}") from None
+        raise ValueError(f"{path} is not a TOML file: {error}") from None
     of = str(own.get("variant_of"))
     if of not in devices or "variant_of" in devices[of]:
         bases = [name for name, data in devices.items() if "variant_of" not in data]
@@ -90,8 +90,8 @@ def own_variant(path: Path, devices: Mapping[str, Mapping[str, Any]]) -> dict[st
     if not current["nominal"] <= current["overcurrent"] <= current["full_scale"]:
         raise ValueError(
             f"{path}: current.nominal = {current['nominal']:g} A, overcurrent = {current['overcurrent']:g} A and "
-            f"full_scale = {current['full_scale']:g} A must come in this order: what flows for ever, what trips, what "
-            "can be measured"
+            f"full_scale = {current['full_scale']:g} A must come in this order: continuous current, overcurrent "
+            "threshold, measuring range"
         )
     try:
         check_rates(whole["rates"])

@@ -110,6 +110,6 @@ def _check_range(entry: Entry, raw: NDArray[Any]) -> None:
 
 
 def _describe(raw: NDArray[Any]) -> str:
-    return {"f": "a float", "b": "a truth value", "U": "a text", "c": "complex", "O": "no array of integers"}.get(
+    return {"f": "a float", "b": "a boolean", "U": "a text", "c": "complex", "O": "not an array of integers"}.get(
         raw.dtype.kind, str(raw.dtype)
     )

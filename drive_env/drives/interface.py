@@ -101,19 +101,19 @@ class Drives(BasicDrives, Protocol):
 def machine_of(drives: Drives) -> Machines:
     """Return the emulated machines behind drives; ValueError for drives that have none."""
     if drives.machine is None:
-        raise ValueError("these drives show no emulated machine; this takes EmulatedDrives")
+        raise ValueError("these drives have no emulated machine; use EmulatedDrives")
     return drives.machine
 
 
 def bus_of(drives: Drives) -> BusDrives:
     """Return the drives of a bus; ValueError for emulated ones."""
     if drives.bus is None:
-        raise ValueError("these drives are on no bus; this takes CanDrives")
+        raise ValueError("these drives are not on a bus; use CanDrives")
     return drives.bus
 
 
 def device_of(drives: Drives) -> Device:
     """Return what drives are; ValueError where their EDS alone is known."""
     if drives.device is None:
-        raise ValueError("of these drives the EDS alone is known; this takes a device by name")
+        raise ValueError("only the EDS of these drives is known; give the device by name")
     return drives.device

@@ -115,7 +115,7 @@ def reset_fault(drives: BasicDrives, where: Mask | None = None, timeout: float =
             break
         if waited >= timeout:
             axis = int(np.flatnonzero(late)[0])
-            raise TimeoutError(f"axis {axis} stays in fault: the cause is still there; see 2101h and emergencies()")
+            raise TimeoutError(f"axis {axis} stays in fault: the cause is still there; see emergencies()")
         drives.advance(STEP)
         waited += STEP
     drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
@@ -192,7 +192,7 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
         failed = axes & ~fault & (bits != cia402.HOMED) & ~np.isin(bits, cia402.HOMING_UNDER_WAY)
         if fault.any() or failed.any():
             axis = int(np.flatnonzero(fault | failed)[0])
-            what = "is in fault while homing; see emergencies()" if fault[axis] else "gave up homing"
+            what = "is in fault while homing; see emergencies()" if fault[axis] else "did not complete homing"
             raise RuntimeError(
                 f"axis {axis} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
             )

@@ -1,4 +1,4 @@
-"""Drives that somebody looks at: one wrapper, and observers that count, watch, act, or hide something."""
+"""Drives with observers: one wrapper, and observers that count, monitor, act, or hide something."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CYCLE = 0.001  # s
 
 
 class Observer:
-    """What looks at drives; whatever it does not say otherwise, it leaves as it is.
+    """An observer of drives; methods that it does not override do nothing.
 
     Attributes:
         objects: What it wants recorded, whenever time passes; with any, no time passes unseen.

@@ -37,9 +37,9 @@ PHASE = (
     ObservationRow("ln(1 + n/3 %)", "1", 0.0, 7.0),
     ObservationRow("overshoot", "the move", 0.0, 5.0),
     ObservationRow("ln of the following error's integral over the rule's", "1", -10.0, 10.0),
-    ObservationRow("stopped: it oscillated or tripped", "1", 0.0, 1.0),
+    ObservationRow("stopped: it oscillated or went into fault", "1", 0.0, 1.0),
 )
-COST = ObservationRow("ln J by measured terms, of the lane", "1", -10.0, 4.0)
+COST = ObservationRow("ln J by measured terms, of the machine", "1", -10.0, 4.0)
 TRIED = (*PHASE * len(PHASES), COST)
 WAVE = ObservationRow("error of the move", "the move", -5.0, 5.0)
 LEFT = ObservationRow("trials left", "those of an episode", 0.0, 1.0)

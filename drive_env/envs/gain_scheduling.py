@@ -26,7 +26,7 @@ from drive_env.envs.lanes import Info, Lanes, Reward, Stepped, check_choice
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
-from drive_env.gains import FITTED_RULE, read_gains, rule_gains, small_time_constants, write_gains
+from drive_env.gains import BASELINE_RULE, read_gains, rule_gains, small_time_constants, write_gains
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
@@ -83,7 +83,7 @@ class GainSchedulingConfig:
     duration: Of an episode [s].
     gains: Which gains the agent sets, of the velocity and the position loop; all of those by default: velocity_p,
         velocity_i, position_p of the TMCM-1636.
-    base: What an action of 0 means: "rule", the fitted rule's gains for the nominal machine, or "present", those that
+    base: What an action of 0 means: "rule", the baseline rule's gains for the nominal machine, or "present", those that
         the drives hold when the environment is made; on a bus it is always these.
     span: ln of the largest factor on a gain.
     payload: Parameter of the load that changes; "auto" takes its payload, mass or inertia, "none" changes nothing.
@@ -176,7 +176,7 @@ class GainScheduling(Lanes):
     | 10 | current_increment, RMS from sample to sample | of rated | 0 | 4 |
     | 11 ... 10+G | the last action's entries for this axis | span | -1 | 1 |
 
-    The error scale is what the fitted rule's gains would leave: in csp, where this drive has no feed-forward and lags
+    The error scale is what the baseline rule's gains would leave: in csp, where this drive has no feed-forward and lags
     by v/k_v, at a fifth of the programme's top speed; in csv a/w_v at its top acceleration. What lies beyond its bounds
     is cut off there.
 
@@ -336,8 +336,8 @@ class GainScheduling(Lanes):
         )
         device = device_of(self.drives)
         small = float(small_time_constants(device, device.stage["velocity_filter"].default))
-        w_v = FITTED_RULE.speed / small
-        lag = LAG * self.reach.speed / (FITTED_RULE.position * w_v)
+        w_v = BASELINE_RULE.speed / small
+        lag = LAG * self.reach.speed / (BASELINE_RULE.position * w_v)
         scale = lag if self.config.mode == "csp" else self.reach.acceleration / w_v
         self._error_scale = np.tile(scale, self.num_envs)
         self._speed_scale = np.tile(self.reach.speed, self.num_envs)

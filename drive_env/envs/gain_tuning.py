@@ -33,7 +33,7 @@ from drive_env.gains import read_gains, rule_gains, small_time_constants
 from drive_env.motors import find_motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
 from drive_env.trials.positioning import TRIAL, plan_move, power_up, reach
-from drive_env.trials.score import HiddenScore
+from drive_env.trials.score import RobustScore
 
 Integers = NDArray[np.int64]
 
@@ -99,12 +99,12 @@ class GainTuningConfig:
 
 
 class GainTuning(Lanes):
-    """Lanes of `ServoDrive/GainTuning-v0`: find the gains of an unknown machine in a few trials.
+    """`ServoDrive/GainTuning-v0`: find the gains of an unknown machine in a few trials.
 
-    An episode identifies the machine, starts at the fitted rule's gains and tries them; each step tries others: a
-    positioning move, the reversal and the gain probe (the move with velocity P x 1.5), 250 ms each. What oscillates or
-    trips is stopped within 50 ms, the drive is cleared, and the incumbent returns. The incumbent is the trial with the
-    least J by measured terms, the rule's included; it is the answer (`info["gains"]`).
+    An episode identifies the machine, starts at the baseline rule's gains and tries them; each step tries others: a
+    positioning move, the reversal and the gain probe (the move with velocity P x 1.5), 250 ms each. An axis that
+    oscillates or goes into fault is stopped within 50 ms, the fault is reset, and the incumbent returns. The incumbent
+    is the trial with the least J by measured terms, the rule's included; it is the answer (`info["gains"]`).
 
     All axes of a machine move at once: what is identified is the inertia that an axis sees in that motion, coupling
     included. The pole of the inverted pendulum falls meanwhile, and shakes its cart.
@@ -154,15 +154,16 @@ class GainTuning(Lanes):
     With `privileged` it is a dict of "observation" and "privileged": each true parameter's difference from its default
     over the default's size (where that is 0, the parameter itself), in the order of `info["parameters"]`, -100...100.
 
-    The reward is the decrease of the incumbent's ln hidden J (drive_env/trials/score.py), meant for a discount of 1,
-    less `abort_cost` for a trial that was stopped. On given drives there is no hidden J; it is that of ln J by measured
-    terms. The episode is `truncated` when its trials are used up, `terminated` if a given drive cannot be cleared.
+    The reward is the decrease of ln of the incumbent's robust cost (drive_env/trials/score.py), meant for a discount of
+    1, less `abort_cost` for a trial that was stopped. On given drives there is no robust cost; it is that of ln J by
+    measured terms. The episode is `truncated` when its trials are used up, `terminated` if a given drive cannot be
+    cleared.
 
     `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (lanes, axes, count) raw integers in the order
-    of the device's set; "measured", its J by measured terms, and "hidden", hidden J; "trial_hidden", that of this
-    step's trial; "trial_gains" and "trial_measured" too; "aborted", whether it was stopped, of the rule's trial at the
-    begin as well; "faults", names of the trial's emergencies, tuples; "parameters", the true machine. Of given drives
-    there is nothing hidden.
+    of the device's set; "measured", its J by measured terms, and "robust_cost"; "trial_robust_cost", that of
+    this step's trial; "trial_gains" and "trial_measured" too; "aborted", whether it was stopped, of the rule's trial at
+    the begin as well; "faults", names of the trial's emergencies, tuples; "parameters", the true machine. Given drives
+    have no robust cost.
 
     Args:
         num_envs: Lanes.
@@ -195,7 +196,7 @@ class GainTuning(Lanes):
         self.config = configured(GainTuningConfig, config, options)
         self.motor, self._device = find_motor(self.config.motor), find_device(self.config.device)
         self._machines: RandomMachines | None = None
-        self._hidden: HiddenScore | None = None
+        self._score: RobustScore | None = None
         self._pictures: Pictures | None = None
         self._owned = drives is None
         self.drives = self._new_drives(num_envs) if drives is None else drives
@@ -209,7 +210,7 @@ class GainTuning(Lanes):
                 if reach is not None:
                     raise ValueError("reach is of given drives; give travel in the configuration, or leave it out")
             elif self.config.distributions is not None or self.config.privileged:
-                raise ValueError("given drives are taken as they are: leave distributions and privileged out")
+                raise ValueError("leave distributions and privileged out for given drives, whose machine is not known")
             super().__init__(
                 num_envs, *self._spaces(), autoreset_mode=autoreset_mode, render_mode=render_mode, reward=reward
             )
@@ -236,7 +237,7 @@ class GainTuning(Lanes):
             laws = c.load if c.load in shipped() else {"parameters": {}}
         self._machines = RandomMachines(machine_of(self.drives).drives, Distributions.load(laws))
         self._defaults = machine_of(self.drives).parameters
-        self._hidden = HiddenScore(c.device, c.load, c.motor, num_envs, num_threads=c.num_threads, friction=c.friction)
+        self._score = RobustScore(c.device, c.load, c.motor, num_envs, num_threads=c.num_threads, friction=c.friction)
 
     def _spaces(self) -> tuple[gymnasium.Space[Any], Box]:
         c = self.config
@@ -268,7 +269,7 @@ class GainTuning(Lanes):
         blank = np.zeros((axes, len(TRIED)))
         self._last_features, self._best_features = blank, blank.copy()
         self._wave = np.zeros((axes, c.waveform))
-        self._measured, self._hidden_now = np.ones(n), np.ones(n)
+        self._measured, self._robust_cost = np.ones(n), np.ones(n)
         self._left = np.zeros(n, np.int64)
         self._noise, self._trial = np.ones(n), np.zeros(n)
         self._parameters: dict[str, Floats] = {}
@@ -304,11 +305,11 @@ class GainTuning(Lanes):
         measured = self._measure(self._rule, tried)
         self._take(mask, self._rule, tried, measured)
         self._left[mask] = self.config.trials
-        if self._hidden is not None:
-            self._hidden.set_machines(self._parameters, self._volts(), mask)
-            self._hidden.set_moves(self._move, mask)
-            hidden = self._hidden.set_reference(self._rule, mask).hidden
-            self._hidden_now = np.where(mask, hidden, self._hidden_now)
+        if self._score is not None:
+            self._score.set_machines(self._parameters, self._volts(), mask)
+            self._score.set_moves(self._move, mask)
+            robust_cost = self._score.set_reference(self._rule, mask).robust_cost
+            self._robust_cost = np.where(mask, robust_cost, self._robust_cost)
         drives.emergencies()
         info = self._told()
         info["aborted"] = mask & self._stopped(tried)
@@ -324,12 +325,12 @@ class GainTuning(Lanes):
         tried = self._try(gains, active)
         measured = self._measure(gains, tried)
         better = active & (measured < self._measured)
-        before = self._measured.copy() if self._hidden is None else self._hidden_now.copy()
-        trial_hidden = None if self._hidden is None else self._hidden.score(gains).hidden
+        before = self._measured.copy() if self._score is None else self._robust_cost.copy()
+        trial_robust_cost = None if self._score is None else self._score.score(gains).robust_cost
         self._take(active, gains, tried, measured, better)
-        if trial_hidden is not None:
-            self._hidden_now = np.where(better, trial_hidden, self._hidden_now)
-        after = self._measured if self._hidden is None else self._hidden_now
+        if trial_robust_cost is not None:
+            self._robust_cost = np.where(better, trial_robust_cost, self._robust_cost)
+        after = self._measured if self._score is None else self._robust_cost
         aborted = active & self._stopped(tried)
         terms = {"tuning": np.log(before / after), "abort": -self.config.abort_cost * aborted}
         self._left[active] -= 1
@@ -339,8 +340,8 @@ class GainTuning(Lanes):
         info["trial_measured"] = measured.copy()
         info["aborted"] = aborted
         info["faults"] = self._faults()
-        if trial_hidden is not None:
-            info["trial_hidden"] = trial_hidden
+        if trial_robust_cost is not None:
+            info["trial_robust_cost"] = trial_robust_cost
         dead = zero.astype(bool) if self._owned else active & self._dead()
         return self._observe(), terms["tuning"] + terms["abort"], dead, self._left <= 0, info
 
@@ -398,7 +399,7 @@ class GainTuning(Lanes):
         return np.asarray(costs.reshape(self.num_envs, -1).max(axis=1))
 
     def _stopped(self, tried: Trial) -> Mask:
-        """Return in which lanes a trial was stopped, on any axis."""
+        """Return in which environments a trial was stopped, on any axis."""
         return np.asarray(tried.aborted.any(axis=0).reshape(self.num_envs, -1).any(axis=1))
 
     def _take(self, mask: Mask, gains: Integers, tried: Trial, measured: Floats, better: Mask | None = None) -> None:
@@ -435,8 +436,8 @@ class GainTuning(Lanes):
             "gains": self._best.reshape(n, self._axes, -1).copy(),
             "measured": self._measured.copy(),
         }
-        if self._hidden is not None:
-            info["hidden"] = self._hidden_now.copy()
+        if self._score is not None:
+            info["robust_cost"] = self._robust_cost.copy()
             info["parameters"] = self._parameters
         return info
 
@@ -461,7 +462,7 @@ class GainTuning(Lanes):
     def _close_lanes(self) -> None:
         if self._pictures is not None:
             self._pictures.close()
-        if self._hidden is not None:
-            self._hidden.close()
+        if self._score is not None:
+            self._score.close()
         if self._owned:
             self.drives.close()

@@ -1,8 +1,8 @@
-"""Domain randomisation as data: laws of a machine's parameters, supply, temperatures, bus and faults, and drawing.
+"""Domain randomisation as data: distributions of a machine's parameters, supply, temperatures, bus and faults.
 
-A set of laws is a TOML file (`distributions/`, one for every load); a curriculum widens it from the default machine to
-the whole range. A machine depends on the generator that it is drawn with, and on nothing else: a parameter's share of
-chance belongs to its name, so that adding a law to a set changes no other parameter.
+A set of distributions is a TOML file (`distributions/`, one for every load); a curriculum widens it from the default
+machine to the whole range. A machine depends on the generator that it is drawn with, and on nothing else: a parameter's
+share of chance belongs to its name, so that adding a distribution to a set changes no other parameter.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class Law(NamedTuple):
     def value(self, share: float, default: float, width: float = 1.0) -> float:
         """Return the value at a share of chance 0...1, drawn towards the default where width is below 1.
 
-        A width of 0 is the default, 1 the whole law; in between the distance from the default shrinks: its logarithm
-        under "loguniform", the probability of another value than the default under "choice".
+        A width of 0 is the default, 1 the whole distribution; in between the distance from the default shrinks: its
+        logarithm under "loguniform", the probability of another value than the default under "choice".
         """
         scale = default if self.relative else 1.0
         if self.law == "choice":
@@ -100,7 +100,7 @@ class Law(NamedTuple):
         return default + width * (drawn * scale - default)
 
     def table(self) -> dict[str, Any]:
-        """Return the law as a TOML table has it."""
+        """Return the distribution as a TOML table."""
         found: dict[str, Any] = {"law": self.law}
         for key in (*_KEYS[self.law], *_OPTIONAL[self.law]):
             value = getattr(self, key)
@@ -121,7 +121,7 @@ class Curriculum(NamedTuple):
         return float(np.interp(steps, self.steps, self.stage))
 
     def width(self, name: str, stage: float) -> float:
-        """Return how far a parameter's law is open at a stage, 0...1."""
+        """Return the width of a parameter's distribution at a stage, 0...1."""
         start, end = self.opens.get(name, self.opens.get(name.split(".")[0], (0.0, 1.0)))
         if stage >= end:
             return 1.0
@@ -131,7 +131,8 @@ class Curriculum(NamedTuple):
 class Distributions:
     """Laws by the name of the parameter, and the curriculum that opens them.
 
-    Names are those of `drives.machine.parameters` and of `BESIDE`. `faults` is the law of faults, None without any.
+    Names are those of `drives.machine.parameters` and of `BESIDE`. `faults` is the distribution of faults, None without
+    any.
     """
 
     def __init__(

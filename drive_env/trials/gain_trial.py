@@ -52,8 +52,8 @@ class Trial(NamedTuple):
 
     following: integral of |demand - actual| dt over the whole of a phase, over the move's size.
     error: demand less actual of the move over its size, shape (TRIAL, num_axes).
-    culprit: Axes that oscillated or tripped themselves when their lane was stopped, (num_axes,): others of the lane are
-    stopped with them.
+    culprit: Axes that oscillated or went into fault themselves when their machine was stopped, (num_axes,): others of
+    the machine are stopped with them.
     """
 
     terms: Terms  # its disturbance is 1
@@ -83,17 +83,17 @@ def softness(known: GainSet, gains: Integers) -> Floats:
 
 
 def measured_cost(costs: Floats) -> Floats:
-    """Return what a trial is worth: half of move and reversal's mean, half of the worst phase; hidden J's likeness."""
+    """Return the cost of a trial: half the mean of move and reversal, half the worst phase, as in the robust cost."""
     return np.asarray(0.5 * costs[:2].mean(axis=0) + 0.5 * costs.max(axis=0))
 
 
 class Trials:
-    """Runs trials on drives; the axes of a lane are stopped together.
+    """Runs trials on drives; the axes of a machine are stopped together.
 
     Args:
         drives: The drives, in pp.
         motor: What turns them.
-        axes: Axes of a lane.
+        axes: Axes of a machine.
         t_0: Four times the sum of the small time constants [s].
 
     Attributes:
@@ -135,7 +135,8 @@ class Trials:
     ) -> Trial:
         """Try gains, raw integers of shape (num_axes, count), in a move from the origin [inc], back, and there again.
 
-        Where an axis oscillates or trips, its lane gets the incumbent back at once, is cleared, and goes on with it.
+        Where an axis oscillates or goes into fault, its machine gets the incumbent back at once, its fault is reset,
+        and it continues with it.
 
         Args:
             gains: What is tried.
@@ -190,7 +191,7 @@ class Trials:
     def _phase(
         self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask
     ) -> tuple[Floats, Floats, Floats, Mask, Mask]:
-        """Move and watch; return position, demand, current, whose lanes have been stopped so far, and by whom now."""
+        """Move; return position, demand, current, the machines stopped so far, and the axes that caused it now."""
         drives, to = self._drives, _on_the_counter(target)
         objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
         traces = []

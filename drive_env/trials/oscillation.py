@@ -1,4 +1,4 @@
-"""When an axis that moves counts as oscillating: the one criterion of trials, tuners and audits.
+"""The criterion of oscillation of a moving axis, for trials, tuners and audits.
 
 RMS change of the current from millisecond to millisecond, over the rated current. The edges of a profile make 0.1 on a
 fast loop; a limit cycle, whose current goes from limit to limit, 1 and more.

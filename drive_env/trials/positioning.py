@@ -1,4 +1,4 @@
-"""The positioning move that trials are made of: planned for a machine, started on drives, and what it says.
+"""The positioning move that trials are made of: planned for a machine, started on drives, and evaluated.
 
 Every profile takes 60 ms and every trial 250 ms, so that all axes have the same windows, whatever they turn.
 """

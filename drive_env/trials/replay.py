@@ -1,6 +1,6 @@
-"""A recorded move of a real machine, repeated on emulated ones: how far they lie from it, and which machines would fit.
+"""A recorded move of a real machine, repeated on emulated ones: their deviation, and a fit of machines to it.
 
-The log is the CSV that `drive-env scope` writes. What the drive was told is played again; what it did is compared.
+The log is the CSV that `drive-env scope` writes. The commands are played again; the responses are compared.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Log(NamedTuple):
 
 
 class LogDifference(NamedTuple):
-    """How far one object of an emulated machine lies from the log, each of shape (num_machines,).
+    """The deviation of one object of an emulated machine from the log, each of shape (num_machines,).
 
     nrmse: RMS of the difference over the log's range (greatest less least), samples by samples.
     shift: Time [s] by which the emulator is late: shifted back by it, it fits best.
@@ -83,7 +83,7 @@ class LogDifference(NamedTuple):
 class LogFit(NamedTuple):
     """Machines that fit a log.
 
-    distributions: The laws given, those of fitted parameters replaced by the range of the accepted machines.
+    distributions: The distributions given, those of fitted parameters replaced by the range of the accepted machines.
     accepted: Fitted parameter -> values of the accepted machines [SI], best first.
     distance: Their distances, mean NRMSE over objects and axes, best first.
     nominal: Distance of the machine without any draw.
@@ -97,7 +97,7 @@ class LogFit(NamedTuple):
     narrowed: dict[str, float]
 
     def is_seen(self, name: str) -> bool:
-        """Return whether the log says something about a fitted parameter."""
+        """Return whether the log determines a fitted parameter."""
         return self.narrowed[name] < UNSEEN
 
     def to_toml(self) -> str:
@@ -108,7 +108,7 @@ class LogFit(NamedTuple):
             f"worst accepted {self.distance[-1]:.4f} of {len(self.distance)}.",
         ]
         for name, share in self.narrowed.items():
-            seen = "" if self.is_seen(name) else ": the log says next to nothing about it, its law is the one given"
+            seen = "" if self.is_seen(name) else ": the log does not determine it, its distribution is the one given"
             lines.append(f"# {name}: {100.0 * share:.0f} % of the range given{seen}")
         return "\n".join(lines) + "\n\n" + self.distributions.to_toml()
 
@@ -130,9 +130,9 @@ def read_log(path: str | Path) -> Log:
         with file.open(newline="", encoding="utf-8") as text:
             rows = list(csv.reader(text))
     except UnicodeDecodeError:
-        raise ValueError(f"{file} is no text; give the CSV that drive-env scope writes") from None
+        raise ValueError(f"{file} is not a text file; give the CSV that drive-env scope writes") from None
     except csv.Error as error:
-        raise ValueError(f"{file} is no CSV: {error}; give the one that drive-env scope writes") from None
+        raise ValueError(f"{file} is not CSV: {error}; give the one that drive-env scope writes") from None
     if not rows or not rows[0] or rows[0][0] != "t [s]" or len(rows[0]) < 2:
         raise ValueError(f"{file}: the first line must begin with 't [s]', as drive-env scope writes it")
     columns: dict[Key, list[int]] = {}
@@ -211,7 +211,7 @@ def command_of(log: Log) -> tuple[Key, str, Key]:
         if key in log.objects and (mode != "csp" or _is_a_path(log.objects[key])):
             return key, mode, played
     known = ", ".join(f"{key[0]:04X}h" for key, *_ in COMMANDS)
-    raise ValueError(f"the log holds no command that changes step by step; record one of {known} with the response")
+    raise ValueError(f"the log has no command that changes step by step; record one of {known} with the response")
 
 
 def compare(log: Log, found: Mapping[Key, Integers], num_machines: int = 1) -> dict[Key, LogDifference]:
@@ -235,7 +235,7 @@ def compare(log: Log, found: Mapping[Key, Integers], num_machines: int = 1) -> d
 
 
 def fittable(laws: Distributions) -> list[str]:
-    """Return which parameters of a set of laws can be fitted: those that are drawn from a range."""
+    """Return which parameters of a set of distributions can be fitted: those that are drawn from a range."""
     return [name for name, law in laws.laws.items() if name not in BESIDE and law.law != "choice"]
 
 
@@ -251,17 +251,17 @@ def fit(
     slack: float = 1.2,
     seed: int = 0,
 ) -> LogFit:
-    """Fit laws to a log: draw machines, keep those that respond like it, draw anew around them, and so on.
+    """Fit distributions to a log: draw machines, keep those that respond like it, draw anew around them, and so on.
 
     A population Monte Carlo search without likelihood: every machine of `drives` is a candidate. The first round draws
-    from the laws given, the later ones from the best `accept` share of all so far, spread by their own covariance. The
-    accepted machines are those within `slack` times the best distance. Their range is not a confidence interval: it is
-    the set of machines that this log cannot tell from the best one by more than that.
+    from the distributions given, the later ones from the best `accept` share of all so far, spread by their own
+    covariance. The accepted machines are those within `slack` times the best distance. Their range is not a confidence
+    interval: it is the set of machines that this log cannot tell from the best one by more than that.
 
     Args:
         drives: Emulated drives, at least 16 machines; the more the better.
         log: The recorded move.
-        distributions: Laws, or a set's name; what is not fitted stays nominal in the search.
+        distributions: Distributions, or a set's name; what is not fitted stays nominal in the search.
         parameters: Which of them to fit.
         settings: As in `replay`.
         rounds: Of candidates, 1 or more.

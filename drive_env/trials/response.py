@@ -1,4 +1,4 @@
-"""What a recorded move says: step, disturbance, effort and ringing figures of many axes at once.
+"""Figures of a recorded move: step, disturbance, effort and ringing, of many axes at once.
 
 A record is a time vector t [s], shape (n,), and signals of shape (n,) for one axis or (n, num_axes) for many; every
 figure then has shape () or (num_axes,). A figure that does not exist (never rises, never settles) is nan, never an
@@ -27,7 +27,7 @@ TRANSIENT = 0.2  # leading share of the record in which no swing is measured
 
 @dataclass(frozen=True)
 class StepMetrics:
-    """What one step response says; each figure has shape () or (num_axes,)."""
+    """The figures of one step response; each figure has shape () or (num_axes,)."""
 
     rise_time: Floats  # s, 10 % to 90 %
     settling_time: Floats  # s after the step
@@ -42,7 +42,7 @@ class StepMetrics:
 
 @dataclass(frozen=True)
 class DisturbanceMetrics:
-    """What one load step says; each figure has shape () or (num_axes,)."""
+    """The figures of one load step; each figure has shape () or (num_axes,)."""
 
     dip: Floats  # unit of y, magnitude
     recovery_time: Floats  # s after the load step
@@ -51,7 +51,7 @@ class DisturbanceMetrics:
 
 @dataclass(frozen=True)
 class CurrentMetrics:
-    """What a move cost; each figure has shape () or (num_axes,)."""
+    """The effort of a move; each figure has shape () or (num_axes,)."""
 
     peak: Floats  # A
     rms: Floats  # A
@@ -417,8 +417,8 @@ def _record(t: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
     times, signal = np.asarray(t, dtype=np.float64), _signal(y, "signal")
     if times.ndim != 1 or len(signal) != times.size:
         raise ValueError(
-            f"t of shape {times.shape} does not fit a signal of shape {signal.shape}; "
-            "give t as (n,) and the signal as (n,) or (n, num_axes)"
+            f"t of shape {times.shape} does not fit a signal of shape {signal.shape}; give t as (n,) and the signal "
+            "as (n,) or (n, num_axes)"
         )
     if not np.all(np.diff(times) > 0):
         k = int(np.argmin(np.diff(times) > 0))
@@ -440,8 +440,8 @@ def _per_axis(x: ArrayLike, signal: Floats, name: str) -> Floats:
     values = np.asarray(x, dtype=np.float64)
     if values.shape not in ((), signal.shape[1:]):
         raise ValueError(
-            f"{name} of shape {values.shape} does not fit a signal of shape {signal.shape}; "
-            f"give one number or an array of shape {signal.shape[1:]}"
+            f"{name} of shape {values.shape} does not fit a signal of shape {signal.shape}; give one number or an "
+            f"array of shape {signal.shape[1:]}"
         )
     return values
 

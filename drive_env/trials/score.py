@@ -1,17 +1,17 @@
-"""What a tuning is worth: J of a positioning move and a load step, and hidden J, which counts robustness.
+"""The cost of a tuning: J of a positioning move and a load step, and the robust cost over variants of the machine.
 
 Lower is better. Every machine is judged on its own scales:
 
-    J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 (1 + (n/3 %)^2)^0.2 (1 + max(0, os - 2 %)/10 %), at most 30; a trip scores 30
+    J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 (1 + (n/3 %)^2)^0.2 (1 + max(0, os - 2 %)/10 %), at most 30; a fault scores 30
 
     t_s = t_0 + integral of min(1, |e|/w) dt from the profile's end to the load step; w = max(1 % of the move, 3 counts)
     t_0 = four times the sum of the small time constants
-    E_d = integral of |e| dt after a load step of 0.3 rated torque; E_0 that with the gains of the fitted rule
+    E_d = integral of |e| dt after a load step of 0.3 rated torque; E_0 that with the gains of the baseline rule
     n   = RMS increment of the demanded current from millisecond to millisecond, at rest before the load step, over the
           rated current; on a bus that of the actual current
     os  = largest way beyond the target over the move
 
-Hidden J is half of J plus half of the largest J of the machine as it is and its variants (`VARIANTS`). It is for
+The robust cost is half of J plus half of the largest J of the machine as it is and its variants (`VARIANTS`). It is for
 scoring and training, never something to observe: a load step, and the machine's variants, do not exist on hardware.
 """
 
@@ -61,7 +61,7 @@ _STIFFNESS = ("jnt_stiffness", "contact_stiffness")
 
 
 class Variant(NamedTuple):
-    """A machine a little other than the nominal one: factors of its inertia and stiffness, and of velocity P."""
+    """A variant of the machine: factors of its inertia and stiffness, and of velocity P."""
 
     name: str
     inertia: float = 1.0
@@ -79,7 +79,7 @@ VARIANTS = (
 
 
 class Terms(NamedTuple):
-    """What J is made of, each of one shape: t_s/t_0, E_d/E_0, n and os as fractions, and whether the drive tripped."""
+    """The terms of J, each of one shape: t_s/t_0, E_d/E_0, n and os as fractions, and whether there was a fault."""
 
     settling: Floats
     disturbance: Floats
@@ -99,7 +99,7 @@ class Terms(NamedTuple):
 
 
 def cost(terms: Terms) -> Floats:
-    """Return J of its terms, in their shape."""
+    """Return J from its terms, in their shape."""
     raw = (
         terms.settling**0.4
         * terms.disturbance**0.4
@@ -110,26 +110,26 @@ def cost(terms: Terms) -> Floats:
     return np.where(terms.tripped | ~np.isfinite(raw), TRIP, np.minimum(raw, TRIP))
 
 
-def hidden_cost(j: Floats) -> Floats:
-    """Return hidden J of the variants' J, the nominal machine's first in the last dimension."""
+def robust_cost(j: Floats) -> Floats:
+    """Return the robust cost of the variants' J, the nominal machine's first in the last dimension."""
     return np.asarray(0.5 * j[..., 0] + 0.5 * j.max(axis=-1))
 
 
-# --- hidden J of emulated machines ------------------------------------------------------------------------------------
+# --- the robust cost of emulated machines -----------------------------------------------------------------------------
 class Scores(NamedTuple):
-    """Of every machine: hidden J (num_machines,), and J and its terms, (num_machines, variants).
+    """Of every machine: the robust cost (num_machines,), and J and its terms, (num_machines, variants).
 
-    A machine with several axes is as good as its worst. swing: What a trial's watch would see of it, the largest RMS
+    A machine with several axes is as good as its worst. swing: What a trial would measure, the largest RMS
     increment of the current over 25 ms until the load step, over the rated one, likewise; J does not count it.
     """
 
-    hidden: Floats
+    robust_cost: Floats
     j: Floats
     terms: Terms
     swing: Floats
 
 
-class HiddenScore:
+class RobustScore:
     """Scores gains on emulated machines: every variant of every machine is a machine of one set, run side by side.
 
     The score depends on the machine and the gains alone: every run begins at rest, with the same noise. A variant that
@@ -207,7 +207,7 @@ class HiddenScore:
         self._t_0 = np.repeat(t_0, self._axes[2])
 
     def set_constant_load(self, torque: Floats) -> None:
-        """Take what pulls at the machines all the while [N*m], (num_machines,), signed as `machine.load_torque`."""
+        """Set a constant load [N*m], (num_machines,), signed as `machine.load_torque`."""
         self._constant = np.repeat(np.asarray(torque, float), len(self.variants))
 
     def set_moves(self, move: Move, where: Mask | None = None) -> None:
@@ -224,7 +224,7 @@ class HiddenScore:
         )
 
     def set_reference(self, gains: Integers, where: Mask | None = None) -> Scores:
-        """Take these gains, those of the fitted rule, for E_0; return their scores, E_d/E_0 of the nominal one 1."""
+        """Take these gains, those of the baseline rule, for E_0; return their scores, E_d/E_0 of the nominal one 1."""
         mask = np.ones(self.num_machines, bool) if where is None else where
         measured = self._run(gains)
         self._reference = np.where(mask[:, None], measured[1][:, 0], self._reference)
@@ -235,7 +235,7 @@ class HiddenScore:
         return self._scores(*self._run(gains))
 
     def close(self) -> None:
-        """Give the drives back."""
+        """Close the drives."""
         self._drives.close()
 
     def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -299,4 +299,4 @@ class HiddenScore:
         worst = j.argmax(axis=-1)[..., None]
         of_worst = terms.each(lambda value: np.take_along_axis(value, worst, -1)[..., 0])
         j = j.max(axis=-1)
-        return Scores(hidden_cost(j), j, of_worst, swings.max(axis=-1))
+        return Scores(robust_cost(j), j, of_worst, swings.max(axis=-1))

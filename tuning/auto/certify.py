@@ -1,4 +1,4 @@
-"""What auto did, as a certificate."""
+"""The result of auto as a certificate."""
 
 from __future__ import annotations
 
@@ -25,17 +25,19 @@ if TYPE_CHECKING:
     from tuning.auto.result import AxisRun, Result
     from tuning.target import Target
 
-SETTLED = 0.01  # of the move: what counts as there
+SETTLED = 0.01  # of the move: the band of settling
+# Counted from the end of the profile.
+SETTLING = "settling time after the set-point's arrival, to within 1 % of the move [s]"
 
 
 def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") -> Certificate:
     """Return the certificate of a run of auto.
 
     Args:
-        target: What was tuned.
+        target: The drives that were tuned.
         result: What came of it.
         seed: That of the run.
-        tuner: What found the gains.
+        tuner: Name of the tuner that found the gains.
     """
     axes = tuple(_axis(target, result, axis, run) for axis, run in enumerate(result.axes))
     return Certificate(
@@ -58,7 +60,7 @@ def _axis(target: Target, result: Result, axis: int, run: AxisRun) -> AxisCertif
         axis=axis,
         accepted=run.accepted,
         reservations=tuple(run.reservations),
-        reason=run.reason or f"{_opening(run)}: the gains were verified {run.verified}",
+        reason=run.reason or f"{_opening(run)}; the gains were verified {run.verified}",
         identified={} if run.identified is None else identified(run.identified),
         before=tuple(run.before),
         after=tuple(run.after),
@@ -73,7 +75,7 @@ def _axis(target: Target, result: Result, axis: int, run: AxisRun) -> AxisCertif
 
 
 def _opening(run: AxisRun) -> str:
-    return "every check was passed" if not run.reservations else "every check that could be made was passed"
+    return "all checks passed" if not run.reservations else "all checks that could be made passed"
 
 
 def _steps(result: Result, axis: int) -> tuple[StepResponse, ...]:
@@ -92,18 +94,18 @@ def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
     there = np.flatnonzero(demand != demand[-1])
     settled = len(actual) - 1 not in late
     figures = {
-        # After the profile's end; less than nothing is nothing.
-        "settling [s]": max(float(shown.t[late[-1]] - shown.t[there[-1]]), 0.0) if settled and late.size else np.nan,
+        # Of an actual position that is inside the band before the profile's end, 0.
+        SETTLING: max(float(shown.t[late[-1]] - shown.t[there[-1]]), 0.0) if settled and late.size else np.nan,
         "overshoot [%]": 100.0 * max(float(beyond.max()), 0.0) / size,
         "largest following error [rad]": float(np.abs(demand - actual).max()),
         "error at the end [rad]": float(demand[-1] - actual[-1]),
-        "current at rest afterwards, RMS over rated [%]": 100.0 * float(shown.swing[axis]),
+        "current at rest afterwards, RMS [% of rated]": 100.0 * float(shown.swing[axis]),
     }
     return StepResponse("move", tuned, "rad", shown.t, demand, actual, way * shown.current[:, axis], figures)
 
 
 def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple[FrequencyResponse, ...]:
-    """Return both outer loops as measured with the new gains, and as computed with those before."""
+    """Return both outer loops: measured with the new gains, and computed with the gains before."""
     response = result.response
     if response is None or not np.isfinite(response.open_loop[:, axis]).any():
         return ()
@@ -113,17 +115,17 @@ def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple
     changed = not np.array_equal(response.gains[axis], run.after)
     sources = {
         "velocity": "multisine, 1 kHz samples"
-        + (", with other gains, and by how much these differ" if changed else ""),
-        "position": "the measured velocity loop and position P",
+        + (", with other gains, converted to the new gains by the linear model" if changed else ""),
+        "position": "computed from the measured velocity loop and position P",
     }
     known = device.gains
     closed = run.plant is not None and not known.opens(run.before, "current", "velocity")
     shown = []
     for name, L in (("velocity", loops.velocity), ("position", loops.position)):
         if name == "position" and name not in run.margins:
-            continue  # too little was seen, or an axis alone that never goes alone
+            continue  # too few coherent lines, or one of linked axes
         if closed and not known.opens(run.before, name) and not run.is_kept:
-            assert run.plant is not None, "it was looked for"
+            assert run.plant is not None, "it was identified"
             before = OPEN_LOOPS[name](device, run.plant, run.before, response.f)
             shown.append(
                 frequency_response(
@@ -132,7 +134,7 @@ def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple
                     before,
                     margins(response.f, before),
                     tuned=False,
-                    source="the linear model of what was identified, for the gains before",
+                    source="linear model of the identified axis, with the gains before",
                 )
             )
         shown.append(

@@ -1,4 +1,4 @@
-"""What auto looks at before anything is risked: the wiring, and gains that others left in a drive."""
+"""Checks of auto before the motor turns fast: the wiring, and whether the gains in the drive are safe."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ SENSITIVITY, STEP, STEPS = 4.0, 0.85, 16
 
 
 def unsafe_gains(device: Device, plant: Plant, gains: Sequence[int]) -> str:
-    """Return why an axis is not to be moved with gains, "" if it may be."""
+    """Return why an axis must not be moved with gains, "" if it may."""
     if device.gains.opens(gains, *OPEN_LOOPS):
-        return "a P gain is 0, and a loop open"
+        return "a P gain is 0, so that a loop is open"
     rates = {"current": device.current_rate}
     for name, open_loop in OPEN_LOOPS.items():
         f = np.geomspace(1.0, 0.49 * rates.get(name, device.velocity_rate), LOOKED_AT)
@@ -37,16 +37,17 @@ def unsafe_gains(device: Device, plant: Plant, gains: Sequence[int]) -> str:
         # A loop whose gain is below 1 everywhere has all the phase there is.
         if found.gain_db < SAFE_GAIN_DB or found.phase_deg < SAFE_PHASE:
             return (
-                f"by the model the {name} loop has {found.gain_db:.0f} dB and {found.phase_deg:.0f} degrees of margin "
-                f"with them; {SAFE_GAIN_DB:g} dB and {SAFE_PHASE:g} degrees are needed"
+                f"they are too near to instability: by the model, the {name} loop has {found.gain_db:.0f} dB of gain "
+                f"margin and {found.phase_deg:.0f} degrees of phase margin; {SAFE_GAIN_DB:g} dB and {SAFE_PHASE:g} "
+                "degrees are needed"
             )
     return ""
 
 
 def sound_gains(device: Device, plant: Plant, gains: Sequence[int]) -> tuple[int, ...]:
-    """Return gains with position P as far down as the position loop needs it by the model; as they are if none helps.
+    """Return gains with position P lowered as far as the model demands; unchanged if that does not help.
 
-    A search by J alone may end with eight degrees of phase margin: where nothing disturbs that, it is the fastest.
+    A search by J alone may end with eight degrees of phase margin: without disturbances that is the fastest.
     """
     f = np.geomspace(1.0, 0.49 * device.velocity_rate, LOOKED_AT)
     *_, position_p = cascade_columns(device)
@@ -58,7 +59,7 @@ def sound_gains(device: Device, plant: Plant, gains: Sequence[int]) -> tuple[int
 
 
 def wrong_wiring(target: Target, identified: Identification) -> str:
-    """Return what is wrong with the wiring, "" if nothing is."""
+    """Return what is wrong with the wiring, "" if it is right."""
     direction, pairs = identified.estimates.get("encoder_direction"), identified.estimates.get("pole_pairs")
     if direction is not None and direction.value < 0.0:
         return identified.estimates["inertia"].reason
@@ -66,6 +67,6 @@ def wrong_wiring(target: Target, identified: Identification) -> str:
         index, _ = target.device.roles[Role.POLE_PAIRS]
         return (
             f"the motor has {pairs.value:.0f} pole pairs, and {target.motor.name} has {target.motor.n_p}: "
-            f"it is another motor; give --motor, or correct {index:04X}h"
+            f"this is another motor; give the right one with --motor, or correct {index:04X}h"
         )
     return ""

@@ -1,4 +1,4 @@
-"""The better of what was found and the fitted rule, by digital twins, once the measured loop has calmed it."""
+"""Keep the better of the gains found and the baseline rule's, by digital twins, after slowing by the measured loop."""
 
 from __future__ import annotations
 
@@ -18,25 +18,28 @@ if TYPE_CHECKING:
 
 Mask = NDArray[np.bool_]
 
-CLEARLY = 0.98  # of hidden J on the twins: what is less than that is worth another move
+CLEARLY = 0.98  # of the robust cost on the twins: what is less than that is worth another move
 
 
 def choose(run: AutoRun) -> None:
-    """Take the rule's gains where they serve better on the twins, and the measured loop bears them.
+    """Take the rule's gains where they are better on the twins and the measured loop is stable enough with them.
 
-    What was found is better on the twins before it is calmed; what is left of it afterwards need not be.
+    The gains found are better on the twins before they are slowed; afterwards they need not be.
     """
     better = _rule_is_better(run)
     if not better.any():
         return
     for k in map(int, np.flatnonzero(better)):
         run.gains[k], run.spare[k] = run.reference[k], 0
-        run.axes[k].notes.append("the gains of the fitted rule: on digital twins what was found, calmed, serves worse")
+        run.axes[k].notes.append(
+            "the gains of the baseline rule are kept: on the digital twins, the gains found by "
+            "search are worse once slowed"
+        )
     show(run, better)
 
 
 def _rule_is_better(run: AutoRun) -> Mask:
-    """Return the axes whose rule serves better than the gains they have, (num_axes,)."""
+    """Return the axes for which the rule's gains are better than the present ones, (num_axes,)."""
     target, response = run.target, run.response
     better = np.zeros(target.num_axes, bool)
     found_on_twins = np.array([np.isfinite(axis.twin) for axis in run.axes])
@@ -55,7 +58,7 @@ def _rule_is_better(run: AutoRun) -> Mask:
         known.append(known_of(plant, identified, float(reach[k])))
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[chosen]
     with Twins(target.device, target.motor, known, scaler, 2) as twins:
-        hidden = twins.score(np.stack([run.gains[chosen], run.reference[chosen]], axis=1))
-    for k, (own, rule) in zip(axes, hidden, strict=True):
+        cost = twins.score(np.stack([run.gains[chosen], run.reference[chosen]], axis=1))
+    for k, (own, rule) in zip(axes, cost, strict=True):
         better[k] = rule < CLEARLY * own and sensitivity(run, response, run.reference[k], k) <= SENSITIVITY
     return better

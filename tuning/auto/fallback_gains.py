@@ -1,7 +1,7 @@
-"""Fallback gains: what goes on shaking, even with the last good gains, gets gains that are slow.
+"""Slow fallback gains for axes that keep oscillating, even with the last good gains.
 
-A trial stops what oscillates and returns to the last good gains. Good ones may be so near to the edge that an axis
-that has been shaken goes on for ever in a limit cycle with them; that is seen only here.
+A trial stops an axis that oscillates and returns to the last good gains. These may be so near to instability that the
+axis, once shaken, stays in a limit cycle with them; this is detected only here.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ WINDOWS = 3  # of 25 ms in a row: a trial has acted after the first, and good ga
 
 
 class FallbackGains(Observer):
-    """Gives axes calm gains when they shake for long.
+    """Gives axes slow gains when they shake for too long.
 
     Args:
         num_axes: Axes.
         rated_current: Of their motors [A].
-        windows: Of 25 ms in a row in which it shakes; a trial has acted after the first.
+        windows: Of 25 ms in a row in which an axis shakes; a trial acts after the first.
 
     Attributes:
-        calm: Gains to calm with, (num_axes, count), or None as long as none are known.
+        calm: The slow gains, (num_axes, count), or None as long as none are known.
         calmed: Axes that got them since the last `begin`, (num_axes,).
     """
 
@@ -48,7 +48,7 @@ class FallbackGains(Observer):
         self._windows = np.zeros(num_axes, np.int64)
 
     def begin(self) -> None:
-        """Forget what was before a trial."""
+        """Reset the counts at the beginning of a trial."""
         self.calmed[:] = False
         self._windows[:] = 0
 
@@ -60,7 +60,7 @@ class FallbackGains(Observer):
         asked: Sequence[ObjectName],
         play: Mapping[ObjectName, ArrayLike] | None,
     ) -> None:
-        """Calm what has shaken too long."""
+        """Give slow gains to axes that have shaken too long."""
         if self.calm is None or cia402.TORQUE_ACTUAL not in asked or len(trace) != WATCH:
             return
         shaking = shakes(trace[cia402.TORQUE_ACTUAL], self._rated)

@@ -1,6 +1,6 @@
-"""What a load step does to axes that stand still: on emulated machines only, for a certificate.
+"""The response of axes at standstill to a load step: on emulated machines only, for a certificate.
 
-Hardware has no load step. It is no experiment, and nothing is found by it; gains with which an axis does not come to
+A load step cannot be applied to hardware. Nothing is identified by it, but gains with which an axis does not come to
 rest after it are not accepted.
 """
 
@@ -27,13 +27,13 @@ NAME = "load step of 0.3 rated torque at standstill"
 SHARE = 0.3  # of the rated torque
 # s: until the axis stands, then recorded before the step and after it, and at the end of that looked whether it stands.
 REST, BEFORE, AFTER, LOOKED_AT = 0.1, 0.02, 0.3, 0.1
-SWING = "current at rest afterwards, RMS over rated [%]"
+SWING = "current at rest afterwards, RMS [% of rated]"
 
 
 def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
-    """Return what a load step does to emulated axes with the gains they have; those that were off are off again.
+    """Return the response of emulated axes to a load step with their present gains; axes that were off are off again.
 
-    What is drawn is the first of two, against each other; the swing is the worst after these and after their ends.
+    Two load steps of opposite sign are made; the recording is of the first, the swing is the worst of all rests.
 
     Args:
         target: Emulated machines.

@@ -1,4 +1,4 @@
-"""The frequency response of the velocity loop with the new gains: what comes too near to instability is calmed."""
+"""The frequency response of the velocity loop with the new gains; gains too near to instability are lowered."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ CALMED = {"velocity": ("velocity", "position"), "position": ("position",)}  # wh
 LONGER = 2  # times as long it is shaken where too little was seen
 LEAST_WAY = 1e-3  # rad; an axis without any way is shaken as little as can be, and its response says so
 ALONE = (
-    "its response is that of an axis that moves alone what all axes of its machine share, with the others let go: with "
-    "all of them moving it the loop's gain is higher, and the gain margin less, by as much as their share; nothing was "
-    "measured of the position loop"
+    "the response was measured with this axis alone moving what all axes of its machine share, and the others "
+    "switched off: with all of them active the loop's gain is higher, and the gain margin lower, by the others' "
+    "share; the position loop was not measured"
 )
 FREE_WINDOW = 100  # turns of following error that trip a frequency response: it means nothing there
 
 
 def measure(run: AutoRun) -> None:
-    """Measure the velocity loop's response with the new gains; what comes too near to instability is calmed."""
+    """Measure the velocity loop's response with the new gains; lower gains that are too near to instability."""
     going = run.going
     # A move with the gains before matters more: without it nobody knows whether the new ones are better.
     late = going & ~run.affordable(run.response_time + run.look_back_time)
-    _without_response(run, late, "the drive time was used up")
+    _without_response(run, late, "the drive time of the run was used up")
     going &= ~late
     if not going.any():
         return
@@ -92,7 +92,7 @@ def measure(run: AutoRun) -> None:
 
 
 def _unclear(run: AutoRun, response: MeasuredLoop, going: Mask) -> Mask:
-    """Return the axes of which too little was seen, and for which there is time to look longer, (num_axes,)."""
+    """Return the axes with too few coherent lines and enough time to measure longer, (num_axes,)."""
     left = run.affordable(LONGER * run.response_time + run.response_time + run.look_back_time)
     unclear = np.zeros(run.target.num_axes, bool)
     for k in map(int, np.flatnonzero(going & left)):
@@ -111,7 +111,7 @@ def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
     axis = run.axes[k]
     seen = _seen(response, k)
     if seen < LEAST_LINES:
-        why = f"{seen} of its lines are coherent, and {LEAST_LINES} are needed"
+        why = f"only {seen} frequencies are coherent, and {LEAST_LINES} are needed"
         _without_response(run, np.arange(run.target.num_axes) == k, "; ".join([why, *response.notes[k]]))
         return False
     gains, known = run.gains[k], run.target.device.gains
@@ -126,14 +126,14 @@ def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
                 break
         else:
             axis.reason = (
-                f"the measured {loop} loop is {found.ms:.1f} times as sensitive as an open one: {SENSITIVITY:g} is most"
+                f"the measured {loop} loop has a sensitivity peak Ms of {found.ms:.1f}; {SENSITIVITY:g} is allowed"
             )
             return False
         if factor != 1.0:
             names = " and ".join(known.titles[column] for column in calmed)
             axis.notes.append(
-                f"{names} calmed to {100.0 * factor:.0f} %: the measured {loop} loop came "
-                "too near to instability; margins are computed from that response"
+                f"{names} lowered to {100.0 * factor:.0f} %: the measured {loop} loop was too near to instability; "
+                "the margins with the lower gains are computed from that measurement"
             )
         gains = softer
     if np.array_equal(gains, run.gains[k]):
@@ -143,7 +143,7 @@ def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
 
 
 def _loops(run: AutoRun) -> tuple[str, ...]:
-    """Return which loops a measured velocity loop shows; that of an axis alone, which never goes alone, only itself."""
+    """Return the loops whose margins a measured velocity loop gives; of linked axes only the velocity loop."""
     return ("velocity",) if run.target.linked else tuple(CALMED)
 
 
@@ -162,7 +162,7 @@ def sensitivity(run: AutoRun, response: MeasuredLoop, gains: Integers, k: int) -
 
 
 def judge(run: AutoRun) -> None:
-    """Say which margins the gains have that are to stay: as measured, or what they are at least."""
+    """Write down the margins of the final gains: as measured, or their lower bound."""
     response = run.response
     if response is None:
         return
@@ -179,15 +179,15 @@ def judge(run: AutoRun) -> None:
             axis.reservations.append(ALONE)
         how = "by"
         if not np.array_equal(gains, response.gains[k]):
-            how = "by margins with these gains computed from"
+            how = "by margins computed for these gains from"
         axis.verified = (
-            f"{axis.verified or BY_TRIAL}; and {how} the measured frequency response of the velocity loop, "
-            + ", ".join(f"Ms {one.ms:.1f} of the {loop} loop" for loop, one in axis.margins.items())
+            f"{axis.verified or BY_TRIAL}; and {how} the measured frequency response of the velocity loop: "
+            + ", ".join(f"{loop} loop Ms {one.ms:.1f}" for loop, one in axis.margins.items())
         )
 
 
 def _tell(axis: AxisRun, loop: str, found: Margins, least: AtLeast) -> None:
-    """Say what was not seen of a loop's margins, and what it is at least."""
+    """Add reservations for margins that were not measured, with their lower bound."""
     for name, value, bound, unit in (
         ("phase", found.phase_deg, least.phase_deg, "degrees"),
         ("gain", found.gain_db, least.gain_db, "dB"),
@@ -196,19 +196,20 @@ def _tell(axis: AxisRun, loop: str, found: Margins, least: AtLeast) -> None:
             continue
         if math.isnan(bound):
             axis.reservations.append(
-                f"the {loop} loop's {name} margin was not seen: too few lines are coherent there, and no model fits"
+                f"the {loop} loop's {name} margin was not measured: too few frequencies are coherent, and the "
+                "response fits no model"
             )
         elif not math.isinf(bound):
             (axis.reservations if bound < CLOSE[name] else axis.notes).append(
-                f"the {loop} loop's {name} margin was not seen; by the model fitted to the response, with all that it "
-                f"leaves open, it is at least {bound:.0f} {unit}"
+                f"the {loop} loop's {name} margin was not measured; it is at least {bound:.0f} {unit} by the model "
+                "fitted to the response, with its 95 % intervals"
             )
 
 
 def _try_again(run: AutoRun, calmed: Mask) -> None:
-    """Try gains that were calmed, and record a move with them; without time for a trial, that move must do."""
+    """Try gains that were lowered, and record a move with them; without time for a trial, only the move."""
     where = calmed & run.affordable(TRIAL_TIME + MOVE_TIME + run.look_back_time)
-    run.reserve(calmed & ~where, "a move was the only trial of the calmed gains: the drive time was used up")
+    run.reserve(calmed & ~where, "the lowered gains were tried by one move only: the drive time of the run was used up")
     assert run.ground is not None, "proving makes it"
     if where.any():
         with run.spending(run.target.together(where)):
@@ -217,26 +218,26 @@ def _try_again(run: AutoRun, calmed: Mask) -> None:
             axis = run.axes[k]
             axis.proof = float(proof.cost[k])
             if not proof.passed[k]:
-                axis.reason = f"the calmed gains failed their trial: {proof.reason[k]}"
+                axis.reason = f"the lowered gains failed their trial: {proof.reason[k]}"
     show(run, calmed & run.going)
 
 
 def _go_on_after_faults(run: AutoRun, faults: Mapping[int, str]) -> None:
-    """Have axes move once more that were shaken into a fault: what the gains do by themselves was seen before."""
+    """Repeat the move with axes that went into fault during the measurement."""
     where = np.isin(np.arange(run.target.num_axes), list(faults))
     if not where.any():
         return
     for axis, causes in faults.items():
         only = np.arange(run.target.num_axes) == axis
-        _without_response(run, only, f"the drive went into fault while it was shaken for it ({causes})")
+        _without_response(run, only, f"the drive went into fault during the measurement ({causes})")
     assert run.ground is not None, "proving makes it"
     with run.spending(run.target.together(where)):
         run.ground.recover(where)
-    run.drop_faults("its frequency response was measured, and stays in it")
+    run.drop_faults("its frequency response was measured, and the fault cannot be reset")
     show(run, where & run.going)
 
 
 def _without_response(run: AutoRun, where: Mask, why: str) -> None:
-    """Say why there is no frequency response, and what was verified instead."""
+    """Add the reason why there is no frequency response, and how the gains were verified instead."""
     run.unseen |= where
-    run.reserve(where, f"no margins were measured: {why}; verified {BY_TRIAL} instead")
+    run.reserve(where, f"margins not measured: {why}; the gains were verified {BY_TRIAL} instead")

@@ -1,4 +1,4 @@
-"""Moves for the record, with the new gains and those before, and whether axes stand still after them."""
+"""Recorded moves with the new gains and the gains before, and the check that axes are at rest afterwards."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EASINGS, EASED_LEAST, EASED, EASED_TO, LIMIT_CYCLE = 3, 0.5, 0.8, 0.9, 0.2
 
 
 def show(run: AutoRun, where: Mask | None = None) -> None:
-    """Record a move with the new gains, of all axes or some; one that fails is refused."""
+    """Record a move with the new gains, of all axes or some; an axis that fails is rejected."""
     going = run.going if where is None else run.target.together(where)
     if not going.any():
         return
@@ -61,23 +61,27 @@ def show(run: AutoRun, where: Mask | None = None) -> None:
             # What passed once and fails now is at its edge.
             if run.spare[k].any():
                 run.gains[k], run.spare[k] = run.spare[k], 0
-                axis.notes.append(f"the second best of the trial: with the best, in one more move {why}")
+                axis.notes.append(f"the second best gains of the trial are kept: with the best, in another move, {why}")
             elif axis.eased and not np.array_equal(run.gains[k], run.reference[k]):
                 run.gains[k] = run.reference[k]
-                axis.notes.append(f"the gains of the fitted rule: with the eased ones, in one more move {why}")
+                axis.notes.append(
+                    f"the gains of the baseline rule are kept: with the lowered ones, in another move, {why}"
+                )
             else:
                 run.gains[k] = faster(run.target.device.gains, run.gains[k], AT_THE_EDGE)
-                axis.notes.append(f"slowed to {100.0 * AT_THE_EDGE:.0f} % after the trial: in one more move {why}")
+                axis.notes.append(
+                    f"gains lowered to {100.0 * AT_THE_EDGE:.0f} % after the trial: in another move, {why}"
+                )
         # Axes of one machine pull at one load: one that is to move again has the others move with it.
-        lanes = run.target.axes_per_machine
-        going = np.repeat((failed | again).reshape(-1, lanes).any(axis=1), lanes) & run.going
+        axes = run.target.axes_per_machine
+        going = np.repeat((failed | again).reshape(-1, axes).any(axis=1), axes) & run.going
         if not going.any():
             break
-    run.drop_faults("it moved with the new gains")
+    run.drop_faults("moving with the new gains")
 
 
 def _ease(run: AutoRun, k: int, swing: float, why: str) -> None:
-    """Take calmer gains for an axis that shook: the same, slowed by as much as it shook, or the fitted rule's.
+    """Take lower gains for an axis that shook: the same, lowered by as much as it shook, or the baseline rule's.
 
     Args:
         run: The run.
@@ -93,25 +97,25 @@ def _ease(run: AutoRun, k: int, swing: float, why: str) -> None:
     is_slow = bool(np.all(slowed[outer] <= rule[outer]))
     if not is_rule and (swing > LIMIT_CYCLE or axis.eased == EASINGS - 1 or is_slow):
         run.gains[k] = rule
-        axis.notes.append(f"the gains of the fitted rule: with faster ones {why}")
+        axis.notes.append(f"the gains of the baseline rule are kept: with faster ones {why}")
     else:
         run.gains[k] = slowed
-        axis.notes.append(f"slowed to {100.0 * factor:.0f} %: {why}")
+        axis.notes.append(f"gains lowered to {100.0 * factor:.0f} %: {why}")
     run.spare[k] = 0  # about as fast as the best, which shook
     axis.eased += 1
 
 
 def _shook(swing: float, when: str) -> str:
-    allowed = f"{100.0 * RESTLESS:.0f} % is still"
-    return f"its current swung by {100.0 * swing:.1f} % of the rated one (RMS) {when}, and {allowed}"
+    allowed = f"{100.0 * RESTLESS:.0f} % is allowed"
+    return f"its current swung by {100.0 * swing:.1f} % of the rated current (RMS) {when}; {allowed}"
 
 
 def stand(run: AutoRun, target: Target) -> None:
-    """Have axes stand still: what shakes at rest, on emulated machines after a load step too, is softened or refused.
+    """Check that axes are at rest, on emulated machines after a load step too; lower gains or reject.
 
     Args:
         run: The run.
-        target: Its target, whose time is not counted: a load step is no part of tuning.
+        target: Its target, whose time is not counted, since a load step is not part of tuning.
     """
     for attempt in range(EASINGS + 1):
         shaking = _shaking(run, target)
@@ -120,7 +124,7 @@ def stand(run: AutoRun, target: Target) -> None:
         for k, (swing, why) in shaking.items():
             axis = run.axes[k]
             if last or axis.is_kept or not run.affordable(MOVE_TIME - OVERTIME)[k]:
-                axis.reason = f"it shakes at rest: {why}"
+                axis.reason = f"it does not come to rest: {why}"
             else:
                 _ease(run, k, swing, why)
                 again[k] = True
@@ -130,7 +134,7 @@ def stand(run: AutoRun, target: Target) -> None:
 
 
 def _shaking(run: AutoRun, target: Target) -> dict[int, tuple[float, str]]:
-    """Return the axes that do not stand still: by how much their current swings over the rated one, and in words."""
+    """Return the axes that are not at rest: the swing of their current over the rated current, and a message."""
     going, shown = run.going, run.shown
     if shown is None or not going.any():
         return {}
@@ -155,14 +159,14 @@ def _shaking(run: AutoRun, target: Target) -> dict[int, tuple[float, str]]:
 
 
 def look_back(run: AutoRun) -> None:
-    """Record a move with the gains before, where they are safe by the model; keep them where they do better."""
+    """Record a move with the gains before, where they are safe by the model; keep them where they are better."""
     going = run.going
     late = going & ~run.affordable(run.look_back_time)
     reasons = [why or ("the drive time was used up" if late[k] else "") for k, why in enumerate(run.unsafe)]
     able = run.whole_machines(going & np.array([not why for why in reasons]))
     for k in map(int, np.flatnonzero(going & ~able)):
-        why = reasons[k] or "another axis of its machine could not make it"
-        run.axes[k].notes.append(f"no move with the gains before, for comparison: {why}")
+        why = reasons[k] or "another axis of its machine cannot make it"
+        run.axes[k].notes.append(f"no comparison move with the gains before: {why}")
     if not able.any():
         return
     assert run.ground is not None, "proving makes it"
@@ -177,12 +181,12 @@ def look_back(run: AutoRun) -> None:
         if able[k]:
             # That is those gains' doing, and speaks for the new ones.
             failed[k] = True
-            run.axes[k].notes.append(f"the drive went into fault as it moved with the gains before: {causes}")
+            run.axes[k].notes.append(f"the drive went into fault in the move with the gains before: {causes}")
         else:
-            run.axes[k].reason = f"the drive went into fault while it held its place: {causes}"
+            run.axes[k].reason = f"the drive went into fault while holding its position: {causes}"
     for k in map(int, np.flatnonzero(able & failed)):
         if earlier.reason[k]:
-            run.axes[k].notes.append(f"the move with the gains before: {earlier.reason[k]}")
+            run.axes[k].notes.append(f"in the move with the gains before, {earlier.reason[k]}")
     if (able & failed).any():
         with run.spending(able & failed):
             run.ground.recover(able & failed)
@@ -190,12 +194,12 @@ def look_back(run: AutoRun) -> None:
 
 
 def _keep_what_is_better(run: AutoRun, where: Mask) -> None:
-    """Keep the gains before on machines that moved better with them; one of several axes is as good as its worst."""
+    """Keep the gains before on machines that moved better with them; a machine counts as its worst axis."""
     assert run.shown is not None and run.earlier is not None, "both moves are recorded"
-    lanes = run.target.axes_per_machine
-    now, before = (np.repeat(m.cost.reshape(-1, lanes).max(axis=1), lanes) for m in (run.shown, run.earlier))
+    axes = run.target.axes_per_machine
+    now, before = (np.repeat(m.cost.reshape(-1, axes).max(axis=1), axes) for m in (run.shown, run.earlier))
     # Gains with which an axis shakes at rest are nobody's choice.
-    kept = where & (before < now) & ~np.repeat(run.earlier.restless.reshape(-1, lanes).any(axis=1), lanes)
+    kept = where & (before < now) & ~np.repeat(run.earlier.restless.reshape(-1, axes).any(axis=1), axes)
     if not kept.any():
         return
     run.gains = np.where(kept[:, None], run.before, run.gains)
@@ -204,8 +208,8 @@ def _keep_what_is_better(run: AutoRun, where: Mask) -> None:
     for k in map(int, np.flatnonzero(kept)):
         axis = run.axes[k]
         axis.is_kept, axis.proof = True, float(before[k])
-        axis.verified = "by a move, which was better than with the new ones: they are those before"
+        axis.verified = "by a move, which was better than with the new ones: the gains before are kept"
         axis.notes.append(
-            f"the gains before are kept: J by the measured terms of a move was {now[k]:.2f} with the new ones, and "
-            f"{before[k]:.2f} with those before"
+            f"the gains before are kept: the measured cost J of a move was {now[k]:.2f} with the new gains and "
+            f"{before[k]:.2f} with the gains before"
         )

@@ -1,8 +1,8 @@
-"""One button: check, identify, compute, try, refine, verify, write and keep; or roll back and say why.
+"""Automatic tuning: check, identify, search gains, try, refine, verify and store them; or roll back with the reason.
 
-Everything acts through the Drives interface, on all axes of a target side by side, inside a transaction (snapshot.py):
-the state before is in a file from the first moment on, and an axis that fails any check gets it back. Time is spent
-where it is cheap: gains are searched on digital twins (twin.py), and only the best few are tried on the drives.
+Everything acts through the Drives interface, on all axes of a target at the same time, inside a transaction
+(snapshot.py): the state before is in a file before anything is changed, and an axis that fails a check gets it back.
+Gains are searched on digital twins (twin.py), which costs no drive time; only the best few are tried on the drives.
 """
 
 from __future__ import annotations
@@ -51,23 +51,22 @@ def auto(
     budget: float = BUDGET,
     files: Files = nullcontext,
 ) -> Result:
-    """Tune the axes of a target; what fails is rolled back, and its reason is in the result.
+    """Tune the axes of a target; an axis that fails is rolled back, and the reason is in the result.
 
     Args:
         target: The drives; they may have any gains, also none, and are off afterwards.
-        file: Where the state before is left.
+        file: File for the state before.
         seed: Of the search on twins.
-        keep: Whether drives on a bus are told to keep the new gains over a power cycle.
-        progress: Called with what is under way, and the share done.
-        experiments: What identifies.
-        budget: Most time that may pass on the drives for each axis of a machine [s]; what cannot be afforded is left
-            out, and said.
-        files: Writes down what was done, before the drives keep it; what it raises rolls everything back. Its files
-            are to vanish if the block in it fails.
+        keep: Whether drives on a bus store the new gains, so that they survive a power cycle.
+        progress: Called with the present step, and the share done.
+        experiments: The identification experiments.
+        budget: Longest drive time for each axis of a machine [s]; steps beyond it are left out, with a note.
+        files: Writes the result files before the drives store the gains; if it raises, everything is rolled back. Its
+            files must be removed if the block in it fails.
 
     Raises:
-        BusError: If the drives cannot be reached any more: what then holds is said, and how to bring back what was.
-        OSError: If a file cannot be written: the drives have then what they had before.
+        BusError: If the drives cannot be reached any more; the message says what state they are in and how to undo.
+        OSError: If a file cannot be written; the drives then have their state from before.
     """
     return prove_found(
         target, file, on_twins, seed=seed, keep=keep, progress=progress, experiments=experiments, budget=budget,
@@ -95,18 +94,18 @@ def prove_found(
     budget: float = BUDGET,
     files: Files = nullcontext,
 ) -> Result:
-    """Check and identify axes, have gains found, and prove, write and keep them; what fails is rolled back.
+    """Check and identify axes, find gains, verify, write and store them; an axis that fails is rolled back.
 
     Args:
         target: The drives, as `auto` takes them.
-        file: Where the state before is left.
-        find: What finds gains: it sets the run's gains and proving ground. What it raises ends the run, and everything
-            is as it was before.
+        file: File for the state before.
+        find: Finds gains: it sets the run's gains and proving ground. If it raises, the run ends and everything is
+            rolled back.
         seed: Of the run.
-        keep: Whether drives on a bus are told to keep the new gains over a power cycle.
-        progress: Called with what is under way, and the share done.
-        experiments: What identifies.
-        budget: Most time that may pass on the drives for each axis of a machine [s].
+        keep: Whether drives on a bus store the new gains, so that they survive a power cycle.
+        progress: Called with the present step, and the share done.
+        experiments: The identification experiments.
+        budget: Longest drive time for each axis of a machine [s].
         files: As `auto` takes it.
 
     Raises:
@@ -124,7 +123,7 @@ def prove_found(
         prepare(run)
         if run.going.any():
             find(run, say)
-        say("a move for the record", 0.8)
+        say("recording a move", 0.8)
         show(run)
         say("measuring the frequency response", 0.85)
         measure(run)
@@ -148,7 +147,7 @@ def prove_found(
 
 
 def tell_of_lateness(run: AutoRun) -> None:
-    """Say of a bus in real time whether its SYNCs were late: moves and responses are distorted by that."""
+    """Add a reservation if SYNCs of a bus in real time were late, which distorts moves and responses."""
     drives = run.target.drives
     if drives.time_waits or drives.bus is None:
         return
@@ -158,13 +157,13 @@ def tell_of_lateness(run: AutoRun) -> None:
         run.reserve(
             np.ones(run.target.num_axes, bool),
             f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {worst:.1f} ms: "
-            "this computer is busy, and moves and responses are distorted by that; end other programs, or put "
+            "this computer is too busy, which distorts moves and frequency responses; end other programs, or put "
             "`chrt -f 10` before the command (Linux)",
         )
 
 
 def tune(target: Target, rng: np.random.Generator) -> Outcome:
-    """Tune a target as `drive-tune rank` wants it."""
+    """Tune a target as a tuner of `drive-tune rank`."""
     with tempfile.TemporaryDirectory() as folder:
         found = auto(target, Path(folder) / "before.toml", seed=int(rng.integers(2**31)), keep=False)
     return Outcome(

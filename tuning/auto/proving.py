@@ -1,7 +1,8 @@
-"""Gains on trial: a move, its reversal and the gain probe on the drives themselves, and what they prove.
+"""Trials of gains on the drives: a move, its reversal and a gain probe.
 
-What oscillates or trips is stopped within 50 ms and goes on with the gains that are known to hold. On a bus the
-envelope may be faster: it quick-stops all drives, so that the trial is repeated axis by axis to see which one it was.
+An axis that oscillates or goes into fault is stopped within 50 ms and gets gains that are known to be stable. On a bus
+the safety envelope may be faster: it quick-stops all drives, and the trial is repeated axis by axis to find which axis
+    caused it.
 """
 
 from __future__ import annotations
@@ -50,12 +51,12 @@ PLACES, REST, SETTLED, RESTLESS = 3, 6, 2, 0.05
 
 
 class Proof(NamedTuple):
-    """What a trial showed of every axis, each of shape (num_axes,).
+    """The results of a trial, each of shape (num_axes,).
 
-    cost: J by measured terms. stopped: Whether it oscillated, tripped, or left its envelope in any phase.
+    cost: J by measured terms. stopped: Whether it oscillated, went into fault, or left its envelope in any phase.
     culprit: Whether it did so itself: the other axes of its machine are stopped with it.
     reason: Why it does not pass, "" if it does. ripple: RMS increment of the current over the rated one, of the worst
-    phase. overshoot: Of the move, the largest of move and reversal. settling: t_s/t_0, mean of move and reversal.
+        phase. overshoot: Of the move, the largest of move and reversal. settling: t_s/t_0, mean of move and reversal.
     """
 
     cost: Floats
@@ -73,7 +74,7 @@ class Proof(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """A recorded move: times [s], (n,); demand and actual angle from its start [rad] and current [A], (n, num_axes).
+    """A recorded move: times [s], (n,); demanded and actual angle from its start [rad] and current [A], (n, num_axes).
 
     where: Axes that made it, (num_axes,). reason: Of each axis, why it does not pass, "" if it does. cost: J by its
     measured terms, (num_axes,). swing: Of the current at rest afterwards, over the rated one (RMS), where it was most
@@ -110,9 +111,9 @@ class ProvingGround:
 
     Args:
         target: The drives.
-        plants: What each axis is; None where that is not known: such an axis takes no part.
+        plants: The model of each axis; an axis with None takes no part.
         room: How far each rotor may turn from here [rad], low and high, each (num_axes,).
-        safe: Gains that hold, (num_axes, count): what is stopped goes on with them.
+        safe: Gains known to be stable, (num_axes, count); an axis that is stopped gets them.
         reference: Gains whose softness under a load counts as 1, (num_axes, count).
     """
 
@@ -152,7 +153,7 @@ class ProvingGround:
         self.violations = np.zeros(target.num_axes, np.int64)
 
     def too_short(self) -> Mask:
-        """Return which axes have no way to go that would prove anything."""
+        """Return which axes have too short a travel for a useful trial."""
         counts = np.abs(self.move.distance) / self.move.increments * self.move.counts
         return np.asarray(counts < SHORTEST)
 
@@ -166,7 +167,7 @@ class ProvingGround:
         self._origin = np.where(free, self.target.drives.read(cia402.POSITION_ACTUAL), self._origin)
 
     def recover(self, where: Mask) -> None:
-        """Reset faults of axes, and have them hold with gains that are known to; one that cannot stays as it is."""
+        """Reset faults of axes, and hold them with gains known to be stable; one that cannot stays as it is."""
         where = self.target.together(where)
         write_gains(self.target.drives, self.safe, where)
         for _ in range(RECOVERIES):
@@ -178,9 +179,9 @@ class ProvingGround:
         self._shaken |= where
 
     def run(self, gains: Integers, where: Mask) -> Proof:
-        """Try gains, raw integers of shape (num_axes, count), on some axes; the others' figures mean nothing.
+        """Try gains, raw integers of shape (num_axes, count), on some axes; the others' figures are undefined.
 
-        Axes that pull at one thing move together, all of them with these gains.
+        Linked axes move together, all of them with these gains.
         """
         where = self.target.together(where)
         count, lanes = self.target.num_axes, self.target.axes_per_machine
@@ -200,9 +201,9 @@ class ProvingGround:
         return _merged(proofs)
 
     def show(self, gains: Integers, where: Mask) -> Shown:
-        """Record one move with gains, and judge it; what oscillates or trips gets gains that hold within 50 ms.
+        """Record one move with gains; an axis that oscillates or goes into fault gets stable gains within 50 ms.
 
-        Axes that pull at one thing move together, all of them with these gains.
+        Linked axes move together, all of them with these gains.
         """
         drives, rated = self.target.drives, self.target.motor.rated_current
         where = self.target.together(where)
@@ -265,9 +266,9 @@ class ProvingGround:
         return worst
 
     def _hold_still(self, where: Mask) -> None:
-        """Come to rest with the gains there are, and take that for the beginning: a response leaves an axis turning.
+        """Come to rest with the present gains, and start from there: a frequency response leaves an axis turning.
 
-        What swings on beyond a second window of 25 ms is stopped.
+        An axis that still swings after a second window of 25 ms is stopped.
         """
         windows = np.zeros(self.target.num_axes, np.int64)
         for _ in range(HOLDING // WATCH):
@@ -286,14 +287,14 @@ class ProvingGround:
         return np.asarray(shaking | ~cia402.matches(seen[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED))
 
     def _stop(self, where: Mask) -> Mask:
-        """Give axes, and those that pull at the same thing, gains that hold; return which got them."""
+        """Give axes, and those linked with them, stable gains; return which got them."""
         where = self.target.together(where)
         if where.any():
             write_gains(self.target.drives, self.safe, where)
         return where
 
     def _stands(self, positions: Integers) -> Mask:
-        """Return which axes stood in a recording of their positions, (cycles, num_axes)."""
+        """Return which axes were at rest in a recording of their positions, (cycles, num_axes)."""
         return np.asarray(np.abs(wrapped(positions - positions[-1])).max(axis=0) <= STEP_COUNTS * self._count)
 
     def _run(self, gains: Integers, where: Mask) -> Trial:
@@ -306,7 +307,7 @@ class ProvingGround:
         return tried
 
     def _begin(self, where: Mask) -> None:
-        """Enable axes with gains that hold where they are not enabled yet, and bring back what went astray."""
+        """Enable axes that are off, with stable gains, and bring those back that are not where they should be."""
         drives = self.target.drives
         down = self.target.together(where & self._trials.down())
         if down.any():
@@ -317,7 +318,7 @@ class ProvingGround:
         self._begin_without_a_step(where)
 
     def _come_to_rest(self, where: Mask) -> None:
-        """Enable axes and wait until they stand: what was switched off while it turned is taken over at its speed.
+        """Enable axes and wait until they are at rest: one that still turns is taken over at its speed.
 
         Slow gains stop it sooner by its velocity than by its position.
         """
@@ -331,7 +332,7 @@ class ProvingGround:
         self.begin_here(where)
 
     def _return(self, where: Mask) -> None:
-        """Bring back what is not where it should be: what was stopped went on with slower gains, or fell, or ran."""
+        """Bring axes back that are not where they should be, since they were stopped, fell, or ran away."""
         drives = self.target.drives
         near = np.maximum(NEAR * np.abs(self.move.distance), NEAR_COUNTS * self._count)
         off = np.abs(wrapped(drives.read(cia402.POSITION_ACTUAL) - self._origin))
@@ -356,10 +357,10 @@ class ProvingGround:
         self._shaken &= ~astray
 
     def _begin_without_a_step(self, where: Mask) -> None:
-        """Have the set-point go where axes are.
+        """Set the set-point to where the axes are.
 
-        What slow gains have left of the way, or finding the poles has turned, would be a step for gains that are fast,
-        and its kick would pass for an oscillation.
+        The remaining error of slow gains, or a rotation during commutation alignment, would be a step for fast gains,
+        and its transient would look like an oscillation.
         """
         drives = self.target.drives
         here = drives.read(cia402.POSITION_ACTUAL)
@@ -372,7 +373,7 @@ class ProvingGround:
         drives.advance(SETTLING)
 
     def _refused(self, why: str, where: Mask) -> Proof:
-        """Take note that the envelope stopped a trial."""
+        """Record that the envelope stopped a trial."""
         write_gains(self.target.drives, self.safe, where)
         self.violations[where] += 1
         self.aborts[where] += 1
@@ -417,14 +418,16 @@ class ProvingGround:
         for axis in range(self.target.num_axes):
             if stopped[:, axis].any():
                 phase = PHASES[int(stopped[:, axis].argmax())]
-                reason = f"it oscillated or tripped in the {phase} and was stopped within 50 ms"
+                reason = f"stopped in the {phase}: it oscillated or went into fault (cut off within 50 ms)"
             elif overshoot[axis] > OVERSHOOT:
                 reason = (
-                    f"it overshot by {100.0 * overshoot[axis]:.0f} % of the move; {100.0 * OVERSHOOT:.0f} % is allowed"
+                    f"its overshoot was {100.0 * overshoot[axis]:.0f} % of the move; {100.0 * OVERSHOOT:.0f} % is "
+                    "allowed"
                 )
             elif left[axis] > max(ASTRAY, 5.0 / counts[axis]):
                 reason = (
-                    f"it was {100.0 * left[axis]:.0f} % of the move away at the end; {100.0 * ASTRAY:.0f} % is allowed"
+                    f"its error at the end was {100.0 * left[axis]:.0f} % of the move; {100.0 * ASTRAY:.0f} % is "
+                    "allowed"
                 )
             else:
                 reason = ""
@@ -433,7 +436,7 @@ class ProvingGround:
 
 
 def _merged(proofs: Sequence[tuple[Mask, Proof]]) -> Proof:
-    """Return one proof of those of single lanes; of axes that took part in none it says what the first one says."""
+    """Return one proof made of those of single machines; axes that took part in none have the first one's values."""
     first = proofs[0][1]
     reasons = list(first.reason)
     columns: dict[str, Any] = {name: getattr(first, name).copy() for name in Proof._fields if name != "reason"}

@@ -1,4 +1,4 @@
-"""What auto did to axes, and what it cost."""
+"""The result of auto: what became of each axis, and the drive time it took."""
 
 from __future__ import annotations
 
@@ -26,22 +26,23 @@ Mask = NDArray[np.bool_]
 
 @dataclass
 class AxisRun:
-    """What became of one axis so far.
+    """The state of one axis so far.
 
     Attributes:
         reason: Why it stopped; "" while it goes on.
-        reservations: What a user of the gains should not rely on; each takes the certificate's plain yes away.
-        notes: What else there is to say.
+        reservations: Checks that could not be made or are near a limit; with any of them the certificate is not a plain
+            accept.
+        notes: Further remarks.
         before, after: Raw gains, in the order of the device's gain set.
-        identified: What its signals said, None before.
-        plant: What was made of that, None where nothing could be.
-        twin: Hidden J that the twin gives the gains it found.
+        identified: The identification, None before it.
+        plant: The axis model made of it, None where that was not possible.
+        twin: Robust cost on the twin of the gains that were found.
         proof: J by measured terms of the gains that were taken; nan before.
         verified: How the gains were verified, in words; "" where they were not.
         margins: Of the outer loops as measured, "velocity" and "position"; nothing where nothing was.
-        at_least: What margins are at least that were not seen, alike.
-        eased: How often it got calmer gains because it shook at rest.
-        is_kept: Whether the gains before were better, and are the ones after.
+        at_least: Lower bounds of margins that were not measured, likewise.
+        eased: How often its gains were lowered because it shook at rest.
+        is_kept: Whether the gains before were better and are kept.
     """
 
     before: tuple[int, ...]
@@ -61,7 +62,7 @@ class AxisRun:
 
     @property
     def accepted(self) -> bool:
-        """Whether it got through everything, with reservations or without."""
+        """Whether all checks passed, with reservations or without."""
         return not self.reason
 
     @property
@@ -71,12 +72,12 @@ class AxisRun:
 
 
 class Result(NamedTuple):
-    """What auto did: the axes, and its costs.
+    """The result of a run of auto: the axes, and what it took.
 
     drive_seconds, moves, aborts and violations: Of each axis, (num_axes,). shown: A recorded move with the new gains,
     None if none was made. earlier: One with those before, likewise. response: The velocity loop's, likewise.
-    loaded: What a load step did to axes, of emulated machines.
-    file: The snapshot that brings everything back. kept: Whether drives on a bus keep the gains over a power cycle.
+    loaded: Response to a load step, of emulated machines.
+    file: The snapshot that brings everything back. kept: Whether drives on a bus stored the gains.
     """
 
     axes: tuple[AxisRun, ...]

@@ -1,4 +1,4 @@
-"""What the stages of auto share: the axes that are tuned, what became of each so far, and the drive time it took."""
+"""What the stages of auto share: the axes that are tuned, the state of each, and the drive time used."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ class AutoRun:
 
     Attributes:
         axes: What became of every axis.
-        before: Raw gains that the drives came with, (num_axes, count).
+        before: Raw gains of the drives before the run, (num_axes, count).
         gains: The best so far, likewise.
-        others: What else was found, (2, num_axes, count): the best if everything is as it was identified, and if
-            friction is less.
+        others: Other gains that were found, (2, num_axes, count): the best for the axis exactly as identified, and for
+            less friction.
         spare: The second best that passed a trial, likewise; zeros where none did.
-        reference: Those of the fitted rule, likewise.
-        fallbacks: What is tried when the twin's gains fail, (3, num_axes, count): the fitted rule's; those before, or
+        reference: Those of the baseline rule, likewise.
+        fallbacks: What is tried when the twin's gains fail, (3, num_axes, count): the baseline rule's; those before, or
             the soft rule's; and those that are slow enough for any load, with which what is stopped goes on.
         modes: 6060h as the drives came, (num_axes,).
-        unsafe: Why an axis is not to be moved with the gains before, "" where it may be.
+        unsafe: Why an axis must not be moved with the gains before, "" where it may.
         fresh: Axes that came fresh from the factory, (num_axes,).
         ground: Where gains are tried, None before.
         shown, earlier, response, loaded: As in `Result`.
-        unseen: Axes of which the response says nothing, (num_axes,).
+        unseen: Axes without a usable frequency response, (num_axes,).
         response_time: Drive time of a frequency response of all axes of a machine [s].
         spent: Of each axis, what passed while it took part [s]: axes that are through wait for others at no cost of
             their own.
@@ -74,7 +74,7 @@ class AutoRun:
         self.others = np.ones((len(OTHERS), *shape), np.int64)
         self.spare: Integers = np.zeros_like(self.gains)
         self.fallbacks = np.ones((3, *shape), np.int64)
-        self.unsafe = ["not looked at"] * n
+        self.unsafe = ["not checked"] * n
         self.modes: Integers = drives.read(cia402.MODE)
         self.fresh: Mask = np.zeros(n, bool)
         self.ground: ProvingGround | None = None
@@ -98,21 +98,21 @@ class AutoRun:
 
     def whole_machines(self, where: Mask) -> Mask:
         """Return the axes of machines all of whose axes are chosen, (num_axes,)."""
-        lanes = self.target.axes_per_machine
-        return np.asarray(np.repeat(where.reshape(-1, lanes).all(axis=1), lanes))
+        axes = self.target.axes_per_machine
+        return np.asarray(np.repeat(where.reshape(-1, axes).all(axis=1), axes))
 
     def stop(self, where: Mask, reason: str) -> None:
-        """Take axes out; the first reason of an axis counts."""
+        """Take axes out of the run; the first reason of an axis counts."""
         for axis in np.flatnonzero(where):
             self.axes[axis].reason = self.axes[axis].reason or reason
 
     def note(self, where: Mask, text: str) -> None:
-        """Say something of axes."""
+        """Add a note to axes."""
         for axis in np.flatnonzero(where):
             self.axes[axis].notes.append(text)
 
     def reserve(self, where: Mask, text: str) -> None:
-        """Say of axes what nobody is to rely on."""
+        """Add a reservation to axes."""
         for axis in np.flatnonzero(where):
             self.axes[axis].reservations.append(text)
 
@@ -128,17 +128,17 @@ class AutoRun:
 
     @property
     def look_back_time(self) -> Floats:
-        """What a move with the gains before takes [s], where there is one to be made, (num_axes,)."""
+        """The time that a move with the gains before takes [s], 0 where none is made, (num_axes,)."""
         safe = self.whole_machines(np.array([not why for why in self.unsafe]))
         return np.where(safe, LOOK_BACK_TIME, 0.0)
 
     def affordable(self, seconds: float | Floats) -> Mask:
-        """Return which axes have so much of their drive time left, (num_axes,)."""
+        """Return which axes have this much drive time left, (num_axes,)."""
         return np.asarray(self.spent + seconds <= self._budget)
 
     @contextmanager
     def spending(self, where: Mask) -> Iterator[None]:
-        """Count what passes as drive time of some axes."""
+        """Count the time that passes as drive time of some axes."""
         before = self._clock.seconds
         try:
             yield
@@ -153,12 +153,12 @@ class AutoRun:
         return {axis: causes[axis] for axis in map(int, np.flatnonzero(faulted))}
 
     def drop_faults(self, meanwhile: str) -> None:
-        """Take out axes that went into fault, and say which."""
+        """Take axes that went into fault out of the run, with the reason."""
         for axis, causes in self.faults().items():
             self.axes[axis].reason = f"the drive went into fault while {meanwhile}: {causes}"
 
     def result(self, file: Path, kept: bool) -> Result:
-        """Return what was done."""
+        """Return the result."""
         ground, zero = self.ground, np.zeros(self.target.num_axes, np.int64)
         counts = (zero, zero, zero) if ground is None else (ground.moves, ground.aborts, ground.violations)
         return Result(

@@ -1,4 +1,4 @@
-"""From signals to gains: what auto makes of an identification, and the search on digital twins."""
+"""From identification to gains: the axis models, and the search on digital twins."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from drive_env.safety.envelope import SafetyError, swinging_allowed
 from tuning.auto.checks import sound_gains, unsafe_gains, wrong_wiring
 from tuning.auto.trial_order import BOLD, SLIPPERY
 from tuning.auto.twin import WORLDS, Known, Optimum, Twins, known_of, search
+from tuning.identify.estimate import TITLES
 from tuning.identify.working_state import cautious_bandwidth
 from tuning.response.linear_model import Plant
 from tuning.rules.rules_by_name import RULES, propose
@@ -28,7 +29,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Identify = Callable[[Target, NDArray[np.bool_]], "list[Identification]"]  # of the axes where the mask is true
 
-LANES, GENERATIONS = 16, 24  # of a search on twins: sets of gains at once, and how often
+SETS, GENERATIONS = 16, 24  # of a search on twins: sets of gains at once, and how often
 SEARCHES = 3  # side by side
 OTHER_GENERATIONS, OTHER_WIDTH = 12, 0.5  # of a search on other twins, from what was found, and how wide it begins
 # Two short moves take for dry friction what is drag: an axis that is held by less of it hunts at rest.
@@ -49,7 +50,7 @@ def identify(run: AutoRun, experiments: Identify) -> None:
     except (SafetyError, RuntimeError, TimeoutError) as error:
         if isinstance(error, BusError):
             raise
-        run.stop(run.going, f"identification stopped: {error}")
+        run.stop(run.going, f"identification was stopped: {error}")
         return
     for k in map(int, np.flatnonzero(run.going)):
         axis, identified = run.axes[k], found[k]
@@ -61,14 +62,14 @@ def identify(run: AutoRun, experiments: Identify) -> None:
             except ValueError as error:
                 axis.reason = str(error)
         axis.notes += [
-            f"{name} not identified: {estimate.reason}"
+            f"{TITLES[name]} not identified: {estimate.reason}"
             for name, estimate in identified.estimates.items()
             if estimate.reason and name not in ("inertia",)
         ]
 
 
 def prepare(run: AutoRun) -> None:
-    """Find what gains are measured against, what stands by when they fail, and whether those before are safe."""
+    """Set the reference gains, the fallback gains, and whether the gains before are safe."""
     target = run.target
     for axis in map(int, np.flatnonzero(run.going)):
         plant, before = run.axes[axis].plant, run.axes[axis].before
@@ -101,7 +102,7 @@ def compute(run: AutoRun) -> None:
     run.gains[chosen] = found.gains[:, 0]
     # What the drive itself then tells apart: what is best on other twins.
     for number, worlds in {BOLD: WORLDS[:1], SLIPPERY: SLIPPERY_WORLDS}.items():
-        with Twins(target.device, target.motor, known, scaler, LANES, worlds=worlds) as twins:
+        with Twins(target.device, target.motor, known, scaler, SETS, worlds=worlds) as twins:
             other = search(twins, found.gains, run.rng, generations=OTHER_GENERATIONS, width=OTHER_WIDTH)
         run.others[number, chosen] = other.gains[:, 0]
     for axis in chosen:
@@ -109,24 +110,24 @@ def compute(run: AutoRun) -> None:
         assert plant is not None, "an axis that goes on has one"
         for rows in (run.gains, *run.others):
             rows[axis] = sound_gains(target.device, plant, tuple(map(int, rows[axis])))
-    for axis, hidden in zip(chosen, found.hidden[:, 0], strict=True):
-        run.axes[axis].twin = float(hidden)
+    for axis, cost in zip(chosen, found.cost[:, 0], strict=True):
+        run.axes[axis].twin = float(cost)
 
 
 def _search_apart(run: AutoRun, known: Sequence[Known], starts: Integers, scaler: Floats) -> Optimum:
-    """Search several times side by side, and return what the luckiest search of each axis found.
+    """Run several searches at the same time, and return the best of each axis.
 
-    Of an elastic axis hidden J has several valleys, and a search stays in the one that it comes into first.
+    On an elastic axis the robust cost has several local minima, and a search stays in the first that it reaches.
     """
     target, n = run.target, len(known)
-    with Twins(target.device, target.motor, [*known] * SEARCHES, np.tile(scaler, SEARCHES), LANES) as twins:
+    with Twins(target.device, target.motor, [*known] * SEARCHES, np.tile(scaler, SEARCHES), SETS) as twins:
         found = search(twins, np.tile(starts, (SEARCHES, 1, 1)), run.rng, generations=GENERATIONS)
-    best = found.hidden[:, 0].reshape(SEARCHES, n).argmin(axis=0) * n + np.arange(n)
-    return Optimum(found.gains[best], found.hidden[best], found.start[best])
+    best = found.cost[:, 0].reshape(SEARCHES, n).argmin(axis=0) * n + np.arange(n)
+    return Optimum(found.gains[best], found.cost[best], found.start[best])
 
 
 def calm_gains(target: Target, plant: Plant) -> Integers:
-    """Return gains that suit the rotor alone, too: within backlash, and above a resonance, it has no load."""
+    """Return gains stable with the rotor alone, too: within backlash, and above a resonance, it has no load."""
     velocity_hz = cautious_bandwidth(target.motor, plant.inertia) * ROTOR_SHARE
     return bandwidth_gains(
         target.device, target.motor, plant.inertia, current_hz=CALM_CURRENT_HZ, velocity_hz=velocity_hz,

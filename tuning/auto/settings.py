@@ -1,4 +1,4 @@
-"""What auto tells drives beside gains: a motor to one that has none, and at the end that all else is as it was."""
+"""What auto writes besides gains: the motor's parameters to a factory-fresh drive; all else is restored at the end."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ LEAST_WAY = 0.2  # rad between the ends of the travel: finding the poles alone t
 
 
 def begin(run: AutoRun) -> None:
-    """Refuse what has no way to go, and disable what is enabled: identification begins at rest."""
+    """Reject axes with too short a travel, and disable enabled ones: identification begins at rest."""
     drives, way = run.target.drives, run.target.high - run.target.low
     for axis in np.flatnonzero(way < LEAST_WAY):
         turns, least = (0.5 * x / np.pi for x in (way[axis], LEAST_WAY))
         run.axes[axis].reason = (
-            f"the travel is too short: {way[axis]:.2g} rad, and {LEAST_WAY:g} are needed ({turns:.2g} and {least:.2g} "
-            "turns); allow more with --travel"
+            f"the travel is too short: {way[axis]:.2g} rad ({turns:.2g} turns), and {LEAST_WAY:g} rad ({least:.2g} "
+            "turns) are needed; allow more with --travel"
         )
     on = cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     if on.any():
@@ -40,7 +40,7 @@ def begin(run: AutoRun) -> None:
 
 
 def commission(run: AutoRun) -> None:
-    """Tell a drive that is fresh from the factory which motor it has, and any how that is wired.
+    """Write the motor's parameters to a factory-fresh drive, and the wiring settings to any drive.
 
     Identification did so, too, but left drives as they were.
     """
@@ -56,12 +56,14 @@ def commission(run: AutoRun) -> None:
     unwired = run.fresh & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
     target.drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
     index, _ = target.device.roles[Role.LIMIT_SWITCHES]
-    run.note(unwired, f"both limit switches were active, which no axis can be at: they are ignored ({index:04X}h)")
-    run.note(run.fresh, f"fresh from the factory: commissioned for {target.motor.name} first")
+    run.note(
+        unwired, f"both limit switches were active at once, so they are not connected: they are ignored ({index:04X}h)"
+    )
+    run.note(run.fresh, f"factory-fresh drive: commissioned for {target.motor.name} first")
 
 
 def _wire(run: AutoRun) -> None:
-    """Write what the wiring needs: as it was seen, and where nothing was, as a fresh drive's motor is known to be."""
+    """Write the wiring settings: as identified, or else the known ones of a factory-fresh drive's motor."""
     target = run.target
     preset = _commissioning(target)
     known = {
@@ -80,9 +82,9 @@ def _wire(run: AutoRun) -> None:
 
 
 def write(run: AutoRun, transaction: Transaction) -> Mask:
-    """Leave the accepted axes with their gains and everything else as it was; return which they are, (num_axes,)."""
+    """Leave the accepted axes with their gains and restore everything else; return which they are, (num_axes,)."""
     going = run.going
-    run.stop(~going, "another axis of its machine was refused")
+    run.stop(~going, "another axis of its machine was rejected")
     if not going.any():
         return going
     drives = run.target.drives
@@ -111,9 +113,9 @@ def write(run: AutoRun, transaction: Transaction) -> Mask:
 
 
 def _commissioning(target: Target) -> dict[str, int]:
-    """Return what a drive must be told of its motor; how its encoder finds its angle is left as it is.
+    """Return the motor's parameters for a drive, without those of the encoder's initialisation.
 
-    Presets take the encoder's offset as known, and here nobody knows it.
+    Presets take the encoder's offset as known, which it is not here.
     """
     preset = target.device.preset(target.motor)
     left = target.device.roles.get(Role.ENCODER_INITIALISATION)

@@ -1,4 +1,4 @@
-"""Which gains are tried next on an axis: down until some pass, then others, then beside the first."""
+"""The order in which gains are tried on an axis: lower ones until some pass, then alternatives, then neighbours."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import NamedTuple
 SLOWER, DOWN, UP = 0.6, 0.8, 1.15
 # Beside the gains that serve on all twins: the best if everything is as it was identified, and if friction is less.
 BOLD, SLIPPERY = range(2)
-OTHERS = ("bold gains", "gains for less friction")
+OTHERS = ("the best gains for the axis exactly as identified", "the best gains for less friction")
 MOST_TRIALS = 3  # of an axis on which gains pass
 
 
 class Rung(NamedTuple):
-    """What is tried.
+    """One trial.
 
     factor: Of the gains found. other: Others that were found, by their number, instead. fallback: One, by its number.
     """
@@ -24,10 +24,10 @@ class Rung(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Say which gains these are."""
+        """Return these gains in words."""
         if self.fallback is not None:
-            return "gains of a rule"
-        return f"gains found, at {100.0 * self.factor:.0f} %" if self.other is None else OTHERS[self.other]
+            return "the gains of a rule"
+        return f"the gains found, times {self.factor:.2f}" if self.other is None else OTHERS[self.other]
 
 
 class Ladder:
@@ -55,12 +55,12 @@ class Ladder:
         self._ceiling = float("inf")  # a factor that failed
 
     def step(self, passed: bool, better: bool, loud: bool) -> None:
-        """Take note of how what was to be tried did, and choose what is next.
+        """Record the result of a trial, and choose the next.
 
         Args:
             passed: Whether it passed.
             better: Whether it is the best so far.
-            loud: Whether its current was noisy at rest: it hunts, since little friction holds it.
+            loud: Whether its current was noisy at rest: a limit cycle, since there is little friction.
         """
         rung = self.rung
         assert rung is not None, "nothing was to be tried"
@@ -87,13 +87,13 @@ class Ladder:
             self.rung = Rung(fallback=0)
 
     def _below(self, rung: Rung) -> Rung | None:
-        """Return what is slower than what failed."""
+        """Return lower gains than those that failed."""
         if rung.fallback is None:
             return Rung(SLOWER) if rung.factor > SLOWER else Rung(fallback=0)
         return Rung(fallback=rung.fallback + 1) if rung.fallback + 1 < self._fallbacks else None
 
     def _beside(self, rung: Rung, better: bool) -> Rung | None:
-        """Return a neighbour of the best: farther the same way if that was better, the other way if not."""
+        """Return a neighbour of the best: farther in the same direction if that was better, else in the other."""
         if self._trials >= MOST_TRIALS:
             return None
         if rung.other is not None:

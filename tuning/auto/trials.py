@@ -1,4 +1,4 @@
-"""Gains on the drives: tried, slower ones until some pass, then their neighbours; the best are kept."""
+"""Trials of gains on the drives: lower ones until some pass, then their neighbours; the best are kept."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ WINDOW = 10  # following error that trips a trial, over its move: a slow loop la
 
 
 def prove(run: AutoRun) -> None:
-    """Try the twins' gains on the drives; slower ones until some pass, then others, the best is kept."""
+    """Try the twins' gains on the drives; lower ones until some pass, then alternatives; the best are kept."""
     going = run.going
     if not going.any():
         return
     plants = [axis.plant for axis in run.axes]
     run.ground = ground = ProvingGround(run.target, plants, run.room(), run.fallbacks[-1], run.reference)
     watch_following(run, going)
-    run.stop(going & ground.too_short(), "the travel is too short for a move that proves anything")
+    run.stop(going & ground.too_short(), "the travel is too short for a trial move")
     ladders = [Ladder(len(run.fallbacks), coupled=run.target.axes_per_machine > 1) for _ in run.axes]
     n = run.target.num_axes
     best, cost, last = run.fallbacks[-1].copy(), np.full(n, np.inf), [""] * n
@@ -68,18 +68,18 @@ def prove(run: AutoRun) -> None:
     for k in map(int, np.flatnonzero(run.going)):
         axis, ladder = run.axes[k], ladders[k]
         if not ladder.passed:
-            why = last[k] or "no drive time was left to try them"
-            axis.reason = f"no gains passed the trial: with the last ones {why}"
+            why = last[k] or "there was no drive time left to try them"
+            axis.reason = f"no gains passed the trial; the last ones: {why}"
             continue
         axis.proof, axis.verified = float(cost[k]), BY_TRIAL
         if ladder.failures:
             failed = ", ".join(rung.words for rung in ladder.failures)
-            axis.notes.append(f"no pass with the {failed}: the last time {last[k]}")
+            axis.notes.append(f"failed trials: {failed}; the last: {last[k]}")
     run.gains = best
 
 
 def _to_blame(run: AutoRun, proof: Proof, where: Mask) -> Mask:
-    """Return which axes have stopped their machines: all of them, if none that was tried did or they are linked."""
+    """Return the axes that stopped their machines; all of them if none of those tried did, or if they are linked."""
     culprit = where & proof.culprit
     if run.target.linked:
         return np.ones_like(where)
@@ -88,7 +88,7 @@ def _to_blame(run: AutoRun, proof: Proof, where: Mask) -> Mask:
 
 
 def _meant(run: AutoRun, axis: int, rung: Rung | None) -> Integers:
-    """Return the gains that a rung means for an axis; any, if nothing is to be tried on it."""
+    """Return the gains of a trial of an axis; any, if nothing is to be tried on it."""
     if rung is None:
         return np.asarray(run.fallbacks[-1, axis])
     if rung.fallback is not None:
@@ -99,7 +99,7 @@ def _meant(run: AutoRun, axis: int, rung: Rung | None) -> Integers:
 
 
 def watch_following(run: AutoRun, where: Mask) -> None:
-    """Have a following error trip the drive that trials cannot have."""
+    """Set a following error limit that no normal trial reaches."""
     assert run.ground is not None, "proving makes it"
     drives = run.target.drives
     window = WINDOW * np.abs(run.ground.move.distance) + drives.read(Role.POSITION_SCALE)

@@ -1,8 +1,9 @@
-"""Digital twins: emulated machines set to what was identified, on which gains cost wall time and no drive time.
+"""Digital twins: emulated machines with the identified parameters, on which trials of gains take no drive time.
 
 A twin is the generic machine that identification can know: a rotor with a disc, rigid or on one spring, with dry and
 viscous friction, the identified winding and velocity filter, and the encoder and power stage of the data sheets. Gains
-are scored on it by hidden J (drive_env/trials/score.py), many at once as lanes; of a real axis hidden J does not exist.
+are scored on it by the robust cost (drive_env/trials/score.py), many at once as machines; on a real axis the robust
+cost cannot be measured.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from drive_env.gains import integers_per_si, rule_gains
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.positioning import Move, plan_move
-from drive_env.trials.score import HiddenScore
+from drive_env.trials.score import RobustScore
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -29,7 +30,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # What a search may go down to. Without an integral part a constant load leaves an error for ever, which outlasts the
-# quarter of a second that hidden J looks at.
+# quarter of a second that the robust cost looks at.
 LONGEST_INTEGRATION = 0.65536  # s, of the velocity loop
 FASTEST_RESONANCE = 500.0  # Hz; a faster one is taken as rigid: the physics' step does not resolve it
 LEAST_LOAD = 0.05  # of the total inertia: what is left for a load where the rotor's data sheet value takes all
@@ -47,7 +48,7 @@ class FrictionGuess(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """How uncertain what was identified is: half widths of the 95 % intervals, relative."""
+    """The uncertainty of the identification: half widths of the 95 % intervals, relative."""
 
     inertia: float = 0.0
     anti_resonance: float = 0.0
@@ -56,7 +57,7 @@ class Spread(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What a twin is made of: the axis, its friction, how far its rotor may turn, with the sign [rad]; and how sure.
+    """The data of a twin: the axis, its friction, how far its rotor may turn, with the sign [rad], and the uncertainty.
 
     offset: Current that gravity or another constant load takes [A].
     """
@@ -69,11 +70,11 @@ class Known(NamedTuple):
 
 
 def known_of(plant: Plant, identified: Identification, reach: float) -> Known:
-    """Return what an identification makes of an axis.
+    """Return the data of a twin from an identification.
 
     Args:
-        plant: The axis, as made of the identification.
-        identified: What was identified; friction that was refused counts as none.
+        plant: The axis model.
+        identified: What was identified; friction that was not identified counts as none.
         reach: How far the rotor may turn, with the sign [rad].
     """
     found = (identified.estimates.get(name) for name in ("coulomb", "viscous", "offset"))
@@ -95,10 +96,10 @@ _INTERVALS = {
 
 
 class MachineVariant(NamedTuple):
-    """A guess at what no drive shows and no identification is sure of; a tuning must serve in all of them.
+    """A variant of the machine within what identification leaves open; gains must be good on all of them.
 
-    inertia, anti_resonance, resonance, filter: How far each is from what was identified, relative; as far as its
-    interval reaches if that is farther.
+    inertia, anti_resonance, resonance, filter: Deviation from the identified value, relative; at least that of its
+        interval.
     """
 
     name: str
@@ -132,9 +133,9 @@ def is_elastic(plant: Plant) -> bool:
 
 
 def twin_parameters(device: Device, motor: Motor, known: Known, world: MachineVariant = WORLDS[0]) -> dict[str, float]:
-    """Return the true parameters of the emulated machine that shows what was identified, with an inertia or two masses.
+    """Return the parameters of the emulated machine (one inertia or two masses) that matches the identification.
 
-    Torque constant is the data sheet's: inertia and friction are known over it only, and so it does not matter.
+    The torque constant is the data sheet's: inertia and friction are identified relative to it, so it does not matter.
     """
     plant, spread = known.plant, known.spread
     total = plant.inertia * _factor(world.inertia, spread.inertia)
@@ -176,7 +177,7 @@ def twin_parameters(device: Device, motor: Motor, known: Known, world: MachineVa
 def _corner(device: Device, plant: Plant) -> float:
     """Return the corner of the velocity filter [Hz] that delays as much as filter and delay of an axis together.
 
-    An emulated drive has no other delay than its own; which of the two lags, low frequencies hardly tell.
+    An emulated drive has no delay besides its own; low frequencies hardly distinguish the two lags.
     """
     from drive_env.emulator.parameters import VELOCITY_FILTER_DAMPING
 
@@ -186,21 +187,21 @@ def _corner(device: Device, plant: Plant) -> float:
 
 
 def _factor(way: float, spread: float) -> float:
-    """Return what a world makes of a value that is known to within a relative half width."""
+    """Return the value of a variant, of a value known to within a relative half width."""
     return 1.0 + math.copysign(max(abs(way), min(spread, FARTHEST)), way) if way else 1.0
 
 
 class Twins:
-    """Scores gains on twins, `lanes` sets of gains for every axis at once.
+    """Scores gains on twins, `sets` sets of gains for every axis at once.
 
     Args:
         device: The drive.
         motor: The motor, as its data sheet has it.
-        known: What each axis is, n of them.
+        known: The data of each axis, n of them.
         scaler: 2058h of each axis, shape (n,).
-        lanes: Sets of gains per axis that are scored at once.
+        sets: Sets of gains per axis that are scored at once.
         num_threads: Threads that run them; the number of cores by default.
-        worlds: In which gains must serve.
+        worlds: Variants on which the gains are scored.
     """
 
     def __init__(
@@ -209,11 +210,11 @@ class Twins:
         motor: Motor,
         known: Sequence[Known],
         scaler: Floats,
-        lanes: int,
+        sets: int,
         num_threads: int | None = None,
         worlds: Sequence[MachineVariant] = WORLDS,
     ) -> None:
-        self.lanes = lanes
+        self.sets = sets
         self.device = device
         self.num_axes = len(known)
         elastic = np.array([is_elastic(one.plant) for one in known])
@@ -222,21 +223,21 @@ class Twins:
             if mask.any():
                 axes = np.flatnonzero(mask)
                 chosen = [known[int(k)] for k in axes]
-                part = _Part(device, motor, load, axes, chosen, scaler[mask], lanes, num_threads, worlds)
+                part = _Part(device, motor, load, axes, chosen, scaler[mask], sets, num_threads, worlds)
                 self._parts.append(part)
 
     def score(self, gains: Integers) -> Floats:
-        """Return what gains, raw integers of shape (n, lanes, count), are worth over the worlds, (n, lanes).
+        """Return the cost of gains, raw integers of shape (n, sets, count), over the variants, (n, sets).
 
-        The mean of hidden J, in which gains count for worse that a trial would stop as oscillating.
+        The mean of the robust cost, with a penalty for gains that a trial would stop as oscillating.
         """
-        hidden = np.empty(gains.shape[:2])
+        cost = np.empty(gains.shape[:2])
         for part in self._parts:
-            hidden[part.axes] = part.score(gains[part.axes])
-        return hidden
+            cost[part.axes] = part.score(gains[part.axes])
+        return cost
 
     def close(self) -> None:
-        """Give the emulated machines back."""
+        """Close the emulated machines."""
         for part in self._parts:
             part.close()
 
@@ -258,28 +259,28 @@ class _Part:
         axes: NDArray[np.int64],
         known: Sequence[Known],
         scaler: Floats,
-        lanes: int,
+        sets: int,
         num_threads: int | None,
         worlds: Sequence[MachineVariant],
     ) -> None:
         self.axes = axes
-        self._shape = (len(axes), lanes, len(worlds))
+        self._shape = (len(axes), sets, len(worlds))
         machines = math.prod(self._shape)
-        self._hidden = HiddenScore(device.name, load, motor.name, machines, num_threads=num_threads)
+        self._robust = RobustScore(device.name, load, motor.name, machines, num_threads=num_threads)
         rows = [[twin_parameters(device, motor, one, world) for world in worlds] for one in known]
         parameters = {
             name: self._spread_worlds(np.array([[row[name] for row in axis] for axis in rows])) for name in rows[0][0]
         }
         supply = np.array([one.plant.supply for one in known])
-        self._hidden.set_machines(parameters, self._spread(supply))
+        self._robust.set_machines(parameters, self._spread(supply))
         # What the motor must push for is what the load pulls.
         pull = np.array([-one.offset * motor.torque_constant for one in known])
-        self._hidden.set_constant_load(self._spread(pull))
+        self._robust.set_constant_load(self._spread(pull))
         inertia = np.array([one.plant.inertia for one in known])
         move = plan_move(motor, inertia, scaler, np.array([one.reach for one in known]))
         distance, velocity, acceleration, increments = (self._spread(np.asarray(values)) for values in move[:-1])
-        self._hidden.set_moves(Move(distance, velocity, acceleration, increments, move.counts))
-        self._hidden.set_reference(self._spread(rule_gains(device, motor, inertia)))
+        self._robust.set_moves(Move(distance, velocity, acceleration, increments, move.counts))
+        self._robust.set_reference(self._spread(rule_gains(device, motor, inertia)))
 
     def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return values per axis, (axes, ...), for all machines, (machines, ...)."""
@@ -291,15 +292,15 @@ class _Part:
         return np.broadcast_to(values[:, None], self._shape).reshape(-1)
 
     def score(self, gains: Integers) -> Floats:
-        """Return the mean worth over the worlds, geometric, of gains (axes, lanes, count)."""
+        """Return the geometric mean of the costs over the variants, of gains (axes, sets, count)."""
         every = np.repeat(gains.reshape(-1, gains.shape[-1]), self._shape[2], axis=0)
-        found = self._hidden.score(every)
+        found = self._robust.score(every)
         # A drive on which that swings would be stopped: a trial sees the move and the probe.
         beyond = np.maximum(found.swing.max(axis=1) / MOST_SWING, 1.0)
-        return np.asarray(np.exp(np.log(found.hidden * beyond**SWINGING).reshape(self._shape).mean(axis=2)))
+        return np.asarray(np.exp(np.log(found.robust_cost * beyond**SWINGING).reshape(self._shape).mean(axis=2)))
 
     def close(self) -> None:
-        self._hidden.close()
+        self._robust.close()
 
 
 def least_gains(device: Device) -> Integers:
@@ -313,14 +314,14 @@ def least_gains(device: Device) -> Integers:
 
 
 class Optimum(NamedTuple):
-    """What the search on twins found, of every axis, the best first.
+    """The result of the search on twins, of every axis, the best first.
 
-    gains: (n, found, count) raw integers. hidden: their hidden J on the twin, (n, found). start: that of the best gains
-    that it started from, (n,).
+    gains: (n, found, count) raw integers. cost: their robust cost on the twin, (n, found). start: that of the best
+    gains that it started from, (n,).
     """
 
     gains: Integers
-    hidden: Floats
+    cost: Floats
     start: Floats
 
 
@@ -334,49 +335,49 @@ def search(
     free: Sequence[str] | None = None,
     width: float = 1.0,
 ) -> Optimum:
-    """Return the gains of the least hidden J on twins, found by an evolution strategy in the logarithms of the gains.
+    """Return the gains of least robust cost on twins, found by an evolution strategy in the logarithms of the gains.
 
-    Every axis has a search of its own; they share nothing but the call. What is drawn for an axis depends on the
-    generator, and on how many axes there are.
+    Every axis has a search of its own; they share nothing but the call. The draws for an axis depend on the generator
+    and on the number of axes.
 
     Args:
         twins: The twins.
-        starts: Gains to begin with, shape (n, starts, count), at most as many as the twins have lanes.
+        starts: Gains to begin with, shape (n, starts, count), at most as many as the twins score at once.
         rng: For drawing.
-        generations: How often a generation of `twins.lanes` sets is drawn and scored.
+        generations: How often a generation of `twins.sets` sets is drawn and scored.
         keep: Sets that are returned.
         free: Names of the gains that are searched, all by default; the others stay those of the best start.
         width: First standard deviation of a gain's logarithm.
     """
     known = twins.device.gains
     columns = known.columns(known.names if free is None else free)
-    n, lanes, d = twins.num_axes, twins.lanes, len(columns)
+    n, sets, d = twins.num_axes, twins.sets, len(columns)
     least, highest = least_gains(twins.device)[columns], known.highest[columns]
     reach = np.array([math.log(top) for top in highest])
-    first = starts[:, np.arange(lanes) % starts.shape[1]]
-    hidden = twins.score(first)
+    first = starts[:, np.arange(sets) % starts.shape[1]]
+    cost = twins.score(first)
     at = np.arange(n)
-    best = hidden.argmin(axis=1)
+    best = cost.argmin(axis=1)
     base = first[at, best]
-    start = hidden[at, best]
-    order = hidden.argsort(axis=1, kind="stable")
-    pool_hidden = np.take_along_axis(hidden, order, axis=1)
+    start = cost[at, best]
+    order = cost.argsort(axis=1, kind="stable")
+    pool_cost = np.take_along_axis(cost, order, axis=1)
     pool_gains = np.take_along_axis(first, order[:, :, None], axis=1)
     mean = np.log(np.maximum(base[:, columns], 1).astype(float))
     covariance = np.tile(np.eye(d) * width**2, (n, 1, 1))
-    parents = max(lanes // 4, 2)
+    parents = max(sets // 4, 2)
     weights = np.log(parents + 0.5) - np.log(np.arange(1, parents + 1))
     weights /= weights.sum()
     for _ in range(generations):
         root = np.linalg.cholesky(covariance)
-        drawn = mean[:, None] + np.einsum("nij,nlj->nli", root, rng.standard_normal((n, lanes, d)))
+        drawn = mean[:, None] + np.einsum("nij,nlj->nli", root, rng.standard_normal((n, sets, d)))
         drawn[:, 0] = mean
         # The best so far is drawn again, so that a mean which lost it finds back.
         drawn[:, 1] = np.log(np.maximum(pool_gains[:, 0, columns], 1).astype(float))
-        gains = np.repeat(base[:, None], lanes, axis=1)
+        gains = np.repeat(base[:, None], sets, axis=1)
         gains[:, :, columns] = np.clip(np.rint(np.exp(np.clip(drawn, 0.0, reach))), least, highest)
-        hidden = twins.score(gains)
-        order = hidden.argsort(axis=1)[:, :parents]
+        cost = twins.score(gains)
+        order = cost.argsort(axis=1)[:, :parents]
         chosen = np.take_along_axis(drawn, order[:, :, None], axis=1)
         step = chosen - mean[:, None]
         spread = np.einsum("l,nli,nlj->nij", weights, step, step)
@@ -384,8 +385,8 @@ def search(
         covariance = 0.55 * covariance + 0.45 * spread + 1e-5 * np.eye(d)
         mean = np.einsum("l,nli->ni", weights, chosen)
         pool_gains = np.concatenate([pool_gains, gains], axis=1)
-        pool_hidden = np.concatenate([pool_hidden, hidden], axis=1)
-        order = pool_hidden.argsort(axis=1, kind="stable")[:, :keep]
-        pool_hidden = np.take_along_axis(pool_hidden, order, axis=1)
+        pool_cost = np.concatenate([pool_cost, cost], axis=1)
+        order = pool_cost.argsort(axis=1, kind="stable")[:, :keep]
+        pool_cost = np.take_along_axis(pool_cost, order, axis=1)
         pool_gains = np.take_along_axis(pool_gains, order[:, :, None], axis=1)
-    return Optimum(pool_gains, pool_hidden, start)
+    return Optimum(pool_gains, pool_cost, start)

@@ -1,7 +1,7 @@
-"""The certificate of a tuning: what was found, what was changed, and the proof, with a hash that shows a change.
+"""The certificate of a tuning: what was identified, changed and measured, with a hash that shows later changes.
 
 The hash is over the content, not over the file: indented otherwise or with its keys in another order it is the same
-certificate. It tells that nothing was changed by accident or in passing; it is no signature.
+certificate. It shows accidental changes; it is not a signature.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def verdict(accepted: bool, reservations: Sequence[str]) -> str:
 
 
 class CertificateError(ValueError):
-    """A file that is no certificate: one line with its remedy."""
+    """The file is not a certificate; the message has the remedy."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class StepResponse:
         tuned: Whether with the new gains; else with those before.
         unit: Unit of `reference` and `actual`.
         t: Sample times [s], shape (n,).
-        reference, actual: Set-point and what came of it, shape (n,).
+        reference, actual: Set-point and actual value, shape (n,).
         current: Actual current [A, peak i_q], shape (n,).
-        figures: What it says: name with unit, e.g. "settling [s]", "overshoot [%]", "disturbance dip [rpm]" -> value;
+        figures: Results: name with unit, e.g. "settling [s]", "overshoot [%]", "disturbance dip [rpm]" -> value;
             nan where there is none. A disturbance exists on the emulator only.
     """
 
@@ -80,8 +80,8 @@ class FrequencyResponse:
         frequency: [Hz], shape (n,).
         magnitude_db, phase_deg: Of the open loop as measured, shape (n,).
         coherence: 0 to 1, shape (n,); nan where it is a model's.
-        margins: What it says: name with unit, e.g. "phase margin [deg]" -> value.
-        source: Where it is from, e.g. "multisine over the bus" or "the emulator's trace".
+        margins: Results: name with unit, e.g. "phase margin [deg]" -> value.
+        source: How it was obtained, e.g. "multisine over the bus" or "the emulator's trace".
     """
 
     name: str
@@ -96,7 +96,7 @@ class FrequencyResponse:
 
 @dataclass(frozen=True)
 class StatedParameter:
-    """An identified value with its interval of 95 % confidence; refused: nan and the reason."""
+    """An identified value with its 95 % confidence interval; one not identified is nan, with the reason."""
 
     value: float
     low: float
@@ -107,13 +107,13 @@ class StatedParameter:
 
 @dataclass(frozen=True)
 class AxisCertificate:
-    """What became of one axis.
+    """The result of one axis.
 
     Attributes:
         axis: Number of the axis.
         accepted: Whether the new gains passed the checks and are in the drive; else those before are.
-        reason: Why it stopped, or how it was verified, in words: always said.
-        reservations: What could not be checked, or is near to a limit: the yes is none without them.
+        reason: Why it was rejected, or how it was verified, in words; never empty.
+        reservations: What could not be checked, or is near a limit.
         identified: Name -> parameter.
         before, after: Raw integers in the order of the device's gain set, of the drive before and now.
         before_si, after_si: The same in SI, as `si_gains` has them: name with unit -> value.
@@ -150,14 +150,14 @@ class Certificate:
     """A tuning of one or several axes.
 
     Attributes:
-        tuner: What tuned, e.g. "auto".
+        tuner: Name of the tuner, e.g. "auto".
         device, motor: Names.
-        machine: What turns: an emulated load's name, or the bus and its node-IDs.
+        machine: An emulated load's name, or the bus and its node-IDs.
         supply: Supply voltage as entered [V].
         seed: Of everything random.
-        envelope: What the drive was held to: name with unit -> value, e.g. "speed [rad/s]", "travel low [rad]".
+        envelope: Limits during the tuning: name with unit -> value, e.g. "speed [rad/s]", "travel low [rad]".
         axes: One entry per axis.
-        versions: Of what computed it.
+        versions: Of the packages that computed it.
         created: When [ISO 8601, UTC].
     """
 
@@ -206,15 +206,15 @@ MARGIN_NAMES = {
 
 
 def identified(identification: Identification) -> dict[str, StatedParameter]:
-    """Return what was identified as a certificate has it: nothing that a tuner only guessed."""
+    """Return the identified parameters for a certificate, without a tuner's guesses."""
     told = identification.estimates if identification.told is None else identification.told
     return {name: StatedParameter(*estimate) for name, estimate in told.items()}
 
 
 def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, float]:
-    """Return gains of a device's set in SI, in its order, with their units in the names; nothing without a cascade.
+    """Return gains of a device's set in SI, with their units in the names; empty without a PI cascade.
 
-    Of an I it is the integration time T_i.
+    For an I gain the integration time T_i is given.
     """
     from drive_env.gains import PI, gains_in_si
 
@@ -230,12 +230,12 @@ def _si_name(gain: Gain) -> str:
 
 
 def envelope(target: Target) -> dict[str, float]:
-    """Return what a target allows; where it has several axes, each of them."""
+    """Return the limits of a target, for each axis."""
     rows = {
         "travel low [rad]": target.low,
         "travel high [rad]": target.high,
-        "speed while identified [rad/s]": np.full(target.num_axes, target.speed),
-        "current while identified [A]": np.full(target.num_axes, target.current),
+        "speed during identification [rad/s]": np.full(target.num_axes, target.speed),
+        "current during identification [A]": np.full(target.num_axes, target.current),
     }
     if (limit := target.device.roles.get(Role.CURRENT_LIMIT)) is not None:
         rows[f"current in moves, {limit[0]:04X}h [A]"] = target.drives.read(limit) * 1e-3
@@ -254,9 +254,9 @@ def frequency_response(
     coherence: ArrayLike | None = None,
     source: str = "",
 ) -> FrequencyResponse:
-    """Return an open loop, complex of shape (n,) at frequencies [Hz], as a certificate has it; nan was not seen.
+    """Return an open loop, complex of shape (n,) at frequencies [Hz], for a certificate; nan was not measured.
 
-    `at_least` says what those margins are at least that were not seen.
+    `at_least` has lower bounds of margins that were not measured.
     """
     L = np.asarray(open_loop, complex)
     seen = np.isfinite(L) & (L != 0.0)
@@ -276,7 +276,7 @@ def frequency_response(
 
 
 def _bounds(margins: Margins, least: AtLeast | None) -> dict[str, float]:
-    """Return what those margins are at least that were not seen."""
+    """Return lower bounds of the margins that were not measured."""
     found = {} if least is None else least._asdict()
     return {
         MARGIN_NAMES[key].replace(" [", ", at least ["): float(value)

@@ -25,7 +25,7 @@ def save_certificate(certificate: Certificate, folder: str | Path) -> tuple[Path
 
 @contextmanager
 def certificate_files(certificate: Certificate, folder: str | Path) -> Iterator[tuple[Path, Path]]:
-    """Have certificate.json and report.html on the disk while a block runs; they vanish again if it fails.
+    """Write certificate.json and report.html before a block runs; they are removed again if it fails.
 
     Raises:
         OSError: If they cannot be written, with the file and the reason.
@@ -48,7 +48,7 @@ def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
     try:
         return _built(Certificate, data), unchanged
     except (KeyError, TypeError, ValueError) as error:
-        raise CertificateError(f"{path} is no certificate of this version: {error}") from None
+        raise CertificateError(f"{path} is not a certificate of this version: {error}") from None
 
 
 def is_unchanged(path: str | Path) -> bool:
@@ -70,9 +70,9 @@ def _read(path: Path) -> dict[str, Any]:
     except CertificateError:
         raise
     except ValueError as error:
-        raise CertificateError(f"{path} is no certificate: {error}; give a certificate.json of drive-tune") from None
+        raise CertificateError(f"{path} is not a certificate: {error}; give a certificate.json of drive-tune") from None
     if not isinstance(data, dict) or HASH not in data or data.get("format") != FORMAT:
-        raise CertificateError(f"{path} is no certificate of format {FORMAT}; give a certificate.json of drive-tune")
+        raise CertificateError(f"{path} is not a certificate of format {FORMAT}; give a certificate.json of drive-tune")
     return data
 
 
@@ -82,7 +82,7 @@ def _text(path: Path) -> str:
     except OSError as error:
         raise CertificateError(f"cannot read {path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise CertificateError(f"{path} is no text; give a certificate.json of drive-tune") from None
+        raise CertificateError(f"{path} is not a text file; give a certificate.json of drive-tune") from None
 
 
 def _built(kind: Any, data: Mapping[str, Any]) -> Any:

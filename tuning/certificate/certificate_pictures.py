@@ -21,7 +21,7 @@ PHASES = (-270.0, 90.0)  # degrees shown: about -180, and an anti-resonance, whi
 
 
 def step_picture(steps: Sequence[StepResponse]) -> Figure:
-    """Return set-point, what came of it, and the current, of one move with one or several sets of gains."""
+    """Return a picture of set-point, actual value and current of one move, with one or several sets of gains."""
     figure = Figure(figsize=(8.0, 4.8), dpi=DPI, layout="constrained")
     motion, current = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for step in steps:
@@ -40,7 +40,7 @@ def step_picture(steps: Sequence[StepResponse]) -> Figure:
 
 
 def bode_picture(responses: Sequence[FrequencyResponse]) -> Figure:
-    """Return magnitude, phase and coherence; where the coherence is low the curves are grey."""
+    """Return a Bode diagram with coherence; curves are grey where the coherence is low."""
     figure = Figure(figsize=(8.0, 6.6), dpi=DPI, layout="constrained")
     magnitude, phase, coherence = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 1.5))
     doubtful = False
@@ -79,21 +79,21 @@ def bode_picture(responses: Sequence[FrequencyResponse]) -> Figure:
 
 
 def within_a_turn(phase: np.ndarray) -> np.ndarray:
-    """Return phases [degrees] within PHASES: -540 degrees is as near to instability as -180."""
+    """Return phases [degrees] within PHASES: -540 degrees is as near to instability as -180 degrees."""
     return np.asarray((phase - PHASES[0]) % 360.0 + PHASES[0])
 
 
 def draw_margins(
     magnitude: Axes, phase: Axes, phase_hz: float, phase_deg: float, gain_hz: float, gain_db: float, color: str
 ) -> None:
-    """Draw the phase margin from -180 degrees and the gain margin from 0 dB, each where it is read, if it was seen."""
+    """Draw the phase margin from -180 degrees and the gain margin from 0 dB, each where it was measured."""
     for axes, at, line, size in ((phase, phase_hz, -180.0, phase_deg), (magnitude, gain_hz, 0.0, -gain_db)):
         if np.isfinite(at) and np.isfinite(size):
             axes.plot([at, at], [line, line + size], color=color, linewidth=2.2, marker="_", solid_capstyle="butt")
 
 
 def _curve(axes: Axes, f: np.ndarray, y: np.ndarray, trusted: np.ndarray, color: str, label: str) -> None:
-    """Draw a curve, the doubtful parts of it in grey."""
+    """Draw a curve, in grey where the coherence is low."""
     axes.plot(f, y, color=DOUBTFUL, linewidth=1.0)
     axes.plot(f, np.where(trusted, y, np.nan), color=color, linewidth=1.4, label=label)
 

@@ -1,4 +1,4 @@
-"""The report of a tuning: a certificate as one HTML file, pictures included, that needs nothing from anywhere."""
+"""The report of a tuning: a certificate as one HTML file with its pictures, which loads nothing else."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from drive_env.devices import find_device
 from tuning.certificate.certificate import CertificateError
 from tuning.certificate.certificate_pictures import bode_picture, step_picture
+from tuning.identify.estimate import TITLES, interval
 
 if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
@@ -38,7 +39,7 @@ img { max-width: 100%; height: auto; } .refused { color: #777; } code { font-siz
 COLOURS = {
     "accepted": ("accepted", "new gains in the drive"),
     "accepted with reservations": ("reserved", "new gains in the drive, with reservations"),
-    "rejected": ("rejected", "gains as before"),
+    "rejected": ("rejected", "rejected; the drive has its gains from before"),
 }
 
 
@@ -48,7 +49,7 @@ def to_html(certificate: Certificate) -> str:
     body = [f"<h1>{escape(title)}</h1>", _summary(certificate)]
     for axis in certificate.axes:
         body += _axis(axis, find_device(certificate.device).gains)
-    body += ["<h2>What it was made with</h2>", _pairs(certificate.versions)]
+    body += ["<h2>Conditions and versions</h2>", _pairs(certificate.versions)]
     text = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width">\n'
@@ -67,7 +68,7 @@ def html_is_unchanged(text: str) -> bool:
     """
     content, seal, stated = text.rpartition(SEAL)
     if not seal:
-        raise CertificateError("the file is no report of drive-tune: it does not end with its hash")
+        raise CertificateError("the file is not a report of drive-tune: it does not end with its hash")
     return stated == f"{_hash(content)} -->\n"
 
 
@@ -84,10 +85,10 @@ def _summary(certificate: Certificate) -> str:
         "supply as entered [V]": _figure(certificate.supply),
         "seed": str(certificate.seed),
         "made": certificate.created,
-        "time on the drive [s]": _figure(max((axis.hardware_seconds for axis in axes), default=0.0)),
-        "trials stopped": str(sum(axis.aborts for axis in axes)),
+        "drive time [s]": _figure(max((axis.hardware_seconds for axis in axes), default=0.0)),
+        "trials stopped for oscillation or fault": str(sum(axis.aborts for axis in axes)),
         "axes with new gains": f"{sum(axis.accepted for axis in axes)} of {len(axes)}",
-        "of these with reservations": str(sum(axis.accepted and bool(axis.reservations) for axis in axes)),
+        "of these, accepted with reservations": str(sum(axis.accepted and bool(axis.reservations) for axis in axes)),
     } | {
         f"limit: {name}": _figure(value) if math.isfinite(value) else "none"
         for name, value in certificate.envelope.items()
@@ -107,7 +108,7 @@ def _axis(axis: AxisCertificate, known: GainSet) -> list[str]:
     if axis.notes:
         parts.append(_list("notes", axis.notes))
     if axis.identified:
-        parts += ["<h3>Identified, with intervals of 95 % confidence</h3>", _identified(axis)]
+        parts += ["<h3>Identified parameters, with 95 % confidence intervals</h3>", _identified(axis)]
     for name in dict.fromkeys(step.name for step in axis.steps):
         steps = [step for step in axis.steps if step.name == name]
         parts += [f"<h3>{escape(name)}</h3>", _image(step_picture(steps), f"{name} over time")]
@@ -117,8 +118,8 @@ def _axis(axis: AxisCertificate, known: GainSet) -> list[str]:
         sources = "; ".join(dict.fromkeys(found.source for found in responses if found.source))
         parts += [f"<h3>Open {escape(name)}</h3>", _image(bode_picture(responses), f"Bode diagram of the open {name}")]
         if sources:
-            parts.append(f"<p>From {escape(sources)}.</p>")
-        parts.append(_before_and_after([(found.tuned, found.margins) for found in responses], absent="not seen"))
+            parts.append(f"<p>Source: {escape(sources)}.</p>")
+        parts.append(_before_and_after([(found.tuned, found.margins) for found in responses], absent="not measured"))
     return parts
 
 
@@ -134,18 +135,18 @@ def _gains(axis: AxisCertificate, known: GainSet) -> str:
         label = f"{index:04X}h:{sub:02X}"
         cells = [name, label, axis.before[k], axis.after[k], meaning, _figure(before), _figure(after)]
         rows.append([str(cell) for cell in cells])
-    return _table(("gain", "object", "before", "after", "in SI", "before", "after"), rows, numbers=(2, 3, 5, 6))
+    return _table(("gain", "object", "before", "after", "in SI units", "before", "after"), rows, numbers=(2, 3, 5, 6))
 
 
 def _identified(axis: AxisCertificate) -> str:
     rows = []
     for name, found in axis.identified.items():
-        words = name.replace("_", " ")
+        words = TITLES.get(name, name)
         if math.isnan(found.value):
             rows.append([words, "not identified", "", found.unit, found.reason])
         else:
-            interval = f"{_figure(found.low)} to {_figure(found.high)}"
-            rows.append([words, _figure(found.value), interval, "" if found.unit == "1" else found.unit, found.reason])
+            unit = "" if found.unit == "1" else found.unit
+            rows.append([words, _figure(found.value), interval(found.low, found.high), unit, found.reason])
     return _table(("parameter", "value", "interval", "unit", ""), rows, numbers=(1,))
 
 
@@ -177,7 +178,7 @@ def _table(heads: Iterable[str], rows: Iterable[Sequence[str]], numbers: Iterabl
 
 
 def _figure(value: Any) -> str:
-    """Return a number with four digits; what there is none of is a dash."""
+    """Return a number with four digits; a missing one is a dash."""
     number = float(value)
     return "–" if math.isnan(number) else f"{number:.4g}"  # noqa: RUF001  # the dash that a table has
 

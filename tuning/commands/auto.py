@@ -1,4 +1,4 @@
-"""`drive-tune auto`: one button."""
+"""`drive-tune auto`: identify an axis, find its gains, verify and store them."""
 
 from __future__ import annotations
 
@@ -30,18 +30,19 @@ if TYPE_CHECKING:
 def auto(
     drive: TargetOptions,
     store: Annotated[
-        bool, typer.Option("--store/--no-store", help="Have drives on a bus keep the gains over a power cycle.")
+        bool,
+        typer.Option("--store/--no-store", help="Drives on a bus store the gains, so that they survive a power cycle."),
     ] = True,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-auto")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Tune a drive: check, identify, compute, try, verify, write and keep; what fails a check is rolled back.
+    """Tune a drive: identify, search gains, try, verify and store them; an axis that fails a check is rolled back.
 
-    A motor turns, for about 10 s in all. The verdict is accepted, accepted with reservations, which are named, or
-    rejected. Writes before.toml, from which `drive-tune undo` brings back what was, certificate.json and
-    report.html. Exit code 1 if an axis was rejected; why is said.
+    The motor turns, for about 10 s in all. The verdict is accepted, accepted with reservations, which are listed, or
+    rejected. Writes before.toml, with which `drive-tune undo` restores the state before, certificate.json and
+    report.html. Exit code 1 if an axis was rejected; the reason is printed.
     """
     with errors_as_exit_codes():
         from tuning.runs import provenance
@@ -72,7 +73,7 @@ def _run(target: Target, folder: Path, seed: int, store: bool) -> Result:
 
 
 def _left_behind(target: Target, file: Path) -> str:
-    """Say what drives have after Ctrl-C: it may come before anything was changed, or after everything was."""
+    """Return the state of the drives after Ctrl-C, which may come at any time."""
     import numpy as np
 
     from tuning.snapshot import load_snapshot
@@ -83,11 +84,8 @@ def _left_behind(target: Target, file: Path) -> str:
     if all(
         np.array_equal(target.drives.read(key), [axis[key] for axis in before.axes]) for key in target.device.gains.keys
     ):
-        return (
-            "the drives are disabled and have the gains from before; if ever not, "
-            f"drive-tune undo {file} brings them back"
-        )
-    return f"the drives are disabled and have the new gains: drive-tune undo {file} brings back what was"
+        return f"the drives are disabled and have the gains from before; if not, drive-tune undo {file} restores them"
+    return f"the drives are disabled and have the new gains: drive-tune undo {file} restores the state before"
 
 
 def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
@@ -130,25 +128,25 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
     lines = []
     for k, axis in enumerate(result.axes):
         if not axis.accepted and axis.identified is None and result.drive_seconds[k] == 0.0:  # refused at the outset
-            lines.append(f"axis {k} was left as it was: {axis.reason}")
+            lines.append(f"axis {k} was not tuned: {axis.reason}")
         elif not axis.accepted:
             lines.append(f"axis {k} was rolled back: {axis.reason}")
         else:
-            lines.append(f"axis {k}: {axis.verdict}; it was verified {axis.verified}")
+            lines.append(f"axis {k}: {axis.verdict}; the gains were verified {axis.verified}")
             lines += [f"axis {k}: reservation: {reservation}" for reservation in axis.reservations]
         lines += [f"axis {k}: {note}" for note in axis.notes]
-    kept = "; the drive keeps the gains" if result.kept else ""
+    kept = "; the gains are stored in the drive" if result.kept else ""
     stopped = int(result.aborts.sum())
     trials = f"{stopped} trial{'s' * (stopped != 1)} stopped"
     lines.append(f"{result.drive_seconds.max():.1f} s of drive time, {trials}{kept}")
     lines.append(f"written to {folder}: before.toml, certificate.json, report.html")
     if target.bus:
-        lines.append(f"drive-tune undo {result.file} brings back what was")
+        lines.append(f"drive-tune undo {result.file} restores the state before")
     print_lines(lines)
 
 
 def _margins(axis: AxisRun, loop: str) -> str:
-    """Return phase and gain margin of a loop; what was not seen as what it is at least."""
+    """Return phase and gain margin of a loop; a lower bound where one was not measured."""
     found, least = axis.margins.get(loop), axis.at_least.get(loop)
     texts = []
     for key, unit in (("phase_deg", "°"), ("gain_db", " dB")):
@@ -158,4 +156,4 @@ def _margins(axis: AxisRun, loop: str) -> str:
             texts.append(f"{seen:.0f}{unit}")
         else:
             texts.append(f"≥{bound:.0f}{unit}" if math.isfinite(bound) else "?")
-    return ", ".join(texts) if texts != ["?", "?"] else "not seen"
+    return ", ".join(texts) if texts != ["?", "?"] else "not measured"

@@ -1,4 +1,4 @@
-"""`drive-tune identify`: what an axis's own signals say of its motor and machine, with intervals."""
+"""`drive-tune identify`: parameters of motor and machine from the drive's own signals, with intervals."""
 
 from __future__ import annotations
 
@@ -24,25 +24,14 @@ from tuning.commands.options import (
     unchanged,
     way_back,
 )
+from tuning.identify.estimate import TITLES, interval
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
     from tuning.identify.estimate import Identification
-
-TITLES = {
-    "resistance": "winding resistance, a phase",
-    "inductance": "winding inductance, a phase",
-    "pole_pairs": "pole pairs",
-    "encoder_direction": "encoder direction",
-    "inertia": "inertia (J/K_t, times the data sheet's K_t)",
-    "coulomb": "dry friction, over K_t",
-    "viscous": "viscous friction, over K_t",
-    "offset": "gravity or constant load, over K_t",
-    "anti_resonance": "anti-resonance",
-    "resonance": "resonance",
-    "loop_delay": "delay of the velocity loop",
-    "velocity_filter": "velocity filter",
-}
+K_T_NOTE = (
+    "Inertia, friction and load are measured as current: an inertia is the measured J/K_t times the data sheet's K_t."
+)
 
 
 @takes(TargetOptions)
@@ -53,9 +42,9 @@ def identify(
 ) -> None:
     """Identify axes: winding, encoder, inertia, friction, gravity, resonance, delay and filter.
 
-    The motor turns: there and back within --travel, up to its rated current and 0.7 of its rated speed. Every value
-    has a 95 % interval; what cannot be told is refused with its reason. Afterwards the drive is off and has its own
-    parameters; those of a bus are in a file for `drive-tune undo`, too, beside --out or in runs/.
+    The motor turns: there and back within --travel, up to its rated current and 0.7 of its rated speed. Every value has
+        a 95 % interval; a value that cannot be identified has the reason instead. Afterwards the drive is off and has
+        its own parameters; on a bus they are also saved to a file for `drive-tune undo`, beside --out or in runs/.
     """
     with errors_as_exit_codes():
         if out is not None and not out.parent.is_dir():
@@ -86,7 +75,7 @@ def identify(
 
 
 def row(found: Identification) -> dict[str, Any]:
-    """Return an identification as JSON knows it: nan, which it does not know, is null."""
+    """Return an identification for JSON, with null for nan."""
     from tuning.identify.wiring import named
 
     estimates = {
@@ -109,11 +98,11 @@ def _print(found: list[Identification], device: Device) -> None:
         for name, estimate in one.estimates.items():
             if estimate.is_known:
                 unit = "" if estimate.unit == "1" else estimate.unit
-                interval = f"{estimate.low:.4g} to {estimate.high:.4g}"
-                rows.append((TITLES[name], f"{estimate.value:.4g}", interval, unit))
+                rows.append((TITLES[name], f"{estimate.value:.4g}", interval(estimate.low, estimate.high), unit))
             else:
                 rows.append((TITLES[name], "-", "as above" if estimate.reason == said else estimate.reason, ""))
                 said = estimate.reason
         print_table(columns, rows, f"{head}{one.drive_time:.1f} s of drive time")
         for line in finding(device, one.wiring):
             print(f"{head}{line}")
+    print(K_T_NOTE)

@@ -1,4 +1,4 @@
-"""`drive-tune optimise`: gains found by trials, on emulated machines or on a bus."""
+"""`drive-tune optimise`: search gains by trials, on emulated machines or on a bus."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def optimise(
         typer.Option(
             is_eager=True,
             callback=_from_file,
-            help="settings.toml of a search, which is repeated; other options take the place of what it says.",
+            help="settings.toml of a search, which is repeated; other options replace what it says.",
         ),
     ] = None,
     sampler: Annotated[str, typer.Option(help="random, grid, tpe, cmaes or gp.")] = "tpe",
@@ -59,7 +59,7 @@ def optimise(
         list[str] | None,
         typer.Option(
             "--objective",
-            help="cost, or several of speed, robustness and current: then the front of what none beats is kept.",
+            help="cost, or several of speed, robustness and current: the Pareto front of trials is then shown.",
             show_default="cost",
         ),
     ] = None,
@@ -67,33 +67,36 @@ def optimise(
         list[str] | None,
         typer.Option(
             "--gain",
-            help="Gain that is searched, again for another.",
+            help="Gain to search; may be given several times.",
             show_default="those of the velocity and position loop",
         ),
     ] = None,
     width: Annotated[
         float | None,
         typer.Option(
-            help="The search reaches from the rule's gains over e^WIDTH to those times e^WIDTH.", show_default="ln 6"
+            help="The search covers the rule's gains divided by e^WIDTH to multiplied by e^WIDTH.", show_default="ln 6"
         ),
     ] = None,
     safe: Annotated[
         bool | None,
         typer.Option(
             "--safe/--bold",
-            help="Start from slow gains that are proved first, and go on from what was proved in small steps.",
+            help="Start from slow gains, and go on in small steps from gains that were tried without oscillation.",
             show_default="safe on a bus",
         ),
     ] = None,
-    lanes: Annotated[int, typer.Option(help="Emulated machine: its twins side by side, a generation.")] = 8,
+    lanes: Annotated[
+        int, typer.Option(help="Emulated machine: copies that try a generation of gains at the same time.")
+    ] = 8,
     searches: Annotated[
-        int, typer.Option(help="Emulated machine: searches with a seed each; the best one counts.")
+        int, typer.Option(help="Emulated machine: number of searches, each with its own seed; the best is taken.")
     ] = 1,
     workers: Workers = None,
     cluster: Cluster = None,
     resume: Resume = False,
     journal: Annotated[
-        Path | None, typer.Option(help="File of Optuna's journal: the search is kept there, and goes on from there.")
+        Path | None,
+        typer.Option(help="Journal file of Optuna, which keeps the search and from which it can be continued."),
     ] = None,
     out: Annotated[
         Path | None,
@@ -101,11 +104,11 @@ def optimise(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Search gains by trials: a move, its reversal, and the move with more gain, costed from what the drive shows.
+    """Search gains by trials: a move, its reversal, and the move with more gain, with a cost from the drive's signals.
 
-    What oscillates is stopped within 50 ms and gets the last good gains back. Afterwards the drive has the best gains;
-    trials.csv, trials.png and settings.toml are written, from which `drive-tune optimise --config settings.toml`
-    repeats the search; on a bus also OUT-before.toml, from which drive-tune undo brings back what was.
+    An axis that oscillates is stopped within 50 ms and gets the last good gains back. Afterwards the drive has the best
+    gains. Writes trials.csv, trials.png and settings.toml, with which `drive-tune optimise --config settings.toml`
+    repeats the search, and on a bus OUT-before.toml, with which `drive-tune undo` restores the state before.
     """
     with errors_as_exit_codes():
         check_seed(drive.seed)
@@ -116,8 +119,8 @@ def optimise(
             raise ValueError("--resume needs --out: the folder into which the search was to write")
         if drive.bus and (searches != 1 or workers is not None or cluster is not None or resume):
             raise ValueError(
-                "--searches, --workers, --cluster and --resume are of emulated machines; a search on a bus goes on "
-                "from its --journal"
+                "--searches, --workers, --cluster and --resume are for emulated machines only; a search on a bus is "
+                "continued with --journal"
             )
         from drive_env.devices import find_device
         from tuning.runs import provenance, unfinished
@@ -162,7 +165,7 @@ def optimise(
             try:
                 found = _search_bus(target, settings, before, folder, on_bus)
             except KeyboardInterrupt:
-                lost = "interrupted; the trials made are lost: on a bus they are kept only with --journal FILE"
+                lost = "interrupted; the trials made so far are lost: on a bus they are kept only with --journal FILE"
                 fail(lost if journal is None else _kept_in(journal), INTERRUPTED)
         _report(found, settings, folder, before, where, on_bus, json)
 
@@ -189,7 +192,7 @@ def _search_machine(
         open_pool(workers, cluster) as pool,
     ):
         if log.done or unfinished.has_parts(log):
-            print(f"note: goes on from what was done, {len(log.done)} of {count} searches whole", file=sys.stderr)
+            print(f"note: continues a stopped run; {len(log.done)} of {count} searches are complete", file=sys.stderr)
         for line in pool.differences():
             print(f"note: {line}", file=sys.stderr)
         elsewhere = workers is not None or cluster is not None
@@ -198,11 +201,11 @@ def _search_machine(
 
 
 def _check_unfinished(folder: Path, journal: Path | None) -> None:
-    """Raise ValueError where there is no search to go on with: it would be a new one. A journal has its own."""
+    """Raise ValueError where there is no search to continue. A journal has its own check."""
     from tuning.runs import unfinished
 
     if (folder / "trials.csv").is_file():
-        raise ValueError(f"the search of {folder} is finished: nothing is left to resume, its results are there")
+        raise ValueError(f"the search in {folder} is finished, and its results are there: nothing is left to resume")
     if journal is None and not unfinished.unfinished_folder(folder).is_dir():
         raise ValueError(
             f"there is no search to resume: {unfinished.unfinished_folder(folder)} does not exist; correct --out, or "
@@ -216,9 +219,9 @@ def _kept_in(journal: Path) -> str:
 
 
 def _search_bus(target: Any, settings: Any, before: Path, folder: Path, options: dict[str, Any]) -> Any:
-    """Search on a bus, the state before being in a file; what is no success is undone, and says where that file is.
+    """Search on a bus, with the state before in a file; a failed search is undone, and the message names that file.
 
-    Results that cannot be written down are none.
+    A search whose results cannot be written has failed.
     """
     from tuning.search.optimise import optimise as search
     from tuning.snapshot import put_back
@@ -240,7 +243,7 @@ def _search_bus(target: Any, settings: Any, before: Path, folder: Path, options:
 
 
 def leave_oscillations_to_trials(drives: Drives) -> None:
-    """Have the envelope not end a search for what a trial stops itself, nor for a sampler that thinks."""
+    """Keep the envelope from ending a search where a trial stops an axis itself, or the sampler computes for long."""
     from dataclasses import replace
 
     if drives.safety is not None:
@@ -307,7 +310,7 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
         row = next((row for row in own if row.cost == cost and np.array_equal(row.gains, best)), None)
         rows += _cells("best", best, [""] * len(shown) if row is None else _told(row, shown, found.t_0))
         title = f"{kind} {search} of {where}" if len(searches) > 1 else f"Gains of {where}"
-        print_table(columns, rows, title + ", with the trials that none beats in every objective" * several)
+        print_table(columns, rows, title + ", with the Pareto front of the trials" * several)
     stopped = sum(row.aborted for row in found.rows)
     lines = [f"{len(found.rows)} trials, {stopped} of them stopped, in {found.drive_seconds:.1f} s of drive time."]
     lines += sorted({note for note in found.notes if note})
@@ -315,7 +318,7 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
         lines.append(f"search {int(np.nanargmin(found.cost))} found the best gains")
     lines.append(f"written to {folder}: trials.csv, trials.png, settings.toml")
     if before is not None:
-        lines.append(f"drive-tune undo {before} brings back what the drives had")
+        lines.append(f"drive-tune undo {before} restores the drives' state before")
     print_lines(lines)
 
 

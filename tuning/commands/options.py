@@ -1,4 +1,4 @@
-"""What the commands of `drive-tune` have in common: options, the target that they name, progress, and how they end."""
+"""Options, target, progress and exit codes that the commands of `drive-tune` share."""
 
 from __future__ import annotations
 
@@ -36,19 +36,28 @@ if TYPE_CHECKING:
 # Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
 
 APART = "apart"  # of `tuning.target.AXES`
-MotorName = Annotated[str, typer.Option("--motor", help="Motor by name; its data sheet values are taken.")]
-LoadName = Annotated[str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF.")]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of everything random, 0 or more.")]
+MotorName = Annotated[
+    str,
+    typer.Option(
+        "--motor", help="Motor: a name of the catalogue, or the path of a TOML file; its data sheet values are used."
+    ),
+]
+LoadName = Annotated[
+    str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF file.")
+]
+Seed = Annotated[int, typer.Option("--seed", help="Seed of all random numbers, 0 or more.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results, new or empty.")]
 Bus = Annotated[
     bool,
     typer.Option(
         "--bus",
         help="Use the drives on a bus, inside the safety envelope; --interface, --channel, --node, --bitrate and "
-        "--lockstep say so, too. What stands in the environment does not.",
+        "--lockstep imply it. Environment variables do not.",
     ),
 ]
-Lockstep = Annotated[bool, typer.Option("--lockstep", help="Let time pass by SYNC, for an emulator that is served so.")]
+Lockstep = Annotated[
+    bool, typer.Option("--lockstep", help="Time passes by SYNC only, for an emulator that is served with --lockstep.")
+]
 Supply = Annotated[
     float | None,
     typer.Option("--supply", help="Supply voltage at the drive [V].", show_default="the motor's"),
@@ -58,35 +67,35 @@ TravelRange = Annotated[
     typer.Option(
         "--travel",
         help="How far the rotor may turn from where it stands [turns]: LOW:HIGH, e.g. -0.15:0.15, or free; one for "
-        "all axes, or one for each with commas between. Needed on a bus; an emulated load knows its own.",
+        "all axes, or one for each with commas between. Required on a bus; an emulated load has its own.",
     ),
 ]
 Axes = Annotated[
     str,
     typer.Option(
         "--axes",
-        help="Of several nodes of a bus, how their axes belong together: apart (each is a machine of its own), coupled "
-        "(joints of one machine, which are moved one after the other) or linked (ends of one thing, as of a gantry, "
-        "which are moved together). An emulated load knows.",
+        help="For several nodes on a bus, how their axes are coupled: apart (separate machines), coupled (joints of "
+        "one machine, moved one after the other) or linked (they drive one part, as both ends of a gantry, and "
+        "are moved together). Known for an emulated load.",
     ),
 ]
-Machines = Annotated[int, typer.Option("--machines", help="Emulated machines.")]
-Randomise = Annotated[bool, typer.Option("--randomise", help="Draw every machine's parameters.")]
+Machines = Annotated[int, typer.Option("--machines", help="Number of emulated machines.")]
+Randomise = Annotated[bool, typer.Option("--randomise", help="Draw random parameters for every machine.")]
 Workers = Annotated[
     int | None,
-    typer.Option("--workers", help="Processes of this machine.", show_default="this process, with a thread per core"),
+    typer.Option(
+        "--workers", help="Worker processes on this computer.", show_default="this process, with one thread per core"
+    ),
 ]
 Cluster = Annotated[
     str | None,
     typer.Option(
         "--cluster",
-        help="Dask scheduler on whose workers to run: tcp://host:port, or tls://host:port followed by "
+        help="Run on the workers of this Dask scheduler: tcp://host:port, or tls://host:port followed by "
         "?ca=FILE&cert=FILE&key=FILE.",
     ),
 ]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="Go on with what a run into this --out left when it was stopped.")
-]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue a stopped run with the same --out.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,7 +185,7 @@ def parse_travel(text: str) -> tuple[float, float]:
     except ValueError:
         raise ValueError(f"--travel {text} must be LOW:HIGH in turns, e.g. -0.15:0.15, or free") from None
     if not ends[0] <= 0.0 <= ends[1] or not ends[0] < ends[1]:
-        raise ValueError(f"--travel {text} must hold 0, where the rotor stands; give what is free to both sides")
+        raise ValueError(f"--travel {text} must contain 0, where the rotor is now; give the free way to both sides")
     return ends
 
 
@@ -197,7 +206,7 @@ def check_seed(seed: int) -> None:
 
 
 def check_machines(option: str, machines: int) -> None:
-    """Raise ValueError for a number of emulated machines that cannot be."""
+    """Raise ValueError for an impossible number of emulated machines."""
     from drive_env.emulator.emulated_drives import MOST_MACHINES
 
     if not 1 <= machines <= MOST_MACHINES:
@@ -212,13 +221,15 @@ def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool, a
     Interface and channel may stand in the environment: alone they say nothing, and a motor must not turn by surprise.
     """
     if nodes or bitrate is not None or lockstep:
-        raise ValueError("--node, --bitrate and --lockstep are of drives on a bus; add --bus, or leave them out")
+        raise ValueError("--node, --bitrate and --lockstep are for drives on a bus; add --bus, or leave them out")
     if axes != APART:
-        raise ValueError(f"--axes {axes} is of drives on a bus, an emulated load knows; add --bus, or leave it out")
+        raise ValueError(
+            f"--axes {axes} is for drives on a bus; add --bus, or leave it out (an emulated load has its own coupling)"
+        )
 
 
 def ask_to_turn(nodes: list[int] | None, yes: bool) -> None:
-    """Go on if the user lets the motors of a bus turn; raises as `ask` does."""
+    """Continue if the user agrees that the motors on a bus turn; raises as `ask` does."""
     ask(f"The motor of node {', '.join(map(str, nodes or [1]))} will turn. Is its way clear?", yes)
 
 
@@ -256,7 +267,7 @@ def open_target(
             device, load, motor, num_machines=machines, seed=seed, randomise=randomise, supply=supply, travel=ends
         )
     if travel is None:
-        raise ValueError("--travel is missing: how far may the motor turn? Give LOW:HIGH in turns, or free")
+        raise ValueError("--travel is missing: give how far the motor may turn, LOW:HIGH in turns, or free")
     options: dict[str, Any] = {} if bitrate is None else {"bitrate": bitrate}
     if lockstep:
         options |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE}
@@ -284,7 +295,7 @@ def way_back(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | 
 
 @contextmanager
 def unchanged(target: Target, file: Path | None) -> Iterator[Transaction | None]:
-    """Leave the state before in a file, if there is one to leave, and put back at the end what is not committed."""
+    """Save the state before to a file, if there is one, and restore at the end what is not committed."""
     if file is None:
         yield None
         return
@@ -295,12 +306,12 @@ def unchanged(target: Target, file: Path | None) -> Iterator[Transaction | None]
 
 
 def before_as_json(file: Path | None) -> dict[str, str]:
-    """Return what programs are told of the file with the state before."""
+    """Return the JSON entry of the file with the state before."""
     return {} if file is None else {"before": str(file)}
 
 
 def tell_before(file: Path | None) -> None:
-    """Say where the state before is, once everything is put back."""
+    """Print where the state before is, once everything is restored."""
     if file is not None:
         from tuning.snapshot import what_is_left
 
@@ -309,7 +320,7 @@ def tell_before(file: Path | None) -> None:
 
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
-    """End with one line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
+    """End with one line: exit code 1 for errors of drive or bus, 2 for the user's mistake, 130 for Ctrl-C."""
     from drive_env.master.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError
     from tuning.runs.pools import PoolError
@@ -320,7 +331,7 @@ def errors_as_exit_codes() -> Iterator[None]:
 
 @contextmanager
 def progress_bar(description: str) -> Iterator[Callable[[float], None]]:
-    """Show a bar on stderr while something long goes on; what is given takes the share done, 0 to 1."""
+    """Show a progress bar on stderr; the function given takes the share done, 0 to 1."""
     from rich.console import Console
 
     with progress_on(Console(stderr=True), transient=True) as progress:
@@ -335,11 +346,11 @@ def fail(error: object, code: int = USER_ERROR) -> NoReturn:
 
 
 def what_an_interrupt_leaves(folder: Path) -> str:
-    """Return what an interrupted run that can be resumed says."""
+    """Return the message of an interrupted run that can be resumed."""
     from tuning.runs import unfinished
 
     if unfinished.unfinished_folder(folder).exists():
-        return f"interrupted; what is done is kept; go on with --out {folder} --resume"
+        return f"interrupted; the completed part is kept; continue with --out {folder} --resume"
     return "interrupted; nothing was written"
 
 

@@ -1,4 +1,4 @@
-"""`drive-tune rank`: every tuner on the same machines."""
+"""`drive-tune rank`: compare all tuners on the same machines."""
 
 from __future__ import annotations
 
@@ -25,23 +25,26 @@ from tuning.commands.options import (
 
 
 def rank(
-    suite: Annotated[str, typer.Option(help="Machines: a suite by name, or a TOML file like one.")] = "public",
+    suite: Annotated[str, typer.Option(help="Machines: the name of a suite, or a TOML file like one.")] = "public",
     tuners: Annotated[
         list[str] | None,
-        typer.Option("--tuner", "-t", help="Tuner by name, again for another.", show_default="all but the slow ones"),
+        typer.Option(
+            "--tuner", "-t", help="Tuner to compare; may be given several times.", show_default="all but the slow ones"
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the tuners, and of the suite's part that is drawn.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the tuners and of the randomly drawn machines.")] = 0,
     drawn: Annotated[
-        bool, typer.Option("--drawn/--public-only", help="Draw the suite's other part for the seed, too.")
+        bool, typer.Option("--drawn/--public-only", help="Also use the suite's randomly drawn machines.")
     ] = False,
     count: Annotated[
-        int | None, typer.Option(help="Machines at most, of all loads in turn.", show_default="all")
+        int | None, typer.Option(help="Most machines to use, taken from all loads in turn.", show_default="all")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-compare")
     ] = None,
     trials: Annotated[
-        int | None, typer.Option(help="Trials of every search by trials.", show_default="each tuner's own: 12 or 20")
+        int | None,
+        typer.Option(help="Number of trials of the tuners that search by trials.", show_default="12 or 20, by tuner"),
     ] = None,
     workers: Workers = None,
     cluster: Cluster = None,
@@ -50,12 +53,12 @@ def rank(
     resume: Resume = False,
     json: Json = False,
 ) -> None:
-    """Have every tuner tune the same emulated machines, and score what it finds by hidden J.
+    """Compare tuners: each tunes the same emulated machines, and its gains are scored by the robust cost.
 
-    Hidden J counts speed, stiffness, noise, overshoot and robustness; it is given relative to that of the fitted rule
-    with the true inertia, and machine by machine to that of the best other tuner. Writes tuners.csv, rivals.csv,
-    machines.csv, comparison.png and settings.toml. Stopped at any point, it goes on with --out and --resume, to the
-    same digits; with --workers and --cluster, too.
+    The robust cost counts speed, stiffness, noise, overshoot and robustness: the lower the better. It is given relative
+        to that of the baseline rule with the true inertia, and machine by machine relative to the best other tuner.
+        Writes tuners.csv, rivals.csv, machines.csv, comparison.png and settings.toml. A stopped run continues with
+        --out and --resume, with identical results; also with --workers and --cluster.
     """
     with errors_as_exit_codes():
         if show:
@@ -117,7 +120,8 @@ def _compare(
     run_text = settings_text(settings | {"machines": hashlib.sha256(repr(machines).encode()).hexdigest()})
     with unfinished.shard_log(folder, run_text, resume=resume) as log:
         if log.done:
-            print(f"note: goes on from {len(log.done)} of {len(tuners) * len(groups(machines))} steps that are done",
+            print(f"note: continues a stopped run; {len(log.done)} of {len(tuners) * len(groups(machines))} steps are "
+                  f"done",
                   file=sys.stderr)  # fmt: skip
         with open_pool(workers, cluster) as pool:
             for line in pool.differences():
@@ -148,13 +152,13 @@ def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
          f"{row.moves:.0f}", str(row.aborts), str(row.violations), str(row.failed))
         for row in comparison.tuners
     ]  # fmt: skip
-    title = f"Hidden J over the fitted rule's on {machines} machines"
+    title = f"Robust cost relative to the baseline rule on {machines} machines"
     print_table([Column("tuner", "name"), *map(Column, titles)], rows, title)
-    lines = ["Drive time and moves: median of a machine; stops, violations, gave up: all machines."]
+    lines = ["Drive time and moves: median of a machine. Stops, limit violations, gave up: sum of all machines."]
     for row in all_rivals(comparison):
         lines.append(
-            f"{row.tuner}: machine by machine {row.median:.3f} of the best other's hidden J (median, 95 % of "
-            f"{row.low:.3f} to {row.high:.3f}), better than all on {row.better} of {row.machines}"
+            f"{row.tuner}: robust cost {row.median:.3f} times that of the best other tuner on the same machine "
+            f"(median, 95 % interval {row.low:.3f} to {row.high:.3f}), best on {row.better} of {row.machines} machines"
         )
     lines += [f"left out: {text}" for text in left_out]
     failures = {(row.tuner, row.note) for row in comparison.rows if row.failed}

@@ -25,6 +25,7 @@ from tuning.commands.options import (
     unchanged,
     way_back,
 )
+from tuning.identify.estimate import TITLES
 
 if TYPE_CHECKING:
     from tuning.response.measured_loop import MeasuredLoop
@@ -39,24 +40,25 @@ COLUMNS = (
 def response(
     drive: TargetOptions,
     loop: Annotated[str, typer.Argument(help="velocity or position.")] = "velocity",
-    signal: Annotated[str, typer.Option("--signal", help="What shakes the axis: multisine or chirp.")] = "multisine",
+    signal: Annotated[str, typer.Option("--signal", help="Excitation: multisine or chirp.")] = "multisine",
     low: Annotated[float | None, typer.Option("--low", help="Lowest frequency [Hz].", show_default="5")] = None,
     high: Annotated[
         float | None,
-        typer.Option("--high", help="Highest frequency [Hz], up to 400.", show_default="400; 50 of the position loop"),
+        typer.Option("--high", help="Highest frequency [Hz], up to 400.", show_default="400; 50 for the position loop"),
     ] = None,
-    resolution: Annotated[float, typer.Option("--resolution", help="Distance of two frequencies [Hz].")] = 5.0,
+    resolution: Annotated[float, typer.Option("--resolution", help="Spacing of the frequencies [Hz].")] = 5.0,
     trace: Annotated[
-        bool, typer.Option("--trace", help="Look above 400 Hz, through the emulator's trace; not on a bus.")
+        bool, typer.Option("--trace", help="Measure above 400 Hz, with the emulator's trace; not on a bus.")
     ] = False,
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """Shake the axes with the gains they have and show open loop, coherence and margins.
+    """Measure the axes' frequency response with their present gains: open loop, coherence and margins.
 
-    The axes run there and back at a steady speed, for about two seconds, and end where they began. With --out, a
-    picture and a CSV of each axis are written. What is not coherent is grey, and no margin is read from it. The
-    parameters of drives on a bus are in a file for `drive-tune undo` meanwhile, beside --out or in runs/.
+    The axes run there and back at a steady speed, with an excitation on the set-point, for about two seconds, and end
+    where they began. With --out, a picture and a CSV of each axis are written. Frequencies with low coherence are grey,
+    and no margin is read from them. The parameters of drives on a bus are saved to a file for `drive-tune undo`, beside
+    --out or in runs/.
     """
     with errors_as_exit_codes():
         from tuning.response.frequency_response import measure
@@ -66,7 +68,7 @@ def response(
             provenance.check_folder(out)
         if trace and (drive.bus or high is not None):
             raise ValueError(
-                "--trace looks at emulated drives, up to 1000 Hz; leave --high and --bus out, or take no --trace"
+                "--trace is for emulated drives, up to 1000 Hz; leave out --high and --bus, or leave out --trace"
             )
         file = way_back(drive, "response", out)
         with drive.open() as target, unchanged(target, file), progress_bar("shaking") as show:
@@ -81,10 +83,9 @@ def response(
             _print(measured, out)
             tell_before(file)
         if measured.trusted.mean(axis=0).min() < FEWEST:
-            late = "; or this computer or the drives' emulator is late: serve it with --lockstep" * (
-                drive.bus and not drive.lockstep
-            )
-            fail(f"less than a tenth of an axis's frequencies is coherent: it was shaken too little{late}", REFUSED)
+            slow = "; or this computer or the emulator is too slow for real time: serve the emulator with --lockstep"
+            late = slow * (drive.bus and not drive.lockstep)
+            fail(f"less than a tenth of an axis's frequencies are coherent: the excitation was too weak{late}", REFUSED)
 
 
 def _axes(measured: MeasuredLoop) -> range:
@@ -165,15 +166,17 @@ def _print(measured: MeasuredLoop, out: Path | None) -> None:
         if measured.fits[axis] is not None:
             for name, e in measured.estimates(axis).items():
                 unit = "" if e.unit == "1" else f" {e.unit}"
-                said = e.reason if e.reason else f"{e.value:.4g}{unit} ({e.low:.4g} ... {e.high:.4g})"
-                lines.append(f"axis {axis}: {name} {said}")
+                said = f"{e.value:.4g}{unit} ({e.low:.4g} to {e.high:.4g})"
+                if e.reason:
+                    said = f"not identified: {e.reason}"
+                lines.append(f"axis {axis}: {TITLES[name]} {said}")
         lines += [f"axis {axis}: {note}" for note in measured.notes[axis]]
     written = "" if out is None else f"; written to {out}"
     print_lines([*lines, f"{measured.drive_time:.2f} s of drive time{written}"])
 
 
 def _text(value: float, form: str) -> str:
-    return form.format(value) if math.isfinite(value) else "infinite" if value == math.inf else "not seen"
+    return form.format(value) if math.isfinite(value) else "infinite" if value == math.inf else "not measured"
 
 
 def _or_none(value: float) -> float | None:

@@ -1,4 +1,4 @@
-"""`drive-tune rules`: what every rule proposes for an axis, and what its loops would be worth."""
+"""`drive-tune rules`: gains that tuning rules propose for an axis, with the margins they would have."""
 
 from __future__ import annotations
 
@@ -42,11 +42,13 @@ POINTS = 1500  # frequencies at which margins are looked for
 def rules(
     drive: TargetOptions,
     rule: Annotated[list[str] | None, typer.Argument(help="Rules by name; all by default.")] = None,
-    relay: Annotated[bool, typer.Option("--relay", help="Swing the axis by a relay, too, and show what that says.")] = (
-        False
-    ),
+    relay: Annotated[
+        bool, typer.Option("--relay", help="Also make the axis swing by relay feedback, and show the gains from that.")
+    ] = (False),
     apply: Annotated[str | None, typer.Option("--apply", help="Write this rule's gains to the drive.")] = None,
-    store: Annotated[bool, typer.Option("--store", help="Have the drive keep them over a power cycle.")] = False,
+    store: Annotated[
+        bool, typer.Option("--store", help="Store them in the drive, so that they survive a power cycle.")
+    ] = False,
     snapshot: Annotated[
         Path | None,
         typer.Option(
@@ -58,8 +60,8 @@ def rules(
 ) -> None:
     """Identify an axis and show the gains that each rule proposes, with the margins they would have.
 
-    Margins are those of the velocity loop on the identified model. Notes say what no integer reaches. On a bus the
-    parameters before are in --snapshot from the begin, and back at the end, but for what --apply writes.
+    Margins are those of the velocity loop, computed by the identified model. Notes name limits of the integer gains. On
+    a bus the parameters before are saved to --snapshot first and restored at the end, except what --apply writes.
     """
     with errors_as_exit_codes():
         from tuning.rules.rules_by_name import RULES
@@ -71,9 +73,9 @@ def rules(
             if name not in RULES:
                 raise ValueError(f"no rule is named {name!r}; there are {', '.join(RULES)}")
         if store and not apply:
-            raise ValueError("--store keeps what --apply writes; add --apply RULE, or leave it out")
+            raise ValueError("--store stores what --apply writes; add --apply RULE, or leave it out")
         if snapshot is not None and not (apply or drive.bus):
-            raise ValueError("--snapshot is where --apply keeps the state before; add --apply RULE, or leave it out")
+            raise ValueError("--snapshot is the file for the state before --apply; add --apply RULE, or leave it out")
         file = run_folder("rules") / "before.toml" if snapshot is None else snapshot
         if drive.bus:
             check_place(file)  # written before the motor turns; of emulated drives, before their gains change
@@ -97,7 +99,7 @@ def rules(
                     _print(target, axis, k if len(plants) > 1 else None)
             if not known or (apply and len(known) < len(plants)):
                 fail("nothing was written: a rule needs the inertia of every axis" if known else
-                     "no axis has an identified inertia, and no rule works without", REFUSED)  # fmt: skip
+                     "no axis has an identified inertia, which every rule needs", REFUSED)  # fmt: skip
             if apply:
                 _apply(target, known, apply, file, transaction, store=store, yes=drive.yes)
         if not (apply or json):
@@ -106,7 +108,7 @@ def rules(
 
 @dataclass
 class _AxisRules:
-    """What there is to show of an axis: its plant, or why it is not known, and what the rules say of it."""
+    """The results of an axis: its model, or why there is none, and the rules' proposals."""
 
     plant: Plant | str
     rows: dict[str, Proposal] = field(default_factory=dict)
@@ -114,7 +116,7 @@ class _AxisRules:
 
 
 def _identified(target: Target) -> list[Plant | str]:
-    """Return what the axes are, or why no rule can say anything of one: its inertia was not found."""
+    """Return the axes' models, or why there is none: the inertia was not identified."""
     from drive_env.safety.envelope import swinging_allowed
     from tuning.identify.identification import identify
     from tuning.response.linear_model import Plant
@@ -138,7 +140,7 @@ def _propose(target: Target, plant: Plant, names: Sequence[str]) -> dict[str, Pr
 
 
 def _swing(target: Target, plants: Sequence[Plant]) -> list[Proposal | str]:
-    """Return what relay experiments say, with the current loops that the rule computes; or why one says nothing."""
+    """Return the relay experiments' proposals, with the current loops that the rule computes, or why there is none."""
     import numpy as np
 
     from drive_env.gains import write_gains
@@ -211,12 +213,12 @@ def _print(target: Target, shown: _AxisRules, axis: int | None) -> None:
     lines = []
     if plant.is_elastic and plant.damping == type(plant).damping:
         lines.append(
-            "How much the resonance is damped is not identified: margins are computed with a ratio of "
-            f"{plant.damping:g}, hardly any; `drive-tune response` measures them."
+            "The damping of the resonance is not identified: margins are computed with a damping ratio of "
+            f"{plant.damping:g}; `drive-tune response` measures them."
         )
     lines += [f"{name}: {note}" for name, proposal in rows.items() for note in proposal.notes]
     if shown.unswung:
-        lines.append(f"{MEASURED}: nothing: {shown.unswung}")
+        lines.append(f"{MEASURED}: no gains: {shown.unswung}")
     print_lines(lines)
 
 
@@ -253,5 +255,7 @@ def _apply(
         write_gains(target.drives, np.array([proposal.gains for proposal in proposals], np.int64))
         kept = store and transaction.store()
         transaction.commit()
-    way_back = f"drive-tune undo {file} brings back what was" if target.bus else "emulated drives end with the program"
-    print(f"written{', and kept by the drive' if kept else ''}; {way_back}")
+    way_back = "emulated drives exist in this program only"
+    if target.bus:
+        way_back = f"drive-tune undo {file} restores the state before"
+    print(f"written{', and stored in the drive' if kept else ''}; {way_back}")

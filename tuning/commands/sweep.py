@@ -1,4 +1,4 @@
-"""`drive-tune sweep`: every point of a grid of gains on a machine of its own."""
+"""`drive-tune sweep`: try a grid of gains, each point on its own emulated machine."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ TABLE_FIGURES = ("settling [s]", "overshoot [%]", "dip [rpm]", "ripple [A]")
 
 
 def sweep(
-    config: Annotated[Path | None, typer.Option(help="Experiment (TOML); by default the one that ships.")] = None,
-    device: Annotated[str | None, typer.Option(help="Drive, in place of the experiment's.")] = None,
-    motor: Annotated[str | None, typer.Option(help="Motor, in place of the experiment's.")] = None,
-    load: Annotated[str | None, typer.Option(help="Load, in place of the experiment's.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed, in place of the experiment's.")] = None,
+    config: Annotated[Path | None, typer.Option(help="Experiment (TOML file); the one that ships by default.")] = None,
+    device: Annotated[str | None, typer.Option(help="Device, instead of the experiment's.")] = None,
+    motor: Annotated[str | None, typer.Option(help="Motor (name or TOML file), instead of the experiment's.")] = None,
+    load: Annotated[str | None, typer.Option(help="Load, instead of the experiment's.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed, instead of the experiment's.")] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-sweep")
     ] = None,
@@ -46,9 +46,9 @@ def sweep(
 ) -> None:
     """Try a grid of gains, each on the same emulated machine with the same velocity and load torque step.
 
-    Prints the best and writes results.csv, heatmap.png, best_response.png and settings.toml, from which
-    `drive-tune sweep --config settings.toml` repeats the run to the last digit. Stopped at any point, it goes on with
-    --out and --resume, to the same digits.
+    Prints the best and writes results.csv, heatmap.png, best_response.png and settings.toml, with which `drive-tune
+    sweep --config settings.toml` repeats the run to the last digit. A stopped run continues with --out and --resume,
+    with identical results.
     """
     overrides = {"device": device, "motor": motor, "load": load, "seed": seed}
     with errors_as_exit_codes():
@@ -92,7 +92,7 @@ def _sweep(
     settings = provenance.HEADER + experiment.to_toml(provenance.versions())
     with unfinished.shard_log(folder, settings, resume=resume) as log:
         if log.done:
-            _note(console, f"goes on from {len(log.done)} shards that are done")
+            _note(console, f"continues a stopped run; {len(log.done)} shards are done")
         with open_pool(workers, cluster) as pool:
             for line in pool.differences():
                 _note(console, line)
@@ -157,8 +157,8 @@ def _print_result(result: Any, folder: Path) -> None:
     )
     lines = [f"{usable} of {len(result.order)} points are usable; {counts}."]
     if not usable:
-        lines.append("No point is usable: choose other ranges; heatmap.png and results.csv show what there is.")
-    lines += [f"{name} changes nothing in this excitation." for name in result.without_effect()]
+        lines.append("No point is usable: choose other ranges; heatmap.png and results.csv show all points.")
+    lines += [f"{name} has no effect in this experiment." for name in result.without_effect()]
     if result.simulated > 0.0:
         lines.append(
             f"simulated {result.simulated:.0f} s of drive time in {result.wall:.2f} s: "

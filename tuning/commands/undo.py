@@ -1,4 +1,4 @@
-"""`drive-tune undo`: drives as they were before a change."""
+"""`drive-tune undo`: restore drives to their state before a change."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 
 def undo(
-    file: Annotated[Path, typer.Argument(help="The file that a change left (TOML).")],
+    file: Annotated[Path, typer.Argument(help="File with the state before, which a command saved (TOML).")],
     interface: Interface = None,
     channel: Channel = None,
     store: Annotated[
         bool | None,
         typer.Option(
             "--store/--no-store",
-            help="Have the drives keep it over a power cycle.",
-            show_default="as they were told to keep the change",
+            help="Store it in the drives, so that it survives a power cycle.",
+            show_default="yes if the change was stored",
         ),
     ] = None,
     other_drive: OtherDrive = False,
@@ -41,17 +41,17 @@ def undo(
     yes: Yes = False,
     json: Json = False,
 ) -> None:
-    """Bring drives back to the parameters that they had before a change.
+    """Restore the parameters that drives had before a change.
 
-    The file says which drives, on which bus; --interface and --channel say otherwise. It must be as it was written, and
-    of these drives. Each axis is written all or none, and read back; it must not be enabled.
+    The file names the drives and the bus; --interface and --channel override it. The file must be unchanged and belong
+    to these drives. The axes must be disabled. Each axis is written completely or not at all, and read back.
     """
     with errors_as_exit_codes():
         from tuning.snapshot import load_snapshot
 
         snapshot = load_snapshot(file, unchecked=unchecked)
         if not snapshot.bus:
-            fail(f"{file} was taken from emulated drives, which ended with their program; nothing is left to restore")
+            fail(f"{file} is from emulated drives, which existed in their program only; there is nothing to restore")
         given = {"interface": interface, "channel": channel}
         address = {**snapshot.bus, **{name: value for name, value in given.items() if value is not None}}
         nodes = ", ".join(map(str, address.get("nodes", [])))
@@ -64,7 +64,7 @@ def undo(
         return
     for axis, change in changed:
         print(f"axis {axis}: {change.entry.label}: {change.found} -> {change.wanted}")
-    kept = "; the drives keep them" if keep else ""
+    kept = "; stored in the drives" if keep else ""
     count = f"{len(changed)} parameter{'s' * (len(changed) != 1)}"
     print(f"{count} restored, {verified} verified by a second reading{kept}")
 
@@ -90,8 +90,8 @@ def _restore(
             verified += len(wanted)
             if left := compare(drives, wanted, axis):
                 fail(
-                    f"axis {axis} does not hold what was written, as a second reading shows: {list_differences(left)}; "
-                    f"is another master writing to it? End it, then restore {file} again",
+                    f"axis {axis} does not have the values that were written, by a second reading: "
+                    f"{list_differences(left)}; is another master writing to it? End it, then restore {file} again",
                     REFUSED,
                 )
     return [(axis, change) for axis, changes in enumerate(changed) for change in changes], verified

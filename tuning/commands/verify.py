@@ -1,4 +1,4 @@
-"""`drive-tune verify`: whether a certificate is as it was written."""
+"""`drive-tune verify`: check whether a certificate is unchanged."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from tuning.commands.options import REFUSED, errors_as_exit_codes, fail
 def verify(
     file: Annotated[Path, typer.Argument(help="certificate.json or report.html of a tuning.")],
 ) -> None:
-    """Tell whether a certificate or its report was changed since it was written; exit code 1 if it was.
+    """Check whether a certificate or its report was changed since it was written; exit code 1 if it was.
 
-    The hash shows a change, it is no signature: whoever writes another certificate can write another hash.
+    The hash shows a change; it is not a signature: whoever writes another certificate can compute another hash.
     """
     with errors_as_exit_codes():
         from tuning.certificate.certificate_files import is_unchanged
 
         if not is_unchanged(file):
-            fail(f"{file} was changed since it was written: its hash is not that of its content", REFUSED)
-    print(f"{file} is as it was written")
+            fail(f"{file} was changed since it was written: its hash does not match its content", REFUSED)
+    print(f"{file} is unchanged")

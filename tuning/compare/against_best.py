@@ -1,7 +1,7 @@
-"""Tuners machine by machine: hidden J over the least that any other tuner of the comparison reached on that machine.
+"""Tuners machine by machine: robust cost over that of the best other tuner on the same machine.
 
-A median over machines hides who wins where; whoever had the choice of all others, knowing the outcome, would take the
-best of them on each machine. That is what a tuner is held against here.
+A median over machines hides which tuner wins where. Here a tuner is compared with the best of the others on each
+machine, chosen with knowledge of the outcome.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 class RivalRow:
     """A tuner against the best of the others on each machine.
 
-    rivals: Their names. machines: How many there are. median: Of hidden J over that of the best rival, with `low` and
-    `high`, the ends of its 95 % bootstrap interval over machines. better: Machines on which it is below all rivals.
+    rivals: Their names. machines: How many there are. median: Of the robust cost over that of the best rival, with
+    `low` and `high`, the ends of its 95 % bootstrap interval over machines. better: Machines on which it is below all
+    rivals.
     """
 
     tuner: str
@@ -44,8 +45,8 @@ def against_the_best(comparison: Comparison, tuner: str, rivals: Sequence[str]) 
     """
     if not rivals or tuner in rivals:
         raise ValueError(f"rivals of {tuner} must be other tuners, at least one, not {', '.join(rivals) or 'none'}")
-    own = np.array([row.hidden for row in comparison.of(tuner)])
-    best = np.min([[row.hidden for row in comparison.of(name)] for name in rivals], axis=0)
+    own = np.array([row.robust_cost for row in comparison.of(tuner)])
+    best = np.min([[row.robust_cost for row in comparison.of(name)] for name in rivals], axis=0)
     ratio = own / best
     low, high = bootstrap_interval(lambda drawn: np.median(drawn, axis=1), ratio)
     return RivalRow(tuner, ", ".join(rivals), len(ratio), float(np.median(ratio)), low, high, int(np.sum(ratio < 1.0)))

@@ -1,8 +1,8 @@
-"""Tuners compared on the same machines: what their gains are worth by hidden J, and what it took to find them.
+"""Tuners compared on the same machines: the robust cost of their gains, and the drive time and moves they took.
 
 Every tuner gets every machine as it comes from the box, under an audit that counts time, moves and violations. Gains
-are scored in the emulator by hidden J (drive_env/trials/score.py), relative to that of the fitted rule which knows the
-true inertia; a tuner never sees the score.
+are scored in the emulator by the robust cost (drive_env/trials/score.py), relative to that of the baseline rule which
+knows the true inertia; a tuner never sees the score.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drive_env.drives.interface import machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import rule_gains
 from drive_env.trials.positioning import plan_move
-from drive_env.trials.score import HiddenScore
+from drive_env.trials.score import RobustScore
 from mechanics.untrusted import parse_json
 from tuning.compare.suite import SuiteMachine, groups, open_group
 from tuning.compare.tuners import RuleTuner, find_tuner, identify_all
@@ -43,14 +43,14 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Progress = Callable[[str, float], None]
 
-WORSE = 1.05  # times the fitted rule's hidden J: from here on a tuning counts as worse
+WORSE = 1.05  # times the baseline rule's robust cost: from here on a tuning counts as worse
 
 
 @dataclass(frozen=True)
 class MachineRow:
-    """What a tuner made of a machine.
+    """The result of a tuner on a machine.
 
-    hidden, relative: Hidden J, and over that of the fitted rule. rule: That of the fitted rule.
+    robust_cost, relative: The robust cost, and over that of the baseline rule. rule: That of the baseline rule.
     drive_seconds: Until the drive was last written to or moved [s], waits for the machines beside it included.
     moves: Of all its axes, each from standstill to standstill (moves.py). aborts: As the tuner says.
     violations: Of all kinds. gains: Raw gains of the machine's first axis, by the names that its device has for them.
@@ -59,7 +59,7 @@ class MachineRow:
 
     tuner: str
     machine: str
-    hidden: float
+    robust_cost: float
     relative: float
     rule: float
     drive_seconds: float
@@ -74,9 +74,9 @@ class MachineRow:
 
 @dataclass(frozen=True)
 class TunerRow:
-    """What a tuner is worth over all machines.
+    """The result of a tuner over all machines.
 
-    median, p95: Of hidden J over the fitted rule's. worse: Share of machines that are more than 5 % worse.
+    median, p95: Of the robust cost over the baseline rule's. worse: Share of machines that are more than 5 % worse.
     drive_seconds, moves: Median of a machine. aborts, violations: Of all machines together. failed: Machines on which
     it gave up with an error.
     """
@@ -216,33 +216,33 @@ def _rows_of(text: str) -> list[MachineRow]:
 
 
 class Yardstick:
-    """Hidden J of a group of machines, and that of the fitted rule with their true inertia."""
+    """The robust cost of a group of machines, and that of the baseline rule with their true inertia."""
 
     def __init__(self, group: Sequence[SuiteMachine], num_threads: int | None) -> None:
         device, load, motor, friction = group[0].kind
-        self._hidden = HiddenScore(device, load, motor, len(group), num_threads=num_threads, friction=friction)
+        self._score = RobustScore(device, load, motor, len(group), num_threads=num_threads, friction=friction)
         with open_group(group, num_threads) as target:
             drives = target.drives
             inertia = _true_inertia(target)
             reach = np.where(target.high >= -target.low, target.high, target.low)
             supply = target.supply.reshape(len(group), -1)[:, 0]
-            self._hidden.set_machines(machine_of(drives).parameters, supply)
-            self._hidden.set_moves(plan_move(target.motor, inertia, drives.read(Role.POSITION_SCALE), reach))
+            self._score.set_machines(machine_of(drives).parameters, supply)
+            self._score.set_moves(plan_move(target.motor, inertia, drives.read(Role.POSITION_SCALE), reach))
             rule = np.concatenate(
                 [
                     rule_gains(target.device, target.motor, J, supply=float(volts))
                     for J, volts in zip(inertia, target.supply, strict=True)
                 ]
             )
-        self.rule = self._hidden.set_reference(rule).hidden
+        self.rule = self._score.set_reference(rule).robust_cost
 
     def score(self, gains: Integers) -> Floats:
-        """Return hidden J of every machine, (num_machines,)."""
-        return self._hidden.score(gains).hidden
+        """Return the robust cost of every machine, (num_machines,)."""
+        return self._score.score(gains).robust_cost
 
     def close(self) -> None:
         """Give the machines back."""
-        self._hidden.close()
+        self._score.close()
 
 
 def _true_inertia(target: Target) -> Floats:
@@ -301,7 +301,7 @@ class _Bench:
 
 def _rows(name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Yardstick) -> list[MachineRow]:
     """Return what a tuner made of every machine of a group."""
-    hidden, outcome, audit = yardstick.score(tuned.gains), tuned.outcome, tuned.audit
+    robust_cost, outcome, audit = yardstick.score(tuned.gains), tuned.outcome, tuned.audit
     per_machine = len(tuned.gains) // len(group)
     names = find_device(group[0].device).gains.names
     rows = []
@@ -313,8 +313,8 @@ def _rows(name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Ya
             MachineRow(
                 tuner=name,
                 machine=machine.name,
-                hidden=float(hidden[k]),
-                relative=float(hidden[k] / yardstick.rule[k]),
+                robust_cost=float(robust_cost[k]),
+                relative=float(robust_cost[k] / yardstick.rule[k]),
                 rule=float(yardstick.rule[k]),
                 drive_seconds=round(float(audit.seconds[axes].max()), 3),
                 moves=int(audit.moves[axes].sum()),

@@ -1,4 +1,4 @@
-"""The picture of a comparison: hidden J of every machine over the fitted rule's, tuner by tuner, and what it took."""
+"""The picture of a comparison: robust cost over the baseline rule's for each tuner, drive time and violations."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def draw(comparison: Comparison, path: Path) -> None:
     score.xaxis.set_minor_locator(NullLocator())
     score.axvline(1.0, color="0.5", linewidth=0.8, zorder=0)
     score.set_yticks(range(len(tuners)), [f"{tuner.tuner}, median {tuner.median:.2f}" for tuner in tuners])
-    score.set_xlabel("hidden J over the fitted rule's, less is better\nlong mark: median, short: 95 %")
+    score.set_xlabel("robust cost relative to the baseline rule, less is better\nlong mark: median, short: 95 %")
     machines = tuners[0].machines if tuners else 0
     score.set_title(f"{machines} machines; orange: more than 5 % worse than the rule", fontsize=10)
     _bars(time, [tuner.drive_seconds for tuner in tuners], "drive time of a machine [s]\nmedian")

@@ -63,7 +63,7 @@ class SuiteMachine:
 
     @property
     def kind(self) -> tuple[str, str, str, str]:
-        """What machines must share to be lanes of one set of drives."""
+        """What machines must have in common to be emulated in one set of drives."""
         return self.device, self.load, self.motor, self.friction
 
 
@@ -91,7 +91,7 @@ def load_suite(name_or_path: str | Path = "public", seed: int | None = None, cou
     except OSError as error:
         raise ExperimentError(f"cannot read the suite {path}: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ExperimentError(f"{path} is no TOML: {error}") from error
+        raise ExperimentError(f"{path} is not TOML: {error}") from error
     where = path.name
     check_keys(where, table, ["device", "group", "generated"], optional=("generated", "group"))
     device = as_value(f"{where}: device", table["device"], "str")
@@ -101,13 +101,13 @@ def load_suite(name_or_path: str | Path = "public", seed: int | None = None, cou
     if seed is not None:
         machines += _generated(f"{where}: generated", device, table.get("generated", []), seed)
     if not machines:
-        raise ExperimentError(f"{where}: there is no machine; add a [[group]], or [[generated]] and a seed")
+        raise ExperimentError(f"{where}: it has no machine; add a [[group]], or [[generated]] and a seed")
     _check_names(where, machines)
     return tuple(machines) if count is None else _spread(machines, count)
 
 
 def groups(machines: Sequence[SuiteMachine]) -> list[list[int]]:
-    """Return the indices of machines that can be lanes of one set of drives, in the order of their first."""
+    """Return the indices of machines that can be emulated in one set of drives, in the order of their first."""
     found: dict[tuple[str, str, str, str], list[int]] = {}
     for k, machine in enumerate(machines):
         found.setdefault(machine.kind, []).append(k)
@@ -117,7 +117,7 @@ def groups(machines: Sequence[SuiteMachine]) -> list[list[int]]:
 def open_machines(
     machines: Sequence[SuiteMachine], num_threads: int | None = None
 ) -> Iterator[tuple[Target, list[int]]]:
-    """Yield machines ready to be tuned, those of one load and motor as the lanes of one target, and their indices.
+    """Yield machines ready to be tuned, those of one load and motor as one target, and their indices.
 
     The drives come up commissioned for their motor and at rest; they are closed when the next ones are asked for.
     """
@@ -134,7 +134,9 @@ def open_group(machines: Sequence[SuiteMachine], num_threads: int | None = None)
     """
     if len({machine.kind for machine in machines}) != 1:
         kinds = ", ".join(sorted({f"{machine.load} on {machine.motor}" for machine in machines}))
-        raise ValueError(f"lanes of one set of drives turn one load with one motor, not {kinds}; open them apart")
+        raise ValueError(
+            f"machines emulated in one set of drives have one load and one motor, not {kinds}; open them separately"
+        )
     device, load, motor, friction = machines[0].kind
     defaults = _defaults(device, load, motor)
     names = sorted({name for machine in machines for name in machine.parameters})
@@ -225,7 +227,7 @@ def _check_names(where: str, machines: Sequence[SuiteMachine]) -> None:
     for machine in machines:
         if machine.name in seen:
             raise ExperimentError(
-                f"{where}: two machines are named {machine.name!r}; make one group of those of one load and motor"
+                f"{where}: two machines are named {machine.name!r}; put machines of one load and motor into one group"
             )
         seen.add(machine.name)
 

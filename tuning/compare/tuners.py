@@ -1,4 +1,4 @@
-"""The tuners there are, by name: each turns a target into gains, through its drives and nothing else.
+"""The tuners by name: each finds gains for a target, through its drives only.
 
 A tuner from elsewhere, a trained agent for one, registers in the entry-point group `drive_env.tuners`: a function of a
 `Target` and a random generator that returns an `Outcome`.
@@ -32,7 +32,7 @@ ENTRY_POINTS = "drive_env.tuners"
 
 
 class TunerKind(NamedTuple):
-    """A tuner of the registry: what it is, in a line, and whether it thinks so long that it is asked for by name."""
+    """A tuner of the registry: a line of description, and whether it is slow, so that it runs only if named."""
 
     name: str
     meaning: str
@@ -42,7 +42,7 @@ class TunerKind(NamedTuple):
 
 
 class MissingTunerError(ValueError):
-    """A tuner that is none, or that lacks what it needs; the message has the remedy."""
+    """There is no such tuner, or it lacks what it needs; the message has the remedy."""
 
 
 def tuner_rows() -> dict[str, TunerKind]:
@@ -84,8 +84,8 @@ def _factory(target: Target, rng: np.random.Generator) -> Outcome:
     return _outcome(target, read_gains(target))
 
 
-def _fitted(target: Target, rng: np.random.Generator) -> Outcome:
-    """Take the fitted rule's gains for the inertia that two moves show."""
+def _baseline(target: Target, rng: np.random.Generator) -> Outcome:
+    """Take the baseline rule's gains for the inertia that two moves show."""
     with timed(target) as (watched, clock):
         bench = TrialBench(watched)
         bench.identify()
@@ -172,18 +172,18 @@ def _load(entry: importlib.metadata.EntryPoint) -> Tuner:
     except Exception as error:  # whatever somebody else's module does when it is imported
         raise MissingTunerError(f"the tuner {entry.name!r} of {entry.value} cannot be loaded: {error}") from error
     if not callable(found):
-        raise MissingTunerError(f"the tuner {entry.name!r} of {entry.value} is no function but {found!r}")
+        raise MissingTunerError(f"the tuner {entry.name!r} of {entry.value} is not a function but {found!r}")
     return found
 
 
 _OWN = (
-    TunerKind("factory", "the gains that the drive comes with for its motor", lambda: _factory),
-    TunerKind("fitted", "the fitted rule, for the inertia that two moves show", lambda: _fitted),
+    TunerKind("factory", "the gains of the motor's commissioning preset", lambda: _factory),
+    TunerKind("baseline", "the baseline rule, with the inertia measured in two moves", lambda: _baseline),
 )
 _AFTER = (
-    TunerKind("auto", "one button: identify, compute, verify, refine", _auto),
+    TunerKind("auto", "drive-tune auto: identify, search on twins, try, verify", _auto),
     TunerKind("random", "20 trials drawn at random", partial(_search, "random", trials=20), searches=True),
-    TunerKind("grid", "the fitted rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
+    TunerKind("grid", "the baseline rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
     TunerKind("tpe", "20 trials by tree-structured Parzen estimators",
         partial(_search, "tpe", trials=20), searches=True),
     TunerKind("tpe-safe", "20 trials by TPE from safe gains, in small steps",

@@ -1,4 +1,4 @@
-"""95 % intervals: what scatters, and what no repetition shows."""
+"""95 % intervals, from scatter and from systematic errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the bridge's dead time takes from the voltage: a share of it that follows the current's sign.
+"""The voltage lost by the bridge's dead time, which follows the current's sign.
 
 While both switches of a leg are off the current chooses the rail. Below the current that charges the switches within
 the dead time the loss fades, so that to a small current it looks like resistance.

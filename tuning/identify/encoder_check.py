@@ -45,7 +45,7 @@ PULSED = 1.2  # of the current limit, RMS over 25 ms: beyond, the current loop d
 
 
 class EncoderCheck(NamedTuple):
-    """What the check says of one axis."""
+    """The result of the check for one axis."""
 
     pole_pairs: Estimate
     direction: Estimate
@@ -54,7 +54,7 @@ class EncoderCheck(NamedTuple):
 
     @property
     def is_good(self) -> bool:
-        """Whether torque may be commanded: nothing speaks against the drive's own settings."""
+        """Whether torque may be commanded: no measurement contradicts the drive's settings."""
         return not self.direction.is_known or self.direction.value > 0.0
 
     def is_whole(self, configured: int) -> bool:
@@ -95,8 +95,8 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
             found.append(EncoderCheck(refused("1", reasons[k]), refused("1", reasons[k])))
         elif not alive[k]:
             reason = (
-                "the axis was switched off while the field turned: it left its travel, or the drive did it itself "
-                f"({causes[k]})"
+                "the axis was switched off while the field turned: it left its travel, or the drive switched itself "
+                f"off ({causes[k]})"
             )
             found.append(EncoderCheck(refused("1", reason), refused("1", reason)))
         else:
@@ -133,7 +133,9 @@ def _push(working: Working) -> list[Estimate]:
                     elif not alive[k]:
                         found[k] = refused("1", "the axis was switched off while it was pushed: it left its travel")
                     else:
-                        found[k] = refused("1", "the rotor did not follow the current: is it blocked, a cable open?")
+                        found[k] = refused(
+                            "1", "the rotor did not follow the current: check whether it is blocked or a cable is open"
+                        )
                         continue
                     waiting[k] = False
                 switch_off(drives, working.where & ~waiting)
@@ -250,7 +252,7 @@ def _judge(field: float, away: float, back: float, expected: int) -> EncoderChec
     if abs(rotor) < STUCK * abs(would) or abs(away + back) > 0.5 * abs(away - back):
         reason = (
             f"the rotor did not follow the field: it went {away:.2g} rad there and {back:.2g} rad back, and "
-            f"{would:.2g} rad were expected; is it blocked, a phase open, the current too weak?"
+            f"{would:.2g} rad were expected; check whether it is blocked, a phase is open, or the current is too low"
         )
         return EncoderCheck(refused("1", reason), refused("1", reason))
     ratio = field / rotor
@@ -261,7 +263,8 @@ def _judge(field: float, away: float, back: float, expected: int) -> EncoderChec
     if nearest < 1 or abs(abs(ratio) - nearest) + spread > _tolerance(nearest):
         reason = (
             f"the field's electrical turns are {abs(ratio):.2f} (give or take {spread:.2f}) of those that the encoder "
-            "counts, which is no whole number: check the encoder's steps, 2080h:02, or allow more travel and current"
+            "counts, which is not a whole number: check the encoder's counts per turn, or allow more travel "
+            "and current"
         )
         return EncoderCheck(refused("1", reason), direction, ratio)
     return EncoderCheck(Estimate(float(nearest), float(nearest), float(nearest), "1"), direction, ratio)

@@ -1,4 +1,4 @@
-"""What is said of an axis that was identified: each value with its 95 % interval, or with why there is none."""
+"""The results of an identification: each value with its 95 % interval, or with the reason why there is none."""
 
 from __future__ import annotations
 
@@ -10,17 +10,33 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from tuning.identify.wiring import Settings
 
-Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
+Progress = Callable[[str, float], None]  # the present step, and the share done, 0...1
 
-# In the order in which they are found; what a report shows.
+# In the order in which they are identified and shown.
 NAMES = (
     "resistance", "inductance", "pole_pairs", "encoder_direction", "inertia", "coulomb", "viscous", "offset",
     "anti_resonance", "resonance", "loop_delay", "velocity_filter",
 )  # fmt: skip
 
+TITLES = {  # as people read them
+    "resistance": "phase resistance",
+    "inductance": "phase inductance",
+    "pole_pairs": "pole pairs",
+    "encoder_direction": "encoder direction",
+    "inertia": "total inertia",
+    "coulomb": "Coulomb friction",
+    "viscous": "viscous friction",
+    "offset": "constant load (gravity)",
+    "anti_resonance": "anti-resonance",
+    "resonance": "resonance",
+    "damping": "damping ratio",
+    "loop_delay": "velocity loop delay",
+    "velocity_filter": "velocity filter corner",
+}
+
 
 class Estimate(NamedTuple):
-    """A value with its 95 % confidence interval; one that was refused is nan and says why in `reason`."""
+    """A value with its 95 % confidence interval; one that was not identified is nan, with the `reason`."""
 
     value: float
     low: float
@@ -34,6 +50,11 @@ class Estimate(NamedTuple):
         return math.isfinite(self.value)
 
 
+def interval(low: float, high: float) -> str:
+    """Return an interval in words; that of a whole number without doubt is "exact"."""
+    return "exact" if low == high else f"{low:.4g} to {high:.4g}"
+
+
 def refused(unit: str, reason: str) -> Estimate:
     """Return the estimate of what could not be identified."""
     return Estimate(math.nan, math.nan, math.nan, unit, reason)
@@ -41,7 +62,7 @@ def refused(unit: str, reason: str) -> Estimate:
 
 @dataclass(frozen=True)
 class Identification:
-    """What was identified of one axis.
+    """The identification of one axis.
 
     Attributes:
         estimates: By name, those of `NAMES`: "resistance" [ohm per phase], "inductance" [H per phase, of the q axis],
@@ -49,10 +70,10 @@ class Identification:
             K_t, all that turns, at the rotor [kg*m^2]), "coulomb" [A], "viscous" [A*s/rad], "offset" [A, gravity or a
             constant load], "anti_resonance", "resonance" [Hz], "loop_delay" [s], "velocity_filter" [Hz].
         drive_time: Time that passed on the drive [s].
-        told: What is identified, by the same names, where `estimates` have guesses that only a tuner should work with;
-            None where they have none.
-        wiring: What is known of the cable: the settings that encoder and halls need, by object, and what the drive has.
-            With others than it needs, its motor runs away or is locked.
+        told: The identified values without guesses, where `estimates` have guesses for a tuner; None where they have
+            none.
+        wiring: The settings that encoder and halls need, by object, and those of the drive. With wrong ones the motor
+            runs away or locks.
     """
 
     estimates: Mapping[str, Estimate]
@@ -61,5 +82,5 @@ class Identification:
     wiring: Settings = field(default_factory=dict)
 
     def value(self, name: str) -> float:
-        """Return a value, nan where it was refused."""
+        """Return a value, nan where it was not identified."""
         return self.estimates[name].value

@@ -108,8 +108,8 @@ class Experiments:
                 before = self.found[k][name]
                 if not before.is_known and not before.reason.startswith(OSCILLATED):
                     self.found[k][name] = refused(UNITS[name], (
-                        f"{OSCILLATED} ({what}) and was switched off within 50 ms: is it another motor, or are current "
-                        "and inertia far from what its data sheet says?"
+                        f"{OSCILLATED} ({what}) and was switched off within 50 ms: check whether this is the right "
+                        "motor, and whether current and inertia fit its data sheet"
                     ))  # fmt: skip
         return replace(working, where=working.where & ~swung)
 
@@ -155,32 +155,37 @@ class Experiments:
         aligned = bool(_aligned_by_halls(working)[k])
         by_halls = aligned or target.drives.read(Role.COMMUTATION)[k] == BY_HALLS
         remedy = (
-            "; ".join(finding(working.target.device, self._wiring[k])) or "the drive does not heed 2080h:01 and 2070h"
+            "; ".join(finding(working.target.device, self._wiring[k]))
+            or "the drive ignores its settings of encoder and hall direction"
         )
         if aligned:
-            remedy += ", then switch the drive off and on, since its halls tell it the encoder's angle (2080h:03)"
+            remedy += ", then switch the drive off and on, since the halls set the encoder's angle at start-up"
         if not check.is_good:
             return (
-                f"the encoder counts against the motor, and torque would make it run away: {remedy} (or swap two motor "
-                "phases), then identify again"
+                f"the encoder counts in the wrong direction, and torque would make the motor run away: {remedy} (or "
+                "swap two motor phases), then identify again"
             )
         if by_halls and (check.halls.reversed or check.halls.inverted):
             return (
-                f"the halls do not tell the angle of the field, and torque would lock the motor: {remedy}, then "
-                "identify again"
+                f"the hall signals do not match the angle of the field, and torque would lock the motor: {remedy}, "
+                "then identify again"
             )
         configured = int(target.drives.read(Role.POLE_PAIRS)[k])
         if check.pole_pairs.is_known and round(check.pole_pairs.value) != configured:
             return (
-                f"the motor has {check.pole_pairs.value:.0f} pole pairs and 2056h says {configured}: torque would turn "
-                "with the angle; write the right number (or the right encoder steps, 2080h:02), then identify again"
+                f"the motor has {check.pole_pairs.value:.0f} pole pairs and the drive is set to {configured}: with a "
+                "wrong commutation angle torque cannot be commanded; write the right number of pole pairs (or of "
+                "encoder counts per turn), then identify again"
             )
         if not check.is_whole(configured):
-            return f"{check.pole_pairs.reason}; torque would turn with the angle: correct it, then identify again"
+            return (
+                f"{check.pole_pairs.reason}; with a wrong commutation angle torque cannot be commanded: correct it, "
+                "then identify again"
+            )
         if "did not follow" in check.direction.reason or "switched off" in check.direction.reason:
             return check.direction.reason
         if target.motor.kind != "dc" and not check.direction.is_known:
-            return f"{check.direction.reason}; torque with wiring that is not checked could make the motor run away"
+            return f"{check.direction.reason}; without this check torque could make the motor run away"
         return ""
 
     def turn(self, working: Working) -> None:
@@ -253,7 +258,7 @@ class Experiments:
             elif max(up[k], -down[k]) < LEAST_ROOM:
                 able[k] = False
                 self.refuse(int(k), RESPONSE, (
-                    f"travel too short: {LEAST_ROOM:g} rad are needed to shake the axis while it moves, and there are "
+                    f"travel too short for a frequency response: {LEAST_ROOM:g} rad are needed, and there are "
                     f"{max(up[k], -down[k]):.2g}"
                 ))  # fmt: skip
         if not able.any():
@@ -274,8 +279,8 @@ class Experiments:
             if fit.misfit > WORST_MISFIT:
                 for name in RESPONSE:
                     self.found[k][name] = refused(UNITS[name], (
-                        f"the response is not that of one spring: the model is off by {fit.misfit:.1f} times what "
-                        "noise explains (backlash, or several resonances)"
+                        f"the response does not fit a model with one spring: the error is {fit.misfit:.1f} times the "
+                        "noise (backlash, or several resonances)"
                     ))  # fmt: skip
 
     def response_gains(self, working: Working, inertia: Floats) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""What a drive's own signals say of its motor and machine, each value with a 95 % interval, or with the reason why not.
+"""Parameters of motor and machine from a drive's own signals, each with a 95 % interval or a reason.
 
 `identify` runs the experiments in the order in which each needs what came before, for all axes side by side, and
 leaves every drive as it was found: off, with its own parameters.
@@ -25,11 +25,11 @@ def identify(target: Target, where: Mask | None = None, *, progress: Progress | 
 
     Args:
         target: The axes, with what is known of them. They must be off, and at rest.
-        where: Which of them; all by default. The others' estimates are refused.
-        progress: Told what is under way and the share done.
+        where: Which of them; all by default. The others have no values.
+        progress: Called with the present step and the share done.
 
     Returns:
-        One per axis; what could not be identified is refused with its reason.
+        One per axis; a value that could not be identified has the reason instead.
 
     Raises:
         RuntimeError: If an axis is enabled, or does not come up; ValueError if no axis is chosen.

@@ -358,8 +358,8 @@ def _balance(
     half = t * fit.spread
     if MOST_RATIO * motor.inertia < J:
         inertia = refused("kg*m^2", (
-            f"inertia ratio above {MOST_RATIO:.0f}: the moves say about {J / motor.inertia:.0f} rotor inertias, which "
-            "so slow a motion cannot tell from friction; take a gear or a larger motor, or enter the inertia"
+            f"inertia ratio above {MOST_RATIO:.0f}: the moves give about {J / motor.inertia:.0f} rotor inertias, which "
+            "cannot be separated from friction in so slow a motion; take a gear or a larger motor, or enter the inertia"
         ))  # fmt: skip
     elif not J > 0.0 or half[0] * K > WIDEST * J:
         inertia = refused("kg*m^2", f"{why}: the interval would be {half[0] * K:.2g} around {J:.2g} kg*m^2")

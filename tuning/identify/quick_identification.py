@@ -3,8 +3,8 @@
 Where `identify` moves an axis for five seconds to know inertia and friction within a few percent, two moves of a
 quarter of a second must do here; the frequency response then says the inertia again, and better.
 
-A tuner's twins are better off with a guess than with nothing, and their worlds are as far apart as guesses may be off:
-`Identification.estimates` has those. What is identified is in `Identification.told`: nothing that is guessed.
+A tuner's twins need a value even where it is only a guess, and their variants are as far apart as the guesses are
+uncertain: `Identification.estimates` has those. The identified values, without guesses, are in `Identification.told`.
 """
 
 from __future__ import annotations
@@ -38,19 +38,22 @@ INERTIA_ERROR, FRICTION_ERROR = 0.15, 0.3
 DOUBT = {"inertia": 0.2, "velocity_filter": 0.4, "anti_resonance": 0.1, "resonance": 0.1, "damping": 0.5}
 ANOTHER = 2.5  # times the inertia that two moves tell: a response that says more is that of another axis
 # Of 46 axes of the suite one had its viscous friction and 13 their dry friction within FRICTION_ERROR.
-SHORT, LONGER = "two moves of a quarter of a second do not tell it from", "`drive-tune identify` moves for longer"
+SHORT, LONGER = "two moves of a quarter of a second do not separate it from", "`drive-tune identify` measures longer"
 NOT_TOLD = {
-    "inertia": "two moves of a quarter of a second tell it too roughly, and no response was measured",
+    "inertia": "two moves of a quarter of a second give it too roughly, and no frequency response was measured",
     "coulomb": f"{SHORT} viscous friction and drag; {LONGER}",
-    "viscous": f"{SHORT} dry friction; {LONGER}",
+    "viscous": f"{SHORT} Coulomb friction; {LONGER}",
     "offset": f"{SHORT} friction; {LONGER}",
 }
 OF_ALL = (
-    "in the response an axis moved what all axes of its machine share, and two moves of a quarter of a second tell its "
-    "own part too roughly"
+    "in the frequency response the axis moved the mass shared by all axes of its machine, and two moves of a quarter "
+    "of a second give its own part too roughly"
 )
 # Dead time and friction make it up to 0.09 ms shorter here, to one side, which no scatter shows.
-NO_DELAY = "so short a response tells it to 0.1 ms, which is no better than the period of the drive's velocity loop"
+NO_DELAY = (
+    "so short a frequency response gives it to 0.1 ms only, which is no better than the period of the drive's velocity "
+    "loop"
+)
 
 
 def identify_briefly(
@@ -145,7 +148,9 @@ class _Brief(Experiments):
             ratio = fit.plant.inertia / self.found[k]["inertia"].value
             if not 1.0 / ANOTHER < ratio < ANOTHER:
                 # A fit of few lines may come to rest anywhere, and the two moves went well enough.
-                self._no_response(k, f"the response would be that of {ratio:.2g} times the inertia that was moved")
+                self._no_response(
+                    k, f"the frequency response would need {ratio:.2g} times the inertia found in the moves"
+                )
                 continue
             moved = self.found[k]["inertia"]
             self.found[k] |= _guessed(fit)
@@ -157,7 +162,8 @@ class _Brief(Experiments):
     def _no_response(self, k: int, reason: str) -> None:
         self.refuse(k, RESPONSE, reason)
         self._told[k]["inertia"] = refused(UNITS["inertia"], (
-            f"two moves of a quarter of a second tell it too roughly, and the response does not: {reason}"
+            "two moves of a quarter of a second give it too roughly, and the frequency response does not give it: "
+            f"{reason}"
         ))  # fmt: skip
 
 
@@ -176,12 +182,10 @@ def _told(fit: PlantFit, highest: float) -> dict[str, Estimate]:
     told["loop_delay"] = refused(UNITS["loop_delay"], NO_DELAY)
     if fit.plant.is_elastic and fit.plant.resonance > highest:
         # What lies there may as well be the filter's own lag.
-        reason = f"a resonance above {highest:.0f} Hz, up to which the axis could be seen, is not told from it"
+        reason = f"a resonance above {highest:.0f} Hz, the highest frequency measured, cannot be separated from it"
         told["velocity_filter"] = refused(UNITS["velocity_filter"], reason)
     if fit.misfit > WORST_MISFIT:
-        reason = (
-            f"the response is not that of one spring: the model is off by {fit.misfit:.1f} times what noise explains"
-        )
+        reason = f"the response does not fit a model with one spring: the error is {fit.misfit:.1f} times the noise"
         told |= {name: refused(UNITS[name], reason) for name in RESPONSE}
     return told
 

@@ -1,7 +1,7 @@
 """Winding resistance at rest, from readings that need no time of their own: for drives whose time does not wait.
 
 With commutation in open loop (2055h) the current of 2004h lies along a field that stands still, and the rotor lies in
-it: no torque acts and nothing turns. What the flux regulator's integrator 2041h:06 then holds is the whole duty,
+it: no torque acts and nothing turns. The flux regulator's integrator (`Role.FLUX_ERROR_SUM`) then holds the whole duty,
 
     V duty = R i + V t_dead f(i)
 
@@ -39,8 +39,8 @@ def standstill_resistances(working: Working) -> list[Estimate]:
     target, drives = working.target, working.target.drives
     if target.motor.kind == "dc":
         return [refused("ohm", (
-            "a brushed motor turns with its current, and while it turns the integrator of 2041h can only be read in "
-            "step with the drive: take the data sheet's, or identify an emulator in lockstep (--lockstep)"
+            "a brushed motor turns with its current, and while it turns the current regulator's integrator can only "
+            "be read in step with the drive: take the data sheet's, or identify an emulator in lockstep (--lockstep)"
         ))] * target.num_axes  # fmt: skip
     where, reasons = able(working)
     if not where.any():
@@ -74,11 +74,11 @@ def standstill_resistances(working: Working) -> list[Estimate]:
     for k in range(target.num_axes):
         reason = reasons[k]
         if where[k] and not alive[k]:
-            reason = f"the drive switched off while its current stood: {causes[k]}"
+            reason = f"the drive switched off during the measurement with a constant current: {causes[k]}"
         elif where[k] and np.ptp(angles[:, k]) * target.motor.n_p > MOST_TURN:
-            reason = "the rotor did not stay where its current holds it: it slipped from the field"
+            reason = "the rotor did not stay at the angle of its current: it slipped from the field"
         elif where[k] and np.any(np.abs(errors[:, k]) > MOST_ERROR * currents[:, k]):
-            reason = "the current did not settle: does the supply voltage suffice for it?"
+            reason = "the current did not settle: check whether the supply voltage is high enough"
         found.append(refused("ohm", reason) if reason else _resistance(
             working, k, currents[:, k], duties[:, k], float(field[k])
         ))  # fmt: skip

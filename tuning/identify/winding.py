@@ -1,4 +1,4 @@
-"""Winding resistance and inductance, seen through the integrator of 2041h and the entered supply voltage.
+"""Winding resistance and inductance, from the current regulator's integrator and the entered supply voltage.
 
 The integrator adds P I e every tick, so its change over a millisecond is the sum of the current's error over all 25
 ticks, at far better resolution than a sample of the current has. Set-point less error is the mean current, P e plus
@@ -153,9 +153,10 @@ def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats,
     """
     if pulses.step > CYCLE:
         return [_none(
-            f"the integrator of 2041h can only be read by SDO, and a cycle with its reads took {1e3 * pulses.step:.1f} "
-            f"ms instead of {1e3 * CYCLE:g}: in real time they are not in step with the current; the inductance "
-            "needs an emulator in lockstep (--lockstep) or a faster bus, or take the data sheet's"
+            "the current regulator's integrator can only be read by SDO, and a cycle with its reads took "
+            f"{1e3 * pulses.step:.1f} ms instead of {1e3 * CYCLE:g}: in real time they are not in step with the "
+            "current; the inductance needs an emulator in lockstep (--lockstep) or a faster bus, or take the data "
+            "sheet's"
         )] * working.target.num_axes  # fmt: skip
     able = working.where & pulses.alive
     causes = [] if able.all() else stop_causes(working.target.drives)
@@ -393,7 +394,7 @@ def _judge(working: Working, axis: _AxisWinding, found: _Fit, window: _Window) -
         if not value > 0.0 or float(np.hypot(half / value, model)) > WIDEST:
             swing = float(np.ptp(axis.current))
             estimates.append(refused(unit, (
-                f"excitation too weak: the pulses of {swing:.2g} A peak to peak leave an interval of "
+                f"excitation too weak: the pulses of {swing:.2g} A peak to peak give an interval of "
                 f"{half:.2g} {unit} around {value:.2g} {unit}; allow a greater current"
             )))  # fmt: skip
         else:

@@ -1,6 +1,6 @@
 """How a motor's cable is wired, as the field shows it, and the settings with which a drive makes up for that.
 
-The field turns in open loop and takes the rotor along; what encoder and halls then tell says which way they are wired.
+The field turns in open loop and takes the rotor along; the signals of encoder and halls then show how they are wired.
 One object makes up for a reversed encoder, one for halls of inverted level, one for halls in reverse order.
 """
 
@@ -73,7 +73,7 @@ def judge_halls(field: Floats, halls: Floats) -> Halls:
         return Halls(reason=f"the field turned {abs(way):.2g} rad, and {LEAST_HALL_TURN:g} are needed for the halls")
     ratio = turned(halls) / way
     if abs(abs(ratio) - 1.0) > HALL_SLACK:
-        return Halls(reason=f"the halls turned {ratio:.2g} times as far as the field: are they connected?")
+        return Halls(reason=f"the halls turned {ratio:.2g} times as far as the field: check whether they are connected")
     backwards = ratio < 0.0
     off = float(np.angle(np.exp(1j * (halls - np.sign(ratio) * field)).mean()))
     if CLEAR < abs(off) < np.pi - CLEAR:

@@ -158,7 +158,7 @@ def _title(response: MeasuredLoop, axis: int) -> str:
 
 
 def _text(value: float, form: str) -> str:
-    return form.format(value) if np.isfinite(value) else "not seen"
+    return form.format(value) if np.isfinite(value) else "not measured"
 
 
 def _turns(L: Complex) -> Floats:

@@ -44,7 +44,7 @@ def plan_lines(low: float, high: float, resolution: float, rate: float) -> Lines
     """
     if not 0.0 < resolution <= low < high:
         raise ValueError(
-            f"an excitation from {low:g} to {high:g} Hz every {resolution:g} Hz cannot be; the resolution must be "
+            f"an excitation from {low:g} to {high:g} Hz every {resolution:g} Hz is impossible; the resolution must be "
             "above 0 and at most the lowest frequency, and that below the highest"
         )
     samples = round(rate / resolution)

@@ -107,15 +107,17 @@ def measure(
     """
     if loop not in LOOPS:
         raise ValueError(
-            f"no loop is named {loop!r}; there are {', '.join(LOOPS)}; the current loop is not seen on a bus"
+            f"no loop is named {loop!r}; there are {', '.join(LOOPS)}; the current loop cannot be measured on a bus"
         )
     if traced and target.drives.machine is None:
-        raise ValueError("a trace at the velocity loop's rate exists on emulated drives only; a bus shows up to 400 Hz")
+        raise ValueError(
+            "a trace at the velocity loop's rate exists on emulated drives only; on a bus up to 400 Hz can be measured"
+        )
     bounds = RANGE[loop]
     # A trace begins where a bus ends; a gap between the two could hide a margin.
     top = BUS_LIMIT if traced else bounds[1] if high is None else high
     if top > BUS_LIMIT:
-        raise ValueError(f"highest frequency {top:g} Hz must be at most {BUS_LIMIT:g} Hz, where a bus still sees it")
+        raise ValueError(f"highest frequency {top:g} Hz must be at most {BUS_LIMIT:g} Hz, the limit on a bus")
     # In a trace, what is held at f is seen at 1000 Hz - f, too: lines up to nearly half of it leave no gap.
     lines = plan_lines(bounds[0] if low is None else low, TRACED_TOP if traced else top, resolution, 1.0 / CYCLE)
     axes = np.ones(target.num_axes, bool) if where is None else np.asarray(where, bool)
@@ -200,7 +202,7 @@ class _Measurement:
         stopped = where & ~seen.enabled
         causes = stop_causes(target.drives) if stopped.any() else []
         for axis in np.flatnonzero(stopped):
-            self._notes[axis].append(f"the drive stopped while it was shaken: {causes[axis]}")
+            self._notes[axis].append(f"the drive stopped during the measurement: {causes[axis]}")
         self._note_limits(seen.peak_current, where)
         result = self._evaluate(seen, less, where & seen.enabled)
         progress(1.0)
@@ -273,8 +275,10 @@ class _Measurement:
         amplitude, shaken = amplitude * fits, shaken * fits
         speed = np.minimum(1.1 * shaken, fastest)
         for axis in np.flatnonzero(self._where & (speed < 0.9 * shaken)):
-            why = "its way is too short" if by_way[axis] <= fastest[axis] else "its loop or its limits are too tight"
-            self._notes[axis].append(f"{why} for a steady speed: the motion reversed, friction is part of the response")
+            why = "its travel is too short" if by_way[axis] <= fastest[axis] else "its limits are too narrow"
+            self._notes[axis].append(
+                f"{why} for a steady speed: the motion reversed, so that friction is part of the response"
+            )
         return amplitude, speed
 
     def _link_energy(self) -> Floats:
@@ -303,7 +307,7 @@ class _Measurement:
         limit = self._target.drives.read(Role.CURRENT_LIMIT) * 1e-3
         for axis in np.flatnonzero(where & (peak > 0.98 * limit)):
             self._notes[axis].append(
-                f"the current reached its limit, {limit[axis]:.2f} A, beyond what was asked for: the loop oscillates, "
+                f"the current reached its limit, {limit[axis]:.2f} A, more than the excitation: the loop oscillates, "
                 "or nearly so"
             )
 
@@ -357,7 +361,8 @@ class _Measurement:
         )  # fmt: skip
         if not fit.reason and fit.misfit > GOOD_MISFIT:
             self._notes[axis].append(
-                f"the linear model is off by {fit.misfit:.1f} times the noise; margins are read from the lines alone"
+                f"the linear model does not fit (error {fit.misfit:.1f} times the noise); margins are read from the "
+                "measured frequencies alone"
             )
         if fit.reason:
             self._notes[axis].append(f"excitation too weak: {fit.reason}")

@@ -13,7 +13,7 @@ Complex = NDArray[np.complex128]
 
 
 class Margins(NamedTuple):
-    """What an open loop says of its closed one; nan is what the frequencies looked at do not show.
+    """The margins of an open loop; nan where the measured frequencies do not give one.
 
     phase_deg: Least distance from -180 degrees where the gain is 1 [degrees]; negative is unstable.
     gain_db: Least factor, in dB, by which the gain may rise before the loop oscillates; infinite if the phase never

@@ -45,7 +45,7 @@ class Loops(NamedTuple):
 
 
 class AtLeast(NamedTuple):
-    """What margins are at least, where they were not seen; nan where nothing says so."""
+    """Lower bounds of margins that were not measured; nan where there is none."""
 
     phase_deg: float
     gain_db: float
@@ -140,7 +140,7 @@ class MeasuredLoop:
         """
         fit = self.fits[axis]
         if fit is None:
-            raise ValueError(f"a measured {self.loop} loop says nothing of others; measure the velocity loop")
+            raise ValueError(f"a measured {self.loop} loop does not give the others; measure the velocity loop")
         then, now, known = self.gains[axis], np.asarray(gains), plant or fit.plant
         lines = self.f, self.open_loop[:, axis], self.trusted[:, axis]
         f, L, trusted = self.refined(axis) if refined else lines
@@ -180,7 +180,7 @@ class MeasuredLoop:
         """
         fit = self.fits[axis]
         if fit is None:
-            raise ValueError(f"the {self.loop} loop says nothing of the plant; measure the velocity loop")
+            raise ValueError(f"the {self.loop} loop does not give the axis model; measure the velocity loop")
         return fit.estimates
 
 

@@ -144,7 +144,7 @@ def fit_plant(
         less: The same axis shaken less. Where that says another resonance it is refused, and where it says none.
     """
     if len(f) < FEWEST:
-        return _refusal(start, f"only {len(f)} frequencies are coherent, of {FEWEST} that are needed")
+        return _refusal(start, f"only {len(f)} frequencies are coherent, and {FEWEST} are needed")
     rough = _rough_loop(device, gains, f, seen)
     begin = _with_inertia(start, device, gains, f, rough)
     loop = _Loop(device, gains, f, seen, _weight(seen, spread), lost)
@@ -163,8 +163,8 @@ def fit_plant(
     # What is confirmed may differ from pass to pass for other reasons.
     if (doubt or less is None) and distortion > DISTORTED:
         why = (
-            f"the response is another when it is shaken the other way round, by {100.0 * distortion:.0f} % beyond "
-            "noise: with backlash, or friction that sticks, a resonance depends on how strongly it is shaken"
+            f"the response depends on the direction of the excitation, by {100.0 * distortion:.0f} % beyond noise: "
+            "with backlash or static friction, a resonance depends on the amplitude"
         )
         doubt = f"{doubt}; {why}" if doubt else why
     return _doubted(fit, doubt) if doubt else fit
@@ -182,7 +182,8 @@ def _by_level(loop: _Loop, found: _Solution, less: Seen) -> tuple[Floats, str]:
     p = _with_resonance(_pack(found.model))
     if len(less.f) < FEWEST:
         return np.zeros(len(p)), (
-            f"shaken less, only {len(less.f)} frequencies are coherent, of {FEWEST} that are needed to confirm it"
+            f"with a weaker excitation, only {len(less.f)} frequencies are coherent, and {FEWEST} are needed to "
+            "confirm it"
         )
     weight = _weight(less.seen, less.spread)
     again = _solve(loop._replace(f=less.f, seen=less.seen, weight=weight), found.model)
@@ -191,11 +192,12 @@ def _by_level(loop: _Loop, found: _Solution, less: Seen) -> tuple[Floats, str]:
     change = np.abs(q - p)
     doubt = 2.0 * deviation[-1]
     if doubt > WIDEST["resonance"]:
-        return np.zeros(len(p)), f"shaken less, it can only be told to {100.0 * doubt:.0f} %, which does not confirm it"
+        reason = f"with a weaker excitation, its uncertainty is {100.0 * doubt:.0f} %, which does not confirm it"
+        return np.zeros(len(p)), reason
     if change[-1] > max(LEVEL, doubt):
         return np.zeros(len(p)), (
-            f"it lies at {math.exp(p[-1]):.4g} Hz, and at {math.exp(q[-1]):.4g} Hz where the axis is shaken less: with "
-            "backlash, or friction that sticks, there is no such thing as one resonance"
+            f"it lies at {math.exp(p[-1]):.4g} Hz, and at {math.exp(q[-1]):.4g} Hz with a weaker excitation: with "
+            "backlash or static friction, there is no single resonance frequency"
         )
     return np.sqrt(np.maximum(change**2 - deviation**2, 0.0)), ""
 
@@ -453,13 +455,16 @@ def _with_intervals(solution: _Solution, f: Floats, scatter: Floats, lost: float
         estimates["resonance"] = positive("resonance", [*own, 1.0, 1.0], "Hz")
         estimates["damping"] = positive("damping", [*own, 0.0, 0.0, 1.0], "1")
     else:
-        reason = f"none shows between {f[0]:.0f} and {f[-1]:.0f} Hz"
+        reason = f"no resonance between {f[0]:.0f} and {f[-1]:.0f} Hz"
         if misfit > RIGID_ENOUGH:
-            reason = f"the response from {f[0]:.0f} to {f[-1]:.0f} Hz is not that of a rigid axis, one spring or two"
+            reason = (
+                f"the response from {f[0]:.0f} to {f[-1]:.0f} Hz fits neither a rigid axis nor one with one or two "
+                "springs"
+            )
         estimates |= {name: refused(_UNITS[name], reason) for name in PAIR}
     estimates |= {name: _checked(name, estimate) for name, estimate in estimates.items()}
     if plant.is_elastic and plant.resonance > f[-1]:
-        reason = f"it lies above {f[-1]:.0f} Hz, up to which the axis could be seen"
+        reason = f"it lies above {f[-1]:.0f} Hz, the highest frequency measured"
         estimates |= {name: refused(_UNITS[name], reason) for name in ("resonance", "damping")}
     return PlantFit(plant, estimates, misfit, second=second, lost=loss * lost)
 
@@ -472,7 +477,7 @@ def _checked(name: str, estimate: Estimate) -> Estimate:
         return estimate
     return refused(
         estimate.unit,
-        f"excitation too weak: {estimate.value:.4g} lies anywhere between {estimate.low:.4g} and {estimate.high:.4g}",
+        f"excitation too weak: {estimate.value:.4g} has an interval of {estimate.low:.4g} to {estimate.high:.4g}",
     )
 
 

@@ -48,7 +48,7 @@ def slow_enough(bench: Workbench, plant: Plant, small: float, share: float) -> f
     if wanted <= highest:
         return small
     bench.note(
-        f"velocity loop held to {highest:.0f} Hz, half the anti-resonance at {plant.anti_resonance:.0f} Hz; "
+        f"velocity loop limited to {highest:.0f} Hz, half the anti-resonance at {plant.anti_resonance:.0f} Hz; "
         f"the lags alone would allow {wanted:.0f} Hz"
     )
     return share / (2.0 * math.pi * highest)

@@ -112,7 +112,7 @@ def _greatest(
     if last == 0:
         found = margins_of(1)
         bench.note(
-            f"no integer of {title} keeps {phase_deg:g} degrees and {gain_db:g} dB: 1, the least, has "
+            f"{title}: no integer keeps {phase_deg:g} degrees and {gain_db:g} dB: 1, the least, has "
             f"{found.phase_deg:.0f} degrees and {found.gain_db:.1f} dB"
         )
         return 1

@@ -107,7 +107,8 @@ def gains_from_swing(device: Device, plant: Plant, slope: float, ultimate: Ultim
     if not 1.0 / OFF < slope / expected < OFF:
         raise ValueError(
             f"the axis swung like {1.0 / slope * plant.torque_constant:.2g} kg*m^2, and its inertia is "
-            f"{plant.inertia:.2g}: it swings with its load's resonance, of which a relay says nothing; take margin_45"
+            f"{plant.inertia:.2g}: it swings at its load's resonance, where the relay method does not work; take "
+            "margin_45"
         )
     bench = Workbench(device, plant)
     take_current(bench, device, plant)
@@ -195,13 +196,15 @@ def evaluate(speed: Floats, current: Floats, coulomb: Floats, axes: Mask, inside
         found = fundamental(v)
         periods = found * len(v) * CYCLE
         if not periods >= LEAST_SWINGS:
-            reasons[axis] = f"the axis did not swing {LEAST_SWINGS} times: friction holds it, or it is too heavy"
+            reasons[axis] = (
+                f"the axis did not swing {LEAST_SWINGS} times: friction is too high, or the inertia too large"
+            )
             continue
         V, amps = line(v, found), line(i, found)
         w = 2.0 * math.pi * found
         if abs(V) / w < LEAST_COUNTS * count_angle:
             reasons[axis] = (
-                f"the axis swung by less than {LEAST_COUNTS:g} counts: friction holds it, or it is too heavy"
+                f"the axis swung by less than {LEAST_COUNTS:g} counts: friction is too high, or the inertia too large"
             )
             continue
         # Dry friction brakes with the velocity's sign: a square wave in its phase.
@@ -212,7 +215,9 @@ def evaluate(speed: Floats, current: Floats, coulomb: Floats, axes: Mask, inside
         result["slope"][axis] = abs(G) * w
         lag = -phase / w + HELD
         if lag <= 0.0:
-            reasons[axis] = f"the phase at {found:.0f} Hz leads an integrator's: the swing is not the axis's own"
+            reasons[axis] = (
+                f"the phase at {found:.0f} Hz leads an integrator's: the oscillation is not that of a rigid axis"
+            )
             result["slope"][axis] = math.nan
             continue
         result["lag"][axis] = lag

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from drive_env.gains import check_linear_model
-from tuning.rules.cascade_chain import chain_rule
+from tuning.rules.cascade import cascade_rule
 from tuning.rules.internal_model import imc_rule, simc_rule
 from tuning.rules.margin_targets import TARGETS, margin_rule
 from tuning.rules.optima import modulus_rule, symmetrical_rule
@@ -31,7 +31,7 @@ RULES: Mapping[str, Rule] = {
     "pole_placement": pole_rule,
     "relay": relay_rule,
     **{name: margin_rule(*target) for name, target in TARGETS.items()},
-    "chain": chain_rule,
+    "cascade": cascade_rule,
 }
 
 MEANINGS: Mapping[str, str] = {
@@ -45,7 +45,7 @@ MEANINGS: Mapping[str, str] = {
         name: f"greatest integers with {phase:g} degrees and {gain:g} dB in every loop"
         for name, (phase, gain) in TARGETS.items()
     },
-    "chain": "the classical chain: lags, anti-resonance and encoder counts limit the velocity loop",
+    "cascade": "loop by loop from inside; lags, anti-resonance or encoder counts limit the velocity loop",
 }
 
 

@@ -63,7 +63,7 @@ def best_response(result: SweepResult) -> Figure:
     if np.abs(recording.current[:, 0]).max() > 0.7 * limit:
         for sign in (1.0, -1.0):
             current.axhline(sign * limit, color="black", linewidth=0.8, linestyle=":",
-                            label="limit (2003h)" if sign > 0 else None)  # fmt: skip
+                            label="current limit" if sign > 0 else None)  # fmt: skip
         current.legend(loc="best")
     current.set_ylabel("current i_q [A]")
     torque = np.where(recording.t >= recording.t_load - 1e-9, excitation.load_torque, 0.0)

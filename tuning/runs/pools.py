@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 
 AGAIN = "go on with --resume"
 CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
-FIRST_RESULT = "waiting for the first result (a worker that never ran before compiles for half a minute)"
+FIRST_RESULT = "waiting for the first result (a worker that runs for the first time compiles for half a minute)"
 # Files of a tls:// address, and what Dask's security calls them.
 TLS_FILES = {"ca": "tls_ca_file", "cert": "tls_client_cert", "key": "tls_client_key"}
 WORKERS_PERIOD = 3.0  # s, between two looks at whether a cluster has workers
@@ -89,7 +89,7 @@ def open_pool(workers: int | None = None, cluster: str | None = None, again: str
         PoolError: If the cluster cannot be reached, or `distributed` is not installed.
     """
     if workers is not None and cluster is not None:
-        raise ValueError("workers and a cluster exclude each other; choose --workers or --cluster")
+        raise ValueError("--workers and --cluster exclude each other; choose one")
     if cluster is not None:
         with _cluster(cluster, again) as pool:
             yield pool
@@ -141,7 +141,8 @@ class _Processes:
                 yield futures[future], future.result()
         except BrokenProcessPool:
             raise PoolError(
-                f"a worker process ended on its own, perhaps for want of memory; take fewer --workers and {self._again}"
+                "a worker process ended unexpectedly, perhaps for lack of memory; take fewer --workers and "
+                f"{self._again}"
             ) from None
 
     def differences(self) -> list[str]:
@@ -181,7 +182,7 @@ class _Dask:
         except ImportError as error:
             raise self._without_package(error) from None
         except KilledWorker as error:
-            raise PoolError(f"workers of the cluster died over and over: {error}; {self._again}") from None
+            raise PoolError(f"workers of the cluster ended repeatedly: {error}; {self._again}") from None
         except (CancelledError, OSError) as error:
             raise PoolError(
                 f"the connection to the Dask scheduler at {self._address} was lost: start it again, with its workers, "

@@ -44,7 +44,7 @@ def shard_log(folder: str | Path, settings: str, *, resume: bool) -> Iterator[Sh
     """
     place = unfinished_folder(folder)
     if place.exists() and not resume:
-        raise ShardLogError(f"{place} holds an unfinished run; go on with it by --resume, or remove it")
+        raise ShardLogError(f"{place} holds an unfinished run; continue it with --resume, or remove it")
     place.mkdir(parents=True, exist_ok=True)
     with ShardLog(place / SHARDS, settings) as log:
         if not (place / SETTINGS).exists():

@@ -1,8 +1,8 @@
 """Optimisation of gains on drives: a generation of trials at a time, costed from what a drive shows.
 
-Optimisers search the logarithms of gains about the fitted rule's, each machine by itself or, where the lanes are one
-and the same emulated machine, one search whose generation fills them. The safe search starts at gains that are slow and
-proved, goes on from what has been proved in small steps, and never beyond what oscillated.
+Optimisers search the logarithms of gains around the baseline rule's, each machine separately or, where the emulated
+machines are copies of one machine, in one search whose generation they try at the same time. The safe search starts at
+gains that are slow and proved, goes on from what has been proved in small steps, and never beyond what oscillated.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ class TrialRow(NamedTuple):
     gains: Of the machine's axes, raw integers, (axes_per_machine, count).
     cost: ln J by measured terms.
     objectives: In the order of `OBJECTIVES`.
-    aborted: Stopped, for it oscillated or tripped.
-    fragile: Not kept, for the axis went on shaking with these gains once something else had shaken it.
+    aborted: Stopped, since it oscillated or went into fault. fragile: Not kept, since with these gains the axis did not
+        stop oscillating after a disturbance.
     """
 
     search: int
@@ -100,9 +100,9 @@ class Optimised:
 
     Attributes:
         gains: The best of every machine, raw integers, (num_axes, count); that of the safe search was never stopped.
-        rule: The fitted rule's, from what was identified, (num_axes, count).
+        rule: The baseline rule's, from what was identified, (num_axes, count).
         cost: ln J by measured terms of the best, (num_machines,).
-        rows: Every trial, in the order in which they were told.
+        rows: Every trial, in order.
         drive_seconds: Time that passed on the drives [s].
         moves, aborts: Of every axis, (num_axes,).
         notes: What was in the way, of every machine; "" for nothing.
@@ -243,7 +243,7 @@ class _Search:
         if not unstopped:
             rows = [row for row in self.rows if row.search == k]
             if rows and not self._settings.safe:
-                self._note(k, "every trial was stopped; these are the gains that cost least")
+                self._note(k, "every trial was stopped; these are the gains of least cost")
                 return min(rows, key=lambda row: row.cost)
             return None
         return min(pareto(unstopped, self._settings.objectives), key=lambda row: row.cost)
@@ -285,7 +285,11 @@ class _Search:
                 left = min(self._unstopped(k), key=lambda row: row.cost, default=None)
                 self._bench.incumbent[axes] = self._bench.safe[axes] if left is None else left.gains
                 self._least[machine] = np.inf if left is None else left.cost
-                self._note(k, "gains of a good trial went on shaking once something else had shaken the axis: not kept")
+                self._note(
+                    k,
+                    "gains that passed a trial were not kept: the axis did not stop oscillating with them "
+                    "after a disturbance",
+                )
 
     def _unstopped(self, k: int) -> list[TrialRow]:
         """Return a search's trials that were not stopped, and whose gains have not been found fragile since."""
@@ -323,7 +327,8 @@ class _Search:
         for k in searches:
             self._halted[k] = True
             self._note(
-                k, f"the safe gains were stopped, and so were those of 1/{2 ** (SAFE_STARTS - 1)}: no safe start"
+                k,
+                f"the axis oscillated with the safe gains, and with 1/{2 ** (SAFE_STARTS - 1)} of them: no safe start",
             )
 
     def _held_back(self, k: int, point: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""What proposes gains: points of a box, a generation at a time, and what they cost told back.
+"""What proposes gains: points of a box, a generation at a time, and takes their cost.
 
 TPE, CMA-ES and Gaussian processes are Optuna's, by ask and tell. Their samplers are made anew for every generation from
 seed and number of the generation, so that a study that was broken off and is taken up again proposes what it would have
@@ -40,7 +40,7 @@ class Proposer(Protocol):
         """
 
     def history(self) -> list[Mapping[str, Any]]:
-        """Return the facts of all points that a journal remembers, in the order in which they were told."""
+        """Return the facts of all points that a journal remembers, in their order."""
 
     @property
     def told(self) -> int:
@@ -67,7 +67,7 @@ def new_proposer(
         low: The box's lower ends, shape (dimensions,).
         high: Its upper ends.
         seed: Of everything random.
-        objectives: Values that each point is told.
+        objectives: Values of each point.
         trials: How many points will be asked for; a grid has as many levels as they allow.
         first: Points that are proposed before all others.
         generation: How many points are asked for at a time: the population of CMA-ES, if it is 4 or more.

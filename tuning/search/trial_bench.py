@@ -18,7 +18,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.gains import (
-    FITTED_RULE,
+    BASELINE_RULE,
     Rule,
     bandwidth_gains,
     rule_gains,
@@ -40,9 +40,9 @@ Mask = NDArray[np.bool_]
 MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL = 2, 3
 # What moves an axis of which nothing is known but its motor: the commissioning presets' bandwidths, three rotors.
 FIRST_HZ = {"current_hz": 1000.0, "velocity_hz": 20.0, "position_hz": 5.0}
-# The fitted rule at a third of its speed and with three times its integration time: where a safe search begins.
-SAFE_RULE = FITTED_RULE._replace(
-    speed=FITTED_RULE.speed / 3.0, integration=3.0 * FITTED_RULE.integration, position=0.3 * FITTED_RULE.position
+# The baseline rule at a third of its speed and with three times its integration time: where a safe search begins.
+SAFE_RULE = BASELINE_RULE._replace(
+    speed=BASELINE_RULE.speed / 3.0, integration=3.0 * BASELINE_RULE.integration, position=0.3 * BASELINE_RULE.position
 )
 
 CALM = 0.1  # s until what an axis did before has died away
@@ -83,7 +83,7 @@ class TrialBench:
             and its number alone; drives on a bus go on from where they are.
 
     Attributes:
-        t_0: What settling times are told over [s].
+        t_0: Settling times are relative to this [s].
     """
 
     def __init__(self, target: Target, *, anew: bool = False) -> None:
@@ -119,7 +119,9 @@ class TrialBench:
         self.identified, self._origin = self._moved(gains)
         self._trials.recover(self._where)
         self.move = plan_move(target.motor, self.identified.inertia, drives.read(Role.POSITION_SCALE), self._reach)
-        self.rule, self.safe = (_rule_gains(target, self.identified.inertia, rule) for rule in (FITTED_RULE, SAFE_RULE))
+        self.rule, self.safe = (
+            _rule_gains(target, self.identified.inertia, rule) for rule in (BASELINE_RULE, SAFE_RULE)
+        )
         self.incumbent = self.safe.copy()
         write_gains(drives, self.safe)
         drives.advance(TRIAL * CYCLE)  # the first gains may leave an axis swinging

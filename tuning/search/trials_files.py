@@ -32,7 +32,7 @@ MEANINGS = {
     "current": "ripple of the current [% of rated]",
 }
 
-HEADER = "# The whole search. It repeats from this file: drive-tune optimise --config settings.toml\n"
+HEADER = "# All settings of the search. To repeat it: drive-tune optimise --config settings.toml\n"
 _SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed")
 _MACHINE = ("device", "motor", "load", "supply", "travel", "lanes", "searches", "interface", "channel", "nodes",
             "bitrate", "lockstep", "pace")  # fmt: skip
@@ -95,9 +95,9 @@ def load_options(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}; give settings.toml of drive-tune optimise") from None
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ValueError(f"{path} is no TOML: {error}; give settings.toml of drive-tune optimise") from None
+        raise ValueError(f"{path} is not TOML: {error}; give settings.toml of drive-tune optimise") from None
     if "machine" not in table:
-        raise ValueError(f"{path} is of no search; give settings.toml of drive-tune optimise")
+        raise ValueError(f"{path} is not from a search; give settings.toml of drive-tune optimise")
     check_keys(str(path), table, [*_SEARCH, "machine", "versions"], optional=["versions", *_SEARCH])
     machine = dict(table["machine"]) if isinstance(table["machine"], dict) else {}
     check_keys(f"{path}: machine", machine, list(_MACHINE), optional=_MACHINE)
@@ -138,7 +138,7 @@ def trials_figure(found: Optimised, settings: Settings) -> Figure:
         front = [figures(row, names[:2], found.t_0) for row in pareto([row for row in rows if row.accepted], names)]
         if front:
             axes.plot(*np.array(front).T, color=FRONT, marker="o", markersize=9, fillstyle="none", linestyle="none",
-                      label="accepted, and beaten by none in every objective")  # fmt: skip
+                      label="accepted, on the Pareto front")  # fmt: skip
         axes.set_xlabel(MEANINGS[names[0]])
         _scale(axes.xaxis, axes.set_xscale, names[0])
         _scale(axes.yaxis, axes.set_yscale, names[1])
@@ -146,8 +146,8 @@ def trials_figure(found: Optimised, settings: Settings) -> Figure:
     stopped, fragile = (np.array([getattr(row, name) for row in rows]) for name in ("aborted", "fragile"))
     for where, color, marker, label in (
         (~stopped & ~fragile, KEPT, "o", "trial"),
-        (stopped, STOPPED, "x", "stopped: it oscillated or tripped"),
-        (fragile & ~stopped, FRAGILE, "s", "not kept: it went on shaking once something had shaken it"),
+        (stopped, STOPPED, "x", "stopped: it oscillated or went into fault"),
+        (fragile & ~stopped, FRAGILE, "s", "not kept: it did not stop oscillating after a disturbance"),
     ):
         if where.any():
             axes.scatter(x[where], y[where], s=18, color=color, marker=marker, label=label)

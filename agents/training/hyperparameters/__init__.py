@@ -154,9 +154,9 @@ def _read(file: Path) -> dict[str, Any]:
     except OSError as error:
         raise HyperparameterError(f"{file} cannot be read: {error.strerror}") from None
     except RecursionError:
-        raise HyperparameterError(f"{file} is no YAML that we read: it nests too deep") from None
+        raise HyperparameterError(f"{file} cannot be read as YAML: it nests too deep") from None
     except (yaml.YAMLError, ValueError) as error:
-        raise HyperparameterError(f"{file} is no YAML that we read: {' '.join(str(error).split())}") from None
+        raise HyperparameterError(f"{file} cannot be read as YAML: {' '.join(str(error).split())}") from None
     if not isinstance(table, dict):
         raise HyperparameterError(f"{file} holds no sections; the first is the environment's name")
     for name, section in table.items():

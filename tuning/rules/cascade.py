@@ -1,6 +1,6 @@
-"""The classical chain of commissioning: current, velocity, position, each around what the loop inside became.
+"""Classical commissioning, loop by loop: current, velocity, position, each around the closed loop inside it.
 
-Current by the modulus optimum. Velocity by the symmetrical optimum, slowed by what it meets first: the lags, half the
+Current by the modulus optimum. Velocity by the symmetrical optimum, slowed by the first of these: the lags, half the
 first anti-resonance, or the noise that the encoder's counts put into the current. Position a quarter of the velocity
 loop.
 """
@@ -24,8 +24,8 @@ POSITION = 0.25  # k_v over the velocity loop's crossover
 NOISE = 0.1  # RMS current that the counts may cause, over the rated current
 
 
-def chain_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Propose the classical chain; notes say what limited the velocity loop."""
+def cascade_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
+    """Propose gains loop by loop; notes say what limits the velocity loop."""
     bench = Workbench(device, plant)
     lag = take_current(bench, device, plant)
     small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 1.0 / SPREAD)
@@ -34,8 +34,8 @@ def chain_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     quiet = NOISE * motor.rated_current / velocity_noise(device, plant)
     if wanted > quiet:
         bench.note(
-            f"velocity loop held to {quiet * slope / (2.0 * math.pi):.0f} Hz, where the encoder's {plant.counts} "
-            f"counts shake the current by {100.0 * NOISE:.0f} % of rated; the lags alone would allow "
+            f"velocity loop limited to {quiet * slope / (2.0 * math.pi):.0f} Hz, where the encoder's {plant.counts} "
+            f"counts cause current noise of {100.0 * NOISE:.0f} % of rated; the lags alone would allow "
             f"{wanted * slope / (2.0 * math.pi):.0f} Hz"
         )
         wanted = quiet
