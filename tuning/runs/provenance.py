@@ -16,8 +16,7 @@ from drive_env import __version__
 from drive_env.own_packages import ROOT
 from drive_env.whole_file import keep_names
 
-HEADER = "# All settings of this run. To repeat it: drive-tune sweep --config settings.toml
-"
+HEADER = "# All settings of this run. To repeat it: drive-tune sweep --config settings.toml\n"
 _PACKAGES = ("numpy", "numba", "llvmlite", "mujoco")
 _OURS = tuple(ROOT / name for name in ("drive_env", "mechanics", "tuning", "agents"))
 
