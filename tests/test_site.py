@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -82,6 +84,14 @@ def test_every_environment_has_its_spaces_and_configuration():
             assert f"## {heading}\n" in text, (module, heading)
         assert "| `num_threads` |" in text and "- `num_envs`: " in text
         assert (MACHINERY.parent / "assets" / "environments" / f"{module}.webp").is_file()
+
+
+@pytest.mark.slow
+def test_the_program_of_the_environments_runs():
+    text = environment_pages.pages()["reference/environments/index.md"]
+    (program,) = re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_every_set_of_random_machines_has_its_laws():
