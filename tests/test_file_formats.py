@@ -89,6 +89,13 @@ def test_certificate(certificate):
     assert fields("certificate response") == list(axis["frequency_responses"][0])
 
 
+def test_identification(tmp_path):
+    run("identify", "--load", "inertia", "--out", tmp_path / "found.json")
+    (axis,) = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
+    assert fields("identification") == list(axis)
+    assert {name for one in axis["estimates"].values() for name in one} == set(fields("certificate identified"))
+
+
 def test_state_before_a_change(tmp_path):
     with emulated(load="inertia", num_machines=1) as target:
         take(target).save(tmp_path / "before.toml")
@@ -169,6 +176,13 @@ def test_device():
     assert set(fields("device")) == set(data)
     own = {path.name for path in (ROOT / "tests" / "invented_drive").iterdir() if not path.name.startswith("_")}
     assert {name.replace("*", "invented") for name in fields("device", "files")} == own
+
+
+def test_film():
+    shown = CliRunner().invoke(drive_env_app, ["render", "--show-config"]).stdout
+    keys = re.findall(r"^(?:# )?(\w+) = ", shown.split("[objects]")[0], re.M)
+    assert [name for name in fields("film") if name not in ("objects", "picture")] == keys
+    assert {"objects", "picture"} == set(re.findall(r"^\[(\w+)\]", shown, re.M))
 
 
 def test_recorded_frames():
