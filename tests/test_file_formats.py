@@ -23,9 +23,10 @@ from drive_env.bus.config import Bus, Machine
 from drive_env.bus.faults import Faults
 from drive_env.commands.cli import app as drive_env_app
 from drive_env.commands.log import FORMATS, WRITTEN
+from drive_env.devices import find_device
 from drive_env.envs import randomisation
 from drive_env.master.identity import Identity
-from drive_env.motors import MOTORS, NUMBERS
+from drive_env.motors import MOTORS, NUMBERS, find_motor
 from tuning.certificate.certificate import (
     AxisCertificate,
     Certificate,
@@ -169,6 +170,24 @@ def test_motor():
     assert fields("motor numbers") == list(NUMBERS)
     for name, row in NUMBERS.items():
         assert f"| `{name}` |" in PAGE and f"| {row.unit or '1'} | {row.meaning} |" in PAGE, name
+
+
+def block(begin, name, folder):
+    """Write the TOML block of the page that begins with a text into a file; return its path."""
+    (found,) = (text for text in re.findall(r"```toml\n(.*?)```", PAGE, re.S) if text.startswith(begin))
+    (folder / name).write_text(found, encoding="utf-8")
+    return folder / name
+
+
+def test_the_examples_of_the_page_are_taken(tmp_path):
+    assert find_motor(block("title = ", "acme.toml", tmp_path)).rated_torque == 0.125
+    variant = find_device(str(block("variant_of = ", "small.toml", tmp_path)))
+    assert variant.overcurrent == 40.0
+    mine = block("include = ", "mine.toml", tmp_path)
+    randomisation.Distributions.load(mine)
+    mine.write_text(mine.read_text(encoding="utf-8").replace("loguniform", "logarithmic"), encoding="utf-8")
+    with pytest.raises(ValueError, match="logarithmic"):
+        randomisation.Distributions.load(mine)
 
 
 def test_device():
