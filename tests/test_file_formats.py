@@ -23,9 +23,10 @@ from drive_env.bus.config import Bus, Machine
 from drive_env.bus.faults import Faults
 from drive_env.commands.cli import app as drive_env_app
 from drive_env.commands.log import FORMATS, WRITTEN
+from drive_env.devices import find_device
 from drive_env.envs import randomisation
 from drive_env.master.identity import Identity
-from drive_env.motors import MOTORS, NUMBERS
+from drive_env.motors import MOTORS, NUMBERS, find_motor
 from tuning.certificate.certificate import (
     AxisCertificate,
     Certificate,
@@ -87,6 +88,13 @@ def test_certificate(certificate):
     assert fields("certificate identified") == list(axis["identified"]["inertia"])
     assert fields("certificate step") == list(axis["steps"][0])
     assert fields("certificate response") == list(axis["frequency_responses"][0])
+
+
+def test_identification(tmp_path):
+    run("identify", "--load", "inertia", "--out", tmp_path / "found.json")
+    (axis,) = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
+    assert fields("identification") == list(axis)
+    assert {name for one in axis["estimates"].values() for name in one} == set(fields("certificate identified"))
 
 
 def test_state_before_a_change(tmp_path):
@@ -164,11 +172,36 @@ def test_motor():
         assert f"| `{name}` |" in PAGE and f"| {row.unit or '1'} | {row.meaning} |" in PAGE, name
 
 
+def block(begin, name, folder):
+    """Write the TOML block of the page that begins with a text into a file; return its path."""
+    (found,) = (text for text in re.findall(r"```toml\n(.*?)```", PAGE, re.S) if text.startswith(begin))
+    (folder / name).write_text(found, encoding="utf-8")
+    return folder / name
+
+
+def test_the_examples_of_the_page_are_taken(tmp_path):
+    assert find_motor(block("title = ", "acme.toml", tmp_path)).rated_torque == 0.125
+    variant = find_device(str(block("variant_of = ", "small.toml", tmp_path)))
+    assert variant.overcurrent == 40.0
+    mine = block("include = ", "mine.toml", tmp_path)
+    randomisation.Distributions.load(mine)
+    mine.write_text(mine.read_text(encoding="utf-8").replace("loguniform", "logarithmic"), encoding="utf-8")
+    with pytest.raises(ValueError, match="logarithmic"):
+        randomisation.Distributions.load(mine)
+
+
 def test_device():
     data = tomllib.loads((DEVICE / "device.toml").read_text(encoding="utf-8"))
     assert set(fields("device")) == set(data)
     own = {path.name for path in (ROOT / "tests" / "invented_drive").iterdir() if not path.name.startswith("_")}
     assert {name.replace("*", "invented") for name in fields("device", "files")} == own
+
+
+def test_film():
+    shown = CliRunner().invoke(drive_env_app, ["render", "--show-config"]).stdout
+    keys = re.findall(r"^(?:# )?(\w+) = ", shown.split("[objects]")[0], re.M)
+    assert [name for name in fields("film") if name not in ("objects", "picture")] == keys
+    assert {"objects", "picture"} == set(re.findall(r"^\[(\w+)\]", shown, re.M))
 
 
 def test_recorded_frames():

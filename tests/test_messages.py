@@ -46,8 +46,8 @@ def load_page():
 PAGE = load_page()
 DATA = PAGE.load()
 ROWS = [row for topic in DATA["topic"] for row in topic["message"]]
-PATTERNS = [text for row in ROWS for text in row.get("says", ()) if not text.startswith("abort ")]
-ABORTS = [text for row in ROWS for text in row.get("says", ()) if text.startswith("abort ")]
+PATTERNS = [text for row in ROWS for text in row.get("says", ()) if not text.startswith("abort code ")]
+ABORTS = [text for row in ROWS for text in row.get("says", ()) if text.startswith("abort code ")]
 
 
 # --- what the code says -----------------------------------------------------------------------------------------------
@@ -183,7 +183,7 @@ def test_every_emergency_has_a_row():
 
 def test_every_abort_code_has_a_row():
     codes = {value for name, value in vars(aborts).items() if name.isupper()}
-    assert {int(text[6:].rstrip("h").replace(" ", ""), 16) for text in ABORTS} == codes
+    assert {int(text.removeprefix("abort code ").rstrip("h").replace(" ", ""), 16) for text in ABORTS} == codes
     assert len(ABORTS) == len(codes)
 
 
