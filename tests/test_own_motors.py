@@ -166,6 +166,7 @@ def test_a_motor_that_no_drive_of_ours_can_turn_is_told(tmp_path):
             "resistance_.* is missing; give it with --number",
         ),
         (["own.toml"], "kind of motor, pmsm .* is missing; give it as an option"),
+        ([], "name the file to write: drive-env motor new my_motor.toml"),
     ],
 )
 def test_a_mistake_of_the_command_line_is_one_line_and_writes_nothing(tmp_path, monkeypatch, words, message):
@@ -193,8 +194,9 @@ def test_at_a_terminal_what_is_not_given_is_asked_for(tmp_path, monkeypatch):
     assert (motor.R_s, motor.L_q, motor.torque_constant) == pytest.approx((0.2, 5e-4, 0.06))
 
 
-def test_every_number_is_listed_with_its_unit():
-    done = new("x.toml", "--list")
+@pytest.mark.parametrize("words", [["--list"], ["x.toml", "--list"]])
+def test_every_number_is_listed_with_its_unit(words):
+    done = new(*words)
     assert done.exit_code == 0
     for name, row in NUMBERS.items():
         assert f"{name}: {row.meaning}" in done.output
