@@ -3,7 +3,8 @@
     python examples/curriculum.py --steps 200000
 
 `stage` scales the ranges of the random machines, 0 (the default machine) to 1; it acts at each environment's next
-episode. A schedule that depends on the steps alone needs no callback: the table `curriculum` of the distributions holds one.
+episode. A schedule that depends on the steps alone needs no callback: the
+table `curriculum` of the distributions holds one.
 """
 
 import argparse

@@ -26,9 +26,8 @@ def main(arguments: Arguments) -> None:
     model = PPO("MlpPolicy", env, n_steps=20, batch_size=256, gamma=1.0, seed=arguments.seed, device="cpu")
     model.learn(arguments.steps)
     returns = [episode["r"] for episode in model.ep_info_buffer]
-    print(
-        f"{model.num_timesteps} trials, mean return of the last {len(returns)} episodes {sum(returns) / len(returns):.2f}"
-    )
+    mean = sum(returns) / len(returns)
+    print(f"{model.num_timesteps} trials, mean return of the last {len(returns)} episodes {mean:.2f}")
     model.save(arguments.out)
     env.close()
 
