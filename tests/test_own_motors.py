@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -205,3 +206,29 @@ def test_every_number_is_listed_with_its_unit(words):
 def test_a_motor_of_the_catalogue_that_is_changed_takes_the_rules_preset():
     device, own = find_device("tmcm1636"), MOTORS["qbl4208"]._replace(rated_torque=0.1)
     assert device.preset(own) != device.preset(MOTORS["qbl4208"])
+
+
+@pytest.mark.slow
+def test_auto_and_the_agent_tune_a_motor_of_ones_own(file, tmp_path):
+    """Both look for gains on machines with the motor itself, not one of the catalogue with its name."""
+    from agents.commands.cli import app as agent
+    from tuning.commands.cli import app as tune
+
+    own = ["--motor", str(file), "--load", "inertia"]
+    done = CliRunner().invoke(tune, ["auto", *own, "--out", str(tmp_path / "auto")])
+    assert done.exit_code in (0, 1), done.output  # accepted, or rejected by a check
+    assert (tmp_path / "auto" / "certificate.json").exists()
+    done = CliRunner().invoke(agent, ["tune", *own, "--trials", "1", "--out", str(tmp_path / "agent")])
+    assert done.exit_code in (0, 1), done.output
+    assert (tmp_path / "agent" / "certificate.json").exists()
+
+
+def test_an_environment_takes_a_motor_itself(file):
+    from drive_env.envs.gain_tuning import GainTuning
+
+    motor = load_motor(file)
+    for given in (motor, str(file)):
+        envs = GainTuning(2, load="inertia", motor=given, distributions={"parameters": {}}, num_threads=1)
+        assert envs.motor._replace(name="", sources=()) == motor._replace(name="", sources=())
+        assert np.isfinite(envs.reset(seed=0)[0]).all()
+        envs.close()
