@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -166,6 +167,7 @@ def test_a_motor_that_no_drive_of_ours_can_turn_is_told(tmp_path):
             "resistance_.* is missing; give it with --number",
         ),
         (["own.toml"], "kind of motor, pmsm .* is missing; give it as an option"),
+        ([], "name the file to write: drive-env motor new my_motor.toml"),
     ],
 )
 def test_a_mistake_of_the_command_line_is_one_line_and_writes_nothing(tmp_path, monkeypatch, words, message):
@@ -193,8 +195,9 @@ def test_at_a_terminal_what_is_not_given_is_asked_for(tmp_path, monkeypatch):
     assert (motor.R_s, motor.L_q, motor.torque_constant) == pytest.approx((0.2, 5e-4, 0.06))
 
 
-def test_every_number_is_listed_with_its_unit():
-    done = new("x.toml", "--list")
+@pytest.mark.parametrize("words", [["--list"], ["x.toml", "--list"]])
+def test_every_number_is_listed_with_its_unit(words):
+    done = new(*words)
     assert done.exit_code == 0
     for name, row in NUMBERS.items():
         assert f"{name}: {row.meaning}" in done.output
@@ -203,3 +206,29 @@ def test_every_number_is_listed_with_its_unit():
 def test_a_motor_of_the_catalogue_that_is_changed_takes_the_rules_preset():
     device, own = find_device("tmcm1636"), MOTORS["qbl4208"]._replace(rated_torque=0.1)
     assert device.preset(own) != device.preset(MOTORS["qbl4208"])
+
+
+@pytest.mark.slow
+def test_auto_and_the_agent_tune_a_motor_of_ones_own(file, tmp_path):
+    """Both look for gains on machines with the motor itself, not one of the catalogue with its name."""
+    from agents.commands.cli import app as agent
+    from tuning.commands.cli import app as tune
+
+    own = ["--motor", str(file), "--load", "inertia"]
+    done = CliRunner().invoke(tune, ["auto", *own, "--out", str(tmp_path / "auto")])
+    assert done.exit_code in (0, 1), done.output  # accepted, or rejected by a check
+    assert (tmp_path / "auto" / "certificate.json").exists()
+    done = CliRunner().invoke(agent, ["tune", *own, "--trials", "1", "--out", str(tmp_path / "agent")])
+    assert done.exit_code in (0, 1), done.output
+    assert (tmp_path / "agent" / "certificate.json").exists()
+
+
+def test_an_environment_takes_a_motor_itself(file):
+    from drive_env.envs.gain_tuning import GainTuning
+
+    motor = load_motor(file)
+    for given in (motor, str(file)):
+        envs = GainTuning(2, load="inertia", motor=given, distributions={"parameters": {}}, num_threads=1)
+        assert envs.motor._replace(name="", sources=()) == motor._replace(name="", sources=())
+        assert np.isfinite(envs.reset(seed=0)[0]).all()
+        envs.close()

@@ -110,7 +110,7 @@ def tune_target(
         drives=drives,
         reach=reach,
         device=target.device.name,
-        motor=target.motor.name,
+        motor=target.motor,
         **{name: value for name, value in configuration.items() if name not in NOT_OF_DRIVES},
     )
     space: Any = env.single_action_space

@@ -27,7 +27,10 @@ def motor() -> None:
 
 @motor_app.command("new")
 def new_motor(
-    file: Annotated[Path, typer.Argument(help="New TOML file to write.")],
+    file: Annotated[
+        Path | None,
+        typer.Argument(help="New TOML file to write; only --list needs none.", show_default=False),
+    ] = None,
     kind: Annotated[str | None, typer.Option("--kind", help="pmsm (brushless) or dc (brushed).")] = None,
     title: Annotated[str, typer.Option("--title", help="Name of the motor.")] = "",
     numbers: Annotated[
@@ -50,6 +53,8 @@ def new_motor(
             for name, row in NUMBERS.items():
                 print(f"{name}: {row.meaning}" + (f" [{row.unit}]" if row.unit else ""))
             return
+        if file is None:
+            raise ValueError("name the file to write: drive-env motor new my_motor.toml")
         check_free(file)
         if file.suffix != ".toml":
             raise ValueError(f"{file} must end with .toml, which distinguishes it from a motor's name")

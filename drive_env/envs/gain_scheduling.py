@@ -27,7 +27,7 @@ from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
 from drive_env.gains import BASELINE_RULE, read_gains, rule_gains, small_time_constants, write_gains
-from drive_env.motors import find_motor
+from drive_env.motors import Motor, find_motor
 from mechanics.loads import find_load
 from mechanics.shaft import one, shaft_load, way
 
@@ -98,7 +98,7 @@ class GainSchedulingConfig:
 
     load: Any = "belt"
     device: str = "tmcm1636"
-    motor: str = "qbl4208"
+    motor: str | Motor = "qbl4208"
     friction: str = "stribeck"
     mode: str = "csp"
     excitation: str = "moves"

@@ -30,7 +30,7 @@ from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Reward, Stepped, che
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
 from drive_env.gains import read_gains, rule_gains, small_time_constants
-from drive_env.motors import find_motor
+from drive_env.motors import Motor, find_motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
 from drive_env.trials.positioning import TRIAL, plan_move, power_up, reach
 from drive_env.trials.score import RobustScore
@@ -59,7 +59,7 @@ class GainTuningConfig:
 
     load: Any = "two_mass"
     device: str = "tmcm1636"
-    motor: str = "qbl4208"
+    motor: str | Motor = "qbl4208"
     friction: str = "stribeck"
     gains: tuple[str, ...] | None = None
     trials: int = 10

@@ -25,6 +25,7 @@ from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Observation, Reward,
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines
 from drive_env.envs.trajectories import TRAJECTORIES, draw
+from drive_env.motors import Motor, find_motor
 
 CYCLE = 0.001  # s, one communication cycle
 
@@ -96,7 +97,7 @@ class TrackingConfig:
 
     load: Any = "two_mass"
     device: str = "tmcm1636"
-    motor: str = "qbl4208"
+    motor: str | Motor = "qbl4208"
     friction: str = "stribeck"
     mode: str | None = None
     action: str = "direct"
@@ -311,7 +312,6 @@ class Tracking(Lanes):
         config, drives = self.config, self.drives
         if config.mode != "cst":
             return np.ones(drives.num_axes)
-        from drive_env.motors import find_motor
 
         motor = find_motor(config.motor)
         inertia = cycle.COMMISSIONED_INERTIA * motor.inertia

@@ -18,7 +18,10 @@ written from `drive_env/faults/table.toml` by `python -m drive_env.faults.page d
 In process, on machines:
 
 ```python
-number = drives.machine.fault("encoder_stuck", at=0.5, duration=0.1, where=mask)
+from drive_env import EmulatedDrives
+
+drives = EmulatedDrives(load="inertia", num_machines=4)
+number = drives.machine.fault("encoder_stuck", at=0.5, duration=0.1, where=[True, True, False, False])  # two of them
 drives.machine.fault("payload_jump", when="speed > 40", factor=2.0)  # rad/s of the rotor
 drives.machine.fault("demagnetised", when="enabled", at=0.02, share=0.4)  # 20 ms after operation enabled
 drives.machine.faults()  # those to come and those that are there
@@ -27,7 +30,7 @@ drives.machine.clear_fault(number)
 
 On a bus that is served, also of its wire and nodes:
 
-```
+```bash
 drive-env serve tmcm1636 --control 29637 --fault "supply_dip at=2 duration=0.1 voltage=6"
 drive-env fault bus_loss share=0.2 --duration 1
 drive-env fault encoder_stuck --node 1 --when "speed > 40"

@@ -46,6 +46,7 @@ from drive_env.trials.positioning import (
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
     from drive_env.emulator.emulated_drives import EmulatedDrives
+    from drive_env.motors import Motor
     from mechanics.load import Load
 
 Floats = NDArray[np.float64]
@@ -138,7 +139,7 @@ class RobustScore:
     Args:
         device: Name of the device.
         load: The load.
-        motor: Name of the motor.
+        motor: The motor, by name, by the path of its file, or as it is.
         num_machines: Machines to be scored.
         num_threads: Threads that run them; the number of cores by default.
         friction: Model of the load's friction, as in EmulatedDrives.
@@ -148,7 +149,7 @@ class RobustScore:
         self,
         device: str,
         load: str | Path | Load,
-        motor: str,
+        motor: str | Path | Motor,
         num_machines: int,
         *,
         num_threads: int | None = None,

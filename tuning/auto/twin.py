@@ -266,7 +266,7 @@ class _Part:
         self.axes = axes
         self._shape = (len(axes), sets, len(worlds))
         machines = math.prod(self._shape)
-        self._robust = RobustScore(device.name, load, motor.name, machines, num_threads=num_threads)
+        self._robust = RobustScore(device.name, load, motor, machines, num_threads=num_threads)
         rows = [[twin_parameters(device, motor, one, world) for world in worlds] for one in known]
         parameters = {
             name: self._spread_worlds(np.array([[row[name] for row in axis] for axis in rows])) for name in rows[0][0]

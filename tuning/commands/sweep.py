@@ -202,14 +202,19 @@ def _list_names() -> None:
     from tuning.runs.metrics import METRICS, TRACKING
 
     devices = [find_device(name) for name in device_names()]
-    gains = [(device, entry) for device in devices for entry in gain_objects(device, device.new_dictionary())]
+    gains: dict[tuple[str, str], list[str]] = {}  # by object and what it is: devices that have it
+    for device in devices:
+        for e in gain_objects(device, device.new_dictionary()):
+            gains.setdefault((f"{e.index:04X}h:{e.sub:02X}", f"{e.name}, {e.low}...{e.high}"), []).append(device.name)
+    told: dict[str, str] = {}
+    for (key, meaning), names in gains.items():
+        text = f"{meaning} ({', '.join(names)})"
+        told[key] = f"{told[key]}; {text}" if key in told else text
     combined = f"{TRACKING.meaning} (weights {', '.join(TRACKING.weights)})"
     print_names(
         {
             "devices": {device.name: device.title for device in devices},
-            "gains to sweep": {
-                f"{e.index:04X}h:{e.sub:02X}": f"{e.name}, {e.low}...{e.high} ({d.name})" for d, e in gains
-            },
+            "gains to sweep": told,
             "motors": {motor.name: motor.title for motor in MOTORS.values()},
             "loads": {load.name: load.meaning for load in LOADS.values()},
             "metrics": {f"{TRACKING.name} [{TRACKING.unit}]": combined}
