@@ -16,9 +16,9 @@ Floats = NDArray[np.float64]
 # Copies in one model. mj_step per copy: 1154 ns alone, 318 in 8, 204 in 64, 199 in 128 (two-mass shaft); a multiple of
 # 8, so that every group of machines but the last fills its drives' records.
 COPIES_PER_MODEL = 64
-# Of so many machines each thread has enough models of twice the size, and half as many are made: a model and its data
-# take Python 1 ms and 600 kB, whatever is in them.
-MANY, COPIES_OF_MANY = 16_384, 128
+# Of so many machines each thread has enough models that are larger, and fewer are made: a model and its data take
+# Python 1 ms and 600 kB, whatever is in them. From how many machines on, and how many copies.
+COPIES_OF_MANY = ((65_536, 256), (16_384, 128))
 # Copies that may touch things are told apart by MuJoCo's 32 contact bits.
 CONTACT_BITS = 32
 # MuJoCo's solver works on all copies at once and stops by a tolerance of all: 4e-13 was seen in 0.6 s of motion.
@@ -100,7 +100,7 @@ def copies_per_model(load: Load, machines: int = 1) -> int:
     """Return how many machines of a set one model holds; that of a load without constraints changes no digit."""
     model = read_model(load)
     if not is_constrained(model):
-        return COPIES_OF_MANY if machines >= MANY else COPIES_PER_MODEL
+        return next((copies for many, copies in COPIES_OF_MANY if machines >= many), COPIES_PER_MODEL)
     if not _bits(model):
         return COPIES_PER_MODEL
     return max(CONTACT_BITS // _bits(model) // 8 * 8, 8)
@@ -116,26 +116,15 @@ def compile_packed(load: Load, copies: int) -> mujoco.MjModel:
     # What is only seen would be copied with each model and moved at each step. A fluid, though, acts on shapes.
     packed.compiler.discardvisual = not (single.opt.density or single.opt.viscosity)
     bits = _bits(single)
-    for k in range(copies):
-        child = _spec(load)
-        for actuator in list(child.actuators):
-            child.delete(actuator)
-        for key in list(child.keys):
-            child.delete(key)
-        for name in load.joints:
-            # The rotor enters later, in place of what the file may have.
-            for joint in child.joints:
-                if joint.name == name:
-                    joint.armature = 0.0
-            for tendon in child.tendons:
-                if tendon.name == name:
-                    tendon.armature = 0.0
-        for joint in child.joints:
-            joint.frictionloss = 0.0  # friction.py's, see _joint_friction
-        for geom in child.geoms:
-            geom.contype = _signed(geom.contype << k * bits)
-            geom.conaffinity = _signed(geom.conaffinity << k * bits)
-        packed.attach(child, prefix=f"{k}/", frame=packed.worldbody.add_frame())
+    # An attachment takes as long as there is to attach to. Ten by ten, with the names' last digit first, 256 copies
+    # take half to a third of what they take one by one.
+    for tens in range(-(-copies // 10)):
+        ten = mujoco.MjSpec() if tens else packed
+        ten.option, ten.compiler.discardvisual = packed.option, packed.compiler.discardvisual
+        for k in range(10 * tens, min(10 * tens + 10, copies)):
+            ten.attach(_copy(load, k * bits), prefix=f"{k % 10}/", frame=ten.worldbody.add_frame())
+        if tens:
+            packed.attach(ten, prefix=str(tens), frame=packed.worldbody.add_frame())
     return _checked(load, packed.compile)
 
 
@@ -195,6 +184,29 @@ def _changes(model: mujoco.MjModel, tolerance: float, speed: float) -> bool:
         seen.append(np.concatenate([full.ravel(), data.qfrc_bias, others]))
     scale = np.concatenate([np.sqrt(np.outer(np.diag(full), np.diag(full))).ravel(), largest, largest])
     return bool(np.any(np.ptp(np.array(seen), axis=0) > tolerance * scale + 1e-12))
+
+
+def _copy(load: Load, shift: int) -> mujoco.MjSpec:
+    """Return what a packed model has of a copy whose contact bits are shifted."""
+    child = _spec(load)
+    for actuator in list(child.actuators):
+        child.delete(actuator)
+    for key in list(child.keys):
+        child.delete(key)
+    for name in load.joints:
+        # The rotor enters later, in place of what the file may have.
+        for joint in child.joints:
+            if joint.name == name:
+                joint.armature = 0.0
+        for tendon in child.tendons:
+            if tendon.name == name:
+                tendon.armature = 0.0
+    for joint in child.joints:
+        joint.frictionloss = 0.0  # friction.py's, see _joint_friction
+    for geom in child.geoms:
+        geom.contype = _signed(geom.contype << shift)
+        geom.conaffinity = _signed(geom.conaffinity << shift)
+    return child
 
 
 def _spec(load: Load) -> mujoco.MjSpec:

@@ -12,7 +12,7 @@ import pytest
 from drive_env import EmulatedDrives, motion
 from mechanics.compiled import cached
 from mechanics.loads import LOADS
-from mechanics.model import MANY, compile_packed
+from mechanics.model import COPIES_OF_MANY, compile_packed, copies_per_model
 from mechanics.packed import PackedLoad, pack
 from mechanics.stepping import step
 from mechanics.template import Template
@@ -196,16 +196,28 @@ def test_what_follows_from_masses_is_what_mujoco_finds(name):
 @pytest.mark.parametrize("load", ["two_mass", "gantry"])
 def test_many_machines_in_fewer_models_are_the_same_machines(load, monkeypatch):
     records, models = [], []
-    for many in (MANY, 200):
-        monkeypatch.setattr("mechanics.model.MANY", many)
-        with EmulatedDrives(load=load, num_machines=200, seed=3, randomise=True) as drives:
+    for rows in (COPIES_OF_MANY, ((200, 128),), ((300, 256), (200, 128))):
+        monkeypatch.setattr("mechanics.model.COPIES_OF_MANY", rows)
+        with EmulatedDrives(load=load, num_machines=300, seed=3, randomise=True) as drives:
             motion.enable(drives, mode="pv")
             drives.write("Target velocity", 200_000)
             drives.advance(0.02)
             records.append(drives.inside.records.tobytes())
             models.append([group.load.copies for group in drives.inside.groups])
-    assert models == [[64, 64, 64, 8], [128, 72]]
-    assert records[0] == records[1]
+    assert models == [[64, 64, 64, 64, 44], [128, 128, 44], [256, 44]]
+    assert records[0] == records[1] == records[2]
+
+
+@pytest.mark.parametrize(("machines", "copies"), [(16_383, 64), (16_384, 128), (65_535, 128), (65_536, 256)])
+def test_the_more_machines_there_are_the_more_of_them_a_model_holds(machines, copies):
+    assert copies_per_model(LOADS["two_mass"], machines) == copies
+
+
+def test_copies_are_named_by_their_number_in_its_order():
+    """They are attached ten by ten; names and places are those of copies that are attached one by one."""
+    model = compile_packed(LOADS["two_mass"], 123)
+    joints = [model.joint(k).name for k in range(model.njnt)]
+    assert joints == [f"{k}/{name}" for k in range(123) for name in ("motor", "twist")]
 
 
 # --- divergence -------------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tuning.auto.load_step import NOISE, SWING
 from tuning.certificate.certificate import (
     AxisCertificate,
     Certificate,
@@ -99,8 +100,10 @@ def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
         "overshoot [%]": 100.0 * max(float(beyond.max()), 0.0) / size,
         "largest following error [rad]": float(np.abs(demand - actual).max()),
         "error at the end [rad]": float(demand[-1] - actual[-1]),
-        "current at rest afterwards, RMS [% of rated]": 100.0 * float(shown.swing[axis]),
+        SWING: 100.0 * float(shown.swing[axis]),
     }
+    if shown.noise[axis] > 0.0:
+        figures[NOISE] = 100.0 * float(shown.noise[axis])
     return StepResponse("move", tuned, "rad", shown.t, demand, actual, way * shown.current[:, axis], figures)
 
 

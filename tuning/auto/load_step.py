@@ -28,6 +28,7 @@ SHARE = 0.3  # of the rated torque
 # s: until the axis stands, then recorded before the step and after it, and at the end of that looked whether it stands.
 REST, BEFORE, AFTER, LOOKED_AT = 0.1, 0.02, 0.3, 0.1
 SWING = "current at rest afterwards, RMS [% of rated]"
+NOISE = "noise of the current's measurement, RMS [% of rated]"  # where the swing is not small as it is
 
 
 def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,8 +10,8 @@ from numpy.typing import NDArray
 
 from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
-from tuning.auto.load_step import SWING, load_step
-from tuning.auto.proving import RESTLESS
+from tuning.auto.load_step import NOISE, SWING, load_step
+from tuning.auto.proving import RESTLESS, without_noise
 from tuning.auto.run import MOVE_TIME, TRIAL_TIME
 from tuning.auto.trials import faster
 
@@ -50,8 +51,7 @@ def show(run: AutoRun, where: Mask | None = None) -> None:
         later = run.response_time + TRIAL_TIME + MOVE_TIME + run.look_back_time
         again = going & ~failed & shown.restless & ~eased & run.affordable(MOVE_TIME + later) & (where is None)
         for k in map(int, np.flatnonzero(again)):
-            swing = float(shown.swing[k])
-            _ease(run, k, swing, _shook(swing, "at rest"))
+            _ease(run, k, *_shook(shown.swing[k], shown.noise[k], "at rest"))
         eased |= again
         for k in map(int, np.flatnonzero(failed)):
             axis, why = run.axes[k], shown.reason[k]
@@ -105,9 +105,13 @@ def _ease(run: AutoRun, k: int, swing: float, why: str) -> None:
     axis.eased += 1
 
 
-def _shook(swing: float, when: str) -> str:
-    allowed = f"{100.0 * RESTLESS:.0f} % is allowed"
-    return f"its current swung by {100.0 * swing:.1f} % of the rated current (RMS) {when}; {allowed}"
+def _shook(swing: float, noise: float, when: str) -> tuple[float, str]:
+    """Return by how much a current swings apart from the noise of its measurement, over the rated one; and in words."""
+    alone = float(without_noise(swing, noise))
+    told = f"its current swung by {100.0 * swing:.1f} % of the rated current (RMS) {when}"
+    if noise > 0.0:
+        told += f", {100.0 * alone:.1f} % without the noise of its measurement"
+    return alone, f"{told}; {100.0 * RESTLESS:.0f} % is allowed"
 
 
 def stand(run: AutoRun, target: Target) -> None:
@@ -129,8 +133,12 @@ def stand(run: AutoRun, target: Target) -> None:
                 _ease(run, k, swing, why)
                 again[k] = True
         if not again.any():
-            return
+            break
         show(run, again & run.going)
+    for k in np.flatnonzero(run.going).tolist():
+        if run.shown is not None and run.shown.noise[k] > 0.0:
+            _, told = _shook(run.shown.swing[k], run.shown.noise[k], "at rest")
+            run.axes[k].notes.append(told)
 
 
 def _shaking(run: AutoRun, target: Target) -> dict[int, tuple[float, str]]:
@@ -140,21 +148,37 @@ def _shaking(run: AutoRun, target: Target) -> dict[int, tuple[float, str]]:
         return {}
     found = {}
     for k in np.flatnonzero(going & shown.restless).tolist():
-        swing = float(shown.swing[k])
-        found[k] = swing, _shook(swing, "at rest")
+        found[k] = _shook(shown.swing[k], shown.noise[k], "at rest")
     if target.drives.machine is not None:
         still = run.whole_machines(going & ~shown.restless)
         write_gains(target.drives, run.gains, still)
         run.loaded |= load_step(target, still)
-        for k in np.flatnonzero(still).tolist():
-            swing = 0.01 * run.loaded[k].figures[SWING]
-            if swing > RESTLESS:
-                found[k] = swing, _shook(swing, "after a load step of 0.3 of the rated torque")
+        for k, (swing, noise) in _after_load_step(run, still).items():
+            alone, why = _shook(swing, noise, "after a load step of 0.3 of the rated torque")
+            if alone > RESTLESS:
+                found[k] = alone, why
         shook = run.whole_machines(~np.isin(np.arange(run.target.num_axes), list(found)))
         if not shook[still].all():
             # What the load step has set swinging says nothing of the next gains.
             write_gains(target.drives, run.fallbacks[-1], still & ~shook)
             target.drives.advance(CALMING)
+    return found
+
+
+def _after_load_step(run: AutoRun, where: Mask) -> dict[int, tuple[float, float]]:
+    """Return the axes whose current swings after it: by how much, and the noise in that, both over the rated one."""
+    loaded = np.zeros(len(where))
+    loaded[where] = [0.01 * run.loaded[k].figures[SWING] for k in map(int, np.flatnonzero(where))]
+    large = loaded > RESTLESS
+    if not large.any():
+        return {}
+    assert run.ground is not None, "proving makes it"
+    noise = run.ground.noise(run.gains, large)
+    found = {}
+    for k in map(int, np.flatnonzero(large)):
+        step = run.loaded[k]
+        run.loaded[k] = replace(step, figures={**step.figures, NOISE: 100.0 * float(noise[k])})
+        found[k] = float(loaded[k]), float(noise[k])
     return found
 
 

@@ -46,8 +46,10 @@ ENABLING = 5.0  # s, the longest wait for an axis that is switched on: some alig
 SHORTEST = 16.0  # counts of the encoder: a move that is shorter proves nothing
 # After a move for the record it is looked whether the axis stands, in so many places of an encoder count: a loop at its
 # edge swings between two counts in one place, and stands in another. Windows of 25 ms in each, how many of them pass
-# before, and what the current may swing (RMS about its mean, over the rated one).
+# before, and what the current may swing (RMS about its mean, over the rated one), without the noise of its measurement.
 PLACES, REST, SETTLED, RESTLESS = 3, 6, 2, 0.05
+# Cycles with slow outer loops until an axis is quiet, and windows that show the noise, of so many cycles.
+QUIETENING, NOISE_WINDOWS, NOISE_WINDOW = 100, 2, 100
 
 
 class Proof(NamedTuple):
@@ -78,7 +80,8 @@ class Shown(NamedTuple):
 
     where: Axes that made it, (num_axes,). reason: Of each axis, why it does not pass, "" if it does. cost: J by its
     measured terms, (num_axes,). swing: Of the current at rest afterwards, over the rated one (RMS), where it was most
-    of several places of an encoder count, (num_axes,).
+    of several places of an encoder count, (num_axes,). noise: What the measurement of the current makes of that,
+    alike; 0 where it was not measured, since the swing is small enough as it is.
     """
 
     t: Floats
@@ -89,21 +92,27 @@ class Shown(NamedTuple):
     reason: tuple[str, ...]
     cost: Floats
     swing: Floats
+    noise: Floats
 
     @property
     def restless(self) -> Mask:
         """Which axes shook at rest, (num_axes,)."""
-        return self.where & (self.swing > RESTLESS)
+        return self.where & (without_noise(self.swing, self.noise) > RESTLESS)
 
     def replaced(self, later: Shown) -> Shown:
         """Return this with the axes of a later recording in their place."""
-        demand, actual, current, cost, swing = (
+        demand, actual, current, cost, swing, noise = (
             np.where(later.where, getattr(later, name), getattr(self, name))
-            for name in ("demand", "actual", "current", "cost", "swing")
+            for name in ("demand", "actual", "current", "cost", "swing", "noise")
         )
         both = zip(later.where, self.reason, later.reason, strict=True)
         reason = tuple(new if made else old for made, old, new in both)
-        return Shown(self.t, demand, actual, current, self.where | later.where, reason, cost, swing)
+        return Shown(self.t, demand, actual, current, self.where | later.where, reason, cost, swing, noise)
+
+
+def without_noise(swing: Floats | float, noise: Floats | float) -> Floats:
+    """Return how much a current swings apart from the noise of its measurement; both RMS, and independent."""
+    return np.asarray(np.sqrt(np.maximum(np.square(swing) - np.square(noise), 0.0)))
 
 
 class ProvingGround:
@@ -220,6 +229,7 @@ class ProvingGround:
             traces.append(drives.record(objects, WATCH * CYCLE))
             stopped |= self._stop(where & ~stopped & self._shakes(traces[-1]))
         swing = self._swing(away, where & ~stopped)
+        measured = self._noise(gains, where & ~stopped & (swing > RESTLESS) & (swing < OSCILLATION))
         position, demanded, current = (np.concatenate([part[name] for part in traces]) for name in objects[:3])
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
         way = np.sign(self._direction * self.move.distance)
@@ -238,7 +248,41 @@ class ProvingGround:
         self._origin = np.where(where, away, self._origin)
         self._direction = np.where(where, -self._direction, self._direction)
         t = np.arange(len(demand), dtype=np.float64) * CYCLE
-        return Shown(t, demand, actual, current * 1e-3, where, reason, costs, swing)
+        return Shown(t, demand, actual, current * 1e-3, where, reason, costs, swing, measured)
+
+    def noise(self, gains: Integers, where: Mask) -> Floats:
+        """Return what the measurement of their current makes of the swing at rest of axes, over the rated one (RMS).
+
+        Args:
+            gains: That they have afterwards, (num_axes, count); the current loop works with these.
+            where: Axes, (num_axes,); those that pull at the same thing take part, too.
+        """
+        where = self.target.together(where)
+        self._begin(where)
+        return self._noise(gains, where)
+
+    def _noise(self, gains: Integers, where: Mask) -> Floats:
+        """Return the noise of axes that are enabled, (num_axes,); 0 of the others.
+
+        The outer loops are slow meanwhile, so that they do not amplify it. Their own swing, should they have one, is
+        slow as well and counts for little: noise is new in every sample, and changes by sqrt(2) of its RMS value.
+        """
+        noise = np.zeros(self.target.num_axes)
+        where = self.target.together(where)
+        if not where.any():
+            return noise
+        drives, outer = self.target.drives, self.target.device.gains.columns_of("velocity", "position")
+        slow = gains.copy()
+        slow[:, outer] = self.safe[:, outer]
+        write_gains(drives, slow, where)
+        drives.advance(QUIETENING * CYCLE)
+        shown = []
+        for _ in range(NOISE_WINDOWS):
+            current = drives.record([cia402.TORQUE_ACTUAL], NOISE_WINDOW * CYCLE)[cia402.TORQUE_ACTUAL] * 1e-3
+            change = np.sqrt(0.5 * np.mean(np.diff(current, axis=0) ** 2, axis=0))
+            shown.append(np.minimum(current.std(axis=0), change))
+        write_gains(drives, gains, where)
+        return np.where(where, np.min(shown, axis=0) / self.target.motor.rated_current, noise)
 
     def _swing(self, at: Integers, where: Mask) -> Floats:
         """Return how much the current swings at rest, over the rated one (RMS), the most of several places.
