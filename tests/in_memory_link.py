@@ -30,6 +30,7 @@ from drive_env.node.process_data import MappedObjects
 
 CYCLE = 0.001  # s
 IMAGE = 24  # bytes of an axis' image of either direction
+MOST_BEHIND = 0.01  # s
 WATCHDOG_STEP = 0.04  # s in which a node counts
 FIRST_ADDRESS = 1001
 
@@ -45,6 +46,7 @@ class MemoryNode:
         self.watchdog = 0.0  # s; 0 watches nobody
         self.emergencies = deque()
         self.is_listening = True
+        self.exchanged_at = self.lost_at = 0  # cycles at the last image, and when the master was found silent
         self._drives = drives
         self._mine = np.zeros(drives.num_axes, bool)
         self._mine[first_axis : first_axis + self.device.num_axes] = True
@@ -80,20 +82,21 @@ class MemoryNode:
         assert self.state is State.PREOP, "images are not changed while they are exchanged"
         self._outputs, self._inputs = (MappedObjects([self.port(*key) for key in keys]) for keys in (outputs, inputs))
 
-    def exchange(self, outputs):
+    def exchange(self, outputs, cycles):
         """Take an image, None for none, and return the other; None in a state without process data."""
         if self.state is not State.OP:
             return None
-        self._silent = 0.0
+        self._silent, self.exchanged_at = 0.0, cycles
         if outputs is not None:
             self._outputs.write(outputs)
         return self._inputs.pack()
 
-    def before_cycle(self):
+    def before_cycle(self, cycles):
         """Notice a master that is silent, before the cycle that would be one too many."""
         self._silent += CYCLE
         if self.state is State.OP and self.watchdog and self._silent > self.watchdog:
             self.enter(State.SAFEOP)
+            self.lost_at = cycles
             for axis in self._axes:
                 axis.trip()
 
@@ -127,16 +130,24 @@ class MemoryBus:
     def cycle(self):
         with self.turn:
             for node in self.nodes:
-                node.before_cycle()
+                node.before_cycle(self.cycles)
             self.drives.advance(CYCLE)
             self.cycles += 1
             for node in self.nodes:
                 node.after_cycle()
 
+    def let_pass(self, until, patience=60.0):
+        """Return when `until()`, or so much later [s] on a computer that is busy otherwise."""
+        deadline = time.monotonic() + patience
+        while not until() and time.monotonic() < deadline:
+            time.sleep(CYCLE)
+        assert until()
+
     def _run(self):
-        begun = time.perf_counter()
-        while not self._is_over.wait(max(begun + (self.cycles + 1) * CYCLE - time.perf_counter(), 0.0)):
+        due = time.perf_counter()
+        while not self._is_over.wait(max(due - time.perf_counter(), 0.0)):
             self.cycle()
+            due = max(due + CYCLE, time.perf_counter() - MOST_BEHIND)  # a computer busy otherwise does not catch up
 
     def __enter__(self):
         if not self.lockstep:
@@ -426,7 +437,7 @@ class MemoryLink:
                 return
             self.exchanged_at = time.monotonic()
             for k, node in enumerate(self.bus.nodes):
-                inputs = node.exchange(outputs[k])
+                inputs = node.exchange(outputs[k], self.bus.cycles)
                 if is_cycle and inputs is not None:
                     for images in self.takers:
                         images[k].append(inputs)
