@@ -17,7 +17,7 @@ from drive_env.own_packages import ROOT
 from drive_env.whole_file import keep_names
 
 HEADER = "# The whole experiment of this run. It repeats from this file: drive-tune sweep --config settings.toml\n"
-_PACKAGES = ("numpy", "numba", "llvmlite", "mujoco")
+_PACKAGES = ("drive-env", "numpy", "numba", "llvmlite", "mujoco")
 _OURS = tuple(ROOT / name for name in ("drive_env", "mechanics", "tuning", "agents"))
 
 
@@ -57,7 +57,8 @@ def versions() -> dict[str, str]:
     """Return what decides the digits: packages, our sources, Python, the processor for which kernels are compiled."""
     import llvmlite.binding
 
-    found = {"drive-env": __version__} | {name: importlib.metadata.version(name) for name in _PACKAGES}
+    found = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    found["drive-env"] = __version__  # which an editable installation may have outgrown
     found["sources"] = SOURCES
     return found | {"python": platform.python_version(), "processor": str(llvmlite.binding.get_host_cpu_name())}
 
