@@ -93,6 +93,7 @@ def parts_of(text: str) -> tuple[str, str]:
 
 def with_headings(text: str) -> str:
     """Return a class' text with a heading before each of its parts, which the docstring begins with a known word."""
+    text = re.sub(r" (?=`info`: )", "\n\n", text, count=1)  # where it follows in the same paragraph
     for word, heading in (("Action", "Action space"), ("Observation", "Observation space"),
                           ("(?:The reward|Reward)", "Reward and end"), ("`info`", "Info")):  # fmt: skip
         text = re.sub(rf"(?m)^(?={word}\b|{word}[:,])", f"## {heading}\n\n", text, count=1)

@@ -180,10 +180,8 @@ class Tracking(Lanes):
     | 8A + 1 | its rate | rad/s | -50 | 50 |
 
     The reward is the sum of weighted terms, each in 0...1 (`info["reward_terms"]`). `terminated`: a drive tripped, its
-    machine left physics, or the pole fell; `truncated`: time ran out.
-
-    `info`: "reward_terms"; "parameters" of lanes that begin, the true machine, not on a bus; "fault" once a lane ended
-    so, a name or several, "" of the others.
+    machine left physics, or the pole fell; `truncated`: time ran out. `info`: "reward_terms"; "parameters" of lanes
+    that begin, the true machine, not on a bus; "fault" once a lane ended so, a name or several, "" of the others.
 
     Args:
         num_envs: Lanes.
