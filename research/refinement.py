@@ -350,7 +350,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("agent", nargs="?", type=Path, help="the controller (.npz); without it the load's baseline")
-    parser.add_argument("--load", choices=list(SEARCHES), help="load, where no agent says it")
+    parser.add_argument("--load", choices=list(SEARCHES), help="load, if the agent does not name it")
     parser.add_argument("--out", type=Path, required=True, help="file of the refined one (.npz)")
     parser.add_argument("--seed", type=int, default=0, help="seed of machines and candidates")
     arguments = parser.parse_args()

@@ -517,7 +517,7 @@ def test_an_onnx_policy_refuses_what_is_no_number(tmp_path):
     export(bundle(), tmp_path / "agent.onnx")
     policy = OnnxPolicy(tmp_path / "agent.onnx")
     assert np.allclose(policy.act(observations()), policy_of(bundle()).act(observations()), atol=1e-5)
-    with pytest.raises(PolicyError, match="is no number"):
+    with pytest.raises(PolicyError, match="is not a number"):
         policy.act(np.full(ENTRIES, np.nan))
     with pytest.raises(PolicyError, match="does not take this observation"):
         policy.act(np.zeros(ENTRIES + 1))

@@ -362,7 +362,7 @@ def test_gains_that_are_too_slow_to_arrive_do_not_pass():
             target, [plant] * 2, (target.low, target.high), np.stack([good] * 2), np.stack([good] * 2)
         )
         proof = ground.run(np.stack([slow, good]), np.ones(2, bool))
-    assert "of the move away at the end; 20 % is allowed" in proof.reason[0]
+    assert "of the move; 20 % is allowed" in proof.reason[0]
     assert proof.passed.tolist() == [False, True]
 
 

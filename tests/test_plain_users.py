@@ -77,7 +77,7 @@ def test_a_zip_of_something_else_is_none(tmp_path):
     file = tmp_path / "other.zip"
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("letter.txt", "dear sir")
-    with pytest.raises(CheckpointError, match="is no checkpoint of drive-agent"):
+    with pytest.raises(CheckpointError, match="is not a checkpoint of drive-agent"):
         open_policy(str(file), trust=True)
 
 

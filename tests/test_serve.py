@@ -251,7 +251,7 @@ def test_a_bus_is_read_as_it_is_written(tmp_path):
     ("faults = 1\n[[machines]]", "faults = 1 must be a table"),
     ("[[machines]]\n[faults]\ndrop = 2", "drop = 2.0 must be a share of all frames, 0 to 1"),
     ("[[machines]]\n[faults]\nloss = 2", "faults: key 'loss' is unknown; there are drop, delay"),
-    ("[[machines", "is no TOML file"),
+    ("[[machines", "is not a TOML file"),
 ])  # fmt: skip
 def test_a_bus_that_cannot_be_says_why(tmp_path, text, message):
     with pytest.raises(BusConfigError) as error:

@@ -311,7 +311,8 @@ class GainScheduling(Lanes):
         n, axes = self.num_envs, self.drives.num_axes
         if axes != n * self._axes:
             raise ValueError(
-                f"{n} lanes of load {load.name!r} with {self._axes} axes each need {n * self._axes} drives, not {axes}"
+                f"{n} environments of load {load.name!r} with {self._axes} axes each need {n * self._axes} drives, "
+                f"not {axes}"
             )
         self._prepare_scales(load)
         self._prepare_machines()

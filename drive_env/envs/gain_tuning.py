@@ -203,7 +203,7 @@ class GainTuning(Lanes):
         try:
             axes, rest = divmod(self.drives.num_axes, max(num_envs, 1))
             if rest or not axes:
-                raise ValueError(f"{self.drives.num_axes} axes cannot be shared by {num_envs} lanes")
+                raise ValueError(f"{self.drives.num_axes} axes cannot be shared by {num_envs} environments")
             self._axes = axes
             if self._owned:
                 self._make_world(num_envs)

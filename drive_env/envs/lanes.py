@@ -112,7 +112,9 @@ class Lanes(VectorEnv[Any, Any, Any]):
             return observation, reward, terminated, truncated, info
         own = np.asarray(self.reward_function(observation, action, info), float)
         if own.shape != (self.num_envs,) or not np.isfinite(own).all():
-            raise ValueError(f"reward returned {own!r}; it must return {self.num_envs} numbers, one for each lane")
+            raise ValueError(
+                f"reward returned {own!r}; it must return {self.num_envs} numbers, one for each environment"
+            )
         return observation, own.copy(), terminated, truncated, info
 
     def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
@@ -176,8 +178,8 @@ class Lanes(VectorEnv[Any, Any, Any]):
         before = self._ended
         if self._some_ended and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gymnasium.error.ResetNeeded(
-                f"lane {int(np.flatnonzero(before)[0])} has ended and autoreset is disabled; "
-                'call reset(options={"reset_mask": ended lanes})'
+                f"environment {int(np.flatnonzero(before)[0])} has ended and autoreset is disabled; "
+                'call reset(options={"reset_mask": ended})'
             )
         if not _are_finite(actions):
             actions = _finite_actions(actions, before)
@@ -231,7 +233,7 @@ class Lanes(VectorEnv[Any, Any, Any]):
                 f"{chosen.dtype} {chosen.shape}"
             )
         if not self._has_begun and not chosen.all():
-            raise ValueError("the first reset must begin every lane; leave reset_mask out")
+            raise ValueError("the first reset must be of all environments; leave reset_mask out")
         return chosen
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
@@ -240,7 +242,9 @@ class Lanes(VectorEnv[Any, Any, Any]):
         if isinstance(seed, (int, np.integer)):
             return [int(seed) + lane for lane in range(self.num_envs)]
         if len(seed) != self.num_envs:
-            raise ValueError(f"{len(seed)} seeds do not fit {self.num_envs} lanes; give one number or one per lane")
+            raise ValueError(
+                f"{len(seed)} seeds do not fit {self.num_envs} environments; give one number or one per environment"
+            )
         return seed
 
 
@@ -375,8 +379,8 @@ def _finite_actions(actions: Any, ignored: Mask) -> NDArray[Any]:
     if wrong.size:
         lane, entry = wrong[0]
         raise ValueError(
-            f"entry {entry} of the action of environment {lane} is {rows[lane, entry]:g}, no finite number; nothing "
-            "was sent. A policy whose training diverged gives such actions: take an earlier checkpoint of it"
+            f"entry {entry} of the action of environment {lane} is {rows[lane, entry]:g}, not a finite number; "
+            "nothing was sent. A policy whose training diverged returns such actions: use an earlier checkpoint of it"
         )
     rows[ignored & ~np.isfinite(rows).all(axis=1)] = 0.0
     return values

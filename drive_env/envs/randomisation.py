@@ -318,7 +318,7 @@ class RandomMachines:
                 self._set(one)
             except ValueError as error:
                 if attempt == _TRIES - 1:
-                    raise ValueError(f"{_TRIES} draws in a row gave machines that cannot be: {error}") from error
+                    raise ValueError(f"{_TRIES} draws in a row gave impossible machines: {error}") from error
                 self._draw(lane, rng, stage)
             else:
                 return
@@ -346,7 +346,7 @@ def _from_file(path: Path, includers: tuple[str, ...]) -> Distributions:
     try:
         table = read_toml(path)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no TOML: {error}") from error
+        raise ValueError(f"{path} is not TOML: {error}") from error
     return _from_table(path.name, table, includers)
 
 

@@ -236,7 +236,7 @@ class Tracking(Lanes):
     def _spaces(self, num_envs: int) -> tuple[Box, Box]:
         axes, rest = divmod(self.drives.num_axes, max(num_envs, 1))
         if rest or not axes:
-            raise ValueError(f"{self.drives.num_axes} axes cannot be shared by {num_envs} lanes")
+            raise ValueError(f"{self.drives.num_axes} axes cannot be shared by {num_envs} environments")
         self._axes = axes
         self._has_sensor = self.config.task.joint is not None
         high = np.concatenate([np.tile(cycle.AXIS_HIGH, axes), cycle.LOAD_HIGH if self._has_sensor else []])

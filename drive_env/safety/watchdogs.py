@@ -175,8 +175,8 @@ class Watchdogs:
             self._drives.hear_errors(None)
         if len(beats) > 1:
             raise SafetyError(
-                "pace='lockstep' is for an emulator that is served with --lockstep, and time passes on this bus by "
-                "itself: nobody would watch between two calls; open the drives with pace='real-time'"
+                "pace='lockstep' is for an emulator that is served with --lockstep, and time passes by itself on this "
+                "bus: nothing would monitor the drives between two calls; open them with pace='real-time'"
             )
         self._is_lockstep_proved = True
 
@@ -200,7 +200,7 @@ class Watchdogs:
             logger.error(
                 "node %d could not be proved to be off: %s. Look at the machine, and keep the emergency stop at hand",
                 node,
-                "its watchdog stays, and it hears no more heartbeats, so that it stops by itself"
+                "its watchdog stays on and gets no more heartbeats, so that the drive stops by itself"
                 if control.kind != "none"
                 else "it has no watchdog",
             )

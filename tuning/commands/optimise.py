@@ -215,7 +215,7 @@ def _check_unfinished(folder: Path, journal: Path | None) -> None:
 
 def _kept_in(journal: Path) -> str:
     """Return what an interrupted search with a journal says."""
-    return f"interrupted; the trials made are in {journal}: the same command goes on from there"
+    return f"interrupted; the trials made are in {journal}: the same command continues from there"
 
 
 def _search_bus(target: Any, settings: Any, before: Path, folder: Path, options: dict[str, Any]) -> Any:
