@@ -12,7 +12,7 @@ from pathlib import Path
 
 from stable_baselines3 import PPO
 
-from drive_env.envs.stable_baselines import LanesVecEnv
+from drive_env.envs.stable_baselines import DriveVecEnv
 from drive_env.envs.tracking import Tracking
 
 FLYWHEEL = """<mujoco model="flywheel">
@@ -29,8 +29,8 @@ FLYWHEEL = """<mujoco model="flywheel">
 
 @dataclass
 class Arguments:
-    steps: int = 100_000  # of all lanes together
-    lanes: int = 32
+    steps: int = 100_000  # of all environments together
+    num_envs: int = 32
     seed: int = 0
 
 
@@ -39,17 +39,17 @@ def main(arguments: Arguments) -> None:
         path = Path(folder) / "flywheel.xml"
         path.write_text(FLYWHEEL)
         laws = {"parameters": {"motor.coulomb": {"law": "uniform", "low": 0.5, "high": 2.0, "of": "default"}}}
-        lanes = Tracking(arguments.lanes, load=str(path), mode="csp", action="offset", amplitude=1.0, speed=15.0,
+        envs = Tracking(arguments.num_envs, load=str(path), mode="csp", action="offset", amplitude=1.0, speed=15.0,
                          distributions=laws, autoreset_mode="SameStep")  # fmt: skip
-        model = PPO("MlpPolicy", LanesVecEnv(lanes), n_steps=64, batch_size=512, seed=arguments.seed, device="cpu")
+        model = PPO("MlpPolicy", DriveVecEnv(envs), n_steps=64, batch_size=512, seed=arguments.seed, device="cpu")
         model.learn(arguments.steps)
-        observation, _ = lanes.reset(seed=1_000_000)
+        observation, _ = envs.reset(seed=1_000_000)
         error = 0.0
-        for _ in range(lanes.config.steps):
-            observation = lanes.step(model.predict(observation, deterministic=True)[0])[0]
-            error += float(abs(observation[:, 0]).mean()) / lanes.config.steps
-        print(f"mean following error {error * lanes.config.amplitude:.3f} revolutions")
-        lanes.close()
+        for _ in range(envs.config.steps):
+            observation = envs.step(model.predict(observation, deterministic=True)[0])[0]
+            error += float(abs(observation[:, 0]).mean()) / envs.config.steps
+        print(f"mean following error {error * envs.config.amplitude:.3f} revolutions")
+        envs.close()
 
 
 if __name__ == "__main__":

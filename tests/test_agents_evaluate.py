@@ -25,7 +25,7 @@ from agents.policies.agent_file import AgentFile, BundleError
 from agents.policies.guard import GuardLimits
 from agents.policies.open_policy import PolicyNotFoundError, open_policy, opened
 from agents.policies.policy import PolicyError, policy_of
-from agents.training.tasks import make_lanes
+from agents.training.tasks import make_environments
 from drive_env import CanDrives, EmulatedDrives, Limits, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
@@ -316,7 +316,7 @@ def test_in_real_time_machines_are_served_by_processes_of_their_own(tmp_path):
 
 
 def test_drawn_machines_are_those_of_the_seed_and_number():
-    config = make_lanes("tracking", 1, SHORT | {"distributions": "two_mass"}).config
+    config = make_environments("tracking", 1, SHORT | {"distributions": "two_mass"}).config
     three, five = draw_machines(config, 3, 7), draw_machines(config, 5, 7)
     assert five[:3] == three and three[0].parameters != three[1].parameters
     assert draw_machines(config, 1, 8)[0] != three[0]

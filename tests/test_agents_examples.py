@@ -14,13 +14,13 @@ from agents.policies.agent_file import AgentFile
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 RUNS = {
-    "own_reward": (["--steps", "256", "--lanes", "4"], "mean return of 4 episodes"),
-    "own_load": (["--steps", "256", "--lanes", "4"], "mean following error"),
+    "own_reward": (["--steps", "256", "--num-envs", "4"], "mean return of 4 episodes"),
+    "own_load": (["--steps", "256", "--num-envs", "4"], "mean following error"),
     "own_algorithm": (
         ["--generations", "2", "--candidates", "5", "--machines", "2", "--duration", "0.05"],
         "weights of the observation's entries",
     ),
-    "curriculum": (["--steps", "512", "--lanes", "4"], "trained up to stage"),
+    "curriculum": (["--steps", "512", "--num-envs", "4"], "trained up to stage"),
     "policy_at_1_khz": (["--seconds", "0.6"], "velocity follows within"),
 }
 

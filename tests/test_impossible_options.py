@@ -31,7 +31,7 @@ COMMANDS = [
     *(
         ("drive-tune", (command, option, number), rf"{option} must be (1 or more|65536 at most), not {number}")
         for command, option in (("identify", "--machines"), ("response", "--machines"), ("rules", "--machines"),
-                                ("optimise", "--lanes"))
+                                ("optimise", "--copies"))
         for number in ("1000000000", HUGE, "0", "-1")
     ),
     ("drive-tune", ("optimise", "--searches", "1000000000"), "--searches must be 1 or more, and 10000 at most"),

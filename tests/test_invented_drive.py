@@ -110,7 +110,7 @@ def test_a_search_finds_gains_within_its_ranges():
 
 def test_the_command_writes_them_by_their_names(tmp_path):
     line = ["optimise", "--device", INVENTED, "--load", "inertia", "--sampler", "random", "--trials", "2",
-            "--lanes", "2", "--out", str(tmp_path / "found")]  # fmt: skip
+            "--copies", "2", "--out", str(tmp_path / "found")]  # fmt: skip
     done = CliRunner().invoke(app, line)
     assert done.exit_code == 0, done.output
     head = (tmp_path / "found" / "trials.csv").read_text(encoding="utf-8").splitlines()[0]

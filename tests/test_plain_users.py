@@ -96,7 +96,7 @@ def test_a_function_gives_the_rewards_of_all_lanes(mode):
         before = lanes._ended.copy()
         _, reward, terminated, truncated, info = lanes.step(action)
         told = info.get("final_info", info)
-        wanted = np.where(before, 0.0, by_terms(None, action, told))  # a lane that begins anew earns nothing
+        wanted = np.where(before, 0.0, by_terms(None, action, told))  # an environment that begins anew earns nothing
         np.testing.assert_allclose(reward, wanted, rtol=1e-12)
         if mode == "NextStep":
             assert not (before & (terminated | truncated)).any()

@@ -427,7 +427,7 @@ TEXT = DEFAULT.read_text(encoding="utf-8")
     ("velocity_rpm = 1500.0", "", "excitation: needs velocity_rpm or velocity_pps; it has none"),
     ("acceleration_rpm_per_s = 100000.0", "acceleration_rpm_per_s = 1e9", r"acceleration is \d+ as 6083h:00 "),
     ("acceleration_rpm_per_s = 100000.0", "acceleration_rpm_per_s = 0", "and an acceleration above 0"),
-    ("sampling_period = 0.001", "sampling_period = 0.0015", "sampling_period = 0.0015 s is not a whole .*; use 0.002 s"),
+    ("sampling_period = 0.001", "sampling_period = 0.0015", "= 0.0015 s is not a whole .*; use 0.002 s"),
     ("sampling_period = 0.001", "sampling_period = 0", "sampling_period = 0 s is not a whole number .* use 0.001 s"),
     ("sampling_period = 0.001", "sampling_period = 0.02", "leaves 9 samples after 0.02 s; at least 20 .*: use 0.42"),
     ("velocity_time = 0.02", "velocity_time = 0.0205", "velocity_time = 0.0205 s is not a whole number .* of 0.001 s"),
