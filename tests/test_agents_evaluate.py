@@ -299,7 +299,7 @@ def test_a_machine_that_cannot_be_judged_is_missing_on_both_sides():
             return np.full((len(observation), 1), np.nan if last_one else 0.1)
 
     both = on_both_sides(Wild(), "tracking", SHORT, machines=3, lockstep=True, guard=PATIENT)
-    assert list(both.missing) == [2] and "is nan, no number" in both.missing[2]
+    assert list(both.missing) == [2] and "is nan, not a number" in both.missing[2]
     assert both.inside.seeds == both.bus.seeds == [0, 1]
 
 
@@ -594,7 +594,7 @@ def test_the_command_writes_the_same_bytes_on_processes(tmp_path):
     (("--workers", 2, "--bus"), "--workers is for episodes on the emulator; leave it out on a bus, with --gap"),
     (("--cluster", "tcp://x:1", "--gap", 2), "--cluster is for episodes on the emulator; leave it out on a bus"),
     (("--workers", 0), "--workers 0 is below 1; give the number of processes"),
-    (("--workers", 1, "--cluster", "tcp://x:1"), "choose --workers or --cluster"),
+    (("--workers", 1, "--cluster", "tcp://x:1"), "choose one"),
 ])  # fmt: skip
 def test_what_would_be_ignored_is_refused(more, message):
     found = run("evaluate", "tracking_two_mass", *more)

@@ -175,7 +175,7 @@ def test_verify_tells_by_its_exit_code_whether_a_file_was_changed(certificate, t
     save_certificate(certificate, tmp_path)
     path = tmp_path / name
     done = verify(path)
-    assert (done.exit_code, done.stdout) == (0, f"{path} is as it was written\n")
+    assert (done.exit_code, done.stdout) == (0, f"{path} is unchanged\n")
     path.write_text(path.read_text(encoding="utf-8").replace("0.3612", "0.3613"), encoding="utf-8")
     done = verify(path)
     assert done.exit_code == 1

@@ -261,7 +261,7 @@ def test_autoreset_modes_tell_the_same_episodes_and_their_final_observations(kin
     with lanes_of(kind, 2, autoreset_mode="Disabled") as lanes:
         disabled = run(lanes, given[:steps])
         np.testing.assert_array_equal(disabled[0], observations[: steps + 1])
-        with pytest.raises(gymnasium.error.ResetNeeded, match="lane 0 has ended"):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="environment 0 has ended"):
             lanes.step(given[0])
         again, _ = lanes.reset(options={"reset_mask": np.array([True, True])})
         np.testing.assert_array_equal(again, observations[steps + 1])

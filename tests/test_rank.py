@@ -358,7 +358,7 @@ def test_the_command_lists_tuners_and_suites():
         (("rank", "--count", "0"), "count must be 1 or more"),
         (("rank", "--seed", "-1"), "--seed must be 0 or more, not -1"),
         (("optimise", "--sampler", "luck"), "no sampler is named 'luck'"),
-        (("optimise", "--sampler", "cmaes", "--objective", "speed", "--objective", "current"), "CMA-ES knows one"),
+        (("optimise", "--sampler", "cmaes", "--objective", "speed", "--objective", "current"), "CMA-ES has one"),
         (("optimise", "--copies", "0"), "--copies must be 1 or more"),
         (("optimise", "--load", "pendulum"), "no load is named 'pendulum'"),
         (("optimise", "--bus"), "--travel is missing"),

@@ -77,7 +77,7 @@ def test_it_prints_two_lines_that_join_the_bus(tmp_path):
         output, errors = process.communicate(timeout=30)
     assert process.returncode == 0
     assert errors == ""
-    assert output.splitlines()[-1] == "drive-env: ended"
+    assert output.splitlines()[-1] == "drive-env: stopped"
     assert re.search(r"\d+ frames in 0\.000 s of the drives' time, 0 error frames, 0 lost", output)
 
 
@@ -118,7 +118,7 @@ def test_a_signal_ends_it_with_code_0_and_one_line(tmp_path, number):
     with served(cwd=tmp_path) as (process, _):
         process.send_signal(number)
         output, errors = process.communicate(timeout=30)
-    assert (process.returncode, output, errors) == (0, "drive-env: ended\n", "")
+    assert (process.returncode, output, errors) == (0, "drive-env: stopped\n", "")
 
 
 def test_a_duration_ends_it_and_stats_say_how_late_and_how_full(tmp_path):

@@ -122,7 +122,7 @@ def test_a_rollback_that_fails_names_the_file_that_helps(target, tmp_path, monke
 
     monkeypatch.setattr(target.drives, "write", refuse)
     with (
-        pytest.raises(BusError, match=r"cable is out.*drive-tune undo .*before\.toml brings back"),
+        pytest.raises(BusError, match=r"cable is out.*drive-tune undo .*before\.toml restores"),
         Transaction(target, tmp_path / "before.toml"),
     ):
         change(target.drives)
@@ -322,7 +322,7 @@ def test_a_change_that_the_drives_keep_is_undone_for_good(tmp_path, monkeypatch)
             target.drives.reset_node()
             assert gains(target.drives).tolist() == np.repeat(TRIED, 2, axis=0).tolist()
         done = drive_tune("undo", transaction.path, "--yes")
-        assert re.search(r"^10 parameters restored, \d+ verified .*; the drives keep them$", done.stdout, re.MULTILINE)
+        assert re.search(r"^10 parameters restored, \d+ verified .*; stored in the drives$", done.stdout, re.MULTILINE)
         with opened(channel) as target:
             target.drives.reset_node()
         assert [gains(machine).tolist() for machine in machines] == before

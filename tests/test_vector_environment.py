@@ -106,7 +106,7 @@ def test_disabled_mode_waits_for_the_user():
     lanes = Counting(2, autoreset_mode=AutoresetMode.DISABLED)
     first = lanes.reset(seed=0)[0]
     steps_seen(lanes, 3)
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"lane 0 has ended.*reset_mask"):
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"environment 0 has ended.*reset_mask"):
         lanes.step(zeros(lanes))
     observation = lanes.reset(options={"reset_mask": np.array([True, False])})[0]
     assert observation[0, 1] == 0 and observation[1].tolist() == [first[1, 0], 3]
@@ -143,7 +143,7 @@ def test_a_mask_that_is_none_is_refused(mask):
 
 
 def test_the_first_reset_begins_every_lane():
-    with pytest.raises(ValueError, match="the first reset must begin every lane"):
+    with pytest.raises(ValueError, match="the first reset must be of all environments"):
         Counting(2).reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(gymnasium.error.ResetNeeded):
         Counting(1).step(np.zeros((1, 1), np.float32))
