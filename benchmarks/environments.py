@@ -1,4 +1,4 @@
-"""Figures of the environments: Tracking in lanes and alone, GainScheduling, memory.
+"""Figures of the environments: Tracking vectorised and single, GainScheduling, memory.
 
 What is compared is measured in turn, so that a slower moment of the machine slows both.
 """
@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from drive_env.envs.gain_scheduling import GainScheduling
-from drive_env.envs.lanes import OneLane
 from drive_env.envs.tracking import Tracking
+from drive_env.envs.vector_environment import SingleEnvironment
 
 LANES = 64
-MANY_LANES = 1024
+MANY_ENVS = 1024
 ROUNDS = 12
 MEMORY = (
     "import re, sys, numpy as np; from pathlib import Path; from drive_env.envs.tracking import Tracking;"
@@ -63,7 +63,7 @@ def vectorised(num_envs: int, threads: tuple[int, ...], calls: int) -> dict[str,
         rounds = 3 if num_envs == LANES else 1
         whole.append(min(times_in_turn_once(step, episode) for _ in range(rounds)))
     for k, count in enumerate(threads):
-        name = f"Tracking, two_mass, {num_envs} lanes, {count} thread{'s' if count > 1 else ''}"
+        name = f"Tracking, two_mass, {num_envs} environments, {count} thread{'s' if count > 1 else ''}"
         found[f"{name}: env-steps/s"] = num_envs / times[2 * k]
         found[f"{name}: env-steps/s with autoreset"] = num_envs / whole[k]
         found[f"{name}: overhead over advance"] = times[2 * k] / times[2 * k + 1] - 1.0
@@ -83,7 +83,7 @@ def times_in_turn_once(function: Callable[[], Any], calls: int) -> float:
 
 
 def gain_scheduling() -> dict[str, float]:
-    """Return steps/s of 10 ms, their overhead over bare `advance`, and the time of a reset of all lanes [ms]."""
+    """Return steps/s of 10 ms, their overhead over bare `advance`, and the time of a reset of all environments [ms]."""
     lanes = GainScheduling(LANES, num_threads=1)
     lanes.reset(seed=0)
     given = np.random.default_rng(0).uniform(-1, 1, (256, *(lanes.action_space.shape or ()))).astype(np.float32)
@@ -103,7 +103,7 @@ def gain_scheduling() -> dict[str, float]:
 
 def alone() -> dict[str, float]:
     """Return steps/s of the single environment, and of bare `advance` of its drives."""
-    env = OneLane(Tracking(1, autoreset_mode="Disabled", num_threads=1, duration=1e6 / 1000))
+    env = SingleEnvironment(Tracking(1, autoreset_mode="Disabled", num_threads=1, duration=1e6 / 1000))
     env.reset(seed=0)
     action = np.zeros(1, np.float32)
     drives = env.lanes.drives  # type: ignore[attr-defined]
@@ -113,13 +113,13 @@ def alone() -> dict[str, float]:
 
 
 def memory() -> dict[str, float]:
-    """Return the largest memory of a process with many lanes, and of one with a single lane [MB]; on Linux alone."""
+    """Return the largest memory of a process with many environments and with one [MB]; on Linux only."""
     if sys.platform != "linux":
         return {}
     found = {}
-    for lanes in (1, MANY_LANES):
+    for lanes in (1, MANY_ENVS):
         run = subprocess.run([sys.executable, "-c", MEMORY, str(lanes)], capture_output=True, text=True, check=True)
-        found[f"memory of a process, {lanes} lanes [MB]"] = int(run.stdout) / 1024
+        found[f"memory of a process, {lanes} environments [MB]"] = int(run.stdout) / 1024
     return found
 
 
@@ -127,7 +127,7 @@ def figures() -> dict[str, float]:
     """Return all figures of the environments."""
     return {
         **vectorised(LANES, (1,), 200),
-        **vectorised(MANY_LANES, (1, 2), 20),
+        **vectorised(MANY_ENVS, (1, 2), 20),
         **alone(),
         **gain_scheduling(),
         **memory(),

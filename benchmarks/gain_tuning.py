@@ -35,5 +35,6 @@ def trials_per_second(load: str = "two_mass", lanes: int = LANES) -> float:
 def figures() -> dict[str, float]:
     """Return all figures of GainTuning."""
     return {
-        f"{load}, {LANES} lanes, 1 core [trials of 250 ms/s]": trials_per_second(load) for load in ("two_mass", "belt")
+        f"{load}, {LANES} environments, 1 core [trials of 250 ms/s]": trials_per_second(load)
+        for load in ("two_mass", "belt")
     }

@@ -32,7 +32,7 @@ def training(environment: str, section: str | None, rollouts: int) -> dict[str, 
         train(TrainingRun(environment, "ppo", given, segments=1), folder, report=told.append)
     fastest = max(told, key=lambda progress: progress.speed)
     load, lanes = given["env_kwargs"]["load"], given["n_envs"]
-    name = f"PPO, {environment.partition('/')[2]}, {load}, {lanes} lanes, {cores} threads"
+    name = f"PPO, {environment.partition('/')[2]}, {load}, {lanes} environments, {cores} threads"
     return {
         f"{name}: steps/s": fastest.speed,
         f"{name}: the environment's share of wall time": fastest.environment_share,

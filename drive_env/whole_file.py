@@ -111,20 +111,18 @@ def check_seal(path: Path, table: Mapping[str, Any], *, unchecked: bool = False)
     check = table.get(_CHECK)
     stated = check.get(_SUM) if isinstance(check, dict) else None
     if stated is None and "format" in table:
-        raise FileChangedError(
-            f"{path} is torn: it ends before its check sum, and what is missing nobody knows; take another copy"
-        )
+        raise FileChangedError(f"{path} is incomplete: it ends before its check sum; take another copy")
     if unchecked:
         return
     if stated is None:
         raise FileChangedError(
-            f"{path} has no check sum: it was written by hand, or by a version that knew none, so that neither whether "
-            "it is whole nor of which drive it is can be checked. Look through it, then say --unchecked"
+            f"{path} has no check sum: it was written by hand, or by an older version, so that neither its "
+            "completeness nor its drive can be checked. Read through it, then add --unchecked"
         )
     if content_hash({name: value for name, value in table.items() if name != _CHECK}) != stated:
         raise FileChangedError(
             f"{path} was changed since it was written: its content does not match its check sum. If you changed it, "
-            "look through it, then say --unchecked; else take another copy"
+            "read through it, then add --unchecked; otherwise take another copy"
         )
 
 

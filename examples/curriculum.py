@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
-from drive_env.envs.stable_baselines import LanesVecEnv
+from drive_env.envs.stable_baselines import DriveVecEnv
 from drive_env.envs.tracking import Tracking
 
 
@@ -44,7 +44,7 @@ class Curriculum(BaseCallback):
 def main(arguments: Arguments) -> None:
     envs = Tracking(arguments.environments, load="two_mass", mode="csp", action="offset", distributions="two_mass",
                      duration=0.25, autoreset_mode="SameStep")  # fmt: skip
-    model = PPO("MlpPolicy", LanesVecEnv(envs), n_steps=64, batch_size=512, seed=arguments.seed, device="cpu")
+    model = PPO("MlpPolicy", DriveVecEnv(envs), n_steps=64, batch_size=512, seed=arguments.seed, device="cpu")
     model.learn(arguments.steps, callback=Curriculum(envs, arguments.full_at * arguments.steps))
     print(f"trained up to stage {envs.stage:.2f}")
     envs.close()

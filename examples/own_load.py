@@ -13,7 +13,7 @@ from pathlib import Path
 
 from stable_baselines3 import PPO
 
-from drive_env.envs.stable_baselines import LanesVecEnv
+from drive_env.envs.stable_baselines import DriveVecEnv
 from drive_env.envs.tracking import Tracking
 
 FLYWHEEL = """<mujoco model="flywheel">
@@ -42,7 +42,7 @@ def main(arguments: Arguments) -> None:
         distributions = {"parameters": {"motor.coulomb": {"law": "uniform", "low": 0.5, "high": 2.0, "of": "default"}}}
         envs = Tracking(arguments.environments, load=str(path), mode="csp", action="offset", amplitude=1.0, speed=15.0,
                          distributions=distributions, autoreset_mode="SameStep")  # fmt: skip
-        model = PPO("MlpPolicy", LanesVecEnv(envs), n_steps=64, batch_size=512, seed=arguments.seed, device="cpu")
+        model = PPO("MlpPolicy", DriveVecEnv(envs), n_steps=64, batch_size=512, seed=arguments.seed, device="cpu")
         model.learn(arguments.steps)
         observation, _ = envs.reset(seed=1_000_000)
         error = 0.0

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import VectorWrapper
 from stable_baselines3 import PPO
 
-from drive_env.envs.stable_baselines import LanesVecEnv
+from drive_env.envs.stable_baselines import DriveVecEnv
 from drive_env.envs.tracking import Tracking
 
 
@@ -26,7 +26,7 @@ class Arguments:
 class Thrifty(VectorWrapper):
     """Pays for tracking and fines copper losses: the square of the current, entry 4 of an axis."""
 
-    def __getattr__(self, name):  # LanesVecEnv needs more than Gymnasium's wrappers hand through
+    def __getattr__(self, name):  # DriveVecEnv needs more than Gymnasium's wrappers hand through
         return getattr(self.env, name)
 
     def step(self, actions):
@@ -39,7 +39,7 @@ class Thrifty(VectorWrapper):
 
 def main(arguments: Arguments) -> None:
     envs = Tracking(arguments.environments, load="two_mass", mode="csp", action="offset", autoreset_mode="SameStep")
-    env = LanesVecEnv(Thrifty(envs))
+    env = DriveVecEnv(Thrifty(envs))
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=512, seed=arguments.seed, device="cpu")
     model.learn(arguments.steps)
     env.seed(1_000_000)

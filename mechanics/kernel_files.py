@@ -82,7 +82,7 @@ class KernelFiles:
                 found, kernel = pickle.loads(data)
                 if found == self._identity(key):
                     return kernel
-        logger.warning("the compiled kernel %s is damaged or of another version; it is compiled anew", path)
+        logger.warning("the compiled kernel %s is damaged or of another version; it is compiled again", path)
         _remove(path)
         return self._missing()
 
@@ -131,8 +131,8 @@ def _tell_compiling() -> None:
 @cache
 def _tell_not_kept(folder: str, reason: str | None) -> None:
     logger.warning(
-        "compiled kernels cannot be kept in %s: %s; every program compiles them anew. Make room, or name another "
-        "folder in DRIVE_ENV_CACHE",
+        "compiled kernels cannot be stored in %s: %s; every program compiles them again. Make room, or set "
+        "DRIVE_ENV_CACHE to another folder",
         folder,
         reason,
     )

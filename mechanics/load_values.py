@@ -170,7 +170,7 @@ def check_places(load: Load, model: mujoco.MjModel, joints: Sequence[str]) -> No
         if not found:
             known = ", ".join(name for fields in places for name in fields)
             raise ValueError(
-                f"load {load.name!r}: its parameter {parameter.name!r} is no {parameter.field!r}; there are {known}"
+                f"load {load.name!r}: its parameter {parameter.name!r} is not a {parameter.field!r}; there are {known}"
             )
         if not any(parameter.element in names for names in found):
             raise ValueError(

@@ -51,7 +51,7 @@ def resolve(load: Load) -> Load:
         f"{', '.join(_fixed_tendons(model)) or '(none)'}"
     )
     if not joints:
-        raise ValueError(f"load {load.name!r} does not say which joints its drives turn; {there}")
+        raise ValueError(f"load {load.name!r} does not name the joints that its drives turn; {there}")
     for name in joints:
         if name not in _joint_names(model) and name not in _fixed_tendons(model):
             raise ValueError(f"load {load.name!r} has no joint or fixed tendon {name!r}; {there}")

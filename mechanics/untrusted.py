@@ -165,7 +165,7 @@ def read_arrays(source: str | Path | BinaryIO, most: int = MOST_ARRAYS) -> dict[
     except UntrustedFileError:
         raise
     except _DAMAGED as error:
-        raise UntrustedFileError(f"{name} is no whole .npz: {_one_line(error)}") from None
+        raise UntrustedFileError(f"{name} is not a complete .npz: {_one_line(error)}") from None
 
 
 def read_member(path: str | Path, name: str, most: int = MOST_TEXT) -> bytes:
@@ -187,7 +187,7 @@ def read_member(path: str | Path, name: str, most: int = MOST_TEXT) -> bytes:
     except (UntrustedFileError, KeyError):
         raise
     except _DAMAGED as error:
-        raise UntrustedFileError(f"{path} is no whole .zip: {_one_line(error)}") from None
+        raise UntrustedFileError(f"{path} is not a complete .zip: {_one_line(error)}") from None
 
 
 def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
@@ -222,7 +222,7 @@ def _too_deep() -> str:
 
 
 def _no_constant(name: str) -> NoReturn:
-    raise UntrustedFileError(f"{name} is no number of JSON")
+    raise UntrustedFileError(f"{name} is not a number of JSON")
 
 
 def _finite(text: str) -> float:

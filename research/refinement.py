@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from agents.policies.agent_file import AgentFile, installed, plain
 from agents.policies.baselines import baseline
 from agents.policies.policy import policy_of
-from agents.training.tasks import configuration_of, make_lanes
+from agents.training.tasks import configuration_of, make_environments
 
 Floats = NDArray[np.float64]
 Array = NDArray[np.float32]
@@ -118,7 +118,7 @@ class Played(NamedTuple):
     reward: Floats
 
     def of(self, where: Any) -> Played:
-        """Return that of some lanes, or in another shape."""
+        """Return that of some environments, or in another shape."""
         return Played(*(values[where] for values in self))
 
 
@@ -205,7 +205,7 @@ def cost(found: Played, rival: Played, weight: Floats, search: RefinementSearch)
 def linear(load: str, search: RefinementSearch) -> AgentFile:
     """Return the baseline that a search begins as, as a network of one layer."""
     options = {"load": load, "distributions": load, **dict(search.options)}
-    lanes: Any = make_lanes(ENVIRONMENT, 1, options)
+    lanes: Any = make_environments(ENVIRONMENT, 1, options)
     entries, axes = lanes.single_observation_space.shape[0], lanes.single_action_space.shape[0]
     configuration = configuration_of(lanes)
     lanes.close()
@@ -234,7 +234,7 @@ def linear(load: str, search: RefinementSearch) -> AgentFile:
 
 
 def features_of(bundle: AgentFile) -> Callable[[Any], Array]:
-    """Return the function from observations (lanes, entries) to what the last layer sees, and 1: (lanes, features)."""
+    """Return the function from observations (environments, entries) to the last layer's input and 1."""
     number = _last(bundle)
     width = bundle.arrays[f"weight_{number}"].shape[0]
     bound = np.full(width, UNBOUNDED, np.float32)
@@ -292,13 +292,13 @@ def changes(directions: Floats, weights: Floats, axes: int) -> Floats:
 
 # --- episodes ---------------------------------------------------------------------------------------------------------
 def play(lanes: Any, features: Callable[[Any], Array], layers: Floats, seeds: NDArray[Any]) -> Played:
-    """Return what an episode of every lane brought.
+    """Return what an episode of every environment brought.
 
     Args:
         lanes: Of Tracking.
         features: What the last layers see.
-        layers: A last layer for each candidate, shape (candidates, features, axes); each has as many lanes.
-        seeds: Of the lanes.
+        layers: A last layer for each candidate, shape (candidates, features, axes); each has as many environments.
+        seeds: Of the environments.
     """
     given = layers.astype(np.float32)
 
@@ -311,7 +311,7 @@ def play(lanes: Any, features: Callable[[Any], Array], layers: Floats, seeds: ND
 
 
 def play_policy(lanes: Any, policy: Any, seeds: NDArray[Any]) -> Played:
-    """Return what an episode of every lane brought a policy."""
+    """Return what an episode of every environment brought a policy."""
     return _play(lanes, policy.act, seeds)
 
 
@@ -336,7 +336,7 @@ def machine_seed(seed: int) -> int:
 
 
 def _lanes(bundle: AgentFile, count: int) -> Any:
-    return make_lanes(ENVIRONMENT, count, bundle.configuration, autoreset_mode="NextStep")
+    return make_environments(ENVIRONMENT, count, bundle.configuration, autoreset_mode="NextStep")
 
 
 def _last(bundle: AgentFile) -> int:
@@ -350,7 +350,7 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("agent", nargs="?", type=Path, help="the controller (.npz); without it the load's baseline")
-    parser.add_argument("--load", choices=list(SEARCHES), help="load, where no agent says it")
+    parser.add_argument("--load", choices=list(SEARCHES), help="load, if the agent does not name it")
     parser.add_argument("--out", type=Path, required=True, help="file of the refined one (.npz)")
     parser.add_argument("--seed", type=int, default=0, help="seed of machines and candidates")
     arguments = parser.parse_args()

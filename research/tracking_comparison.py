@@ -20,7 +20,7 @@ from agents.policies.agent_file import AgentFile
 from agents.policies.baselines import ControlLaw, feed_forward, nothing
 from agents.policies.policy import policy_of
 from agents.shipped import find_agent
-from agents.training.tasks import make_lanes
+from agents.training.tasks import make_environments
 from agents.training.train import with_figures
 from drive_env.gains import RAW_MAX
 from tuning.bootstrap import bootstrap_interval
@@ -111,7 +111,7 @@ def compare(
     for number, name in enumerate((None, *rivals)):
         rival = RIVALS[name] if name is not None else None
         changes = {} if rival is None else {"mode": rival.mode}
-        lanes: Any = make_lanes(ENVIRONMENT, min(LANES, episodes), {**bundle.configuration, **changes})
+        lanes: Any = make_environments(ENVIRONMENT, min(LANES, episodes), {**bundle.configuration, **changes})
         try:
             found: list[tuple[Episode, ...]] = []
             commissioned = (
@@ -157,12 +157,12 @@ def identified_lags(error: Floats, speed: Floats, acceleration: Floats) -> Float
     axis' own motion: an offset o leads it from G r to G (r + o), which is r if G o = r - G r, the error.
 
     Args:
-        error: Reference less position [rev], shape (steps, lanes, axes).
+        error: Reference less position [rev], shape (steps, environments, axes).
         speed: Of the axis [rev/s], the same shape.
         acceleration: Of the axis [rev/s^2], the same shape.
 
     Returns:
-        Shape (2, lanes, axes).
+        Shape (2, environments, axes).
     """
     causes = np.stack([speed, acceleration])
     squares = np.einsum("istu,jstu->tuij", causes, causes)
@@ -208,7 +208,7 @@ def _law(rival: Rival, lanes: Any, seeds: Sequence[int], commissioned: NDArray[n
 
 
 def _play(lanes: Any, policy: Any, seeds: Sequence[int], commissioned: NDArray[np.int64] | None) -> tuple[Episode, ...]:
-    """Return an episode of every lane; given the commissioned velocity P, the cascades are tuned before."""
+    """Return an episode of every environment; given the commissioned velocity P, the cascades are tuned before."""
     steps, count = lanes.config.steps, lanes.num_envs
     observation, _ = lanes.reset(seed=list(seeds))
     if commissioned is not None:

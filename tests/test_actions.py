@@ -16,7 +16,7 @@ NO_NUMBERS = [np.nan, np.inf, -np.inf]
 
 
 def message(lane, entry, value):
-    return rf"entry {entry} of the action of environment {lane} is {value:g}, no finite number; nothing was sent"
+    return rf"entry {entry} of the action of environment {lane} is {value:g}, not a finite number; nothing was sent"
 
 
 class Watched:

@@ -87,7 +87,12 @@ def test_a_changed_file_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(None, "there is no file"), (b"", "is no agent"), (b"PK\x03\x04 no", "is no agent"), (b"hello", "is no agent")],
+    [
+        (None, "there is no file"),
+        (b"", "is not an agent"),
+        (b"PK\x03\x04 no", "is not an agent"),
+        (b"hello", "is not an agent"),
+    ],
 )
 def test_a_file_that_is_none_is_told(tmp_path, content, message):
     path = tmp_path / "agent.npz"
@@ -121,7 +126,7 @@ def test_a_file_of_another_program_is_told_without_numpys_advice(tmp_path, write
     with pytest.raises(BundleError) as error:
         AgentFile.load(path)
     assert str(error.value) == (
-        f"{path} is no agent; give the .npz that drive-agent train writes, or the name of an agent that ships"
+        f"{path} is not an agent; give the .npz that drive-agent train writes, or the name of an agent that ships"
     )
 
 
@@ -132,7 +137,7 @@ def test_what_cannot_be_read_is_told(tmp_path):
         BundleError, match=r"cannot read .*folder\.npz: .*; give the \.npz that drive-agent train writes"
     ):
         AgentFile.load(path)
-    with pytest.raises(BundleError, match=r"half\.npz is no agent; give"):
+    with pytest.raises(BundleError, match=r"half\.npz is not an agent; give"):
         another_about(tmp_path / "half.npz")
         AgentFile.load(tmp_path / "half.npz")
 
@@ -140,7 +145,7 @@ def test_what_cannot_be_read_is_told(tmp_path):
 def test_pickles_are_not_opened(tmp_path):
     path = tmp_path / "agent.npz"
     np.savez(path, **{ABOUT: np.array([{"format": "drive-agent"}], object)})
-    with pytest.raises(BundleError, match="is no agent"):
+    with pytest.raises(BundleError, match="is not an agent"):
         AgentFile.load(path)
 
 
@@ -226,7 +231,7 @@ def test_no_number_goes_in_or_comes_out(kind, wrong):
     policy = policy_of(bundle(kind))
     row = observations()[0]
     row[3] = wrong
-    with pytest.raises(PolicyError, match="entry 3 of the observation is no number"):
+    with pytest.raises(PolicyError, match="entry 3 of the observation is not a number"):
         policy.act(row)
     arrays = dict(bundle(kind).arrays)
     arrays["weight_1"] = np.full_like(arrays["weight_1"], 3e38)

@@ -62,7 +62,7 @@ def test_a_search_finds_and_goes_on(tmp_path, shrunk):
     assert rows and 3e-5 <= table["learning_rate"] <= 3e-3 and table["n_envs"] == 4
     assert run("train", "tracking", "--config", out / "best.yaml", "--out", tmp_path / "run").exit_code == 0
     with (tmp_path / "run" / "training.csv").open() as file:
-        assert list(csv.DictReader(file))[-1]["timesteps"] == "64"  # whole rollouts of 16 steps of 4 lanes
+        assert list(csv.DictReader(file))[-1]["timesteps"] == "64"  # whole rollouts of 16 steps of 4 environments
 
 
 @pytest.mark.slow

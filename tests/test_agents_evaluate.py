@@ -25,7 +25,7 @@ from agents.policies.agent_file import AgentFile, BundleError
 from agents.policies.guard import GuardLimits
 from agents.policies.open_policy import PolicyNotFoundError, open_policy, opened
 from agents.policies.policy import PolicyError, policy_of
-from agents.training.tasks import make_lanes
+from agents.training.tasks import make_environments
 from drive_env import CanDrives, EmulatedDrives, Limits, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
@@ -299,7 +299,7 @@ def test_a_machine_that_cannot_be_judged_is_missing_on_both_sides():
             return np.full((len(observation), 1), np.nan if last_one else 0.1)
 
     both = on_both_sides(Wild(), "tracking", SHORT, machines=3, lockstep=True, guard=PATIENT)
-    assert list(both.missing) == [2] and "is nan, no number" in both.missing[2]
+    assert list(both.missing) == [2] and "is nan, not a number" in both.missing[2]
     assert both.inside.seeds == both.bus.seeds == [0, 1]
 
 
@@ -316,7 +316,7 @@ def test_in_real_time_machines_are_served_by_processes_of_their_own(tmp_path):
 
 
 def test_drawn_machines_are_those_of_the_seed_and_number():
-    config = make_lanes("tracking", 1, SHORT | {"distributions": "two_mass"}).config
+    config = make_environments("tracking", 1, SHORT | {"distributions": "two_mass"}).config
     three, five = draw_machines(config, 3, 7), draw_machines(config, 5, 7)
     assert five[:3] == three and three[0].parameters != three[1].parameters
     assert draw_machines(config, 1, 8)[0] != three[0]
@@ -517,7 +517,7 @@ def test_an_onnx_policy_refuses_what_is_no_number(tmp_path):
     export(bundle(), tmp_path / "agent.onnx")
     policy = OnnxPolicy(tmp_path / "agent.onnx")
     assert np.allclose(policy.act(observations()), policy_of(bundle()).act(observations()), atol=1e-5)
-    with pytest.raises(PolicyError, match="is no number"):
+    with pytest.raises(PolicyError, match="is not a number"):
         policy.act(np.full(ENTRIES, np.nan))
     with pytest.raises(PolicyError, match="does not take this observation"):
         policy.act(np.zeros(ENTRIES + 1))
@@ -594,7 +594,7 @@ def test_the_command_writes_the_same_bytes_on_processes(tmp_path):
     (("--workers", 2, "--bus"), "--workers is for episodes on the emulator; leave it out on a bus, with --gap"),
     (("--cluster", "tcp://x:1", "--gap", 2), "--cluster is for episodes on the emulator; leave it out on a bus"),
     (("--workers", 0), "--workers 0 is below 1; give the number of processes"),
-    (("--workers", 1, "--cluster", "tcp://x:1"), "choose --workers or --cluster"),
+    (("--workers", 1, "--cluster", "tcp://x:1"), "choose one"),
 ])  # fmt: skip
 def test_what_would_be_ignored_is_refused(more, message):
     found = run("evaluate", "tracking_two_mass", *more)

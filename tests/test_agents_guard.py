@@ -69,8 +69,8 @@ def deadlock():
 
 
 WRONGS = {
-    "nan": (lambda: np.nan, PATIENT, r"entry 0 of the policy's action is nan, no number"),
-    "inf": (lambda: np.inf, PATIENT, r"entry 0 of the policy's action is inf, no number"),
+    "nan": (lambda: np.nan, PATIENT, r"entry 0 of the policy's action is nan, not a number"),
+    "inf": (lambda: np.inf, PATIENT, r"entry 0 of the policy's action is inf, not a number"),
     "no number inside": (no_number, PATIENT, "the policy's output is not a number"),
     "fails": (fail, PATIENT, r"the policy failed: IndexError: list index out of range \(.*guard.py, line \d+\)"),
     "saturates": (lambda: 1.0, PATIENT, r"at the end of its range for 100 ms, and the limit is 100 ms; .*--saturation"),

@@ -53,7 +53,7 @@ def observation(lanes, seed=1):
 
 
 def after(gains, shown=0.0):
-    """An observation after a trial of gains, (lanes, G) over the rule's, from the rule's gains as incumbent."""
+    """An observation after a trial of gains, (environments, G) over the rule's, from the rule's gains as incumbent."""
     gains = np.atleast_2d(gains)
     seen = np.zeros((len(gains), ENTRIES + 1), np.float32)
     seen[:, IDENTIFIED : IDENTIFIED + G] = gains

@@ -15,7 +15,7 @@ from agents.policies.baselines import ControlLaw, baseline, feed_forward
 from agents.policies.guard import GuardLimits
 from agents.policies.policy import policy_of
 from agents.shipped import shipped, shipped_names
-from agents.training.tasks import make_lanes
+from agents.training.tasks import make_environments
 from drive_env.envs.tracking import TASKS, TrackingConfig
 from research import refinement, tracking_comparison
 from research.refinement import ENVIRONMENT, Played, RefinementSearch, refine
@@ -90,7 +90,7 @@ def test_what_is_compared_is_what_drive_agent_evaluate_says():
 
 def test_a_tuned_cascade_has_velocity_gains_for_its_inertia():
     """Stiff shaft, so that inertia is rotor and disc; what a drive measures is inertia over torque constant."""
-    lanes = make_lanes(ENVIRONMENT, 2, {"load": "inertia", "mode": "csp", "action": "offset"})
+    lanes = make_environments(ENVIRONMENT, 2, {"load": "inertia", "mode": "csp", "action": "offset"})
     drives = lanes.drives
     commissioned = drives.read((0x2042, 1))
     drives.machine.set("load.inertia", np.array([2e-6, 8e-6]))
@@ -126,7 +126,7 @@ def test_feed_forward_is_lag_times_motion(mode, lags, action):
 @pytest.mark.parametrize("load", ["two_mass", "gantry"])
 def test_a_linear_controller_does_what_its_baseline_does(load):
     made = leading(load)
-    lanes = make_lanes(ENVIRONMENT, 1, made.configuration)
+    lanes = make_environments(ENVIRONMENT, 1, made.configuration)
     axes, entries = lanes.single_action_space.shape[0], lanes.single_observation_space.shape[0]
     law = baseline("feed_forward", ENVIRONMENT, lanes.config, axes)
     lanes.close()
@@ -160,7 +160,7 @@ def test_features_and_last_layer_make_the_action():
 def test_a_direction_adds_its_entry_in_standard_deviations():
     """A linear controller's features are the observation itself, so that the change is exact; here of the error."""
     made = leading()
-    lanes = make_lanes(ENVIRONMENT, 4, made.configuration)
+    lanes = make_environments(ENVIRONMENT, 4, made.configuration)
     features, layer = refinement.features_of(made), refinement.last_layer(made)
     found = refinement.directions_of(lanes, features, layer, np.arange(4))
     lanes.close()

@@ -23,7 +23,7 @@ from agents.training import checkpoint, hyperparameters, search
 from agents.training import train as training
 from agents.training.hyperparameters import ALGORITHMS, HyperparameterError, read_value
 from agents.training.imitation import imitate
-from agents.training.tasks import ENVIRONMENTS, environment_name, make_lanes
+from agents.training.tasks import ENVIRONMENTS, environment_name, make_environments
 from agents.training.train import AGENT, CHECKPOINT, TABLE, DivergedError, TrainingRun, train
 from tuning.runs.pools import PoolError
 
@@ -95,9 +95,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one(algorithm, tmp_path, monkeypa
 
 def test_a_curriculum_goes_on_where_a_run_was_cut(tmp_path, monkeypatch):
     stages = []
-    kind = type(make_lanes("tracking", 1, TINY["ServoDrive/Tracking-v0"]))
-    begin = kind._reset_lanes
-    monkeypatch.setattr(kind, "_reset_lanes", lambda self, *rest: (stages.append(self.stage), begin(self, *rest))[1])
+    kind = type(make_environments("tracking", 1, TINY["ServoDrive/Tracking-v0"]))
+    begin = kind._reset_environments
+    monkeypatch.setattr(
+        kind, "_reset_environments", lambda self, *rest: (stages.append(self.stage), begin(self, *rest))[1]
+    )
     schedule = {"steps": [0, 480], "stage": [0.0, 1.0]}
     run = tiny(timesteps=480, env_kwargs={"distributions": {"include": ["two_mass"], "curriculum": schedule}})
     whole = train(run, tmp_path / "whole")
@@ -152,7 +154,7 @@ def test_a_policy_begins_as_what_it_imitates(tmp_path):
     shares = [progress.imitated for progress in told if not progress.timesteps]
     assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == 1.0 and len(shares) > 100
     options = {"episodes": 4, "seed": 5}
-    lanes = make_lanes(run.environment, 1, bundle.configuration)
+    lanes = make_environments(run.environment, 1, bundle.configuration)
     lanes.close()
     teacher = baseline("feed_forward", run.environment, lanes.config, 1)
     error = {
@@ -197,7 +199,7 @@ def test_an_asymmetric_critic_learns_from_the_machine_while_the_actor_imitates()
 
 
 def test_the_shipped_tuner_is_a_baseline_of_its_own_gains():
-    lanes = make_lanes("gain_tuning", 1, {"num_threads": 1})
+    lanes = make_environments("gain_tuning", 1, {"num_threads": 1})
     policy = baseline("surrogate", "gain_tuning", lanes.config, 3)
     lanes.close()
     ships = AgentFile.load(shipped(TUNER))
@@ -209,8 +211,8 @@ def test_the_shipped_tuner_is_a_baseline_of_its_own_gains():
 
 # --- rewards ----------------------------------------------------------------------------------------------------------
 def both(environment, options, wrapper):
-    """Lanes as they are, and the same behind a reward of agents.training.rewards."""
-    plain = make_lanes(environment, 4, {**options, "num_threads": 1}, autoreset_mode="SameStep")
+    """Environments as they are, and the same behind a reward of agents.training.rewards."""
+    plain = make_environments(environment, 4, {**options, "num_threads": 1}, autoreset_mode="SameStep")
     name = environment_name(environment)
     settings = {"n_envs": 4, "env_kwargs": {**options, "num_threads": 1}, "vec_env_wrapper": wrapper}
     _, env = training.make_env(TrainingRun(name, "ppo", settings))
@@ -270,7 +272,7 @@ def test_every_environment_trains(environment, algorithm, tmp_path):
 
 def test_an_asymmetric_critic_sees_the_machine_and_the_actor_does_not(tmp_path):
     bundle = train(tiny("gain_tuning", timesteps=32), tmp_path)
-    lanes = make_lanes("gain_tuning", 1, {"privileged": True})
+    lanes = make_environments("gain_tuning", 1, {"privileged": True})
     seen, all_ = (lanes.single_observation_space[key].shape[0] for key in ("observation", "privileged"))
     lanes.close()
     assert bundle.arrays["weight_0"].shape[0] == seen
@@ -494,5 +496,5 @@ def test_there_is_nothing_to_resume(tmp_path):
     with pytest.raises(ValueError, match=r"no file .*checkpoint\.zip to continue from: a run writes its first"):
         train(tiny(), tmp_path, resume=True, trust=True)
     (tmp_path / CHECKPOINT).write_bytes(b"no")
-    with pytest.raises(ValueError, match="is no checkpoint"):
+    with pytest.raises(ValueError, match="is not a checkpoint"):
         train(tiny(), tmp_path, resume=True, trust=True)

@@ -101,7 +101,7 @@ def test_a_new_run_needs_no_trust(folder):
 )  # fmt: skip
 def test_what_a_checkpoint_says_of_its_run_is_checked(text, folder):
     hostile(folder / "run" / "checkpoint.zip", text)
-    with pytest.raises(CheckpointError, match=r"checkpoint\.zip is no checkpoint of drive-agent"):
+    with pytest.raises(CheckpointError, match=r"checkpoint\.zip is not a checkpoint of drive-agent"):
         checkpoint.read_run(folder / "run" / "checkpoint.zip")
     for arguments in (("evaluate", "run/checkpoint.zip", "--card"), ("train", "--resume", "run", "--trust")):
         found = run(*arguments)
@@ -111,7 +111,7 @@ def test_what_a_checkpoint_says_of_its_run_is_checked(text, folder):
 def test_a_run_of_another_version_is_told(folder):
     hostile(folder / "run" / "checkpoint.zip", json.dumps(RUN | {"run": RUN["run"] | {"colour": "red"}}))
     found = run("train", "--resume", "run", "--trust")
-    assert found.exit_code == 2 and "is no checkpoint of this drive-agent" in found.output
+    assert found.exit_code == 2 and "is not a checkpoint of this drive-agent" in found.output
 
 
 def test_a_bomb_in_a_checkpoint_is_not_unpacked(folder):

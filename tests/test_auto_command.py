@@ -91,7 +91,7 @@ def test_auto_leaves_the_way_back_a_certificate_and_a_report(tmp_path, monkeypat
     assert axis["before"] != axis["after"]
     # What shakes at rest has some time more than the ten seconds.
     # What shakes at rest has some time more than the ten seconds.
-    was_eased = any("slowed to" in note for note in axis["notes"])
+    was_eased = any("lowered to" in note for note in axis["notes"])
     assert 0.0 < said["drive seconds"][0] < 10.0 + OVERTIME * was_eased
     assert sorted(path.name for path in out.iterdir()) == ["before.toml", "certificate.json", "report.html"]
     assert is_unchanged(out / "certificate.json")

@@ -104,7 +104,7 @@ def test_a_writer_is_not_believed(drive, file, monkeypatch):
     [
         (lambda text: text.replace(f"= {SPEED} ", "= 50 "), "was changed since it was written", DONE),
         (lambda text: text.replace("serial = 4711", "serial = 4712"), "was changed since it was written", USER_ERROR),
-        (lambda text: text[: text.index('"6083')], "is torn: it ends before its check sum", USER_ERROR),
+        (lambda text: text[: text.index('"6083')], "is incomplete: it ends before its check sum", USER_ERROR),
         (lambda text: text[: text.index('"6083') + 4], "is not TOML, or incomplete", USER_ERROR),
         (lambda text: text[: text.index("[check]")].replace("format = 2\n", ""), "has no check sum", DONE),
         (lambda text: text.replace("# Profile velocity", "# the user's own words").replace("\n", "\r\n"), "", DONE),

@@ -276,8 +276,8 @@ def test_a_file_that_cannot_be_written_is_a_hardware_error(tmp_path, drives):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("", "holds no parameters of a tmcm1636"),
-        ("{}", "holds no parameters of a tmcm1636"),
+        ("", "has no parameters of a tmcm1636"),
+        ("{}", "has no parameters of a tmcm1636"),
         ("[1, 2]", "holds no parameters"),
         ('{"format": 1, "device": "tmcm6212", "sections": {}}', "it is of format 1 and of a tmcm6212"),
         ('{"format": 2, "device": "tmcm1636", "sections": {}}', "it is of format 2"),

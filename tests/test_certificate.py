@@ -152,10 +152,10 @@ def test_any_change_shows(certificate, tmp_path, where, value):
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ("", "is no certificate"),
+    ("", "is not a certificate"),
     ("[1]", "is not a certificate of format 2"),
     ('{"a": 1}', "is not a certificate of format 2"),
-    ('{"format": 1, "sha256": "", "x": NaN}', "NaN is no number of JSON"),
+    ('{"format": 1, "sha256": "", "x": NaN}', "NaN is not a number of JSON"),
     ('{"format": 2, "sha256": ""}', "is not a certificate of this version: 'tuner'"),
 ])  # fmt: skip
 def test_what_is_no_certificate_is_said_to_be_none(tmp_path, text, message):
@@ -175,7 +175,7 @@ def test_verify_tells_by_its_exit_code_whether_a_file_was_changed(certificate, t
     save_certificate(certificate, tmp_path)
     path = tmp_path / name
     done = verify(path)
-    assert (done.exit_code, done.stdout) == (0, f"{path} is as it was written\n")
+    assert (done.exit_code, done.stdout) == (0, f"{path} is unchanged\n")
     path.write_text(path.read_text(encoding="utf-8").replace("0.3612", "0.3613"), encoding="utf-8")
     done = verify(path)
     assert done.exit_code == 1
@@ -184,7 +184,7 @@ def test_verify_tells_by_its_exit_code_whether_a_file_was_changed(certificate, t
 
 @pytest.mark.parametrize(("name", "message"), [
     ("none.json", "cannot read .*none.json: No such file"),
-    ("x.json", "is no certificate"),
+    ("x.json", "is not a certificate"),
     ("x.html", "is not a report of drive-tune"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line(tmp_path, name, message):

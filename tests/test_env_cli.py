@@ -184,7 +184,7 @@ def test_get_raw_several_nodes_texts_and_json(run):
         (["jog", "10 rpm", "--by", "1e9 rev"], USER_ERROR, "607Ah:00 Target position cannot be"),
         (["jog", "10 rpm", "-n", "2"], USER_ERROR, "profile acceleration 6083h is 0"),
         (["scope", "2003"], USER_ERROR, "2003h:00 Maximum Current cannot be recorded"),
-        (["scope", "--trigger", "whenever"], USER_ERROR, "is no condition"),
+        (["scope", "--trigger", "whenever"], USER_ERROR, "is not a condition"),
         (["scope", "--period", "0.0015"], USER_ERROR, "no whole number of milliseconds"),
         (["scope", "--duration", "0.0004"], USER_ERROR, "--duration 0.0004 s is not a whole number of milliseconds"),
         (["scope", "--out", "nowhere/file"], USER_ERROR, "there is no folder nowhere"),
@@ -307,9 +307,9 @@ def test_diff_of_two_files(run, tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("nonsense", "is no TOML"),
+        ("nonsense", "is not TOML"),
         ("[other]\n", "has no table [parameters]"),
-        ('[parameters]\n"velocity" = 3\n', "'velocity' is no index:sub-index"),
+        ('[parameters]\n"velocity" = 3\n', "'velocity' is not an index:sub-index"),
         ('[parameters]\n"6041:00" = 3\n', "can only be read"),
         ('[parameters]\n"2003:00" = 99999\n', "its highest is 45000"),
         ('[parameters]\n"2003:00" = 1.5\n', "takes integers"),

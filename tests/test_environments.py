@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
-from drive_env.envs.stable_baselines import LanesVecEnv
+from drive_env.envs.stable_baselines import DriveVecEnv
 from drive_env.envs.tracking import Tracking
 from mechanics.loads import LOADS
 
@@ -48,7 +48,7 @@ def lanes_of(kind, num_envs=1, **options):
 
 
 def actions(lanes, steps, first=0):
-    """Return a random agent's actions, (steps, lanes, ...), those of lane k being those of seed first + k."""
+    """Return a random agent's actions, (steps, environments, ...); those of number k are those of seed first + k."""
     low, high = lanes.single_action_space.low, lanes.single_action_space.high
     rows = [
         np.random.default_rng((11, first + lane)).uniform(low, high, (steps, *low.shape))
@@ -66,7 +66,7 @@ def steps_of(lanes):
 
 
 def run(lanes, given, seed=0):
-    """Return observations (steps + 1, lanes, ...), rewards, terminated and truncated (steps, lanes), and infos."""
+    """Return observations (steps + 1, n, ...), rewards, terminated and truncated (steps, n), and infos."""
     observations = [lanes.reset(seed=seed)[0]]
     rewards, ends, cuts, infos = [], [], [], []
     for action in given:
@@ -127,7 +127,7 @@ def test_make_and_make_vec(kind):
 @EVERY_KIND
 def test_stable_baselines_gets_the_lanes_own_arrays(kind):
     with lanes_of(kind, 3, autoreset_mode="SameStep") as lanes:
-        env = LanesVecEnv(lanes)
+        env = DriveVecEnv(lanes)
         handed = []
         step = lanes.step
         lanes.step = lambda given: handed.append(step(given)) or handed[-1]
@@ -261,7 +261,7 @@ def test_autoreset_modes_tell_the_same_episodes_and_their_final_observations(kin
     with lanes_of(kind, 2, autoreset_mode="Disabled") as lanes:
         disabled = run(lanes, given[:steps])
         np.testing.assert_array_equal(disabled[0], observations[: steps + 1])
-        with pytest.raises(gymnasium.error.ResetNeeded, match="lane 0 has ended"):
+        with pytest.raises(gymnasium.error.ResetNeeded, match="environment 0 has ended"):
             lanes.step(given[0])
         again, _ = lanes.reset(options={"reset_mask": np.array([True, True])})
         np.testing.assert_array_equal(again, observations[steps + 1])
@@ -269,7 +269,7 @@ def test_autoreset_modes_tell_the_same_episodes_and_their_final_observations(kin
 
 @pytest.mark.parametrize("kind", ["Tracking", "GainScheduling"])
 def test_a_lane_that_trips_is_terminated_named_and_begins_anew_alone(kind):
-    """The enable input of lane 1 opens; what lanes 0 and 2 see does not change. GainTuning goes on after a trip."""
+    """The enable input of environment 1 opens; what 0 and 2 see does not change. GainTuning goes on after a fault."""
     options = {"duration": 0.4, "autoreset_mode": "SameStep"}
     with lanes_of(kind, 3, **options) as lanes:
         given = actions(lanes, 12)
@@ -293,7 +293,8 @@ def test_a_lane_that_trips_is_terminated_named_and_begins_anew_alone(kind):
     assert len(ended) == 1 and ended[0] in (4, 5)
 
 
-# --- a lane that is broken --------------------------------------------------------------------------------------------
+# --- an environment that is broken
+# --------------------------------------------------------------------------------------------
 @EVERY_KIND
 @pytest.mark.filterwarnings("ignore:machine 1 left the range of physics:RuntimeWarning")
 def test_a_broken_machine_leaves_the_others_bit_identical(kind):
@@ -338,7 +339,7 @@ def test_info_carries_reward_terms_true_parameters_and_named_faults(kind):
     signs = {"trip": -1.0} if kind == "Tracking" else {}
     total = sum(weights[name] * signs.get(name, 1.0) * term for name, term in info["reward_terms"].items())
     np.testing.assert_allclose(reward, total, rtol=1e-12)
-    assert len(np.unique(begun["parameters"]["load.coulomb"])) == 2  # every lane has its own machine
+    assert len(np.unique(begun["parameters"]["load.coulomb"])) == 2  # every environment has its own machine
 
 
 # --- the curriculum ---------------------------------------------------------------------------------------------------
@@ -364,7 +365,7 @@ def test_a_curriculum_is_a_schedule_over_the_distributions(kind):
 @EVERY_KIND
 def test_stable_baselines_view_follows_the_schedule(kind):
     with lanes_of(kind, 2, distributions=SCHEDULE, autoreset_mode="SameStep") as lanes:
-        env = LanesVecEnv(lanes)
+        env = DriveVecEnv(lanes)
         env.reset()
         assert lanes.stage == 0.0
         for k in range(1, 4):

@@ -241,7 +241,7 @@ def test_clients_that_do_not_speak_or_speak_nonsense_end_nothing(control):
         pass
     with socket.create_connection(("127.0.0.1", served.port)) as one:
         one.sendall(b"\xff\xfe\x00\n")
-        assert b"is no request; there are fault, faults and clear" in one.recv(4096)
+        assert b"is not a request; there are fault, faults and clear" in one.recv(4096)
     with socket.create_connection(("127.0.0.1", served.port)) as one:
         one.sendall(b"x" * 100_000)
         one.settimeout(10.0)

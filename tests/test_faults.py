@@ -476,8 +476,8 @@ def test_the_run_is_the_same_however_it_is_cut_and_without_a_fault_nothing_chang
     ("encoder_stuck", {"at": 0.0005}, "not a whole number of communication cycles"),
     ("encoder_stuck", {"duration": 0.0}, "duration=0 s must be 0.001 s or more"),
     ("encoder_jump", {"duration": 0.1}, "is a moment and has no duration"),
-    ("encoder_stuck", {"when": "torque > 3"}, "is no condition; use 'enabled', or compare position"),
-    ("encoder_stuck", {"when": "speed > nan"}, "is no condition"),
+    ("encoder_stuck", {"when": "torque > 3"}, "is not a condition; use 'enabled', or compare position"),
+    ("encoder_stuck", {"when": "speed > nan"}, "is not a condition"),
     ("encoder_stuck", {"axis": 1}, "axis=1 must be 0 to 0 of a machine"),
     ("encoder_stuck", {"where": np.ones(3, bool)}, r"shape \(1,\)"),
 ])  # fmt: skip

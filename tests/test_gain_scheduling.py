@@ -1,4 +1,4 @@
-"""GainScheduling: gains on line, a changing payload, lanes that know nothing of each other, and the same on a bus."""
+"""GainScheduling: gains on line, a changing payload, environments that do not depend on each other, and on a bus."""
 
 import numpy as np
 import pytest
@@ -118,7 +118,8 @@ def test_a_heavier_payload_needs_more_current():
     assert currents[1] > 3.0 * currents[0]
 
 
-# --- lanes ------------------------------------------------------------------------------------------------------------
+# --- environments
+# ------------------------------------------------------------------------------------------------------------
 def test_a_lane_is_the_same_among_one_and_among_eight():
     for lane in (0, 5):
         alone, _ = run(env(1), 60, reset_seed=3 + lane)
@@ -127,7 +128,7 @@ def test_a_lane_is_the_same_among_one_and_among_eight():
 
 
 def test_an_episode_begins_anew_while_others_go_on():
-    """Lane 1 begins anew in the middle; what lane 0 sees does not change, and lane 1's is that of its seed."""
+    """Environment 1 begins anew in the middle; what 0 sees does not change, and what 1 sees is that of its seed."""
     whole, _ = run(env(2), 40)
     environment = env(2)
     rng = np.random.default_rng(0)
@@ -255,7 +256,7 @@ def test_a_file_configures(tmp_path):
 
 def test_drives_that_do_not_fit_are_refused():
     drives = EmulatedDrives(load="gantry", num_machines=2, num_threads=1)
-    with pytest.raises(ValueError, match="3 lanes of load 'gantry' with 2 axes each need 6 drives, not 4"):
+    with pytest.raises(ValueError, match="3 environments of load 'gantry' with 2 axes each need 6 drives, not 4"):
         GainScheduling(3, drives=drives, load="gantry")
 
 

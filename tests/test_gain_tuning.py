@@ -23,7 +23,7 @@ FEW = {"trials": 3, "num_threads": 1}
 
 
 def actions(env, steps, seed=0):
-    """Return the actions of a random agent, the same for lane k of any number of lanes."""
+    """Return the actions of a random agent, the same for environment k of any number of environments."""
     shape = env.single_action_space.shape
     lanes = [np.random.default_rng((seed, lane)).uniform(-0.7, 0.7, (steps, *shape)) for lane in range(env.num_envs)]
     return np.stack(lanes, axis=1).astype(np.float32)
@@ -371,7 +371,7 @@ def test_a_given_drive_that_cannot_be_cleared_terminates_its_lane_alone():
 
 
 def test_a_trip_in_a_trial_costs_is_cleared_and_does_not_end_the_episode():
-    """Of emulated machines every trial begins anew: the drive of lane 1 trips by its lag, lane 0 sees nothing of it."""
+    """Of emulated machines every trial begins anew: drive 1 trips by its lag, environment 0 sees nothing of it."""
     env = GainTuning(2, **FEW)
     acted = actions(env, 2)
     undisturbed, _ = episode(env, 30, acted)
@@ -404,7 +404,7 @@ def test_given_drives_of_two_kinds_say_the_same_as_long_as_they_are_the_same():
     np.testing.assert_array_equal(*observations)
 
 
-# The envelope would stop the whole bus where the trial's own watch stops a lane.
+# The envelope would stop the whole bus where the trial's own watch stops an environment.
 @pytest.mark.slow
 @pytest.mark.parametrize("safety", [False, Limits(oscillation=False)], ids=["no envelope", "envelope"])
 def test_over_can_in_lockstep_the_observations_are_the_same(safety):

@@ -33,7 +33,7 @@ def test_values_intervals_and_reasons_are_shown_and_written(tmp_path):
     resistance = rows[0]["estimates"]["resistance"]
     assert resistance["low"] < 0.36 < resistance["high"]
     assert "winding resistance" in done.stdout
-    assert "none shows" in done.stdout  # of the resonance
+    assert "no resonance between" in done.stdout  # of the resonance
     assert rows[0]["estimates"]["resonance"]["value"] is None
     assert rows[0]["drive_time"] < 20.0
 

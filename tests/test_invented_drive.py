@@ -110,7 +110,7 @@ def test_a_search_finds_gains_within_its_ranges():
 
 def test_the_command_writes_them_by_their_names(tmp_path):
     line = ["optimise", "--device", INVENTED, "--load", "inertia", "--sampler", "random", "--trials", "2",
-            "--lanes", "2", "--out", str(tmp_path / "found")]  # fmt: skip
+            "--copies", "2", "--out", str(tmp_path / "found")]  # fmt: skip
     done = CliRunner().invoke(app, line)
     assert done.exit_code == 0, done.output
     head = (tmp_path / "found" / "trials.csv").read_text(encoding="utf-8").splitlines()[0]
@@ -311,10 +311,10 @@ def test_the_other_environments_run_on_it(kind, options):
     ("file", "old", "new", "message"),
     [
         ("device.toml", "undervoltage", "undervolts", r"device.toml lacks or does not know 'undervoltage'"),
-        ("device.toml", "axes = 2", "axes = ", "device.toml is no TOML file"),
+        ("device.toml", "axes = 2", "axes = ", "device.toml is not a TOML file"),
         ("device.toml", "axes = 2", 'axes = 2\nvariant_of = "tmcm1636"', "give the path of this file as the device"),
         ("bindings.toml", '"1/1000"', '"1/100"', "bindings.toml: .* has no unit '1/100'"),
-        ("bindings.toml", '"3200:3"', '"3200:9"', "gains.toml: 3200h:03 is no gain"),
+        ("bindings.toml", '"3200:3"', '"3200:9"', "gains.toml: 3200h:03 is not a gain"),
         ("roles.toml", "outputs =", "out_puts =", "roles.toml lacks or does not know 'OUT_PUTS'"),
         ("gains.toml", "highest", "most", "gains.toml lacks or does not know 'highest'"),
         ("device.toml", "invented.eds", "none.eds", "none.eds"),

@@ -188,7 +188,7 @@ def estimates(**values):
 
 def test_what_was_refused_is_taken_from_the_data_sheet():
     found = estimates(inertia=2e-5, resistance=0.4, viscous=1e-3)
-    found.estimates["resonance"] = refused("Hz", "none shows")
+    found.estimates["resonance"] = refused("Hz", "no resonance between")
     plant = Plant.from_identification(DEVICE, MOTOR, 24.0, found)
     assert (plant.inertia, plant.R, plant.L) == (2e-5, 0.4, MOTOR.L_q)
     assert plant.viscous == pytest.approx(1e-3 * MOTOR.torque_constant)

@@ -26,6 +26,7 @@ from tuning.search import optimise as optimise_module
 from tuning.search import trial_bench
 from tuning.search.optimise import SAFE_STEP, Settings, objective_values, optimise, pareto
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, first_gains, read_gains
+from tuning.search.trials_files import load_options
 from tuning.target import Target, emulated
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
@@ -520,7 +521,7 @@ def test_the_way_back_of_an_earlier_search_is_not_replaced(node, monkeypatch, tm
 
 def test_what_there_is_not_is_not_resumed(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    search = ("optimise", "--load", "inertia", "--trials", 2, "--lanes", 1, "--sampler", "random", "--out", "run")
+    search = ("optimise", "--load", "inertia", "--trials", 2, "--copies", 1, "--sampler", "random", "--out", "run")
     assert drive_tune(*search, "--resume") == (
         2, "drive-tune: there is no search to resume: run.unfinished does not exist; correct --out, or leave --resume "
         "out to begin a new one",
@@ -583,3 +584,9 @@ def test_the_first_gains_are_those_of_the_commissioning_preset(rigid):
     preset = [rigid.drives.read(name)[0] for name in GAIN_OBJECTS]
     np.testing.assert_array_equal(first_gains(rigid), np.tile(preset, (4, 1)))
     assert len(preset) == len(Gains._fields)
+
+
+def test_settings_of_versions_before_0_2_are_read(tmp_path):
+    file = tmp_path / "settings.toml"
+    file.write_text('sampler = "tpe"\n[machine]\nload = "inertia"\nlanes = 3\n', encoding="utf-8")
+    assert load_options(file) == {"sampler": "tpe", "load": "inertia", "copies": 3}

@@ -192,7 +192,7 @@ def test_a_mapping_that_does_not_fit_is_answered_with_what_there_is(file, option
         (("tool", "kg", "body_mass", "arm"), r"'tool', a body_mass, names 'arm'; there are .*slider, table"),
         (("k", "N/m", "jnt_stiffness", "y"), r"'k', a jnt_stiffness, names 'y'; there are x, turn"),
         (("c", "N", "coulomb", "guide"), r"'c', a coulomb, names 'guide'; there are \(none\)"),
-        (("m", "kg", "mass", "table"), r"'m' is no 'mass'; there are body_mass, body_inertia"),
+        (("m", "kg", "mass", "table"), r"'m' is not a 'mass'; there are body_mass, body_inertia"),
     ],
 )
 def test_a_parameter_that_lives_nowhere_is_answered_with_the_places(file, parameter, text):

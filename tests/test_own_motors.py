@@ -65,8 +65,8 @@ def test_a_brushed_motor_has_one_winding():
     [
         ({"inertia_kg_m2": None}, "inertia_kg_m2 is missing"),
         ({"inertia_kg_m2": 0.0}, r"inertia_kg_m2 = 0.0 kg\*m\^2 must be above 0 \(inertia of the rotor\)"),
-        ({"inertia_kg_m2": math.nan}, "inertia_kg_m2 = nan is no number"),
-        ({"inertia_kg_m2": "much"}, "inertia_kg_m2 = 'much' is no number"),
+        ({"inertia_kg_m2": math.nan}, "inertia_kg_m2 = nan is not a number"),
+        ({"inertia_kg_m2": "much"}, "inertia_kg_m2 = 'much' is not a number"),
         ({"pole_pairs": 3.5}, "pole_pairs = 3.5 must be a whole number"),
         ({"pole_pairs": 500}, "pole_pairs = 500  must be at least 1 and at most 127"),
         ({"inertia": 1e-5}, "'inertia' is not a number of a motor; did you mean 'inertia_kg_m2'"),
@@ -93,9 +93,9 @@ def test_a_wrong_number_is_told_with_the_remedy(change, message):
     ("change", "message"),
     [
         ({"kind": "stepper"}, "kind is 'stepper'; it is 'pmsm'"),
-        ({"sources": {}}, "there is no source 'sheet'; say what it is under"),
+        ({"sources": {}}, "there is no source 'sheet'; describe it under"),
         ({"numbers": {"voltage_v": 48.0}}, r"voltage_v = 48.0: write the number and where it comes from"),
-        ({"poles": 8}, "'poles' is no key of a motor"),
+        ({"poles": 8}, "'poles' is not a key of a motor"),
         ({"numbers": 3}, "sources and numbers are tables"),
     ],
 )
@@ -108,7 +108,7 @@ def test_files_that_are_none_are_told(tmp_path):
     with pytest.raises(MotorError, match="cannot be read: No such file"):
         find_motor(tmp_path / "none.toml")
     (tmp_path / "bad.toml").write_text("title = ")
-    with pytest.raises(MotorError, match="is no TOML file"):
+    with pytest.raises(MotorError, match="is not a TOML file"):
         find_motor(str(tmp_path / "bad.toml"))
     with pytest.raises(ValueError, match=r"no motor is named 'qbl'.*or give the path of a motor's .toml file"):
         find_motor("qbl")

@@ -85,7 +85,7 @@ def test_currents_are_counted_as_its_measuring_range_has_them(files):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("title = ", "is no TOML file"),
+        ("title = ", "is not a TOML file"),
         ('variant_of = "tgz"', "variant_of is 'tgz'; it names the device that differs a little: tmcm1636"),
         ("[supply]\novervoltage = 100.0", "variant_of is 'None'"),
         ('variant_of = "tmcm1636"\n[suply]\novervoltage = 100.0', "suply is nothing that a device has; did you mean"),

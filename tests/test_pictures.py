@@ -65,7 +65,7 @@ def test_a_picture_shows_the_machine_and_the_scope(kind):
     else:
         assert of_trace(first[:, scope]) > 3 * of_trace(at_rest[:, scope])  # the traces have grown
     assert of_trace(machine_of(first)) == 0
-    assert not np.array_equal(first[:, scope], second[:, scope])  # every lane its own
+    assert not np.array_equal(first[:, scope], second[:, scope])  # every environment its own
     # The carriage is drawn where it is.
     assert np.ptp(lanes.drives.machine.joint_positions[:, 0]) > 0.0
     assert not np.array_equal(machine_of(first), machine_of(second))

@@ -77,7 +77,7 @@ def test_a_zip_of_something_else_is_none(tmp_path):
     file = tmp_path / "other.zip"
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("letter.txt", "dear sir")
-    with pytest.raises(CheckpointError, match="is no checkpoint of drive-agent"):
+    with pytest.raises(CheckpointError, match="is not a checkpoint of drive-agent"):
         open_policy(str(file), trust=True)
 
 
@@ -96,7 +96,7 @@ def test_a_function_gives_the_rewards_of_all_lanes(mode):
         before = lanes._ended.copy()
         _, reward, terminated, truncated, info = lanes.step(action)
         told = info.get("final_info", info)
-        wanted = np.where(before, 0.0, by_terms(None, action, told))  # a lane that begins anew earns nothing
+        wanted = np.where(before, 0.0, by_terms(None, action, told))  # an environment that begins anew earns nothing
         np.testing.assert_allclose(reward, wanted, rtol=1e-12)
         if mode == "NextStep":
             assert not (before & (terminated | truncated)).any()

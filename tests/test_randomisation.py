@@ -1,4 +1,4 @@
-"""Domain randomisation: laws as data, machines drawn by lane, and what a bus does to messages on their way."""
+"""Domain randomisation: laws as data, machines drawn by environment, and what a bus does to messages on their way."""
 
 import numpy as np
 import pytest
@@ -314,8 +314,8 @@ def test_a_bus_without_faults_hands_on_what_it_is_given():
         ("nowhere.toml", r"no file nowhere\.toml"),
         ({"parameter": {}}, r"key 'parameter' is unknown; there are include, parameters, curriculum"),
         ({"include": ["belts"]}, r"no set is named 'belts'; there are arm"),
-        ({"parameters": {"load.mass": {"law": "gauss"}}}, r"no law is named 'gauss'; there are uniform, loguniform"),
-        ({"parameters": {"load.mass": {"law": "uniform", "low": 1}}}, r"a law 'uniform' needs 'high'"),
+        ({"parameters": {"load.mass": {"law": "gauss"}}}, r"law = 'gauss' is unknown; there are uniform, loguniform"),
+        ({"parameters": {"load.mass": {"law": "uniform", "low": 1}}}, r"law = 'uniform' needs 'high'"),
         ({"parameters": {"load.mass": {"law": "uniform", "low": 2, "high": 1}}}, r"low 2 is above high 1"),
         ({"parameters": {"load.mass": {"law": "uniform", "low": 1, "top": 2}}}, r"key 'top' is unknown; there are low"),
         ({"parameters": {"load.mass": {"law": "loguniform", "low": 0, "high": 1}}}, r"needs a low above 0, not 0"),

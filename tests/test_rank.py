@@ -358,8 +358,8 @@ def test_the_command_lists_tuners_and_suites():
         (("rank", "--count", "0"), "count must be 1 or more"),
         (("rank", "--seed", "-1"), "--seed must be 0 or more, not -1"),
         (("optimise", "--sampler", "luck"), "no sampler is named 'luck'"),
-        (("optimise", "--sampler", "cmaes", "--objective", "speed", "--objective", "current"), "CMA-ES knows one"),
-        (("optimise", "--lanes", "0"), "--lanes must be 1 or more"),
+        (("optimise", "--sampler", "cmaes", "--objective", "speed", "--objective", "current"), "CMA-ES has one"),
+        (("optimise", "--copies", "0"), "--copies must be 1 or more"),
         (("optimise", "--load", "pendulum"), "no load is named 'pendulum'"),
         (("optimise", "--bus"), "--travel is missing"),
         (("optimise", "--lockstep"), "--travel is missing"),
@@ -379,7 +379,7 @@ def test_a_mistake_is_one_line_and_exit_code_2(arguments, message, tmp_path):
 
 def test_optimise_prints_and_writes_what_it_found(tmp_path):
     folder = tmp_path / "out"
-    result = run("optimise", "--load", "inertia", "--trials", 6, "--lanes", 3, "--safe", "--out", folder)
+    result = run("optimise", "--load", "inertia", "--trials", 6, "--copies", 3, "--safe", "--out", folder)
     assert result.exit_code == 0, result.output
     assert "6 trials" in result.output and "safe start" in result.output
     rows = list(csv.DictReader((folder / "trials.csv").open(encoding="utf-8")))
@@ -388,7 +388,7 @@ def test_optimise_prints_and_writes_what_it_found(tmp_path):
     assert "safe = true" in (folder / "settings.toml").read_text()
     told = json.loads(
         run(
-            "optimise", "--load", "inertia", "--trials", 6, "--lanes", 3, "--safe", "--json", "--out", tmp_path / "b"
+            "optimise", "--load", "inertia", "--trials", 6, "--copies", 3, "--safe", "--json", "--out", tmp_path / "b"
         ).stdout
     )
     best = min((row for row in rows if row["stopped"] == "False"), key=lambda row: float(row["J"]))
@@ -397,7 +397,7 @@ def test_optimise_prints_and_writes_what_it_found(tmp_path):
 
 def test_a_search_repeats_from_its_settings_and_what_is_said_besides_takes_their_place(tmp_path):
     first, again, other = tmp_path / "first", tmp_path / "again", tmp_path / "other"
-    options = ("--searches", 2, "--lanes", 2, "--load", "gantry", "--travel=-1:1,-0.5:0.5", "--seed", 5, "--gain",
+    options = ("--searches", 2, "--copies", 2, "--load", "gantry", "--travel=-1:1,-0.5:0.5", "--seed", 5, "--gain",
                "velocity_p", "--objective", "speed", "--objective", "current", "--width", 1.2)  # fmt: skip
     assert run("optimise", "--trials", 3, *options, "--out", first).exit_code == 0
     settings = first / "settings.toml"

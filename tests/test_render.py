@@ -203,8 +203,8 @@ def test_a_fault_is_filmed_with_its_cause():
         ("hold = 0.0005", "hold = 0.0005 s must be whole milliseconds"),
         ("seed = true", "seed = True must be a whole number"),
         ("setpoints = 3", "setpoints = 3 must be an array"),
-        ("setpoints = [nan]", "nan is no finite number"),
-        ("[objects]\nx = 1.5", "objects: x = 1.5 is no whole number"),
+        ("setpoints = [nan]", "nan is not a finite number"),
+        ("[objects]\nx = 1.5", "objects: x = 1.5 is not a whole number"),
         ("[picture]\nwidth = 641", "width = 641 pixels must be an even number within 640...4096"),
         ("[picture]\nslow = 0", "slow = 0 lies outside 0.1...1000"),
         ("x", "is not valid TOML"),
@@ -527,7 +527,12 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other s
         ("glfw", ":0", "glfw", ""),
         ("glfw", None, "", "MUJOCO_GL=glfw needs a display and there is none; set MUJOCO_GL=egl or MUJOCO_GL=osmesa"),
         ("off", None, "", "MUJOCO_GL=off switches drawing off; unset it"),
-        ("vulkan", None, "", "MUJOCO_GL=vulkan is no OpenGL of this system; set it to one of glfw, glx, egl, osmesa"),
+        (
+            "vulkan",
+            None,
+            "",
+            "MUJOCO_GL=vulkan is not an OpenGL platform of this system; set it to one of glfw, glx, egl, osmesa",
+        ),
     ],
 )
 def test_which_opengl_draws(monkeypatch, asked, display, library, says):

@@ -173,7 +173,7 @@ def test_an_elastic_load_holds_every_rule_to_half_its_anti_resonance_and_says_so
     velocity_p = gains_in_si(DEVICE, elastic.supply, proposal.gains).velocity_p
     crossover = velocity_p * elastic.torque_constant / elastic.inertia / (2.0 * math.pi)
     assert crossover == pytest.approx(20.0, rel=0.01)
-    assert any("held to 20 Hz, half the anti-resonance at 40 Hz" in note for note in proposal.notes)
+    assert any("limited to 20 Hz, half the anti-resonance at 40 Hz" in note for note in proposal.notes)
     assert not any("anti-resonance" in note for note in propose(rule, DEVICE, MOTOR, plant()).notes)
 
 

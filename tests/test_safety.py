@@ -320,7 +320,7 @@ def test_without_a_heartbeat_consumer_life_is_guarded(tmp_path, bus, drive):
 def test_a_drive_that_cannot_watch_is_not_moved_unless_the_user_wants_it(bus, drive, caplog):
     drive.refusals[0x1016, 1] = 0x06060000
     with CanDrives(bus=bus) as drives:
-        with pytest.raises(SafetyError, match=r"node 1 cannot watch over its master: .*Limits\(silence=None\)"):
+        with pytest.raises(SafetyError, match=r"node 1 cannot monitor its master: .*Limits\(silence=None\)"):
             motion.enable(drives, mode="csv")
         assert 15 not in sent_controlwords(bus)
     with CanDrives(bus=bus, safety=Limits(silence=None)) as drives:

@@ -77,7 +77,7 @@ def test_it_prints_two_lines_that_join_the_bus(tmp_path):
         output, errors = process.communicate(timeout=30)
     assert process.returncode == 0
     assert errors == ""
-    assert output.splitlines()[-1] == "drive-env: ended"
+    assert output.splitlines()[-1] == "drive-env: stopped"
     assert re.search(r"\d+ frames in 0\.000 s of the drives' time, 0 error frames, 0 lost", output)
 
 
@@ -118,7 +118,7 @@ def test_a_signal_ends_it_with_code_0_and_one_line(tmp_path, number):
     with served(cwd=tmp_path) as (process, _):
         process.send_signal(number)
         output, errors = process.communicate(timeout=30)
-    assert (process.returncode, output, errors) == (0, "drive-env: ended\n", "")
+    assert (process.returncode, output, errors) == (0, "drive-env: stopped\n", "")
 
 
 def test_a_duration_ends_it_and_stats_say_how_late_and_how_full(tmp_path):
@@ -251,7 +251,7 @@ def test_a_bus_is_read_as_it_is_written(tmp_path):
     ("faults = 1\n[[machines]]", "faults = 1 must be a table"),
     ("[[machines]]\n[faults]\ndrop = 2", "drop = 2.0 must be a share of all frames, 0 to 1"),
     ("[[machines]]\n[faults]\nloss = 2", "faults: key 'loss' is unknown; there are drop, delay"),
-    ("[[machines", "is no TOML file"),
+    ("[[machines", "is not a TOML file"),
 ])  # fmt: skip
 def test_a_bus_that_cannot_be_says_why(tmp_path, text, message):
     with pytest.raises(BusConfigError) as error:

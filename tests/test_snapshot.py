@@ -122,7 +122,7 @@ def test_a_rollback_that_fails_names_the_file_that_helps(target, tmp_path, monke
 
     monkeypatch.setattr(target.drives, "write", refuse)
     with (
-        pytest.raises(BusError, match=r"cable is out.*drive-tune undo .*before\.toml brings back"),
+        pytest.raises(BusError, match=r"cable is out.*drive-tune undo .*before\.toml restores"),
         Transaction(target, tmp_path / "before.toml"),
     ):
         change(target.drives)
@@ -186,8 +186,8 @@ def test_drives_of_another_kind_or_number_are_refused(target):
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ("device = 3", "is no snapshot"),
-    ("device = ", "is no TOML"),
+    ("device = 3", "is not a file with the state before"),
+    ("device = ", "is not TOML"),
     ('device = "tmcm1636"\n[[axis]]\n"6041:00" = 3', "6041:00 = 3: .* can only be read"),
     ('device = "tmcm1636"\n[[axis]]\n"2003:00" = 999999999', "2003:00 = 999999999"),
     ('device = "tmcm1636"\n[[axis]]\nx = 3', "x = 3"),
@@ -322,7 +322,7 @@ def test_a_change_that_the_drives_keep_is_undone_for_good(tmp_path, monkeypatch)
             target.drives.reset_node()
             assert gains(target.drives).tolist() == np.repeat(TRIED, 2, axis=0).tolist()
         done = drive_tune("undo", transaction.path, "--yes")
-        assert re.search(r"^10 parameters restored, \d+ verified .*; the drives keep them$", done.stdout, re.MULTILINE)
+        assert re.search(r"^10 parameters restored, \d+ verified .*; stored in the drives$", done.stdout, re.MULTILINE)
         with opened(channel) as target:
             target.drives.reset_node()
         assert [gains(machine).tolist() for machine in machines] == before
@@ -404,7 +404,7 @@ def test_the_way_back_is_read_again_before_anything_is_changed(target, tmp_path,
     ("spoil", "words", "unchecked"),
     [
         (lambda text: text.replace('"2003:00" = 7000', '"2003:00" = 9000'), "was changed since it was written", 0),
-        (lambda text: text[: text.index('"2042')], "is torn: it ends before its check sum", 2),
+        (lambda text: text[: text.index('"2042')], "is incomplete: it ends before its check sum", 2),
         (lambda text: text[: text.index("[check]")].replace("format = 2\n", ""), "has no check sum", 0),
         (lambda text: text.replace('"2003:00"', '"6040:00" = 15\n"2003:00"'), "holds what is no parameter: 6040h", 2),
     ],
@@ -494,10 +494,10 @@ def test_a_mistake_is_one_line(target, tmp_path, monkeypatch, arguments, code, m
 
 @pytest.mark.parametrize(
     ("bus", "said"),
-    [('[bus]\nsafety = false\n', r"\[bus\] has a key 'safety', which is none of interface, channel"),
-     ('[bus]\nnodes = 1\n', r"\[bus\] nodes = 1 is no int"),
-     ('[bus]\nnodes = ["1"]\n', "is no int"),
-     ('[bus]\nchannel = 3\n', "channel = 3 is no str"),
+    [('[bus]\nsafety = false\n', r"\[bus\] has a key 'safety', which is not one of interface, channel"),
+     ('[bus]\nnodes = 1\n', r"\[bus\] nodes = 1 is not of type int"),
+     ('[bus]\nnodes = ["1"]\n', "is not of type int"),
+     ('[bus]\nchannel = 3\n', "channel = 3 is not of type str"),
      ('bus = 3\n', "must be a table")],
 )  # fmt: skip
 def test_a_file_does_not_say_how_else_drives_are_opened(tmp_path, bus, said):

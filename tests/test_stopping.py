@@ -119,7 +119,7 @@ def test_an_axis_that_does_not_obey_the_quick_stop_loses_its_voltage_after_100_m
 
 def test_an_axis_that_is_not_seen_loses_its_voltage_after_400_ms():
     one, cut = stop(Axis(down(RAMP), seen_until=0.05))
-    assert one.why.startswith("it was not seen for 0.4 s")
+    assert one.why.startswith("its position was not received for 0.4 s")
     assert 0.45 < cut <= 0.45 + 3 * PERIOD
 
 

@@ -111,7 +111,7 @@ def test_a_machine_is_the_same_alone_and_among_others():
 
 
 def test_machines_of_several_kinds_cannot_share_drives():
-    with pytest.raises(ValueError, match=r"one load with one motor, not .*belt on qbl4208"):
+    with pytest.raises(ValueError, match=r"one load and one motor, not .*belt on qbl4208"):
         open_group([machine for machine in load_suite() if machine.load in ("belt", "fan")])
 
 
@@ -162,7 +162,7 @@ def test_few_machines_are_taken_from_all_groups():
         ('"inertia"\nmotor', '"pendulum"\nmotor', r"no load is named 'pendulum'"),
         ("count = 3", "number = 3", r"key 'number' is unknown; there are count, groups"),
         ('"tmcm1636"', "1", r"device = 1 is a whole number; it must be a text"),
-        ("[[generated]]", "[generated", r"is no TOML"),
+        ("[[generated]]", "[generated", r"is not TOML"),
         ("[[generated]]", "[generated]", r"generated is a table; write one table \[\[generated\]\]"),
     ],
 )

@@ -93,7 +93,7 @@ EMULATED = [
     ("drive-tune", "rank", "--list"),
     ("drive-tune", "rules", "--load", "inertia"),
     ("drive-tune", "response", "--load", "gantry"),
-    ("drive-tune", "optimise", "--load", "gantry", "--trials", "3", "--lanes", "3", "--objective", "speed",
+    ("drive-tune", "optimise", "--load", "gantry", "--trials", "3", "--copies", "3", "--objective", "speed",
      "--objective", "robustness", "--objective", "current", "--out", "found"),
 ]  # fmt: skip
 SLOW = [

@@ -63,7 +63,7 @@ def test_a_factory_fresh_drive_has_no_gains():
 @pytest.mark.parametrize(("change", "message"), [
     ({"low": np.array([0.1])}, "axis 0: travel 0.1 to inf rad must contain 0"),
     ({"high": np.array([-0.1])}, "axis 0: travel -inf to -0.1 rad must contain 0"),
-    ({"low": np.zeros(1), "high": np.zeros(1)}, "somewhere to go"),
+    ({"low": np.zeros(1), "high": np.zeros(1)}, "must not be empty"),
     ({"low": np.full(2, -1.0)}, r"low must have shape \(1,\), not \(2,\)"),
     ({"supply": np.array([0.5])}, r"supply 0.5 V lies outside 8...60 V, with which a tmcm1636 works; give the voltage"),
     ({"supply": np.array([60.0])}, "supply 60 V lies outside"),

@@ -1,4 +1,4 @@
-"""ServoDrive/Tracking-v0: the agent as outer controller, in many lanes, alone, and over CAN."""
+"""ServoDrive/Tracking-v0: the agent as outer controller, in many environments, alone, and over CAN."""
 
 from __future__ import annotations
 
@@ -77,7 +77,8 @@ def test_a_toml_file_configures(tmp_path):
         assert lanes.config.weights["effort"] == 0.5 and lanes.config.weights["tracking"] == 1.0
 
 
-# --- one lane among many ----------------------------------------------------------------------------------------------
+# --- one environment among many
+# ----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("load", LOADS)
 def test_a_lane_is_the_same_alone_and_among_others(load):
     axes = 2 if load == "gantry" else 1
@@ -413,12 +414,12 @@ def test_on_a_bus_what_needs_a_machine_is_refused():
 def test_stable_baselines_trains_on_lanes_without_copies():
     import stable_baselines3 as sb3
 
-    from drive_env.envs.stable_baselines import LanesVecEnv
+    from drive_env.envs.stable_baselines import DriveVecEnv
 
     with pytest.raises(ValueError, match="SameStep"), tracking(2) as lanes:
-        LanesVecEnv(lanes)
+        DriveVecEnv(lanes)
     with tracking(8, duration=0.03, autoreset_mode="SameStep") as lanes:
-        env = LanesVecEnv(lanes)
+        env = DriveVecEnv(lanes)
         handed = []
         step = lanes.step
         lanes.step = lambda given: handed.append(step(given)) or handed[-1]

@@ -184,7 +184,7 @@ def test_arrays_that_are_not_what_they_say(kind, tmp_path, memory):
     with pytest.raises(UntrustedFileError, match=r"agent\.npz") as told:
         read_arrays(path)
     assert "\n" not in str(told.value)
-    with pytest.raises(BundleError, match=r"agent\.npz is no agent"):
+    with pytest.raises(BundleError, match=r"agent\.npz is not an agent"):
         AgentFile.load(path)
     with pytest.raises(ValueError, match=r"agent\.npz has no episodes"):
         episode_log.load(path)
@@ -272,7 +272,7 @@ def test_a_frame_that_holds_no_arrays_is_told(tmp_path):
     with path.open("ab") as file:
         header = {"shard": 1, "bytes": 4, "sha256": hashlib.sha256(b"data").hexdigest()}
         file.write(json.dumps(header).encode() + b"\ndata")
-    with pytest.raises(ShardLogError, match=r"shards is damaged: .*; remove it to begin anew"):
+    with pytest.raises(ShardLogError, match=r"shards is damaged: .*; remove it to start again"):
         ShardLog(path, "run")
 
 
@@ -283,7 +283,7 @@ STORE = '{"format": 1, "device": "tmcm1636", "sections": {"communication": {"607
 @pytest.mark.parametrize("value", ["Infinity", "NaN", "1e999", "1.5", '"5"', "true", "null", "[]", DEEP_JSON])
 def test_a_store_holds_whole_numbers(value, tmp_path):
     (tmp_path / "node.json").write_text(STORE % value)
-    with pytest.raises(ValueError, match=r"node\.json holds no parameters of a tmcm1636 \(.*\); give another file"):
+    with pytest.raises(ValueError, match=r"node\.json has no parameters of a tmcm1636 \(.*\); give another file"):
         Store(tmp_path / "node.json", "tmcm1636")
 
 
@@ -293,7 +293,7 @@ def test_a_store_names_objects(key, tmp_path):
     if key == "٣:0":  # digits all the same
         assert Store(tmp_path / "node.json", "tmcm1636").sections == {"communication": {(3, 0): 5}}
         return
-    with pytest.raises(ValueError, match=r"node\.json holds no parameters of a tmcm1636"):
+    with pytest.raises(ValueError, match=r"node\.json has no parameters of a tmcm1636"):
         Store(tmp_path / "node.json", "tmcm1636")
 
 

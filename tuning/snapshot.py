@@ -181,10 +181,12 @@ def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
         raise SnapshotError(f"{file}: bus = {bus!r} must be a table; give a file as drive-tune left it")
     for key, value in bus.items():
         if key not in _BUS:
-            raise SnapshotError(f"{file}: [bus] has a key {key!r}, which is none of {', '.join(_BUS)}; take it out")
+            raise SnapshotError(f"{file}: [bus] has a key {key!r}, which is not one of {', '.join(_BUS)}; remove it")
         numbers = value if isinstance(value, list) else [value]
         if (isinstance(value, list) != (key == "nodes")) or any(type(one) is not _BUS[key] for one in numbers):
-            raise SnapshotError(f"{file}: [bus] {key} = {value!r} is no {_BUS[key].__name__}; give it as it was")
+            raise SnapshotError(
+                f"{file}: [bus] {key} = {value!r} is not of type {_BUS[key].__name__}; restore the file"
+            )
     return bus
 
 

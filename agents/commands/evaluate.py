@@ -293,10 +293,10 @@ def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, 
             return evaluation.evaluate(
                 loaded.policy, loaded.environment, configuration, **{**options, "guard": None}, told=show
             )
-    from agents.training.tasks import make_lanes
+    from agents.training.tasks import make_environments
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
-    lanes: Any = make_lanes(loaded.environment, 1, configuration)
+    lanes: Any = make_environments(loaded.environment, 1, configuration)
     config = lanes.config
     lanes.close()
     with (

@@ -19,7 +19,7 @@ import numpy as np
 from agents.evaluation.scores import Episode, Interval, figures, interval
 from agents.policies.agent_file import plain
 from agents.policies.guard import LIMITS, PATIENT, GuardedPolicy, GuardLimits, come_to_rest, stopping, unchanged
-from agents.training.tasks import ENVIRONMENTS, configuration_of, environment_name, make_lanes
+from agents.training.tasks import ENVIRONMENTS, configuration_of, environment_name, make_environments
 from agents.tuner.tune_target import TRIAL_SECONDS
 from drive_env.drives.interface import Drives
 from drive_env.drives.observed import ObservedDrives, Observer
@@ -147,7 +147,7 @@ def evaluate(
             machines.
         side: What the report calls the drives.
         told: Is told the share that is done.
-        at_once: Episodes side by side on emulated machines; by default `lanes_for` as many.
+        at_once: Episodes side by side on emulated machines; by default `environments_for` as many.
 
     Raises:
         PolicyStoppedError: If the policy did what it must not; given drives are at rest and disabled then.
@@ -159,7 +159,7 @@ def evaluate(
     if given:  # machines are drawn on emulators alone
         options = {key: value for key, value in options.items() if key not in ("distributions", "privileged", "stage")}
     lanes: Any
-    count = (at_once or lanes_for(episodes)) if drives is None else _lanes_of(environment, drives, options)
+    count = (at_once or environments_for(episodes)) if drives is None else _num_envs_of(environment, drives, options)
     more = {"drives": drives, "autoreset_mode": "Disabled"} if given else {"autoreset_mode": "NextStep"}
     if sensor is not None:
         more["sensor"] = sensor
@@ -169,7 +169,7 @@ def evaluate(
         if drives is not None:
             care.enter_context(unchanged(drives))
             care.enter_context(stopping(drives))
-        lanes = make_lanes(environment, count, options, **more)
+        lanes = make_environments(environment, count, options, **more)
         if drives is not None and not drives.time_waits:
             care.enter_context(undisturbed())
         try:
@@ -206,7 +206,7 @@ def evaluate(
     return evaluation
 
 
-def lanes_for(episodes: int) -> int:
+def environments_for(episodes: int) -> int:
     """Return how many of so many episodes run at the same time on emulated machines."""
     return min(episodes, LANES)
 
@@ -266,7 +266,7 @@ def _episodes(
     count = lanes.num_envs
     observation, begun = lanes.reset(seed=list(seeds))
     policy.reset(None)
-    first = [_of_lane(begun, lane) for lane in range(count)]
+    first = [_of_environment(begun, lane) for lane in range(count)]
     rows: list[Any] = [_seen(observation)]
     actions: list[Any] = []
     rewards: list[Any] = []
@@ -291,7 +291,7 @@ def _episodes(
         ended = open_ & (terminated | truncated)
         for lane in map(int, np.flatnonzero(ended)):
             fell[lane] = terminated[lane]
-            last[lane] = _of_lane(info, lane)
+            last[lane] = _of_environment(info, lane)
             faults[lane] = str(last[lane].get("fault", "") or "")
         open_ &= ~ended
         if (now := time.perf_counter()) - last_told > TOLD:
@@ -299,7 +299,7 @@ def _episodes(
             told(len(rewards))
         if all_end and ended.any():
             for lane in map(int, np.flatnonzero(open_)):
-                last[lane] = _of_lane(info, lane)
+                last[lane] = _of_environment(info, lane)
             break
     seconds = time.perf_counter() - start
     if "trial_gains" in info and (answer := policy.answer(rows[-1])) is not None:
@@ -325,7 +325,7 @@ def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[d
     """Let the end of episodes tell of a tuner's own answers, which are gains that it tried, instead of incumbents.
 
     Args:
-        gains: The answers, (lanes, axes, count).
+        gains: The answers, (environments, axes, count).
         trials: What was told of every trial of all environments, by the names of TRIAL_OF.
         last: What the environment told in the last step of each environment; changed.
     """
@@ -343,7 +343,7 @@ def _seen(observation: Any) -> Any:
     return np.array(observation["observation"] if isinstance(observation, dict) else observation)
 
 
-def _of_lane(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
+def _of_environment(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
     """Return the numbers and texts of an info for one environment."""
     found = {}
     for key, value in info.items():
@@ -353,7 +353,7 @@ def _of_lane(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
     return found
 
 
-def _lanes_of(environment: str, drives: Drives, options: Mapping[str, Any]) -> int:
+def _num_envs_of(environment: str, drives: Drives, options: Mapping[str, Any]) -> int:
     """Return how many environments given drives make: each has the axes of the load."""
     from mechanics.loads import find_load
 

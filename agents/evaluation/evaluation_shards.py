@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from agents.evaluation.evaluation import Evaluation, evaluate, lanes_for, summary
+from agents.evaluation.evaluation import Evaluation, environments_for, evaluate, summary
 from agents.evaluation.scores import Episode
 from agents.policies.open_policy import names_a_file, opened
-from agents.training.tasks import configuration_of, environment_name, make_lanes
+from agents.training.tasks import configuration_of, environment_name, make_environments
 
 if TYPE_CHECKING:
     from tuning.runs.pools import Pool
@@ -73,7 +73,7 @@ def evaluate_elsewhere(
 ) -> Evaluation:
     """Run episodes on emulated machines and return what they say, as `evaluate` does, wherever the pool runs them."""
     environment, options = environment_name(environment), dict(configuration)
-    at_once = lanes_for(episodes)
+    at_once = environments_for(episodes)
     rounds = [
         _Round(policy, environment, options, seed + first, min(at_once, episodes - first), at_once)
         for first in range(0, episodes, at_once)
@@ -82,7 +82,7 @@ def evaluate_elsewhere(
     for k, recorded in pool.unordered(_run, rounds):
         found[k] = recorded
         told(len(found) / len(rounds))
-    lanes: Any = make_lanes(environment, 1, options)
+    lanes: Any = make_environments(environment, 1, options)
     config, complete = lanes.config, configuration_of(lanes)
     lanes.close()
     every = [episode for k in range(len(rounds)) for episode in found[k]]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.policies.guard import GuardLimits
-from agents.training.tasks import environment_name, make_lanes
+from agents.training.tasks import environment_name, make_environments
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 
@@ -62,7 +62,7 @@ def target_for(
     warm_up(environment, configuration)
     position, velocity = None, None
     if environment_name(environment) == "ServoDrive/Tracking-v0":
-        lanes = make_lanes(environment, 1, _emulated(configuration))
+        lanes = make_environments(environment, 1, _emulated(configuration))
         amplitude, speed = lanes.config.amplitude, lanes.config.speed  # type: ignore[attr-defined]
         lanes.close()
         with open_drives(**more) as drives:
@@ -71,7 +71,7 @@ def target_for(
         reach = POSITION_SLACK * amplitude * turn
         position = ((at - reach).tolist(), (at + reach).tolist())
         velocity = (SPEED_SLACK * speed * speed_turn).tolist()
-    # A trial of gains may oscillate: it sees that and stops the lane by itself.
+    # A trial of gains may oscillate: it sees that and stops the environment by itself.
     oscillation = environment_name(environment) != "ServoDrive/GainTuning-v0"
     limits = Limits(position=position, velocity=velocity, oscillation=oscillation, stall=guard.stall)
     with on_bus(travel=FREE, safety=limits, **more) as target:
@@ -80,7 +80,7 @@ def target_for(
 
 def warm_up(environment: str, configuration: Mapping[str, Any]) -> None:
     """Compile what the environment runs, on an emulated machine: a policy would else stall in its first step."""
-    lanes = make_lanes(environment, 1, _emulated(configuration))
+    lanes = make_environments(environment, 1, _emulated(configuration))
     space: Any = lanes.action_space
     lanes.reset(seed=0)
     lanes.step(np.zeros(space.shape, np.float32))

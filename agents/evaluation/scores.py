@@ -26,7 +26,7 @@ class Episode(NamedTuple):
     terms: Reward term -> values, shape (steps,).
     terminated: Whether it ended early, which is a violation.
     fault: What ended it; "" if nothing did.
-    first, last: The environment's info at its begin and in its last step, of this lane.
+    first, last: The environment's info at its begin and in its last step, of this environment.
     """
 
     seed: int

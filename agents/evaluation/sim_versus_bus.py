@@ -15,7 +15,7 @@ from agents.evaluation.evaluation import Evaluation, as_on_a_bus, evaluate, join
 from agents.evaluation.on_the_bus import drives_for
 from agents.evaluation.served import Served, draw_machines, emulated, in_lockstep, in_real_time
 from agents.policies.guard import LIMITS, GuardLimits, PolicyStoppedError
-from agents.training.tasks import environment_name, make_lanes
+from agents.training.tasks import environment_name, make_environments
 from drive_env.bus.config import Machine
 from drive_env.drives.interface import Drives, machine_of
 from drive_env.master.errors import BusError
@@ -74,7 +74,7 @@ def on_both_sides(
         BusError: If no machine could be judged over the bus.
     """
     environment = environment_name(environment)
-    lanes: Any = make_lanes(environment, 1, configuration)
+    lanes: Any = make_environments(environment, 1, configuration)
     config = lanes.config
     lanes.close()
     joint = getattr(getattr(config, "task", None), "joint", None)

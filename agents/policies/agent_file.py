@@ -113,19 +113,19 @@ class AgentFile:
         except TooLargeError as error:
             raise BundleError(f"{error} Give {AN_AGENT}") from None
         except (OSError, KeyError, ValueError):
-            raise BundleError(f"{path} is no agent; give {AN_AGENT}") from None
+            raise BundleError(f"{path} is not an agent; give {AN_AGENT}") from None
         if not isinstance(about, dict) or about.get("format") != FORMAT:
-            raise BundleError(f"{path} is no agent; give {AN_AGENT}")
+            raise BundleError(f"{path} is not an agent; give {AN_AGENT}")
         if about.get("format_version") != FORMAT_VERSION:
             raise BundleError(
                 f"{path} has format {about.get('format_version')} and this drive-env reads {FORMAT_VERSION}; "
                 "use the drive-env that wrote it, or train again"
             )
         if not all(isinstance(about.get(name), kind) for name, kind in KINDS_OF_ABOUT.items()):
-            raise BundleError(f"{path} is no agent; give {AN_AGENT}")
+            raise BundleError(f"{path} is not an agent; give {AN_AGENT}")
         bundle = cls(arrays=arrays, **{name: about[name] for name in KINDS_OF_ABOUT})
         if bundle.hash != about.get("hash"):
-            raise BundleError(f"{path} was changed after it was written: its hash is {bundle.hash[:12]}…; get it anew")
+            raise BundleError(f"{path} was changed after it was written: its hash is {bundle.hash[:12]}…; get it again")
         return bundle
 
     def _about(self) -> dict[str, Any]:

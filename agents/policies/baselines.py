@@ -36,13 +36,13 @@ def nothing(axes: int) -> Any:
 
 
 class ControlLaw:
-    """A function of observations, shape (lanes, entries), as a policy."""
+    """A function of observations, shape (environments, entries), as a policy."""
 
     def __init__(self, function: Any) -> None:
         self._function = function
 
     def act(self, observation: Any) -> Array:
-        """Return the action for one observation, or one for each lane."""
+        """Return the action for one observation, or one for each environment."""
         action = np.clip(self._function(np.atleast_2d(observation)), -1.0, 1.0).astype(np.float32)
         found: Array = action[0] if np.ndim(observation) == 1 else action
         return found
@@ -62,8 +62,8 @@ def state_feedback(configuration: Any) -> ControlLaw:
 def feed_forward(configuration: Any, lags: Any = None) -> ControlLaw:
     """Return the identified feed-forward for a configuration of Tracking whose action is the offset.
 
-    csp: 60B0h leads by the lags, those of the load or given ones, each a number or of shape (lanes, axes). csv: a
-    position loop in the master, and through 60B1h the velocity that the acceleration needs besides. Of cst it is
+    csp: 60B0h leads by the lags, those of the load or given ones, each a number or of shape (environments, axes). csv:
+    a position loop in the master, and through 60B1h the velocity that the acceleration needs besides. Of cst it is
     nothing: its profile is the current already.
     """
     mode, offset = configuration.mode, configuration.offset

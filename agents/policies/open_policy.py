@@ -84,13 +84,13 @@ def opened(
         trust: As `open_policy` takes it.
     """
     from agents.policies.baselines import baseline
-    from agents.training.tasks import make_lanes
+    from agents.training.tasks import make_environments
 
     if not is_baseline(text):
         return open_policy(text, trust=trust)
     if environment is None:
         raise ValueError(f"{text} does not name its environment; give --environment")
-    lanes: Any = make_lanes(environment, 1, configuration)
+    lanes: Any = make_environments(environment, 1, configuration)
     actions, config = lanes.single_action_space.shape[0], lanes.config
     lanes.close()
     return LoadedPolicy(text, baseline(text, environment, config, actions), environment)

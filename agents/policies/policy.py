@@ -215,7 +215,7 @@ class LstmPolicy:
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
         """Reset the state, in all environments or where the mask is true."""
         keep = np.zeros(len(self._state), bool) if mask is None else ~np.asarray(mask, bool)
-        if len(keep) != len(self._state):  # of an earlier number of lanes
+        if len(keep) != len(self._state):  # of an earlier number of environments
             keep = np.zeros(len(self._state), bool)
         self._state, self._cell = (np.where(keep[:, None], x, np.float32(0.0)) for x in (self._state, self._cell))
 

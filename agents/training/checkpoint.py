@@ -69,7 +69,7 @@ def read_run(path: Path) -> dict[str, Any]:
     if not isinstance(run, dict) or any(not isinstance(run.get(name), kind) for name, kind in _OF_A_RUN.items()):
         raise CheckpointError(f"{path} is not a checkpoint of drive-agent: {RUN} lacks {', '.join(_OF_A_RUN)}")
     if not isinstance(run["run"].get("seed"), int) or not isinstance(run["run"].get("hyperparameters"), dict):
-        raise CheckpointError(f"{path} is not a checkpoint of drive-agent: {RUN} says no seed, or no hyper-parameters")
+        raise CheckpointError(f"{path} is not a checkpoint of drive-agent: {RUN} has no seed, or no hyper-parameters")
     return run
 
 

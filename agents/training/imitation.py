@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from agents.policies.policy import ACTOR
 
-STEPS = 60_000  # of all lanes together
+STEPS = 60_000  # of all environments together
 BATCH, UPDATES, LEARNING_RATE = 1024, 1200, 1e-3
 PLAYING = 0.9  # of the time, about
 
@@ -37,7 +37,7 @@ def imitate(
         model: With its environment, the normaliser included, which learns its statistics here.
         teacher: What acts on the environment's own observations: `act(observations)`, `reset(mask)`.
         seed: Of the environments and of the noise.
-        steps: Of all lanes together.
+        steps: Of all environments together.
         updates: Of the network.
         told: Is told how much of it is done, 0...1.
     """

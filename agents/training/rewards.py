@@ -21,7 +21,7 @@ class EachTrial(VecEnvWrapper):  # type: ignore[misc]
     others reach.
 
     Args:
-        venv: Of GainTuning, over `CountedLanes`.
+        venv: Of GainTuning, over `CountedEnvironments`.
         limit: Of the reward, either way: what oscillates costs so much, and no machine counts for more.
     """
 

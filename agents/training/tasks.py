@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from drive_env.envs.lanes import Lanes
+    from drive_env.envs.vector_environment import VectorEnvironment
 
 
 class TrainingTask(NamedTuple):
@@ -44,9 +44,9 @@ def environment_name(text: str) -> str:
     raise ValueError(f"there is no environment {text!r}; there are {', '.join(ENVIRONMENTS)}")
 
 
-def make_lanes(
+def make_environments(
     environment: str, num_envs: int, configuration: Mapping[str, Any] | None = None, **options: Any
-) -> Lanes:
+) -> VectorEnvironment:
     """Return a vectorised environment.
 
     Args:
@@ -62,7 +62,7 @@ def make_lanes(
 
     task = ENVIRONMENTS[environment_name(environment)]
     kind = getattr(importlib.import_module(f"drive_env.envs.{task.short}"), task.kind)
-    made: Lanes = kind(num_envs, config=dict(configuration or {}), **options)
+    made: VectorEnvironment = kind(num_envs, config=dict(configuration or {}), **options)
     return made
 
 

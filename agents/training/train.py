@@ -23,11 +23,11 @@ import numpy as np
 from agents.policies.agent_file import AgentFile, plain
 from agents.training import checkpoint
 from agents.training.algorithms import ALGORITHMS, algorithm_class, need
+from agents.training.counted_environments import CountedEnvironments
 from agents.training.hyperparameters import RUN_KEYS, HyperparameterError, schedule
 from agents.training.learning_curve import draw_learning_curve
 from agents.training.networks import bundle_of
-from agents.training.tasks import ENVIRONMENTS, configuration_of, environment_name, make_lanes
-from agents.training.training_lanes import CountedLanes
+from agents.training.tasks import ENVIRONMENTS, configuration_of, environment_name, make_environments
 from agents.training.training_table import TrainingTable
 
 logger = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 CHECKPOINT, AGENT, TABLE, CURVE = "checkpoint.zip", "agent.npz", "training.csv", "learning_curve.png"
 ROWS = 200  # of the table, about
 IMITATION = 1_000_000  # a segment's number that no run has, for seeds
-EPISODES_PER_SEGMENT = 3  # of every lane, at least
+EPISODES_PER_SEGMENT = 3  # of every environment, at least
 # "constant" is SB3's word for SAC's automatic entropy and others.
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 # Keys whose value SB3 wants as a whole number, though YAML may say 1e5.
@@ -145,7 +145,7 @@ def train(
         model.set_logger(configure(str(folder), ["tensorboard"]))
         segments = _segments_class()(run, folder, lanes, normaliser, report, resume)
         if resume:
-            # SB3 would reset the lanes before the segment does, and count that in the normaliser.
+            # SB3 would reset the environments before the segment does, and count that in the normaliser.
             model._last_obs = np.zeros(0)
             model._last_episode_starts = np.ones(lanes.num_envs, bool)
         else:
@@ -233,15 +233,15 @@ def with_figures(bundle: AgentFile, figures: Mapping[str, Any], seeds: Mapping[s
     return replace(bundle, card=card)
 
 
-def make_env(run: TrainingRun) -> tuple[CountedLanes, Any]:
+def make_env(run: TrainingRun) -> tuple[CountedEnvironments, Any]:
     """Return counted environments, and the VecEnv of Stable-Baselines3 over them."""
     need("stable_baselines3")
-    from drive_env.envs.stable_baselines import LanesVecEnv
+    from drive_env.envs.stable_baselines import DriveVecEnv
 
     options = run.hyperparameters.get("env_kwargs") or {}
-    lanes = make_lanes(run.environment, run.hyperparameters["n_envs"], options, autoreset_mode="SameStep")
-    counted = CountedLanes(lanes)
-    env: Any = LanesVecEnv(counted)  # type: ignore[arg-type]
+    lanes = make_environments(run.environment, run.hyperparameters["n_envs"], options, autoreset_mode="SameStep")
+    counted = CountedEnvironments(lanes)
+    env: Any = DriveVecEnv(counted)  # type: ignore[arg-type]
     wrapper = run.hyperparameters.get("vec_env_wrapper")
     if wrapper:
         name, settings = _named(wrapper)
@@ -284,7 +284,7 @@ def is_sound(model: Any) -> bool:
     return all(bool(weight.isfinite().all()) for weight in weights)
 
 
-def segment_length(run: TrainingRun, lanes: CountedLanes) -> int:
+def segment_length(run: TrainingRun, lanes: CountedEnvironments) -> int:
     """Return the steps of a segment: a share of the run, but at least some episodes of every environment."""
     episode: int = ENVIRONMENTS[run.environment].steps(lanes.config) * lanes.num_envs
     return max(int(run.total // run.segments), EPISODES_PER_SEGMENT * episode)
@@ -302,7 +302,7 @@ def _count_from(env: Any, steps: int) -> None:
     env._steps = steps
 
 
-def _imitate(run: TrainingRun, model: Any, lanes: CountedLanes, report: Report | None) -> None:
+def _imitate(run: TrainingRun, model: Any, lanes: CountedEnvironments, report: Report | None) -> None:
     """Have the model begin as the baseline that the hyper-parameters name."""
     from agents.policies.baselines import baseline
     from agents.training.imitation import imitate
@@ -385,7 +385,7 @@ def _segments_class() -> Any:
             self,
             run: TrainingRun,
             folder: Path,
-            lanes: CountedLanes,
+            lanes: CountedEnvironments,
             normaliser: Any,
             report: Report | None,
             resumed: bool,

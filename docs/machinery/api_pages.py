@@ -54,7 +54,7 @@ PAGES = {
             ("drive_env.envs.gain_tuning", "GainTuning"),
             ("drive_env.envs.gain_scheduling", "GainScheduling"),
             ("drive_env.envs.tracking", "Tracking"),
-            ("drive_env.envs.lanes", "Lanes"),
+            ("drive_env.envs.vector_environment", "VectorEnvironment"),
             ("drive_env.envs.randomisation", "Distributions Law Curriculum"),
         ),
     ),

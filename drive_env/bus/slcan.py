@@ -35,12 +35,12 @@ def parse_frame(line: bytes) -> tuple[Frame, bool]:
     """Return the frame of a line t, T, r or R, and whether it is extended.
 
     Raises:
-        ValueError: If the line is no frame of classical CAN.
+        ValueError: If the line is not a frame of classical CAN.
     """
     extended = line[:1] in (b"T", b"R")
     match = (_EXTENDED if extended else _STANDARD).fullmatch(line)
     if match is None:
-        raise ValueError(f"{line[:MAX_LINE]!r} is no frame")
+        raise ValueError(f"{line[:MAX_LINE]!r} is not a frame")
     can_id, length, data = int(match[1], 16), int(match[2]), bytes.fromhex(match[3].decode())
     if line[:1] in (b"r", b"R"):
         if data:

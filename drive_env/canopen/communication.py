@@ -90,7 +90,7 @@ class ModuleObjects:
     def value(self, index: int, sub: int = 0) -> int:
         """Return a number; 0 of an object that this device does not have."""
         raw: int | str = self._values.get((index, sub), 0)
-        assert isinstance(raw, int), "a text is no number"
+        assert isinstance(raw, int), "a text is not a number"
         return raw
 
     def role(self, role: str) -> int:
@@ -128,7 +128,7 @@ class ModuleObjects:
     def factory_value(self, entry: Entry) -> int:
         """Return the factory's number of an object, with node 1's COB-IDs."""
         raw = self.factory(1)[entry.index, entry.sub]
-        assert isinstance(raw, int), "a text is no number"
+        assert isinstance(raw, int), "a text is not a number"
         return raw
 
     def find(self, index: int, sub: int) -> Entry:

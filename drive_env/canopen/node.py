@@ -79,7 +79,7 @@ class Node:
     ) -> None:
         device = drives.device
         if not 1 <= node_id <= 127:
-            raise ValueError(f"node {node_id} cannot be: CANopen numbers nodes 1 to 127")
+            raise ValueError(f"node {node_id} is impossible: CANopen has nodes 1 to 127")
         if not 0 <= first_axis <= drives.num_axes - device.num_axes:
             raise ValueError(
                 f"first_axis={first_axis}: {device.name} has {device.num_axes} of the {drives.num_axes} axes there "

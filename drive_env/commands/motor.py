@@ -63,7 +63,7 @@ def new_motor(
             kind = _asked("kind of motor, pmsm (brushless) or dc (brushed)", "pmsm")
         missing = _missing(kind, given)
         if missing and not _is_answered():
-            raise ValueError(f"{' or '.join(missing[0])} is missing; give it with --number (--list says what it is)")
+            raise ValueError(f"{' or '.join(missing[0])} is missing; give it with --number (--list describes it)")
         for choice in missing:
             name, value = _ask_for(choice)
             given[name] = value

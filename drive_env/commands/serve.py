@@ -135,7 +135,7 @@ def _bus(
         bus = load_bus(config)
         if one and len(bus.machines) > 1:
             flag = {"nodes": "--node", "device": "a device"}.get(next(iter(one)), f"--{next(iter(one))}")
-            _fail(f"{config} has {len(bus.machines)} machines, so {flag} cannot say which it means; change the file")
+            _fail(f"{config} has {len(bus.machines)} machines, so {flag} is ambiguous; change the file")
         return replace(bus, machines=tuple(replace(row, **one) for row in bus.machines), **every)
     except BusConfigError as error:
         _fail(str(error))

@@ -78,7 +78,7 @@ def check_allowed(entry: Entry, raw: NDArray[np.int64], allowed: tuple[int, ...]
     """Raise 06090030h for a value that is none of the few that the object knows."""
     wrong = raw[~np.isin(raw, allowed)]
     if wrong.size:
-        raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {wrong[0]}; it knows {_listed(allowed)}")
+        raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {wrong[0]}; allowed are {_listed(allowed)}")
 
 
 def _listed(values: tuple[int, ...]) -> str:

@@ -484,7 +484,7 @@ class EmulatedDrives:
         if new.size:
             warnings.warn(
                 f"machine {', '.join(map(str, new[:10]))}{' ...' if new.size > 10 else ''} left the range of physics "
-                "and is frozen at rest until machine.reset(); the others go on",
+                "and is frozen at rest until machine.reset(); the others continue",
                 RuntimeWarning,
                 stacklevel=4,
             )

@@ -1,6 +1,7 @@
 """The Gymnasium environments; `import drive_env` registers them, and each is imported only when one is made.
 
-Each has a file with its vector environment, a class of `lanes.Lanes`; the single environment is a view of it.
+Each has a file with its vector environment, a class of `vector_environment.VectorEnvironment`; the single environment
+is a view of it.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ def register() -> None:
 
 
 def make_vec_env(name: str, num_envs: int = 8, **options: Any) -> VecEnv:
-    """Return lanes of an environment as Stable-Baselines3 takes them, with the episodes' returns for its log.
+    """Return a VecEnv of Stable-Baselines3, with the episodes' returns for its log.
 
     Args:
         name: As it is registered, e.g. "ServoDrive/Tracking-v0".
-        num_envs: Lanes.
+        num_envs: Number of environments.
         options: Of the environment.
 
     Raises:
@@ -51,33 +52,33 @@ def make_vec_env(name: str, num_envs: int = 8, **options: Any) -> VecEnv:
     try:
         from stable_baselines3.common.vec_env import VecMonitor
 
-        from drive_env.envs.stable_baselines import LanesVecEnv
+        from drive_env.envs.stable_baselines import DriveVecEnv
     except ImportError as error:
         raise ImportError(f"make_vec_env needs Stable-Baselines3 ({error}): pip install 'drive-env[agents]'") from None
     module, kind = ENVIRONMENTS[name]
     lanes = getattr(importlib.import_module(f"drive_env.envs.{module}"), kind)
-    return VecMonitor(LanesVecEnv(lanes(num_envs, autoreset_mode="SameStep", **options)))
+    return VecMonitor(DriveVecEnv(lanes(num_envs, autoreset_mode="SameStep", **options)))
 
 
 def make_gain_tuning(**options: Any) -> gymnasium.Env[Any, Any]:
-    """Return one lane of GainTuning."""
+    """Return a single GainTuning environment."""
     from drive_env.envs.gain_tuning import GainTuning
-    from drive_env.envs.lanes import OneLane
+    from drive_env.envs.vector_environment import SingleEnvironment
 
-    return OneLane(GainTuning(1, autoreset_mode="Disabled", **options))
+    return SingleEnvironment(GainTuning(1, autoreset_mode="Disabled", **options))
 
 
 def make_gain_scheduling(**options: Any) -> gymnasium.Env[Any, Any]:
-    """Return one lane of GainScheduling."""
+    """Return a single GainScheduling environment."""
     from drive_env.envs.gain_scheduling import GainScheduling
-    from drive_env.envs.lanes import OneLane
+    from drive_env.envs.vector_environment import SingleEnvironment
 
-    return OneLane(GainScheduling(1, autoreset_mode="Disabled", **options))
+    return SingleEnvironment(GainScheduling(1, autoreset_mode="Disabled", **options))
 
 
 def make_tracking(**options: Any) -> gymnasium.Env[Any, Any]:
-    """Return one lane of Tracking."""
-    from drive_env.envs.lanes import OneLane
+    """Return a single Tracking environment."""
     from drive_env.envs.tracking import Tracking
+    from drive_env.envs.vector_environment import SingleEnvironment
 
-    return OneLane(Tracking(1, autoreset_mode="Disabled", **options))
+    return SingleEnvironment(Tracking(1, autoreset_mode="Disabled", **options))

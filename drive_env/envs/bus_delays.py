@@ -27,21 +27,21 @@ _LOST, _ACTION, _OBSERVATION = (k << 40 for k in (1, 2, 3))
 
 
 class BusDelays:
-    """The delays of every lane's bus; a lane's chance follows from its generator alone.
+    """The delays of every environment's bus; an environment's chance follows from its generator alone.
 
     Args:
-        num_lanes: Lanes.
-        deepest: Longest latency and jitter together that a lane can have [communication cycles].
+        num_envs: Number of environments.
+        deepest: Longest latency and jitter together that an environment can have [communication cycles].
 
     Compiled code passes messages on by `pass_on`, with the lines' addresses.
     """
 
-    def __init__(self, num_lanes: int, deepest: int = 8) -> None:
-        self._keys = np.zeros(num_lanes, np.uint64)
-        self._lost_sync = np.zeros(num_lanes)
+    def __init__(self, num_envs: int, deepest: int = 8) -> None:
+        self._keys = np.zeros(num_envs, np.uint64)
+        self._lost_sync = np.zeros(num_envs)
         self.actions = _new_line(_ACTION, self._keys, self._lost_sync, deepest)
         self.observations = _new_line(_OBSERVATION, self._keys, self._lost_sync, deepest)
-        self.is_there = False  # whether any lane's bus does anything: without, all arrives at once
+        self.is_there = False  # whether any environment's bus does anything: without, all arrives at once
 
     def reset(
         self,
@@ -51,16 +51,16 @@ class BusDelays:
         observation: NDArray[Any],
         where: Mask | None = None,
     ) -> None:
-        """Begin anew in the lanes where the mask is true.
+        """Begin anew in the environments where the mask is true.
 
         Args:
             values: `RandomMachines.values`, of which those of the bus are used: "bus.action_latency",
                 "bus.observation_latency", "bus.jitter" (the most that a message takes longer) [communication cycles],
-                "bus.lost_sync" (probability per cycle); each of shape (num_lanes,).
-            rngs: The lanes' generators; one number is taken from each lane's that begins.
-            action: What acts until the first action arrives, shape (num_lanes, ...).
-            observation: What is seen until the first measurement arrives, shape (num_lanes, ...).
-            where: Lanes.
+                "bus.lost_sync" (probability per cycle); each of shape (num_envs,).
+            rngs: The environments' generators; one number is taken from each environment's that begins.
+            action: What acts until the first action arrives, shape (num_envs, ...).
+            observation: What is seen until the first measurement arrives, shape (num_envs, ...).
+            where: Environments.
 
         Raises:
             ValueError: For delays deeper than these lines are, or negative ones.
@@ -77,7 +77,7 @@ class BusDelays:
         self.is_there = bool(self._lost_sync.any()) or self.actions.is_there or self.observations.is_there
 
     def act(self, actions: NDArray[Any]) -> NDArray[Any]:
-        """Send actions in some cycles, shape (cycles, num_lanes, ...); return those that the drives act on in each."""
+        """Send actions in some cycles, shape (cycles, num_envs, ...); return those that the drives act on in each."""
         return self.actions.pass_on(actions) if self.is_there else actions
 
     def act_unlatched(self, actions: NDArray[Any]) -> NDArray[Any]:
@@ -85,32 +85,32 @@ class BusDelays:
         return self.actions.pass_on(actions, latched=False) if self.is_there else actions
 
     def observe(self, observations: NDArray[Any]) -> NDArray[Any]:
-        """Let the drives sample in some cycles, (cycles, num_lanes, ...); return what the master has by their ends."""
+        """Let the drives sample in some cycles, (cycles, num_envs, ...); return what the master has by their ends."""
         return self.observations.pass_on(observations) if self.is_there else observations
 
 
 @dataclass(eq=False)
 class Line(Bundle):
-    """Messages under way of every lane, in one direction; as doubles, which hold all integers of 32 bits."""
+    """Messages under way of every environment, in one direction; as doubles, which hold all integers of 32 bits."""
 
-    keys: Annotated[NDArray[np.uint64], types.uint64[::1]]  # of chance, (num_lanes,)
+    keys: Annotated[NDArray[np.uint64], types.uint64[::1]]  # of chance, (num_envs,)
     mark: int  # of this direction's chances
-    lost_sync: Vector  # probability per cycle, (num_lanes,)
+    lost_sync: Vector  # probability per cycle, (num_envs,)
     latency: Numbers  # [communication cycles]
     jitter: Numbers
-    cycle: Numbers  # of each lane, counted since its reset
+    cycle: Numbers  # of each environment, counted since its reset
     last_arrival: Numbers
-    arrivals: NumberMatrix  # of the last messages, (num_lanes, depth)
-    messages: Cube  # (num_lanes, depth, width)
-    held: Matrix  # what is there now, (num_lanes, width)
+    arrivals: NumberMatrix  # of the last messages, (num_envs, depth)
+    messages: Cube  # (num_envs, depth, width)
+    held: Matrix  # what is there now, (num_envs, width)
 
     @property
     def is_there(self) -> bool:
-        """Whether this direction of any lane delays anything."""
+        """Whether this direction of any environment delays anything."""
         return bool(self.latency.any() or self.jitter.any())
 
     def reset(self, latency: Floats, jitter: Floats, first: NDArray[Any], where: Mask) -> None:
-        """Begin anew in the lanes where the mask is true, with what is there before the first message."""
+        """Begin anew in the environments where the mask is true, with what is there before the first message."""
         lanes, width, depth = len(where), first[0].size, self.arrivals.shape[1]
         if self.held.shape[1] != width:
             self.replace(messages=np.zeros((lanes, depth, width)), held=np.zeros((lanes, width)))
@@ -130,7 +130,7 @@ class Line(Bundle):
         self.held[where] = begun[where]
 
     def pass_on(self, messages: NDArray[Any], latched: bool = True) -> NDArray[Any]:
-        """Return what is there in each cycle, of messages of shape (cycles, num_lanes, ...) sent in them."""
+        """Return what is there in each cycle, of messages of shape (cycles, num_envs, ...) sent in them."""
         sent = np.ascontiguousarray(messages, float).reshape(*messages.shape[:2], -1)
         arrived = np.empty_like(sent)
         _pass_rows_on(self.address, sent, arrived, latched)
@@ -162,7 +162,7 @@ def _share(key: Any, mark: Any) -> Any:
 
 @stage
 def pass_on(line: Any, lane: Any, message: Any, latched: Any) -> None:
-    """Let a cycle of a lane begin with a message, shape (width,); `line.held` of the lane is what is there then."""
+    """Begin a cycle of an environment with a message, shape (width,); `line.held` is what has arrived by then."""
     held, latency, jitter, lost = line.held, line.latency[lane], line.jitter[lane], line.lost_sync[lane]
     if latency == 0 and jitter == 0 and (lost == 0.0 or not latched):
         for part in range(message.shape[0]):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.envs.lanes import check_choice
+from drive_env.envs.vector_environment import check_choice
 
 if TYPE_CHECKING:
     from drive_env.emulator.machine import Machines
@@ -56,31 +56,31 @@ def find_payload(load: Load, chosen: str, low: float | None, high: float | None)
 
 
 class PayloadChanges:
-    """When the payload of each lane's machine changes in an episode, and to what: once in each of its equal parts.
+    """When each machine's payload changes in an episode, and to what: once in each of its equal parts.
 
     Args:
         payload: What changes.
-        machines: Emulated ones, one per lane, with the nominal value.
-        num_lanes: Lanes.
+        machines: Emulated ones, one per environment, with the nominal value.
+        num_envs: Number of environments.
         steps: Of an episode.
         count: Changes in an episode.
 
     Attributes:
-        at: Step of each change, shape (num_lanes, count).
-        factor: On the nominal value, from then on, shape (num_lanes, count).
+        at: Step of each change, shape (num_envs, count).
+        factor: On the nominal value, from then on, shape (num_envs, count).
     """
 
-    def __init__(self, payload: Payload, machines: Machines, num_lanes: int, steps: int, count: int) -> None:
+    def __init__(self, payload: Payload, machines: Machines, num_envs: int, steps: int, count: int) -> None:
         self._payload = payload
         self._machines = machines
         self._steps = steps
         if payload.name != NO_PAYLOAD:
             self._nominal = machines.parameters[payload.name]
-        self.at = np.zeros((num_lanes, count), np.int64)
-        self.factor = np.ones((num_lanes, count))
+        self.at = np.zeros((num_envs, count), np.int64)
+        self.factor = np.ones((num_envs, count))
 
     def draw(self, rngs: Sequence[np.random.Generator], where: Mask) -> None:
-        """Draw new changes for the lanes where the mask is true."""
+        """Draw new changes for the environments where the mask is true."""
         _, low, high = self._payload
         count = self.at.shape[1]
         for lane in map(int, np.flatnonzero(where)):
@@ -89,10 +89,10 @@ class PayloadChanges:
             self.factor[lane] = low * (high / low) ** chance[1]
 
     def apply(self, now: Integers, parameters: dict[str, Floats]) -> dict[str, Floats]:
-        """Give the lanes whose time has come another payload; one that cannot be stepped keeps the one it has.
+        """Give the environments whose time has come another payload; one that cannot be stepped keeps the one it has.
 
         Args:
-            now: The lanes' present step, shape (num_lanes,).
+            now: The environments' present step, shape (num_envs,).
             parameters: The true machines before.
 
         Returns:

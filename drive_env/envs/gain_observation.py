@@ -1,4 +1,4 @@
-"""What GainTuning shows of identification, trials and the true machine: rows with their bounds, and their values."""
+"""The observation of GainTuning, from identification, trials and true machine: rows with bounds, and their values."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ LEFT = ObservationRow("trials left", "those of an episode", 0.0, 1.0)
 
 
 def rows_of(axes: int, gains: int, waveform: int, highest: int) -> list[ObservationRow]:
-    """Return the entries of a lane: of each axis in turn, of the last trial before the incumbent's, then of the lane.
+    """Return the entries: of each axis in turn, of the last trial before the incumbent's, then of the environment.
 
     Args:
-        axes: Of the lane.
+        axes: Of the environment.
         gains: How many the action changes.
         waveform: Points of the last move's error.
         highest: The greatest integer of any gain.
@@ -78,7 +78,7 @@ def tried_entries(tried: Trial, following: Floats, measured: Floats) -> Floats:
     Args:
         tried: The trial.
         following: That of the rule's trial, shape (phases, num_axes).
-        measured: J by measured terms of each axis's lane, shape (num_axes,).
+        measured: J by measured terms of each axis's environment, shape (num_axes,).
     """
     terms = tried.terms
     rows = np.stack(
@@ -96,7 +96,7 @@ def tried_entries(tried: Trial, following: Floats, measured: Floats) -> Floats:
 
 
 def true_entries(parameters: Mapping[str, Floats], defaults: Mapping[str, Floats]) -> NDArray[np.float32]:
-    """Return each true parameter's difference from its default over the default's size, shape (lanes, parameters)."""
+    """Return each true parameter's relative difference from its default, shape (environments, parameters)."""
     true = np.stack(
         [
             (parameters[name] - default) / np.where(default == 0.0, 1.0, np.abs(default))

@@ -22,10 +22,10 @@ from drive_env.drives.speeds import per_increment
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.changing_payload import PayloadChanges, find_payload
 from drive_env.envs.configuration import configured
-from drive_env.envs.lanes import Info, Lanes, Reward, Stepped, check_choice
 from drive_env.envs.motion_programme import EXCITATIONS, Programme, Reach
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
+from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.gains import BASELINE_RULE, read_gains, rule_gains, small_time_constants, write_gains
 from drive_env.motors import Motor, find_motor
 from mechanics.loads import find_load
@@ -149,7 +149,7 @@ class GainSchedulingConfig:
         return self.gains or ()
 
 
-class GainScheduling(Lanes):
+class GainScheduling(VectorEnvironment):
     """Gains that follow the machine: set every 5 to 20 ms, while a programme with changing payload runs.
 
     Action, float32, for each axis, with G gains of the configuration; a gain is written by SDO between two cycles, as
@@ -182,17 +182,17 @@ class GainScheduling(Lanes):
 
     Reward: the weighted sum of the terms, each in 0...1: tracking = 1/(1 + (error_rms/scale)^2), smoothness =
     1/(1 + (current_increment/3 %)^2), the worst axis counting, less trip when the drive trips. `terminated`: a drive of
-    the lane tripped, or its machine left physics; `truncated`: the programme's time ran out.
+    its drive went into fault, or its machine left physics; `truncated`: the programme's time ran out.
 
     `info`: "reward_terms" by name; "parameters", not on a bus, the true machine as it is now; "fault", the name of the
     emergency that ended the episode, "diverged", or "".
 
     Args:
-        num_envs: Lanes.
+        num_envs: Number of environments.
         config: A `GainSchedulingConfig`, a table like it, or a TOML file.
         drives: Drives to act on, `num_envs` machines of the configured load; emulated ones of the configuration by
             default. On a bus an episode begins with a fault reset and a move back to the start.
-        autoreset_mode, render_mode, reward: As `Lanes` takes them.
+        autoreset_mode, render_mode, reward: As `VectorEnvironment` takes them.
         options: Fields of the configuration that replace its own.
 
     Raises:
@@ -238,11 +238,12 @@ class GainScheduling(Lanes):
                 self._pictures = Pictures(self.drives, render_mode)
             self._prepare(row)
         except BaseException:
-            self._close_lanes()
+            self._close_environments()
             raise
 
-    # --- Lanes ----------------------------------------------------------------------------------------------------
-    def _reset_lanes(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
+    # --- Environments
+    # ----------------------------------------------------------------------------------------------------
+    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
         for name in options:
             check_choice("an option of reset", name, ("reset_mask",))
         axes = np.repeat(mask, self._axes)
@@ -273,7 +274,7 @@ class GainScheduling(Lanes):
         nothing = np.zeros((self._cycles, self.drives.num_axes))
         return self._observe(nothing, nothing, nothing), self._tell(np.full(self.num_envs, "", object))
 
-    def _step_lanes(self, action: Any) -> Stepped:
+    def _step_environments(self, action: Any) -> Stepped:
         chosen = np.clip(np.asarray(action, float).reshape(self._action.shape), -1.0, 1.0)
         self._action = np.nan_to_num(chosen)
         if self._machines is not None:
@@ -291,10 +292,10 @@ class GainScheduling(Lanes):
         info = self._tell(fault) | {"reward_terms": terms}
         return self._observe(*seen), np.asarray(reward, float), terminated, self._now >= self._steps, info
 
-    def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
+    def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
         return None if self._pictures is None else self._pictures.draw(lane)
 
-    def _close_lanes(self) -> None:
+    def _close_environments(self) -> None:
         if self._pictures is not None:
             self._pictures.close()
         if self._owned:
@@ -311,14 +312,15 @@ class GainScheduling(Lanes):
         n, axes = self.num_envs, self.drives.num_axes
         if axes != n * self._axes:
             raise ValueError(
-                f"{n} lanes of load {load.name!r} with {self._axes} axes each need {n * self._axes} drives, not {axes}"
+                f"{n} environments of load {load.name!r} with {self._axes} axes each need {n * self._axes} drives, "
+                f"not {axes}"
             )
         self._prepare_scales(load)
         self._prepare_machines()
         self._prepare_gains()
         self._programme = Programme(n, self._steps * self._cycles, 2 * self._cycles, CYCLE)
         self._bus, self._gain_bus = BusDelays(n), BusDelays(n)
-        self._now = np.zeros(n, np.int64)  # steps since the lane's reset
+        self._now = np.zeros(n, np.int64)  # steps since the environment's reset
         self._origin = np.zeros(axes, np.int64)
         self._action = np.zeros((axes, len(self.config.chosen)))
         self._acting = np.zeros((n, self._axes), np.int64)
@@ -380,7 +382,7 @@ class GainScheduling(Lanes):
         return np.asarray(np.clip(raw, 1, self._highest), np.int64)
 
     def _set_points(self, cycles: Integers) -> Integers:
-        """Return set-points [drive units] of cycles from the lanes' present step on, (cycles, num_envs, axes)."""
+        """Return set-points [drive units] of cycles from the present step on, (cycles, num_envs, axes)."""
         position, velocity, _ = self._programme.rows(self._now * self._cycles, cycles, self.reach)
         way, start = (position, self._origin) if self.config.mode == "csp" else (velocity, 0)
         found: Integers = start + np.rint(way * self._counts).astype(np.int64)
@@ -406,7 +408,7 @@ class GainScheduling(Lanes):
         begins = [k for k in range(self._cycles) if k == 0 or apart or changed[k - 1]]
         traces = []
         with warnings.catch_warnings():
-            # A machine that leaves physics ends its lane; who steps it is told so by `info`.
+            # A machine that leaves physics ends its environment; who steps it is told so by `info`.
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
             for begin, end in zip(begins, [*begins[1:], self._cycles], strict=True):
                 for k, key in enumerate(self._gain_objects):
@@ -466,7 +468,7 @@ class GainScheduling(Lanes):
         return terms | {"trip": -1.0 * terminated}
 
     def _faults(self, tripped: Mask) -> NDArray[np.object_]:
-        """Return the name of what ended each lane, "" where nothing did."""
+        """Return the name of what ended each environment, "" where nothing did."""
         names = np.full(self.num_envs, "", object)
         if tripped.any():
             names[tripped.reshape(self.num_envs, -1).any(axis=1)] = "unknown"

@@ -26,9 +26,9 @@ from drive_env.envs.gain_observation import (
     tried_entries,
     true_entries,
 )
-from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Reward, Stepped, check_choice
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
+from drive_env.envs.vector_environment import Floats, Info, Mask, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.gains import read_gains, rule_gains, small_time_constants
 from drive_env.motors import Motor, find_motor
 from drive_env.trials.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
@@ -98,7 +98,7 @@ class GainTuningConfig:
         return self.gains or ()
 
 
-class GainTuning(Lanes):
+class GainTuning(VectorEnvironment):
     """`ServoDrive/GainTuning-v0`: find the gains of an unknown machine in a few trials.
 
     An episode identifies the machine, starts at the baseline rule's gains and tries them; each step tries others: a
@@ -141,7 +141,7 @@ class GainTuning(Lanes):
     | 16+2G | last trial's probe: overshoot | the move | 0 | 5 |
     | 17+2G | last trial's probe: ln of the following error's integral over the rule's | 1 | -10 | 10 |
     | 18+2G | last trial's probe: stopped: it oscillated or tripped | 1 | 0 | 1 |
-    | 19+2G | last trial: ln J by measured terms, of the lane | 1 | -10 | 4 |
+    | 19+2G | last trial: ln J by measured terms, of the environment | 1 | -10 | 4 |
     | 20+2G ... 35+2G | incumbent's trial: as 4+2G ... 19+2G | | | |
     | 36+2G ... 35+2G+W | error of the last trial's move, demand less actual | the move | -5 | 5 |
 
@@ -159,22 +159,22 @@ class GainTuning(Lanes):
     measured terms. The episode is `truncated` when its trials are used up, `terminated` if a given drive cannot be
     cleared.
 
-    `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (lanes, axes, count) raw integers in the order
-    of the device's set; "measured", its J by measured terms, and "robust_cost"; "trial_robust_cost", that of
+    `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (environments, axes, count) raw integers in
+    the order of the device's set; "measured", its J by measured terms, and "robust_cost"; "trial_robust_cost", that of
     this step's trial; "trial_gains" and "trial_measured" too; "aborted", whether it was stopped, of the rule's trial at
     the begin as well; "faults", names of the trial's emergencies, tuples; "parameters", the true machine. Given drives
     have no robust cost.
 
     Args:
-        num_envs: Lanes.
+        num_envs: Number of environments.
         config: A `GainTuningConfig`, a table like it, or a TOML file.
         drives: Drives to tune as they are, `num_envs` machines, commissioned with gains that are stable; emulated ones
             of the configuration by default, of which every trial begins at rest at zero. On a bus the safety envelope
             stops all drives where one oscillates, with a SafetyError; `Limits(oscillation=False)` leaves that to the
-            trial, which stops the lane alone.
+            trial, which stops the environment alone.
         reach: How far each rotor of given drives may turn from where it stands, with its sign [rad], shape
             (num_axes,); by the configuration's load or travel if not given.
-        autoreset_mode, render_mode, reward: As `Lanes` takes them.
+        autoreset_mode, render_mode, reward: As `VectorEnvironment` takes them.
         options: Fields of the configuration that replace its own.
 
     Raises:
@@ -203,7 +203,7 @@ class GainTuning(Lanes):
         try:
             axes, rest = divmod(self.drives.num_axes, max(num_envs, 1))
             if rest or not axes:
-                raise ValueError(f"{self.drives.num_axes} axes cannot be shared by {num_envs} lanes")
+                raise ValueError(f"{self.drives.num_axes} axes cannot be shared by {num_envs} environments")
             self._axes = axes
             if self._owned:
                 self._make_world(num_envs)
@@ -218,7 +218,7 @@ class GainTuning(Lanes):
                 self._pictures = Pictures(self.drives, render_mode)
             self._prepare(reach)
         except BaseException:
-            self._close_lanes()
+            self._close_environments()
             raise
 
     # --- construction ---------------------------------------------------------------------------------------------
@@ -275,7 +275,7 @@ class GainTuning(Lanes):
         self._parameters: dict[str, Floats] = {}
 
     # --- an episode -----------------------------------------------------------------------------------------------
-    def _reset_lanes(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Any, Info]:
+    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Any, Info]:
         for name in options:
             check_choice("an option of reset", name, ("reset_mask",))
         drives, axes = self.drives, np.repeat(mask, self._axes)
@@ -293,7 +293,7 @@ class GainTuning(Lanes):
         self._direction = np.where(axes, 1, self._direction)
         scaler = drives.read(Role.POSITION_SCALE)
         planned = plan_move(self.motor, self._identified.inertia, scaler, self._reach)
-        # Lanes outside the mask keep theirs: nothing of what it follows from has changed.
+        # Environments outside the mask keep theirs: nothing of what it follows from has changed.
         self._move = planned
         supply = float(self.motor.voltage)
         rule = rule_gains(self._device, self.motor, self._identified.inertia, supply=supply)
@@ -315,7 +315,7 @@ class GainTuning(Lanes):
         info["aborted"] = mask & self._stopped(tried)
         return self._observe(), info
 
-    def _step_lanes(self, action: Any) -> Stepped:
+    def _step_environments(self, action: Any) -> Stepped:
         n = self.num_envs
         active = self._left > 0
         zero = np.zeros(n)
@@ -346,7 +346,7 @@ class GainTuning(Lanes):
         return self._observe(), terms["tuning"] + terms["abort"], dead, self._left <= 0, info
 
     def gains_of(self, action: ArrayLike) -> Integers:
-        """Return the gains that an action means now, without trying them: (lanes, axes, count), as `info["gains"]`."""
+        """Return the gains of an action, without trying them: (environments, axes, count), as `info["gains"]`."""
         return self._changed(action).reshape(self.num_envs, self._axes, -1)
 
     def _changed(self, action: ArrayLike) -> Integers:
@@ -361,8 +361,8 @@ class GainTuning(Lanes):
     def _begin_trial(self, mask: Mask) -> None:
         """Bring the drives of a trial to where it begins: enabled, in pp; emulated machines at rest at zero.
 
-        An emulated trial begins anew so that it follows from machine, gains and the lane's noise alone, not from how
-        long other lanes were being reset meanwhile.
+        An emulated trial begins anew so that it follows from machine, gains and the environment's noise alone, not from
+        how long other environments were being reset meanwhile.
         """
         drives, axes, pictures = self.drives, np.repeat(mask, self._axes), self._pictures
         if self._machines is not None:
@@ -450,7 +450,7 @@ class GainTuning(Lanes):
                 found[lane] = (*found[lane], message.name)
         return found
 
-    def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
+    def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
         return None if self._pictures is None else self._pictures.draw(lane)
 
     def _dead(self) -> Mask:
@@ -459,7 +459,7 @@ class GainTuning(Lanes):
     def _volts(self) -> Floats:
         return np.asarray(machine_of(self.drives).supply.reshape(self.num_envs, -1)[:, 0])
 
-    def _close_lanes(self) -> None:
+    def _close_environments(self) -> None:
         if self._pictures is not None:
             self._pictures.close()
         if self._score is not None:

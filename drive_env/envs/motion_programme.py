@@ -29,32 +29,32 @@ class Reach(NamedTuple):
 
 
 class Programme:
-    """A programme for each lane: all axes of a lane move in unison, from rest at the start.
+    """A programme for each lane: all axes of an environment move in unison, from rest at the start.
 
     Args:
-        num_lanes: Lanes.
+        num_envs: Number of environments.
         cycles: Length [cycles].
         preview: Cycles that are known beyond it.
         cycle: [s].
     """
 
-    def __init__(self, num_lanes: int, cycles: int, preview: int, cycle: float) -> None:
+    def __init__(self, num_envs: int, cycles: int, preview: int, cycle: float) -> None:
         self._cycle = cycle
-        # Place, speed and acceleration of every lane as shares of the axes' distance [1, 1/s, 1/s^2].
-        self._table = np.zeros((3, num_lanes, cycles + preview + 1))
+        # Place, speed and acceleration of every environment as shares of the axes' distance [1, 1/s, 1/s^2].
+        self._table = np.zeros((3, num_envs, cycles + preview + 1))
 
     def draw(self, excitation: str, reach: Reach, rngs: Sequence[np.random.Generator], where: Mask) -> None:
-        """Draw new programmes for the lanes where the mask is true."""
+        """Draw new programmes for the environments where the mask is true."""
         t = np.arange(self._table.shape[2], dtype=np.float64) * self._cycle
         kind = {"moves": _moves, "sine": _sine}[excitation]
         for lane in map(int, np.flatnonzero(where)):
             self._table[:, lane] = kind(t, reach, rngs[lane])
 
     def rows(self, start: Integers, cycles: Integers, reach: Reach) -> tuple[Floats, Floats, Floats]:
-        """Return position [rad], velocity [rad/s] and acceleration [rad/s^2], each (cycles, num_lanes * axes).
+        """Return position [rad], velocity [rad/s] and acceleration [rad/s^2], each (cycles, num_envs * axes).
 
         Args:
-            start: The lanes' present cycle, shape (num_lanes,).
+            start: The environments' present cycle, shape (num_envs,).
             cycles: Cycles from there on, shape (n,).
             reach: What the axes can do.
         """

@@ -22,7 +22,7 @@ FRAME = 0.02  # s of emulated time between two pictures in a window: one takes a
 
 
 class Pictures:
-    """Draws lanes of emulated drives; "human" shows lane 0 in a window while time passes.
+    """Draws environments of emulated drives; "human" shows environment 0 in a window while time passes.
 
     Args:
         drives: The drives.
@@ -48,17 +48,17 @@ class Pictures:
 
     @property
     def is_looking(self) -> bool:
-        """Whether a lane is recorded: only then is `look` worth a call."""
+        """Whether an environment is recorded: only then is `look` worth a call."""
         return bool(self._recorders)
 
     def begin(self, lanes: Mask) -> None:
-        """Begin a new recording of the lanes where the mask is true; a window shows lane 0 alone."""
+        """Begin a new recording of the environments where the mask is true; a window shows environment 0 alone."""
         shown = [0] if self._window is not None else range(len(lanes))
         for lane in [lane for lane in shown if lanes[lane]]:
             self._record(lane)
 
     def look(self, wanted: tuple[Floats, Floats] | None = None) -> None:
-        """Remember where the lanes that are shown are now, and what is wanted of them, as `Recorder.look` takes it."""
+        """Record position and set-point of the environments that are shown, as `Recorder.look` takes it."""
         for recorder in self._recorders.values():
             recorder.look(wanted)
         if self._window is not None and self._recorders:
@@ -67,7 +67,7 @@ class Pictures:
                 self.draw(0)
 
     def draw(self, lane: int) -> Image | None:
-        """Return the picture of a lane, uint8 of shape (height, width, 3); with "human" show it and return None."""
+        """Return an environment's picture, uint8 of shape (height, width, 3); with "human" show it and return None."""
         if self._window is not None and not self._window.is_open:
             return None
         if lane not in self._recorders:

@@ -15,7 +15,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class RandomFaults:
-    """The law of faults of a set of distributions.
+    """The distribution of faults in a set of distributions.
 
     probability: Of an episode that it has a fault, 0...1.
     names: Which there may be, all as likely.

@@ -146,7 +146,7 @@ class Distributions:
 
     @classmethod
     def load(cls, source: str | Path | Mapping[str, Any] | Distributions) -> Distributions:
-        """Return a set of laws: a shipped one by its name (`shipped()`), a TOML file, or a table like one.
+        """Return a set of distributions: a shipped one by its name (`shipped()`), a TOML file, or a table like one.
 
         Tables: `include`, names of sets whose laws come first; `parameters`, name -> law; `curriculum` with `steps`
         and `stage`, and `opens`, group or parameter -> [from, to] in stages; `faults` with `probability`, `names` (of
@@ -171,9 +171,9 @@ class Distributions:
         """Draw one machine.
 
         Args:
-            rng: Generator of the machine's lane; exactly one number is taken from it, whatever the set.
-            defaults: Default by name, as `drives.machine.parameters` has them; only these are drawn, and a law of
-                `BESIDE` that has no default here is left out.
+            rng: The environment's generator; exactly one number is taken from it, whatever the set.
+            defaults: Default by name, as `drives.machine.parameters` has them; only these are drawn, and a distribution
+                of `BESIDE` that has no default here is left out.
             stage: Stage of the curriculum, 0 (the defaults) to 1 (whole ranges).
 
         Raises:
@@ -202,7 +202,7 @@ class Distributions:
         return drawn, self.faults.draw(partial(_chance, key), self.curriculum.width("faults", stage))
 
     def to_toml(self) -> str:
-        """Return the set as TOML that `load` reads, included laws spelled out."""
+        """Return the set as TOML that `load` reads, included ones written out."""
         lines = ["[parameters]"]
         for name, law in self.laws.items():
             lines.append(f'"{name}" = {{ {", ".join(f"{k} = {_toml(v)}" for k, v in law.table().items())} }}')
@@ -221,14 +221,14 @@ class Distributions:
 
 
 class RandomMachines:
-    """Emulated machines drawn anew, lane by lane.
+    """Emulated machines drawn anew, environment by environment.
 
     Args:
         drives: The emulated drives, as built: their machines' parameters are the defaults.
-        distributions: The laws.
+        distributions: The distributions.
 
     Raises:
-        ValueError: If a law names a parameter that these machines do not have.
+        ValueError: If a distribution names a parameter that these machines do not have.
     """
 
     def __init__(self, drives: EmulatedDrives, distributions: Distributions) -> None:
@@ -318,7 +318,7 @@ class RandomMachines:
                 self._set(one)
             except ValueError as error:
                 if attempt == _TRIES - 1:
-                    raise ValueError(f"{_TRIES} draws in a row gave machines that cannot be: {error}") from error
+                    raise ValueError(f"{_TRIES} draws in a row gave impossible machines: {error}") from error
                 self._draw(lane, rng, stage)
             else:
                 return
@@ -346,7 +346,7 @@ def _from_file(path: Path, includers: tuple[str, ...]) -> Distributions:
     try:
         table = read_toml(path)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no TOML: {error}") from error
+        raise ValueError(f"{path} is not TOML: {error}") from error
     return _from_table(path.name, table, includers)
 
 
@@ -408,14 +408,14 @@ def _law(where: str, name: str, row: Any) -> Law:
     row = dict(_mapping(where, row))
     kind = row.pop("law", None)
     if kind not in LAWS:
-        raise ValueError(f"{where}: no law is named {kind!r}; there are {', '.join(LAWS)}")
+        raise ValueError(f"{where}: law = {kind!r} is unknown; there are {', '.join(LAWS)}")
     of = row.pop("of", None)
     if of not in (None, "default"):
         raise ValueError(f'{where}: of = {of!r}; leave it out for absolute numbers, or write of = "default"')
     _check_keys(where, row, (*_KEYS[kind], *_OPTIONAL[kind]))
     missing = [key for key in _KEYS[kind] if key not in row]
     if missing:
-        raise ValueError(f"{where}: a law {kind!r} needs {missing[0]!r}")
+        raise ValueError(f"{where}: law = {kind!r} needs {missing[0]!r}")
     numbers = {key: _numbers(f"{where}: {key}", value) for key, value in row.items()}
     law = Law(kind, of == "default", **numbers)
     _check_law(where, law)
@@ -428,12 +428,12 @@ def _check_law(where: str, law: Law) -> None:
     if law.low > law.high:
         raise ValueError(f"{where}: low {law.low:g} is above high {law.high:g}")
     if law.law == "loguniform" and law.low <= 0.0:
-        raise ValueError(f"{where}: a law 'loguniform' needs a low above 0, not {law.low:g}")
+        raise ValueError(f"{where}: law = 'loguniform' needs a low above 0, not {law.low:g}")
     if law.law == "normal" and law.deviation <= 0.0:
         raise ValueError(f"{where}: deviation must be above 0, not {law.deviation:g}")
     if law.law == "choice":
         if not law.values:
-            raise ValueError(f"{where}: a law 'choice' needs at least one value")
+            raise ValueError(f"{where}: law = 'choice' needs at least one value")
         if law.weights and (len(law.weights) != len(law.values) or min(law.weights) < 0.0 or sum(law.weights) <= 0.0):
             raise ValueError(f"{where}: weights must be {len(law.values)} numbers, none negative, not all 0")
 

@@ -1,4 +1,4 @@
-"""Lanes as a VecEnv of Stable-Baselines3, without copying: its arrays are the lanes' own.
+"""Environments as a VecEnv of Stable-Baselines3, without copying: its arrays are the environments' own.
 
 Needs stable-baselines3 (pip install stable-baselines3); nothing else in this package imports it.
 """
@@ -12,21 +12,21 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-from drive_env.envs.lanes import Info, Lanes
+from drive_env.envs.vector_environment import Info, VectorEnvironment
 
 
-class LanesVecEnv(VecEnv):  # type: ignore[misc]
-    """Stable-Baselines3's view of lanes with autoreset mode "SameStep".
+class DriveVecEnv(VecEnv):  # type: ignore[misc]
+    """Stable-Baselines3's view of environments with autoreset mode "SameStep".
 
     Observations, rewards and ends are handed over as they are; infos are dicts with "terminal_observation",
-    "TimeLimit.truncated", "fault" of lanes that ended, and empty otherwise. Where the distributions have a curriculum,
-    its stage follows the steps of all lanes.
+    "TimeLimit.truncated", "fault" of environments that ended, and empty otherwise. Where the distributions have a
+    curriculum, its stage follows the steps of all environments.
 
     Raises:
-        ValueError: For lanes of another autoreset mode, which SB3 does not know.
+        ValueError: For environments of another autoreset mode, which SB3 does not know.
     """
 
-    def __init__(self, lanes: Lanes) -> None:
+    def __init__(self, lanes: VectorEnvironment) -> None:
         if lanes.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise ValueError(f"Stable-Baselines3 needs autoreset_mode='SameStep', not {lanes.autoreset_mode.value!r}")
         self.lanes = lanes
@@ -36,12 +36,12 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc]
         super().__init__(lanes.num_envs, lanes.single_observation_space, lanes.single_action_space)
 
     def reset(self) -> Any:
-        """Begin an episode in every lane, with the seeds and options given before."""
+        """Begin an episode in every environment, with the seeds and options given before."""
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
         options = self._options[0] if self._options and self._options[0] else None
         self._follow_curriculum()
         observation, told = self.lanes.reset(seed=seeds, options=options)
-        self.reset_infos = [_of_lane(told, lane) for lane in range(self.num_envs)]
+        self.reset_infos = [_of_environment(told, lane) for lane in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return observation
@@ -51,7 +51,7 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc]
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, Any, Any, list[Info]]:
-        """Act in every lane."""
+        """Act in every environment."""
         self._steps += self.num_envs
         self._follow_curriculum()
         observation, reward, terminated, truncated, info = self.lanes.step(self._actions)
@@ -75,32 +75,32 @@ class LanesVecEnv(VecEnv):  # type: ignore[misc]
         self.lanes.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the lanes, once per lane asked for."""
+        """Return an attribute of the environments, once per environment asked for."""
         return [getattr(self.lanes, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the lanes."""
+        """Set an attribute of the environments."""
         setattr(self.lanes, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the lanes once, and return its result once per lane asked for."""
+        """Call a method of the environments once, and return its result once per environment asked for."""
         result = getattr(self.lanes, method_name)(*method_args, **method_kwargs)
         return [result] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """Return that no lane is wrapped."""
+        """Return that no environment is wrapped."""
         return [False] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[Any]:
-        """Return a picture of every lane."""
+        """Return a picture of every environment."""
         return list(self.lanes.render() or ())
 
 
-def _of_lane(info: Mapping[str, Any], lane: int) -> Info:
-    """Return what an info says of one lane."""
+def _of_environment(info: Mapping[str, Any], lane: int) -> Info:
+    """Return what an info says of one environment."""
     found: Info = {}
     for key, value in info.items():
         if key.startswith("_") or value is None or (f"_{key}" in info and not info[f"_{key}"][lane]):
             continue
-        found[key] = _of_lane(value, lane) if isinstance(value, Mapping) else value[lane]
+        found[key] = _of_environment(value, lane) if isinstance(value, Mapping) else value[lane]
     return found

@@ -21,10 +21,19 @@ from drive_env.emulator.cyclic_control import Hooks, cyclic_control
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.bus_delays import BusDelays
 from drive_env.envs.configuration import configured
-from drive_env.envs.lanes import Floats, Info, Lanes, Mask, Observation, Reward, Stepped, check_choice
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines
 from drive_env.envs.trajectories import TRAJECTORIES, draw
+from drive_env.envs.vector_environment import (
+    Floats,
+    Info,
+    Mask,
+    Observation,
+    Reward,
+    Stepped,
+    VectorEnvironment,
+    check_choice,
+)
 from drive_env.motors import Motor, find_motor
 
 CYCLE = 0.001  # s, one communication cycle
@@ -149,8 +158,8 @@ class TrackingConfig:
         return max(1, round(self.duration * self.rate))
 
 
-class Tracking(Lanes):
-    """Lanes of `ServoDrive/Tracking-v0`: follow a trajectory, or stabilise what the load's row says.
+class Tracking(VectorEnvironment):
+    """`ServoDrive/Tracking-v0`: follow a trajectory, or stabilise the load.
 
     Action, float32, one entry per axis a = 0, 1, ... of the machine:
 
@@ -180,16 +189,17 @@ class Tracking(Lanes):
     | 8A + 1 | its rate | rad/s | -50 | 50 |
 
     The reward is the sum of weighted terms, each in 0...1 (`info["reward_terms"]`). `terminated`: a drive tripped, its
-    machine left physics, or the pole fell; `truncated`: time ran out. `info`: "reward_terms"; "parameters" of lanes
-    that begin, the true machine, not on a bus; "fault" once a lane ended so, a name or several, "" of the others.
+    machine left physics, or the pole fell; `truncated`: time ran out. `info`: "reward_terms"; "parameters" of
+    environments that begin, the true machine, not on a bus; "fault" once an environment ended so, a name or several, ""
+    of the others.
 
     Args:
-        num_envs: Lanes.
+        num_envs: Number of environments.
         config: A `TrackingConfig`, a table like it, or a TOML file.
         drives: Drives to act on, `num_envs` machines; emulated ones of the configuration by default. Without machine
             (on a bus) an episode begins with a fault reset and a move back to the start.
-        sensor: Returns the pendulum's angle of each lane [rad], shape (num_envs,); needed on a bus alone.
-        autoreset_mode, render_mode, reward: As `Lanes` takes them.
+        sensor: Returns the pendulum's angle of each environment [rad], shape (num_envs,); needed on a bus alone.
+        autoreset_mode, render_mode, reward: As `VectorEnvironment` takes them.
         options: Fields of the configuration that replace its own.
 
     Raises:
@@ -217,7 +227,7 @@ class Tracking(Lanes):
             )
             self._prepare(sensor)
         except BaseException:
-            self._close_lanes()
+            self._close_environments()
             raise
 
     # --- construction ---------------------------------------------------------------------------------------------
@@ -237,7 +247,7 @@ class Tracking(Lanes):
     def _spaces(self, num_envs: int) -> tuple[Box, Box]:
         axes, rest = divmod(self.drives.num_axes, max(num_envs, 1))
         if rest or not axes:
-            raise ValueError(f"{self.drives.num_axes} axes cannot be shared by {num_envs} lanes")
+            raise ValueError(f"{self.drives.num_axes} axes cannot be shared by {num_envs} environments")
         self._axes = axes
         self._has_sensor = self.config.task.joint is not None
         high = np.concatenate([np.tile(cycle.AXIS_HIGH, axes), cycle.LOAD_HIGH if self._has_sensor else []])
@@ -316,7 +326,7 @@ class Tracking(Lanes):
         return 1e3 * inertia / motor.torque_constant * 2.0 * np.pi / np.repeat(self._per_turn, self._axes)
 
     # --- an episode -----------------------------------------------------------------------------------------------
-    def _reset_lanes(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
+    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:
         for name in options:
             check_choice("an option of reset", name, ("reset_mask",))
         axes = np.repeat(mask, self._axes)
@@ -348,7 +358,7 @@ class Tracking(Lanes):
         return observation, {"parameters": {name: values.copy() for name, values in self._machines.values.items()}}
 
     def _act(self, action: Any) -> bool:
-        """Let a step pass; return whether a lane tripped or fell."""
+        """Make a step; return whether any drive went into fault or a pole fell."""
         own = self._episodes
         own.action[:] = np.reshape(action, own.action.shape)
         if self._sensor is not None:
@@ -365,7 +375,7 @@ class Tracking(Lanes):
         position, velocity = np.repeat(own.reference[np.arange(self.num_envs), :2, at], self._axes, axis=0).T
         return own.origin + position, velocity
 
-    def _step_lanes(self, action: Any) -> Stepped:
+    def _step_environments(self, action: Any) -> Stepped:
         some, own = self._act(action), self._episodes
         terms, ended = own.terms.copy(), own.ended.copy()
         info: Info = {"reward_terms": dict(zip(cycle.TERMS, terms, strict=True))}
@@ -384,7 +394,7 @@ class Tracking(Lanes):
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _draw_references(self, mask: Mask) -> None:
-        """Draw the trajectories of the lanes that begin."""
+        """Draw the trajectories of the environments that begin."""
         config, own = self.config, self._episodes
         for lane in np.flatnonzero(mask):
             turns = draw(str(config.trajectory), self.rngs[lane], own.reference.shape[2], CYCLE,
@@ -395,7 +405,7 @@ class Tracking(Lanes):
         own.lanes["steps"][mask] = config.steps
 
     def _delays(self) -> dict[str, Floats]:
-        """Return what the lanes' buses do, as BusDelays takes it: beside the cycle that an answer takes anyway."""
+        """Return the delays of the environments' buses, without the cycle that an answer takes anyway."""
         none = np.zeros(self.num_envs)
         drawn = {} if self._machines is None else self._machines.values
         found = {name: drawn.get(f"bus.{name}", none) for name in ("action_latency", "observation_latency", "jitter")}
@@ -486,10 +496,10 @@ class Tracking(Lanes):
             found[lane] = ", ".join(names[lane]) or "not enabled"
         return found
 
-    def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
+    def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
         return None if self._pictures is None else self._pictures.draw(lane)
 
-    def _close_lanes(self) -> None:
+    def _close_environments(self) -> None:
         if getattr(self, "_pictures", None) is not None:
             self._pictures.close()  # type: ignore[union-attr]
         if self._owned:

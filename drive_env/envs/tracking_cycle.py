@@ -14,7 +14,7 @@ from drive_env.envs.bus_delays import Line, pass_on
 from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, Vector, reader
 from mechanics.compiled import cached, inlined, stage
 
-# A lane's episode: step and number of steps; the pendulum's angle at the last step [rad]; whether it fell.
+# An environment's episode: step and number of steps; the pendulum's angle at the last step [rad]; whether it fell.
 LANE = np.dtype([("step", "i8"), ("steps", "i8"), ("angle", "f8"), ("fallen", "i8")])
 
 AXIS_HIGH = np.array([4.0, 4.0, 4.0, 4.0, 2.0, 2.0, 2.0, 1.0])  # of the entries of an axis, -low as well
@@ -51,13 +51,13 @@ Lanes = Annotated[NDArray[np.void], types.Array(from_dtype(LANE), 1, "C")]
 
 @dataclass(eq=False)
 class Episodes(Bundle):
-    """All that a step reads and writes, of n lanes with their axes; raw values are the drives' integers."""
+    """All that a step reads and writes, of n environments with their axes; raw values are the drives' integers."""
 
     lanes: Lanes  # (n,)
     action: Vector  # -1...1, (axes,)
     scales: Matrix  # amplitude [inc], speed [606Ch], current limit [mA], full scale of the action [raw], (axes, 4)
     origin: Vector  # position at the episode's start [inc], (axes,)
-    actions: Line  # raw values on their way to the drives, one for each of a lane's axes
+    actions: Line  # raw values on their way to the drives, one for each of an environment's axes
     observations: Line  # status, position, velocity, torque of each axis on their way, and their cycle's number
     message: Matrix  # scratch, (n, as many as an observation)
     reference: Cube  # position [inc], velocity [inc/s], acceleration [inc/s^2], (n, 3, cycles)
@@ -124,7 +124,7 @@ def position_error(reference, position, origin):
 
 @stage
 def describe(own, k):
-    """Write the observation of lane k, from the samples that have come by now."""
+    """Write the observation of environment k, from the samples that have come by now."""
     reference, held, scales, origin = own.reference, own.observations.held, own.scales, own.origin
     angles, observation, last = own.angles, own.observation, own.last
     lane = own.lanes[k]
@@ -154,7 +154,7 @@ def describe(own, k):
 
 @cached(allocates=False)
 def describe_lanes(address, where):
-    """Write the observations of the lanes where the mask is true."""
+    """Write the observations of the environments where the mask is true."""
     own = episodes_at(address)
     for k in range(where.shape[0]):
         if where[k]:
@@ -163,7 +163,7 @@ def describe_lanes(address, where):
 
 @cached(allocates=False)
 def observe(address, first, count):
-    """Take some axes' samples in; write observations, rewards and their terms, and which lanes have ended."""
+    """Take some axes' samples in; write observations, rewards and their terms, and which environments have ended."""
     own = episodes_at(address)
     lanes, sampled, reference, observations = own.lanes, own.sampled, own.reference, own.observations
     scales, origin, last, angles, weights = own.scales, own.origin, own.last, own.angles, own.weights

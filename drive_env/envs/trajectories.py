@@ -1,4 +1,4 @@
-"""Trajectories to follow: position, velocity and acceleration of an episode, drawn with a lane's generator."""
+"""Trajectories to follow: position, velocity and acceleration of an episode, drawn with an environment's generator."""
 
 from __future__ import annotations
 

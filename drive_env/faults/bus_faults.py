@@ -132,7 +132,9 @@ class BusFaults:
         nodes = self._world.nodes
         known = ", ".join(map(str, nodes))
         if order.node is None and len(nodes) > 1:
-            raise ValueError(f"fault {order.name} is of one node; say which: node={next(iter(nodes))}, of {known}")
+            raise ValueError(
+                f"fault {order.name} is a fault of one node; give it: node={next(iter(nodes))}, of {known}"
+            )
         node = next(iter(nodes)) if order.node is None else order.node
         if node not in nodes:
             raise ValueError(f"fault {order.name}: there is no node {node} on the bus; there are {known}")

@@ -82,7 +82,7 @@ class Control:
             if request == "clear":
                 self._faults.clear(None if rest == "all" else _number(rest))
                 return {}
-            raise ValueError(f"{request!r} is no request; there are fault, faults and clear")
+            raise ValueError(f"{request!r} is not a request; there are fault, faults and clear")
         except ValueError as error:
             return {"error": str(error)}
 

@@ -45,7 +45,7 @@ class Condition:
             limit = math.nan
         if match is None or not math.isfinite(limit):
             raise ValueError(
-                f"when={text!r} is no condition; use 'enabled', or compare position [rad] or speed [rad/s] of the "
+                f"when={text!r} is not a condition; use 'enabled', or compare position [rad] or speed [rad/s] of the "
                 "rotor with a number, as 'speed > 100'"
             )
         return cls(match[1], match[2] == ">", limit)

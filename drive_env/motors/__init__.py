@@ -177,7 +177,7 @@ def load_motor(path: Path) -> Motor:
     except OSError as error:
         raise MotorError(f"{path} cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
-        raise MotorError(f"{path} is no TOML file: {error}") from None
+        raise MotorError(f"{path} is not a TOML file: {error}") from None
     try:
         return motor_of(path.stem, data)
     except MotorError as error:
@@ -188,7 +188,7 @@ def motor_of(name: str, data: Mapping[str, Any]) -> Motor:
     """Return the motor of a file's tables."""
     unknown = sorted(set(data) - {"title", "kind", "sources", "numbers"})
     if unknown:
-        raise MotorError(f"{unknown[0]!r} is no key of a motor; there are title, kind, sources, numbers")
+        raise MotorError(f"{unknown[0]!r} is not a key of a motor; there are title, kind, sources, numbers")
     kind = data.get("kind", "pmsm")
     if kind not in ("pmsm", "dc"):
         raise MotorError(f"kind is {kind!r}; it is 'pmsm' (brushless) or 'dc' (brushed)")
@@ -204,13 +204,15 @@ def motor_of(name: str, data: Mapping[str, Any]) -> Motor:
 def _checked(key: str, row: Any, texts: Mapping[str, Any]) -> tuple[float, str]:
     """Return a number and the text of its source."""
     if key not in NUMBERS:
-        raise MotorError(f"{key!r} is no number of a motor{did_you_mean(key, NUMBERS)}; there are {', '.join(NUMBERS)}")
+        raise MotorError(
+            f"{key!r} is not a number of a motor{did_you_mean(key, NUMBERS)}; there are {', '.join(NUMBERS)}"
+        )
     if not (isinstance(row, list) and len(row) == 2 and isinstance(row[1], str)):
         raise MotorError(f'{key} = {row!r}: write the number and where it comes from, {key} = [1.0, "data_sheet"]')
     value, source = row
     known = NUMBERS[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise MotorError(f"{key} = {value!r} is no number")
+        raise MotorError(f"{key} = {value!r} is not a number")
     if key in WHOLE and value != int(value):
         raise MotorError(f"{key} = {value!r} must be a whole number")
     if not (known.low <= value if known.with_low else known.low < value) or value > known.high:
@@ -218,7 +220,7 @@ def _checked(key: str, row: Any, texts: Mapping[str, Any]) -> tuple[float, str]:
         most = "" if math.isinf(known.high) else f" and at most {known.high:g}"
         raise MotorError(f"{key} = {value!r} {known.unit} must be {least} {known.low:g}{most} ({known.meaning})")
     if source not in texts:
-        raise MotorError(f'{key}: there is no source {source!r}; say what it is under [sources], {source} = "..."')
+        raise MotorError(f'{key}: there is no source {source!r}; describe it under [sources], {source} = "..."')
     return value, str(texts[source])
 
 
@@ -283,7 +285,11 @@ def _one_of(quantity: tuple[str, ...], values: Mapping[str, float]) -> None:
     """Raise MotorError unless a quantity is given, in one form."""
     given = [key for key in quantity if key in values]
     if len(given) != 1:
-        said = f"{' and '.join(given)} say the same twice; keep one" if given else f"{' or '.join(quantity)} is missing"
+        said = (
+            f"{' and '.join(given)} are two forms of the same number; keep one"
+            if given
+            else f"{' or '.join(quantity)} is missing"
+        )
         raise MotorError(said)
 
 
@@ -291,7 +297,7 @@ def _torque_constant(kind: str, n_p: int, values: Mapping[str, float]) -> float 
     """Return torque per ampere of peak current [N*m/A], None where it follows from the rated point."""
     given = [key for key in TORQUE_CONSTANT if key in values]
     if len(given) > 1:
-        raise MotorError(f"{' and '.join(given)} say the same twice; keep one")
+        raise MotorError(f"{' and '.join(given)} are two forms of the same number; keep one")
     if not given:
         return None
     key = given[0]
@@ -311,7 +317,7 @@ def _rated_current(values: Mapping[str, float], torque: float, k: float | None, 
     """Return the rated current, peak [A]: as given, or that of the rated torque."""
     given = [key for key in RATED_CURRENT if key in values]
     if len(given) > 1:
-        raise MotorError(f"{' and '.join(given)} say the same twice; keep one")
+        raise MotorError(f"{' and '.join(given)} are two forms of the same number; keep one")
     if given:
         return values[given[0]] * (math.sqrt(2.0) if given[0] == "rated_current_rms_a" else 1.0)
     if k is None:

@@ -103,7 +103,8 @@ def _parse(path: Path, device: str) -> dict[str, Section]:
         }
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
-            f"{path} holds no parameters of a {device} ({error}); give another file, or delete it to start afresh"
+            f"{path} has no parameters of a {device} ({error}); give another file, or delete it to start with factory "
+            "values"
         ) from error
 
 

@@ -235,7 +235,7 @@ def _read(data: Mapping[str, Any]) -> Demonstration:
         values["setpoints"] = _read_setpoints(values["setpoints"])
     for name, value in values.get("objects", {}).items():
         if type(value) is not int:
-            raise DemonstrationError(f"objects: {name} = {value!r} is no whole number; give the integer on the wire")
+            raise DemonstrationError(f"objects: {name} = {value!r} is not a whole number; give the integer on the wire")
     if "picture" in values:
         values["picture"] = PictureFormat(**_values("picture", values["picture"], PictureFormat))
     return Demonstration(**values)
@@ -267,7 +267,7 @@ def _values(where: str, table: Any, kind: type) -> dict[str, Any]:
 def _read_setpoints(given: Any) -> tuple[float | tuple[float, ...], ...]:
     def number(value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise DemonstrationError(f"setpoints: {value!r} is no finite number; give numbers, or arrays of numbers")
+            raise DemonstrationError(f"setpoints: {value!r} is not a finite number; give numbers, or arrays of numbers")
         return float(value)
 
     if not isinstance(given, list) or not given:

@@ -46,7 +46,9 @@ def choose_library() -> str:
     if name in _UNSET:
         return next(iter(known)) if has_display() else "egl"
     if name not in known:
-        raise OpenGLError(f"MUJOCO_GL={name} is no OpenGL of this system; set it to one of {', '.join(known)}")
+        raise OpenGLError(
+            f"MUJOCO_GL={name} is not an OpenGL platform of this system; set it to one of {', '.join(known)}"
+        )
     if known[name] == "mujoco.glfw" and not has_display():
         raise OpenGLError(f"MUJOCO_GL={name} needs a display and there is none; set MUJOCO_GL=egl or MUJOCO_GL=osmesa")
     return name

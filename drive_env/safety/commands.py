@@ -328,8 +328,8 @@ class Commands:
             keys = scale_objects(self._drives.description)
             names = ", ".join(f"{index:04X}h" for index in dict.fromkeys(index for index, _ in keys))
             raise SafetyError(
-                f"axis {axis}: a revolution has {scale[axis]:g} increments ({names}), too few to watch its travel; "
-                f"nothing was sent. Set {1.0 / SLACK_TURNS:.0f} or more, or open the drives without limits of position"
+                f"axis {axis}: a revolution has {scale[axis]:g} increments ({names}), too few to monitor its travel; "
+                f"nothing was sent. Set {1.0 / SLACK_TURNS:.0f} or more, or open the drives without position limits"
             )
 
     def _check_speeds(
@@ -385,7 +385,7 @@ class Commands:
         if 0.0 < by_ramp <= bounds.velocity[axis] + 1e-6:
             return f"the quick stop's ramp, 6085h: no axis may be faster than it stops within {STOP_WITHIN:g} s"
         if bounds.default_speed[axis]:
-            return "Limits(velocity=...): this drive has no limit of its own, and 6,000 rpm are taken"
+            return "Limits(velocity=...): this drive has no limit of its own; 6,000 rpm is used"
         return self._limits.origin(self._limits.user.velocity, "velocity", "607Fh")
 
     def _last(self, key: Key) -> Integers:

@@ -383,8 +383,8 @@ class Envelope:
         """
         if self._axes.lost:
             raise SafetyError(
-                f"axis {min(self._axes.lost)} could not be proved to be off, and is left to its watchdog; look at it, "
-                "and open the drives again"
+                f"axis {min(self._axes.lost)} could not be confirmed to be off, and is left to its watchdog; check "
+                "it, and open the drives again"
             )
         self._drives.start()
         if self._axes.is_armed:
@@ -399,7 +399,7 @@ class Envelope:
             self._watch.first_look()
         except BaseException:
             with self._uninterrupted():
-                self.stop("the drives cannot be watched")
+                self.stop("the drives cannot be monitored")
                 self._watchdogs.give_up()
             self._end_watching()
             raise

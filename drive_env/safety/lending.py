@@ -49,9 +49,14 @@ class Lending:
             self._drives.write_raw(entry, axis, value)
             if int(self._drives.read_raw(entry, axis)) == value:
                 return True
-            logger.warning("axis %d does not take %s = %d; it is watched from here alone", axis, entry.label, value)
+            logger.warning(
+                "axis %d does not accept %s = %d; this limit is monitored by this computer only",
+                axis,
+                entry.label,
+                value,
+            )
         except ObjectAccessError as error:
-            logger.warning("axis %d: %s; this limit is watched from here alone", axis, error)
+            logger.warning("axis %d: %s; this limit is monitored by this computer only", axis, error)
             self._loans.pop((key, axis), None)
         return False
 

@@ -62,8 +62,8 @@ class Limits:
             raise ValueError(f"stall must be above 0 s, not {self.stall}; None is for any")
         if self.silence is not None and not LEAST_SILENCE <= self.silence <= MOST_SILENCE:
             raise ValueError(
-                f"silence = {self.silence} s cannot be: a drive counts it in milliseconds, and this computer keeps "
-                f"{LEAST_SILENCE:g} s at best; choose {LEAST_SILENCE:g} to {MOST_SILENCE:g} s"
+                f"silence = {self.silence} s is impossible: a drive counts it in milliseconds, and this computer can "
+                f"guarantee {LEAST_SILENCE:g} s at best; choose {LEAST_SILENCE:g} to {MOST_SILENCE:g} s"
             )
 
     def check_axes(self, num_axes: int) -> None:

@@ -115,7 +115,7 @@ class AxisStop:
     def _watch_ramp(self, now: float, sample: Sample, fresh: bool) -> None:
         if not fresh:
             if now - self._seen > BLIND:
-                self.why = f"it was not seen for {now - self._seen:.1f} s"
+                self.why = f"its position was not received for {now - self._seen:.1f} s"
                 self._enter(Phase.CUT, now)
             return
         self._first = max(self._first, abs(sample.speed)) if sample.time < self._begun + GRACE else self._first
@@ -139,7 +139,7 @@ class AxisStop:
             self.why = f"it is still turning after {RAMP_TIMEOUT:g} s"
             self._enter(Phase.CUT, now)
         elif not self._slows_down(now, sample):
-            self.why = "it does not slow down as its ramp says"
+            self.why = "it does not slow down by its ramp"
             self._enter(Phase.CUT, now)
 
     def _slows_down(self, now: float, sample: Sample) -> bool:

@@ -72,7 +72,7 @@ class Supervisor:
                     told = str(error)
                     logger.error("%s", told)
             except Exception:
-                logger.exception("the drives cannot be watched any more; they stop by themselves")
+                logger.exception("the drives cannot be monitored any more; they stop by their own watchdogs")
                 self._fail()
                 return
             self._wake.wait(max(PERIOD - (time.monotonic() - begun), 0.0005))

@@ -169,7 +169,7 @@ class Watch:
             if not self._drives.description.has(key)
         ]
         if missing:
-            raise SafetyError(f"the EDS has no {', '.join(missing)}: the drives cannot be watched; complete the EDS")
+            raise SafetyError(f"the EDS has no {', '.join(missing)}: the drives cannot be monitored; complete the EDS")
         if not self._drives.time_waits:
             self._prepare()
             self._prove_operational()
@@ -189,7 +189,7 @@ class Watch:
         else:
             return
         raise SafetyError(
-            "a node sends no process data at SYNC, though it was started: it cannot be watched; "
+            "a node sends no process data at SYNC, though it was started: it cannot be monitored; "
             f"{self._drives.link.wording.check_samples}"
         )
 
@@ -321,7 +321,9 @@ class Watch:
             self._stops.begin(self._axes.may_turn, holds=False)
             self._axes.lost.update(np.flatnonzero(self._axes.may_turn).tolist())
         self._watchdogs.cease()
-        self._pending = SafetyError("the drives cannot be watched any more, and stop by themselves; see the log")
+        self._pending = SafetyError(
+            "the drives cannot be monitored any more, and stop by their own watchdogs; see the log"
+        )
 
     def _look(self) -> None:
         """See to it that the newest sample is young."""

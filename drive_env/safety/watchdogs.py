@@ -150,8 +150,8 @@ class Watchdogs:
         passes = self._drives.link.time_passes()
         if passes:
             raise SafetyError(
-                "pace='lockstep' is for an emulator that is served with --lockstep, and time passes on this bus by "
-                "itself: nobody would watch between two calls; open the drives with pace='real-time'"
+                "pace='lockstep' is for an emulator that is served with --lockstep, and time passes by itself on this "
+                "bus: nothing would monitor the drives between two calls; open them with pace='real-time'"
             )
         self._is_lockstep_proved = passes is not None
 
@@ -175,7 +175,7 @@ class Watchdogs:
             logger.error(
                 "node %d could not be proved to be off: %s. Look at the machine, and keep the emergency stop at hand",
                 node,
-                f"its watchdog stays, and it hears no more {heard}, so that it stops by itself"
+                f"its watchdog stays on and it gets no more {heard}, so that the drive stops by itself"
                 if self._watch.is_set(k)
                 else "it has no watchdog",
             )

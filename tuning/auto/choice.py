@@ -54,7 +54,7 @@ def _rule_is_better(run: AutoRun) -> Mask:
     known = []
     for k in axes:
         plant, identified = run.axes[k].plant, run.axes[k].identified
-        assert plant is not None and identified is not None, "an axis that goes on has both"
+        assert plant is not None and identified is not None, "an axis in the run has both"
         known.append(known_of(plant, identified, float(reach[k])))
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[chosen]
     with Twins(target.device, target.motor, known, scaler, 2) as twins:

@@ -73,7 +73,7 @@ def prepare(run: AutoRun) -> None:
     target = run.target
     for axis in map(int, np.flatnonzero(run.going)):
         plant, before = run.axes[axis].plant, run.axes[axis].before
-        assert plant is not None, "an axis that goes on has one"
+        assert plant is not None, "an axis in the run has one"
         fitted = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)[0]
         run.unsafe[axis] = unsafe_gains(target.device, plant, before)
         # What the drive had may be better than what is only soft.
@@ -93,7 +93,7 @@ def compute(run: AutoRun) -> None:
     known, starts = [], []
     for axis in chosen:
         plant, identified = run.axes[axis].plant, run.axes[axis].identified
-        assert plant is not None and identified is not None, "an axis that goes on has both"
+        assert plant is not None and identified is not None, "an axis in the run has both"
         known.append(known_of(plant, identified, float(reach[axis])))
         proposals = (propose(name, target.device, target.motor, plant) for name in RULES)
         starts.append(np.array([run.reference[axis], *(proposal.gains for proposal in proposals)], np.int64))
@@ -107,7 +107,7 @@ def compute(run: AutoRun) -> None:
         run.others[number, chosen] = other.gains[:, 0]
     for axis in chosen:
         plant = run.axes[axis].plant
-        assert plant is not None, "an axis that goes on has one"
+        assert plant is not None, "an axis in the run has one"
         for rows in (run.gains, *run.others):
             rows[axis] = sound_gains(target.device, plant, tuple(map(int, rows[axis])))
     for axis, cost in zip(chosen, found.cost[:, 0], strict=True):

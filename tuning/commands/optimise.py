@@ -85,7 +85,7 @@ def optimise(
             show_default="safe on a bus",
         ),
     ] = None,
-    lanes: Annotated[
+    copies: Annotated[
         int, typer.Option(help="Emulated machine: copies that try a generation of gains at the same time.")
     ] = 8,
     searches: Annotated[
@@ -112,7 +112,7 @@ def optimise(
     """
     with errors_as_exit_codes():
         check_seed(drive.seed)
-        check_machines("--lanes", lanes)
+        check_machines("--copies", copies)
         if not 1 <= searches <= MOST_SEARCHES:
             raise ValueError(f"--searches must be 1 or more, and {MOST_SEARCHES} at most, not {searches}")
         if resume and out is None:
@@ -148,12 +148,12 @@ def optimise(
         where = "the bus" if drive.bus else f"an emulated {drive.load}"
         common = {name: getattr(drive, name) for name in ("device", "motor", "supply", "travel")}
         if not drive.bus:
-            machine = drive.machine() | {"num_machines": lanes}
+            machine = drive.machine() | {"num_machines": copies}
             try:
                 found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
             except KeyboardInterrupt:
                 fail(what_an_interrupt_leaves(folder) if journal is None else _kept_in(journal), INTERRUPTED)
-            emulated = common | {"load": drive.load, "lanes": lanes, "searches": searches}
+            emulated = common | {"load": drive.load, "copies": copies, "searches": searches}
             _save(found, settings, folder, emulated)
             _report(found, settings, folder, None, where, emulated, json)
             unfinished.discard(folder)
@@ -215,7 +215,7 @@ def _check_unfinished(folder: Path, journal: Path | None) -> None:
 
 def _kept_in(journal: Path) -> str:
     """Return what an interrupted search with a journal says."""
-    return f"interrupted; the trials made are in {journal}: the same command goes on from there"
+    return f"interrupted; the trials made are in {journal}: the same command continues from there"
 
 
 def _search_bus(target: Any, settings: Any, before: Path, folder: Path, options: dict[str, Any]) -> Any:

@@ -66,7 +66,8 @@ TravelRange = Annotated[
     str | None,
     typer.Option(
         "--travel",
-        help="How far the rotor may turn from where it stands [turns]: LOW:HIGH, e.g. -0.15:0.15, or free; one for "
+        help="How far the rotor may turn from its present position [turns]: LOW:HIGH, e.g. -0.15:0.15, or free; one "
+        "for "
         "all axes, or one for each with commas between. Required on a bus; an emulated load has its own.",
     ),
 ]

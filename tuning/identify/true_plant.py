@@ -28,7 +28,7 @@ def true_plant(drives: Drives, axis: int = 0) -> Plant:
         ValueError: For drives on a bus, whose truth nobody knows, and for a machine with several axes.
     """
     if drives.machine is None:
-        raise ValueError("what a machine on a bus truly is cannot be looked up; identify it")
+        raise ValueError("the true parameters of a machine on a bus are unknown; identify it")
     emulated = drives.machine.drives  # whoever observes them
     if emulated.load.num_axes != 1:
         raise ValueError(f"load {emulated.load.name!r} couples {emulated.load.num_axes} axes; the model has one")

@@ -261,8 +261,8 @@ def _swept_entry(device: Device, dictionary: ObjectDictionary, number: int, swep
         ) from None
     if entry not in gains:
         raise ExperimentError(
-            f"{where}: object = {swept.object!r} is {entry.label}, no writable gain; "
-            f"gains of {device.name} are {', '.join(label(gain) for gain in gains)}"
+            f"{where}: object = {swept.object!r} is {entry.label}, no writable gain; gains of {device.name} are "
+            f"{', '.join(label(gain) for gain in gains)}"
         )
     assert entry.low is not None and entry.high is not None, "gains are numbers"
     for key, value in (("low", swept.low), ("high", swept.high)):
@@ -316,7 +316,7 @@ def _check_times(excitation: Excitation, cycle: float) -> None:
     period, duration = excitation.sampling_period, excitation.duration
     if period < cycle or not _is_multiple(period, cycle):
         raise ExperimentError(
-            f"excitation: sampling_period = {period:g} s is no whole number of communication cycles of {cycle:g} s; "
+            f"excitation: sampling_period = {period:g} s is not a whole number of communication cycles of {cycle:g} s; "
             f"use {max(1, round(period / cycle)) * cycle:g} s"
         )
     if not 0.0 < duration <= MAX_DURATION:
@@ -325,7 +325,7 @@ def _check_times(excitation: Excitation, cycle: float) -> None:
         value = getattr(excitation, key)
         if not _is_multiple(value, period):
             raise ExperimentError(
-                f"excitation: {key} = {value:g} s is no whole number of sampling periods of {period:g} s; "
+                f"excitation: {key} = {value:g} s is not a whole number of sampling periods of {period:g} s; "
                 f"use {round(value / period) * period:g} s"
             )
     if not 0.0 <= excitation.velocity_time < excitation.load_time < duration:

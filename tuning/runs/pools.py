@@ -30,7 +30,7 @@ Say = Callable[[str], None]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-AGAIN = "go on with --resume"
+AGAIN = "continue with --resume"
 CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
 FIRST_RESULT = "waiting for the first result (a worker that runs for the first time compiles for half a minute)"
 # Files of a tls:// address, and what Dask's security calls them.

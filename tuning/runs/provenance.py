@@ -49,7 +49,7 @@ def check_sources(expected: str) -> None:
         if found != expected:
             raise ValueError(
                 f"a worker has sources {found}, the run was begun with {expected}, and their results are not mixed: "
-                "install the same files there, start the worker again, and go on with --resume"
+                "install the same files there, start the worker again, and continue with --resume"
             )
 
 

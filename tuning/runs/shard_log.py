@@ -89,8 +89,8 @@ class ShardLog:
             if first.get("sources") != provenance.SOURCES:
                 raise ShardLogError(
                     f"{self.path} holds results of sources {first.get('sources', 'unknown')}, these are "
-                    f"{provenance.SOURCES}, and they are not mixed; go on with the sources that it was begun with, or "
-                    "remove it"
+                    f"{provenance.SOURCES}, and they are not mixed; continue with the sources that it was begun with, "
+                    "or remove it"
                 )
             if first.get("run") != self._key:
                 raise ShardLogError(
@@ -108,7 +108,7 @@ class ShardLog:
                 try:
                     self.done[int(header["shard"])] = read_arrays(io.BytesIO(content))
                 except (ValueError, TypeError) as error:
-                    raise ShardLogError(f"{self.path} is damaged: {error}; remove it to begin anew") from None
+                    raise ShardLogError(f"{self.path} is damaged: {error}; remove it to start again") from None
                 self.holds_results = True
                 end = file.tell()
         return end

@@ -149,7 +149,9 @@ def optimise(
         ShardLogError: If the log is of another search.
     """
     if log is not None and (not anew or settings.journal is not None):
-        raise ValueError("a search goes on from its log if every trial begins anew, and if it has no journal besides")
+        raise ValueError(
+            "a search is continued from its log only if every trial starts from rest, and if it has no journal"
+        )
     chosen = target.device.gains.outer if settings.gains is None else settings.gains
     columns = target.device.gains.columns(chosen)  # before anything moves
     with timed(target) as (watched, clock):

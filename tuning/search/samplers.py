@@ -81,7 +81,7 @@ def new_proposer(
         raise ValueError(f"no sampler is named {sampler!r}; there are {', '.join(SAMPLERS)}")
     check_installed(sampler)
     if objectives > 1 and sampler == "cmaes":
-        raise ValueError("CMA-ES knows one objective; take tpe or gp for several, or let cmaes minimise the cost")
+        raise ValueError("CMA-ES has one objective only; take tpe or gp for several, or let cmaes minimise the cost")
     if sampler == "grid":
         if journal is not None:
             raise ValueError("a grid keeps no journal; leave it out, or use drive-tune sweep, which resumes")

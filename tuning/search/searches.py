@@ -109,7 +109,7 @@ def _done(
 
 
 def joined(found: list[Optimised]) -> Optimised:
-    """Return searches as one: gains (searches * axes, count) and cost (searches,) of each, the counts of all lanes."""
+    """Return searches as one: gains (searches * axes, count) and cost (searches,) of each, counts of all machines."""
     return Optimised(
         np.concatenate([one.gains for one in found]),
         np.concatenate([one.rule for one in found]),
@@ -124,7 +124,7 @@ def joined(found: list[Optimised]) -> Optimised:
 
 
 def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: None) -> Arrays:
-    """Return what a search found, of the machine that its lanes are, as arrays."""
+    """Return what a search found, of the machine that its machines are, as arrays."""
     search = task.search
     kept = nullcontext() if task.path is None else part_log(task.path, task.key)
     with emulated(**search.machine) as target, kept as log:

@@ -48,7 +48,7 @@ class LoggedTrials:
             return tried
         known = self._log.done[number]
         if not np.array_equal(known["tried"], gains) or not np.array_equal(known["where"], where):
-            raise ShardLogError(f"{self._log.path} holds trials of another search; remove it and begin anew")
+            raise ShardLogError(f"{self._log.path} holds trials of another search; remove it and start again")
         write_gains(drives, known["left"])
         bench.moves, bench.aborts = known["moves"].copy(), known["aborts"].copy()
         self._clock.seconds = float(known["seconds"])

@@ -34,7 +34,7 @@ MEANINGS = {
 
 HEADER = "# All settings of the search. To repeat it: drive-tune optimise --config settings.toml\n"
 _SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed")
-_MACHINE = ("device", "motor", "load", "supply", "travel", "lanes", "searches", "interface", "channel", "nodes",
+_MACHINE = ("device", "motor", "load", "supply", "travel", "copies", "searches", "interface", "channel", "nodes",
             "bitrate", "lockstep", "pace")  # fmt: skip
 
 
@@ -100,6 +100,8 @@ def load_options(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not from a search; give settings.toml of drive-tune optimise")
     check_keys(str(path), table, [*_SEARCH, "machine", "versions"], optional=["versions", *_SEARCH])
     machine = dict(table["machine"]) if isinstance(table["machine"], dict) else {}
+    if "lanes" in machine:  # as versions before 0.2 named them
+        machine["copies"] = machine.pop("lanes")
     check_keys(f"{path}: machine", machine, list(_MACHINE), optional=_MACHINE)
     machine.pop("pace", None)  # what lockstep says
     return {name: table[name] for name in _SEARCH if name in table} | machine

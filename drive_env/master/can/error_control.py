@@ -122,7 +122,7 @@ class ErrorControl:
                 self._objects.change(_ERROR_BEHAVIOUR, b"\0", only_from=bytes((STAYS,)))
             self._objects.quick_stop_on_lost_connection()
         except ObjectAccessError as error:
-            raise NoWatchdogError(f"node {self._node} cannot watch over its master: {error}; {REMEDY}") from None
+            raise NoWatchdogError(f"node {self._node} cannot monitor its master: {error}; {REMEDY}") from None
         if self.kind == "none":
             raise NoWatchdogError(
                 f"node {self._node} would not stop by itself when this process dies: it has neither a heartbeat "
@@ -176,9 +176,11 @@ class ErrorControl:
                 living.append(watched)
                 continue
             elif watched in MASTERS:
-                logger.warning("node %d still watches a master that died (node-ID %d)", self._node, watched)
+                logger.warning("node %d still monitors a master that is gone (node-ID %d)", self._node, watched)
             else:
-                logger.warning("node %d watches node-ID %d, which is silent: replaced meanwhile", self._node, watched)
+                logger.warning(
+                    "node %d monitors node-ID %d, which sends no heartbeat: replaced for now", self._node, watched
+                )
             self._objects.change(key, ours, before=bytes(4) if watched in MASTERS else None)
             self._watched_id = self._heartbeats.node_id
             return

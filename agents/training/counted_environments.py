@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from drive_env.envs.lanes import Lanes
+    from drive_env.envs.vector_environment import VectorEnvironment
 
 EPISODES = 100  # the last ones, of which means are told
 
 
-class CountedLanes:
+class CountedEnvironments:
     """A vectorised environment that counts; it behaves as the one it holds.
 
     Attributes:
@@ -24,7 +24,7 @@ class CountedLanes:
         told: The info of the last reset or step, of all environments: Stable-Baselines3 gets none of it.
     """
 
-    def __init__(self, lanes: Lanes) -> None:
+    def __init__(self, lanes: VectorEnvironment) -> None:
         self.lanes = lanes
         self.episodes = self.steps = 0
         self.seconds = 0.0

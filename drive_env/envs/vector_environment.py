@@ -1,7 +1,7 @@
-"""What all environments share: many episodes side by side over one set of drives, and one of them as an Env.
+"""Base of all environments: many episodes at the same time over one set of drives, and a single one as an Env.
 
-A lane is a machine with its drives and its episode. A lane's episode follows from its seed and its actions alone, so
-that it is the same among 1, 8 or 64 lanes and under any number of threads.
+An environment is a machine with its drives and its episode. An environment's episode follows from its seed and its
+actions alone, so that it is the same among 1, 8 or 64 environments and under any number of threads.
 """
 
 from __future__ import annotations
@@ -22,37 +22,38 @@ from drive_env.envs.randomisation import Curriculum
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Info = dict[str, Any]
-Observation = Any  # an array with lanes first, or a dict of such arrays
+Observation = Any  # an array with environments first, or a dict of such arrays
 Stepped = tuple[Observation, Floats, Mask, Mask, Info]
-# Observations that come of a step, its actions, and its info, of all lanes -> rewards, shape (num_envs,).
+# Observations that come of a step, its actions, and its info, of all environments -> rewards, shape (num_envs,).
 Reward = Callable[[Observation, Any, Info], ArrayLike]
 
 RENDER_MODES = ("rgb_array", "human")
 
 
-class Lanes(VectorEnv[Any, Any, Any]):
+class VectorEnvironment(VectorEnv[Any, Any, Any]):
     """Base of the vector environments; `config` is a subclass's configuration.
 
-    A subclass gives `_reset_lanes` and `_step_lanes`; it may replace `_render_lane` and `_close_lanes`. Arrays that it
+    A subclass gives `_reset_environments` and `_step_environments`; it may replace `_render_environment` and
+    `_close_environments`. Arrays that it
     returns are handed out as they are: it must make new ones in each step.
 
-    In next-step mode the reset of an ended lane takes place after the others' step, so that an episode is the same in
-    every mode; the lane's action of that step is ignored, its reward is 0.
+    In next-step mode the reset of an ended environment takes place after the others' step, so that an episode is the
+    same in every mode; the environment's action of that step is ignored, its reward is 0.
 
     Args:
-        num_envs: Lanes.
-        observation_space: Of one lane.
-        action_space: Of one lane.
-        autoreset_mode: When an ended lane begins anew: "NextStep", "SameStep", or "Disabled": by
+        num_envs: Number of environments.
+        observation_space: Of one environment.
+        action_space: Of one environment.
+        autoreset_mode: When an ended environment begins anew: "NextStep", "SameStep", or "Disabled": by
             `reset(options={"reset_mask": ...})` alone.
         render_mode: None, "rgb_array" or "human".
-        reward: Called after every step with the observations, the actions and the info of all lanes, of which
+        reward: Called after every step with the observations, the actions and the info of all environments, of which
             info["reward_terms"] are the environment's own terms, (num_envs,) each; returns the rewards, (num_envs,),
             in place of the environment's.
 
     Raises:
-        ValueError: For a mode that is none, or less than one lane; in a step for a reward of another shape, or one
-            that is no number.
+        ValueError: For a mode that is none, or less than one environment; in a step for a reward of another shape, or
+            one that is no number.
     """
 
     config: Any
@@ -88,38 +89,41 @@ class Lanes(VectorEnv[Any, Any, Any]):
         self._stage: float | None = None
 
     # --- what a subclass gives ------------------------------------------------------------------------------------
-    def _reset_lanes(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Observation, Info]:
-        """Begin an episode in the lanes where the mask is true, drawing from `rngs` of these lanes alone.
+    def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Observation, Info]:
+        """Begin an episode in the environments where the mask is true, drawing from `rngs` of these environments alone.
 
         Returns:
-            Observations of all lanes, of which only the masked are used; and arrays with what is to be told of them.
+            Observations of all environments, of which only the masked are used; and arrays with what is to be told of
+            them.
         """
         raise NotImplementedError
 
-    def _step_lanes(self, action: Any) -> Stepped:
-        """Act in every lane; return observation, reward, terminated, truncated and info of all lanes."""
+    def _step_environments(self, action: Any) -> Stepped:
+        """Act in every environment; return observation, reward, terminated, truncated and info of all environments."""
         raise NotImplementedError
 
     def _step_alone(self, action: Any) -> tuple[Observation, float, bool, bool, Info]:
-        """Act in the only lane there is, whose action this is; return what `gymnasium.Env.step` does."""
+        """Act in the only environment; return what `gymnasium.Env.step` returns."""
         observation, reward, terminated, truncated, info = self._step_rewarded(_batch_of_one(action))
         return one_of(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), one_of(info)
 
     def _step_rewarded(self, action: Any) -> Stepped:
-        """Act in every lane; return what `_step_lanes` does, with the rewards of the user's function if he gave one."""
-        observation, reward, terminated, truncated, info = self._step_lanes(action)
+        """Act in every environment, with the rewards of the user's function if one was given."""
+        observation, reward, terminated, truncated, info = self._step_environments(action)
         if self.reward_function is None:
             return observation, reward, terminated, truncated, info
         own = np.asarray(self.reward_function(observation, action, info), float)
         if own.shape != (self.num_envs,) or not np.isfinite(own).all():
-            raise ValueError(f"reward returned {own!r}; it must return {self.num_envs} numbers, one for each lane")
+            raise ValueError(
+                f"reward returned {own!r}; it must return {self.num_envs} numbers, one for each environment"
+            )
         return observation, own.copy(), terminated, truncated, info
 
-    def _render_lane(self, lane: int) -> NDArray[np.uint8] | None:
+    def _render_environment(self, lane: int) -> NDArray[np.uint8] | None:
         raise NotImplementedError
 
-    def _close_lanes(self) -> None:
-        """Give back what is held."""
+    def _close_environments(self) -> None:
+        """Release drives and pictures."""
 
     # --- the curriculum -------------------------------------------------------------------------------------------
     @property
@@ -146,10 +150,11 @@ class Lanes(VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, Info]:
-        """Begin an episode in every lane, or in those of `options["reset_mask"]`.
+        """Begin an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Of lane 0, the others follow by one; or one for each lane. None goes on with each lane's generator.
+            seed: Of environment 0, the others follow by one; or one for each environment. None goes on with each
+                environment's generator.
             options: "reset_mask", shape (num_envs,), bool; others are the environment's.
         """
         options = dict(options or {})
@@ -157,33 +162,34 @@ class Lanes(VectorEnv[Any, Any, Any]):
         for lane, one in enumerate(self._seeds(seed)):
             if one is not None and mask[lane]:
                 self.rngs[lane], self._np_random_seed = seeding.np_random(one)
-        observation, info = self._reset_lanes(mask, options)
+        observation, info = self._reset_environments(mask, options)
         self._ended = self._ended & ~mask
         self._some_ended = bool(self._ended.any())
         self._has_begun = True
         return observation, info
 
     def step(self, actions: Any) -> Stepped:
-        """Act in every lane; what follows the end of an episode is `autoreset_mode`'s.
+        """Act in every environment; what follows the end of an episode is `autoreset_mode`'s.
 
         Raises:
-            gymnasium.error.ResetNeeded: Before the first reset, or, with autoreset disabled, while a lane has ended.
-            ValueError: For an action that is no finite number, before any drive is told anything; that of a lane that
-                has ended is ignored.
+            gymnasium.error.ResetNeeded: Before the first reset, or, with autoreset disabled, while an environment has
+            ended.
+            ValueError: For an action that is no finite number, before any drive is told anything; that of an
+                environment that has ended is ignored.
         """
         if not self._has_begun:
             raise gymnasium.error.ResetNeeded("call reset() before the first step()")
         before = self._ended
         if self._some_ended and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gymnasium.error.ResetNeeded(
-                f"lane {int(np.flatnonzero(before)[0])} has ended and autoreset is disabled; "
-                'call reset(options={"reset_mask": ended lanes})'
+                f"environment {int(np.flatnonzero(before)[0])} has ended and autoreset is disabled; "
+                'call reset(options={"reset_mask": ended})'
             )
         if not _are_finite(actions):
             actions = _finite_actions(actions, before)
         observation, reward, terminated, truncated, info = self._step_rewarded(actions)
         if self._some_ended:
-            begun, told = self._reset_lanes(before, {})
+            begun, told = self._reset_environments(before, {})
             observation = merge(begun, observation, before)
             info = merge_info(told, info, before)
             reward[before] = 0.0
@@ -193,7 +199,7 @@ class Lanes(VectorEnv[Any, Any, Any]):
         self._ended = ended
         if self._some_ended and self.autoreset_mode is AutoresetMode.SAME_STEP:
             final, final_info = observation, info
-            begun, told = self._reset_lanes(ended, {})
+            begun, told = self._reset_environments(ended, {})
             observation = merge(begun, final, ended)
             info = merge_info(told, final_info, ended)
             info["final_obs"] = _rows(final, ended)
@@ -204,21 +210,21 @@ class Lanes(VectorEnv[Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
     def render(self) -> tuple[Any, ...] | None:
-        """Return a picture of every lane, uint8 of shape (height, width, 3); "human" shows lane 0 and returns None."""
+        """Return all pictures, uint8 of shape (height, width, 3); "human" shows the first and returns None."""
         if self.render_mode is None:
             return None
         if self.render_mode == "human":
-            self._render_lane(0)
+            self._render_environment(0)
             return None
-        return tuple(self._render_lane(lane) for lane in range(self.num_envs))
+        return tuple(self._render_environment(lane) for lane in range(self.num_envs))
 
     def render_lane(self, lane: int) -> NDArray[np.uint8] | None:
-        """Return the picture of one lane; with "human", show it and return None."""
-        return None if self.render_mode is None else self._render_lane(lane)
+        """Return the picture of one environment; with "human", show it and return None."""
+        return None if self.render_mode is None else self._render_environment(lane)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Give drives and pictures back."""
-        self._close_lanes()
+        """Release drives and pictures."""
+        self._close_environments()
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _reset_mask(self, mask: Any) -> Mask:
@@ -231,7 +237,7 @@ class Lanes(VectorEnv[Any, Any, Any]):
                 f"{chosen.dtype} {chosen.shape}"
             )
         if not self._has_begun and not chosen.all():
-            raise ValueError("the first reset must begin every lane; leave reset_mask out")
+            raise ValueError("the first reset must be of all environments; leave reset_mask out")
         return chosen
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
@@ -240,18 +246,20 @@ class Lanes(VectorEnv[Any, Any, Any]):
         if isinstance(seed, (int, np.integer)):
             return [int(seed) + lane for lane in range(self.num_envs)]
         if len(seed) != self.num_envs:
-            raise ValueError(f"{len(seed)} seeds do not fit {self.num_envs} lanes; give one number or one per lane")
+            raise ValueError(
+                f"{len(seed)} seeds do not fit {self.num_envs} environments; give one number or one per environment"
+            )
         return seed
 
 
-class OneLane(gymnasium.Env[Any, Any]):
-    """One lane as a gymnasium.Env: the same episode as lane 0 of any number of lanes with that seed.
+class SingleEnvironment(gymnasium.Env[Any, Any]):
+    """A single environment as a gymnasium.Env: the same episode as environment 0 of a vectorised one with that seed.
 
     Args:
-        lanes: Lanes with num_envs=1 and autoreset disabled.
+        lanes: Environments with num_envs=1 and autoreset disabled.
     """
 
-    def __init__(self, lanes: Lanes) -> None:
+    def __init__(self, lanes: VectorEnvironment) -> None:
         if lanes.num_envs != 1 or lanes.autoreset_mode is not AutoresetMode.DISABLED:
             raise ValueError("a single environment needs num_envs=1 and autoreset_mode='Disabled'")
         self.lanes = lanes
@@ -273,8 +281,10 @@ class OneLane(gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded("the episode has ended or none has begun; call reset()")
         if not _are_finite(action):
             _finite_actions(_batch_of_one(action), np.zeros(1, bool))
-        # A user's reward is of all lanes' arrays; without one there is a way with less overhead.
-        stepped = lanes._step_alone(action) if lanes.reward_function is None else Lanes._step_alone(lanes, action)
+        # A user's reward is of all environments' arrays; without one there is a way with less overhead.
+        stepped = (
+            lanes._step_alone(action) if lanes.reward_function is None else VectorEnvironment._step_alone(lanes, action)
+        )
         if stepped[2] or stepped[3]:
             lanes._ended = np.ones(1, bool)
             lanes._some_ended = True
@@ -285,11 +295,12 @@ class OneLane(gymnasium.Env[Any, Any]):
         return self.lanes.render_lane(0)
 
     def close(self) -> None:
-        """Give drives and pictures back."""
+        """Release drives and pictures."""
         self.lanes.close()
 
 
-# --- arrays with lanes first, and dicts of them -----------------------------------------------------------------------
+# --- arrays with environments first, and dicts of them
+# -----------------------------------------------------------------------
 def merge(chosen: Observation, others: Observation, mask: Mask) -> Observation:
     """Return `chosen` where the mask is true and `others` elsewhere; neither is changed."""
     if isinstance(others, dict):
@@ -300,7 +311,7 @@ def merge(chosen: Observation, others: Observation, mask: Mask) -> Observation:
 
 
 def merge_info(chosen: Info, others: Info, mask: Mask) -> Info:
-    """Return what is told of lanes: `chosen` where the mask is true; an entry of one side alone keeps its values.
+    """Return merged infos: `chosen` where the mask is true; an entry of one side alone keeps its values.
 
     Such an entry comes with a mask, its name behind an underscore, as Gymnasium has it.
     """
@@ -321,7 +332,7 @@ def merge_info(chosen: Info, others: Info, mask: Mask) -> Info:
 
 
 def one_of(tree: Any) -> Any:
-    """Return lane 0 of an array, or of a dict of arrays; of a masked entry only what is there."""
+    """Return environment 0 of an array, or of a dict of arrays; of a masked entry only what is there."""
     if not isinstance(tree, dict):
         return tree[0]
     if not any(key.startswith("_") for key in tree):
@@ -340,7 +351,7 @@ def check_choice(what: str, value: Any, valid: Sequence[Any]) -> None:
 
 
 def _told(info: Info, key: str, mask: Mask) -> Mask:
-    """Return of which lanes an entry tells."""
+    """Return the mask of the environments that an entry is about."""
     if key not in info:
         return np.zeros(len(mask), bool)
     there: Mask = info.get(f"_{key}", np.ones(len(mask), bool))
@@ -348,7 +359,7 @@ def _told(info: Info, key: str, mask: Mask) -> Mask:
 
 
 def _rows(tree: Observation, mask: Mask) -> NDArray[np.object_]:
-    """Return one observation per lane where the mask is true, None elsewhere: Gymnasium's final observations."""
+    """Return one observation per environment where the mask is true, None elsewhere: Gymnasium's final observations."""
     rows = np.full(len(mask), None, object)
     for lane in np.flatnonzero(mask):
         rows[lane] = {k: v[lane] for k, v in tree.items()} if isinstance(tree, dict) else tree[lane]
@@ -364,7 +375,7 @@ def _are_finite(actions: Any) -> bool:
 
 
 def _finite_actions(actions: Any, ignored: Mask) -> NDArray[Any]:
-    """Return actions with 0 for what is no number in lanes whose action is ignored.
+    """Return actions with 0 for what is no number in environments whose action is ignored.
 
     Raises:
         ValueError: For what is no number elsewhere: a drive would be told whatever its integer happens to be.
@@ -375,8 +386,8 @@ def _finite_actions(actions: Any, ignored: Mask) -> NDArray[Any]:
     if wrong.size:
         lane, entry = wrong[0]
         raise ValueError(
-            f"entry {entry} of the action of environment {lane} is {rows[lane, entry]:g}, no finite number; nothing "
-            "was sent. A policy whose training diverged gives such actions: take an earlier checkpoint of it"
+            f"entry {entry} of the action of environment {lane} is {rows[lane, entry]:g}, not a finite number; "
+            "nothing was sent. A policy whose training diverged returns such actions: use an earlier checkpoint of it"
         )
     rows[ignored & ~np.isfinite(rows).all(axis=1)] = 0.0
     return values

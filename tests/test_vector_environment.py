@@ -1,4 +1,4 @@
-"""What all environments share, on a lane that counts: its episode is as long as its generator says."""
+"""What all environments share, on an environment that counts: its episode is as long as its generator says."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode
 
 import drive_env  # noqa: F401 - registers
-from drive_env.envs.lanes import Lanes, OneLane, merge, merge_info
+from drive_env.envs.vector_environment import SingleEnvironment, VectorEnvironment, merge, merge_info
 
 
-class Counting(Lanes):
-    """Observation: [lane's draw, steps]; odd lanes are terminated, even ones truncated, after 3 + lane steps."""
+class Counting(VectorEnvironment):
+    """Observation: [draw, steps]; odd environments are terminated, even ones truncated, after 3 + number steps."""
 
     def __init__(self, num_envs, **options):
         super().__init__(num_envs, Box(0, 1000, (2,), np.float32), Box(-1, 1, (1,), np.float32), **options)
@@ -21,13 +21,13 @@ class Counting(Lanes):
         self.drawn = np.zeros(num_envs)
         self.actions = []
 
-    def _reset_lanes(self, mask, options):
+    def _reset_environments(self, mask, options):
         for lane in np.flatnonzero(mask):
             self.drawn[lane] = self.rngs[lane].integers(1, 1000)
         self.steps[mask] = 0
         return self._observation(), {"drawn": self.drawn.copy()}
 
-    def _step_lanes(self, action):
+    def _step_environments(self, action):
         self.actions.append(np.array(action))
         self.steps += 1
         ended = self.steps >= 3 + np.arange(self.num_envs)
@@ -106,7 +106,7 @@ def test_disabled_mode_waits_for_the_user():
     lanes = Counting(2, autoreset_mode=AutoresetMode.DISABLED)
     first = lanes.reset(seed=0)[0]
     steps_seen(lanes, 3)
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"lane 0 has ended.*reset_mask"):
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"environment 0 has ended.*reset_mask"):
         lanes.step(zeros(lanes))
     observation = lanes.reset(options={"reset_mask": np.array([True, False])})[0]
     assert observation[0, 1] == 0 and observation[1].tolist() == [first[1, 0], 3]
@@ -143,7 +143,7 @@ def test_a_mask_that_is_none_is_refused(mask):
 
 
 def test_the_first_reset_begins_every_lane():
-    with pytest.raises(ValueError, match="the first reset must begin every lane"):
+    with pytest.raises(ValueError, match="the first reset must be of all environments"):
         Counting(2).reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(gymnasium.error.ResetNeeded):
         Counting(1).step(np.zeros((1, 1), np.float32))
@@ -152,7 +152,7 @@ def test_the_first_reset_begins_every_lane():
 
 
 def test_one_lane_is_a_view():
-    one = OneLane(Counting(1, autoreset_mode="Disabled"))
+    one = SingleEnvironment(Counting(1, autoreset_mode="Disabled"))
     observation, info = one.reset(seed=6)
     assert np.array_equal(observation, Counting(3).reset(seed=4)[0][2])
     assert info == {"drawn": observation[0]}
@@ -163,7 +163,7 @@ def test_one_lane_is_a_view():
     with pytest.raises(gymnasium.error.ResetNeeded):
         one.step(np.zeros(1, np.float32))
     with pytest.raises(ValueError, match="num_envs=1"):
-        OneLane(Counting(2, autoreset_mode="Disabled"))
+        SingleEnvironment(Counting(2, autoreset_mode="Disabled"))
 
 
 def test_dicts_of_arrays_merge_lane_by_lane():
