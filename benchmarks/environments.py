@@ -22,8 +22,8 @@ MANY_ENVS = 1024
 ROUNDS = 12
 MEMORY = (
     "import re, sys, numpy as np; from pathlib import Path; from drive_env.envs.tracking import Tracking;"
-    "n = int(sys.argv[1]); lanes = Tracking(n, num_threads=1); lanes.reset(seed=0);"
-    "[lanes.step(np.zeros((n, 1), np.float32)) for _ in range(5)];"
+    "n = int(sys.argv[1]); envs = Tracking(n, num_threads=1); envs.reset(seed=0);"
+    "[envs.step(np.zeros((n, 1), np.float32)) for _ in range(5)];"
     "print(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1])"
 )
 
@@ -68,7 +68,7 @@ def vectorised(num_envs: int, threads: tuple[int, ...], calls: int) -> dict[str,
         found[f"{name}: env-steps/s with autoreset"] = num_envs / whole[k]
         found[f"{name}: overhead over advance"] = times[2 * k] / times[2 * k + 1] - 1.0
     if len(threads) > 1:
-        found[f"Tracking, two_mass, {num_envs} lanes: two threads over one"] = times[0] / times[2]
+        found[f"Tracking, two_mass, {num_envs} environments: two threads over one"] = times[0] / times[2]
     for lanes in sets:
         lanes.close()
     return found
@@ -106,7 +106,7 @@ def alone() -> dict[str, float]:
     env = SingleEnvironment(Tracking(1, autoreset_mode="Disabled", num_threads=1, duration=1e6 / 1000))
     env.reset(seed=0)
     action = np.zeros(1, np.float32)
-    drives = env.lanes.drives  # type: ignore[attr-defined]
+    drives = env.vector.drives  # type: ignore[attr-defined]
     step, advance = times_in_turn([lambda: env.step(action), lambda: drives.advance(0.001)], 300)
     env.close()
     return {"Tracking, single Env.step/s": 1.0 / step, "Tracking, single, bare advance/s": 1.0 / advance}

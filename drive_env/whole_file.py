@@ -26,7 +26,7 @@ class FileChangedError(ValueError):
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file under another name, have the disk keep it, and give it its name; make its folder if needed.
 
-    What is no file (/dev/null, a pipe) is written as it is.
+    A device or pipe (/dev/null) is written directly.
 
     Raises:
         OSError: If it cannot be written, with the file and the reason; what was there before is there still.

@@ -31,7 +31,7 @@ class Parameter(NamedTuple):
 
 
 class Friction(NamedTuple):
-    """Friction on one motion of the load; see friction.py for the laws.
+    """Friction on one motion of the load; see friction.py for the equations.
 
     coulomb, breakaway [N*m or N], stribeck [rad/s or m/s], viscous [N*m*s/rad or N*s/m]. `drag` [N*m*s^2/rad^2 or
     N*s^2/m^2] grows with the square of speed: air and water. `bristle` [rad or m] is the deflection at break-away,

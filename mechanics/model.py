@@ -297,7 +297,8 @@ def _bits(model: mujoco.MjModel) -> int:
     bits = used.bit_length()
     if bits > CONTACT_BITS // 8:
         raise ValueError(
-            f"the model uses contact bit {bits - 1}; copies of it are told apart by contact bits, so that it may use "
+            f"the model uses contact bit {bits - 1}; copies of it are distinguished by contact bits, so that it may "
+            f"use "
             f"bits 0 to {CONTACT_BITS // 8 - 1} of contype and conaffinity only"
         )
     return bits

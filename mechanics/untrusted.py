@@ -88,7 +88,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the table in a text; raises tomllib.TOMLDecodeError if it is no TOML or passes a limit."""
+    """Return the table in a text; raises tomllib.TOMLDecodeError if it is not TOML or exceeds a limit."""
     if _LONG_KEY.search(text):
         raise tomllib.TOMLDecodeError(_too_deep())
     try:
@@ -104,7 +104,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value in a text; raises ValueError if it is no JSON, holds what is no number, or passes a limit.
+    """Return the value in a text; raises ValueError if it is not JSON, has NaN, or exceeds a limit.
 
     JSON has neither NaN nor Infinity, though Python's reader takes both.
     """

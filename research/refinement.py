@@ -108,9 +108,9 @@ SEARCHES = {
 class Played(NamedTuple):
     """What episodes brought.
 
-    error: RMS following error of the worst axis, share of the amplitude, shape (lanes,).
-    current: RMS current of the worst axis, share of the limit, shape (lanes,).
-    reward: Mean of a step's, shape (lanes,).
+    error: RMS following error of the worst axis, share of the amplitude, shape (n,).
+    current: RMS current of the worst axis, share of the limit, shape (n,).
+    reward: Mean of a step's, shape (n,).
     """
 
     error: Floats
@@ -131,7 +131,7 @@ def refine(
         bundle: The controller, a network of fully connected layers.
         search: How.
         seed: Of machines and candidates.
-        told: Is told the generation and the cost of the mean controller in it.
+        told: Called with the generation and the cost of the mean controller in it.
 
     Raises:
         ValueError: If the bundle is none of that kind.
@@ -142,7 +142,7 @@ def refine(
         )
     first, rng = machine_seed(seed), np.random.default_rng(seed)
     features, start = features_of(bundle), acting_as_one(last_layer(bundle))
-    pool = _lanes(bundle, search.pool)
+    pool = _environments(bundle, search.pool)
     try:
         seeds = np.arange(first, first + search.pool)
         directions = directions_of(pool, features, start, seeds)
@@ -156,7 +156,7 @@ def refine(
         pool.close()
     order = np.argsort(rival.current - own.current, kind="stable")
     hard, others = order[: search.hard], order[search.hard :]
-    lanes = _lanes(bundle, search.candidates * (search.hard + search.machines))
+    envs = _environments(bundle, search.candidates * (search.hard + search.machines))
     mean = np.zeros(directions.shape[-1])
     deviation = np.full(mean.shape, search.deviation)
     ranks = np.arange(search.elite, 0, -1.0)
@@ -170,7 +170,7 @@ def refine(
             candidates = mean + deviation * rng.standard_normal((search.candidates, len(mean)))
             candidates[0] = mean
             layers = start + changes(directions, candidates, start.shape[1])
-            found = play(lanes, features, layers, np.tile(seeds[some], search.candidates))
+            found = play(envs, features, layers, np.tile(seeds[some], search.candidates))
             shape = (search.candidates, len(some))
             costs = cost(Played(*(row.reshape(shape) for row in found)), rival.of(some), weight, search)
             if told is not None:
@@ -180,7 +180,7 @@ def refine(
             deviation = np.maximum(0.8 * deviation + 0.2 * spread, LEAST_DEVIATION * search.deviation)
             mean = 0.5 * (mean + ranks @ best)
     finally:
-        lanes.close()
+        envs.close()
     return with_last_layer(bundle, start + changes(directions, search.share * mean[None], start.shape[1])[0])
 
 
@@ -205,11 +205,11 @@ def cost(found: Played, rival: Played, weight: Floats, search: RefinementSearch)
 def linear(load: str, search: RefinementSearch) -> AgentFile:
     """Return the baseline that a search begins as, as a network of one layer."""
     options = {"load": load, "distributions": load, **dict(search.options)}
-    lanes: Any = make_environments(ENVIRONMENT, 1, options)
-    entries, axes = lanes.single_observation_space.shape[0], lanes.single_action_space.shape[0]
-    configuration = configuration_of(lanes)
-    lanes.close()
-    law = baseline(search.start, ENVIRONMENT, lanes.config, axes)
+    envs: Any = make_environments(ENVIRONMENT, 1, options)
+    entries, axes = envs.single_observation_space.shape[0], envs.single_action_space.shape[0]
+    configuration = configuration_of(envs)
+    envs.close()
+    law = baseline(search.start, ENVIRONMENT, envs.config, axes)
     probe = 1e-3  # small enough that no action is cut off
     weight = np.asarray(law.act(probe * np.eye(entries, dtype=np.float32)), np.float32) / np.float32(probe)
     arrays = {
@@ -261,7 +261,7 @@ def acting_as_one(layer: Floats) -> Floats:
     return np.repeat(layer.mean(axis=1, keepdims=True), layer.shape[1], axis=1)
 
 
-def directions_of(lanes: Any, features: Callable[[Any], Array], layer: Floats, seeds: NDArray[Any]) -> Floats:
+def directions_of(envs: Any, features: Callable[[Any], Array], layer: Floats, seeds: NDArray[Any]) -> Floats:
     """Return the changes of the last layer that add entries of the observation, shape (features, directions).
 
     There is one for each of an axis' entries, of the mean over the axes, and one for each of the load's; each adds its
@@ -269,13 +269,13 @@ def directions_of(lanes: Any, features: Callable[[Any], Array], layer: Floats, s
     """
     axes = layer.shape[1]
     seen, inside = [], []
-    observation, _ = lanes.reset(seed=seeds.tolist())
-    for step in range(lanes.config.steps):
+    observation, _ = envs.reset(seed=seeds.tolist())
+    for step in range(envs.config.steps):
         row = features(observation)
         if step % EVERY == 0:
             seen.append(np.array(observation, float))
             inside.append(row.astype(float))
-        observation, *_ = lanes.step(np.clip(row @ layer, -1.0, 1.0).astype(np.float32))
+        observation, *_ = envs.step(np.clip(row @ layer, -1.0, 1.0).astype(np.float32))
     x, h = np.concatenate(seen), np.concatenate(inside)
     own = x[:, : AXIS_ENTRIES * axes].reshape(len(x), axes, AXIS_ENTRIES).mean(axis=1)
     entries = np.hstack([own, x[:, AXIS_ENTRIES * axes :]])
@@ -291,11 +291,11 @@ def changes(directions: Floats, weights: Floats, axes: int) -> Floats:
 
 
 # --- episodes ---------------------------------------------------------------------------------------------------------
-def play(lanes: Any, features: Callable[[Any], Array], layers: Floats, seeds: NDArray[Any]) -> Played:
+def play(envs: Any, features: Callable[[Any], Array], layers: Floats, seeds: NDArray[Any]) -> Played:
     """Return what an episode of every environment brought.
 
     Args:
-        lanes: Of Tracking.
+        envs: Of Tracking.
         features: What the last layers see.
         layers: A last layer for each candidate, shape (candidates, features, axes); each has as many environments.
         seeds: Of the environments.
@@ -307,21 +307,21 @@ def play(lanes: Any, features: Callable[[Any], Array], layers: Floats, seeds: ND
         found: Array = np.matmul(rows.reshape(len(given), -1, rows.shape[1]), given).reshape(len(rows), -1)
         return found
 
-    return _play(lanes, act, seeds)
+    return _play(envs, act, seeds)
 
 
-def play_policy(lanes: Any, policy: Any, seeds: NDArray[Any]) -> Played:
+def play_policy(envs: Any, policy: Any, seeds: NDArray[Any]) -> Played:
     """Return what an episode of every environment brought a policy."""
-    return _play(lanes, policy.act, seeds)
+    return _play(envs, policy.act, seeds)
 
 
-def _play(lanes: Any, act: Callable[[Any], Array], seeds: NDArray[Any]) -> Played:
-    steps, axes = lanes.config.steps, lanes.single_action_space.shape[0]
-    observation, _ = lanes.reset(seed=seeds.tolist())
-    squares, rewards = np.zeros((2, lanes.num_envs, axes)), np.zeros(lanes.num_envs)
-    standing = np.ones(lanes.num_envs, bool)
+def _play(envs: Any, act: Callable[[Any], Array], seeds: NDArray[Any]) -> Played:
+    steps, axes = envs.config.steps, envs.single_action_space.shape[0]
+    observation, _ = envs.reset(seed=seeds.tolist())
+    squares, rewards = np.zeros((2, envs.num_envs, axes)), np.zeros(envs.num_envs)
+    standing = np.ones(envs.num_envs, bool)
     for _ in range(steps):
-        observation, reward, terminated, _, _ = lanes.step(np.clip(act(observation), -1.0, 1.0))
+        observation, reward, terminated, _, _ = envs.step(np.clip(act(observation), -1.0, 1.0))
         standing &= ~terminated
         rows = observation[:, : AXIS_ENTRIES * axes].reshape(-1, axes, AXIS_ENTRIES)
         squares += np.square(rows[:, :, (ERROR, CURRENT)], dtype=float).transpose(2, 0, 1)
@@ -335,7 +335,7 @@ def machine_seed(seed: int) -> int:
     return int(np.random.SeedSequence([seed, zlib.crc32(b"refinement")]).generate_state(1)[0]) >> 1
 
 
-def _lanes(bundle: AgentFile, count: int) -> Any:
+def _environments(bundle: AgentFile, count: int) -> Any:
     return make_environments(ENVIRONMENT, count, bundle.configuration, autoreset_mode="NextStep")
 
 

@@ -150,7 +150,7 @@ def train(
     seed: int = 0,
     *,
     rounds: Sequence[Round] = ROUNDS,
-    lanes: int = LANES,
+    machines_at_once: int = LANES,
     rows: Sequence[tuple[str, str]] = TRAINING,
     kept: Path | None = None,
     progress: Callable[[str, float], None] = lambda what, share: None,
@@ -160,7 +160,7 @@ def train(
     Args:
         seed: Of machines, trials and networks.
         rounds: What is tried; the first round's gains are random.
-        lanes: Machines in a set.
+        machines_at_once: Machines in a set.
         rows: Load and motor.
         kept: Folder of the trials of a training with the same arguments; nothing is kept if not given.
         progress: Called with what is under way and how much of it is done.
@@ -175,7 +175,7 @@ def train(
         for done, (k, j) in enumerate(each):
             own = int(np.random.SeedSequence((FIRST_SEED + 1000 * number + seed, k, j)).generate_state(1)[0])
             file = None if kept is None else kept / f"trials_{seed}_{number}_{k}_{j}.npz"
-            parts.append(_kept(file) or _keep(file, collect(*rows[j], lanes, trials, own, policy)))
+            parts.append(_kept(file) or _keep(file, collect(*rows[j], machines_at_once, trials, own, policy)))
             progress(f"{what}: trials", (done + 1) / len(each))
         networks = 1 if number + 1 < len(rounds) else NETWORKS
         arrays = fit(join(parts), seed, networks, partial(progress, f"{what}: networks"))

@@ -96,7 +96,7 @@ def compare(
         episodes: How many, each with a machine and a reference of its own.
         seed: Of the first one.
         rivals: Rows of RIVALS.
-        told: Is told the share that is done.
+        told: Called with the share that is done.
 
     Raises:
         ValueError: If the bundle is none of that kind.
@@ -111,26 +111,26 @@ def compare(
     for number, name in enumerate((None, *rivals)):
         rival = RIVALS[name] if name is not None else None
         changes = {} if rival is None else {"mode": rival.mode}
-        lanes: Any = make_environments(ENVIRONMENT, min(LANES, episodes), {**bundle.configuration, **changes})
+        envs: Any = make_environments(ENVIRONMENT, min(LANES, episodes), {**bundle.configuration, **changes})
         try:
             found: list[tuple[Episode, ...]] = []
             commissioned = (
-                lanes.drives.read(velocity_p(lanes.drives.device)) if rival is not None and rival.tuned else None
+                envs.drives.read(velocity_p(envs.drives.device)) if rival is not None and rival.tuned else None
             )
             for first in range(0, episodes, LANES):
-                seeds = list(range(seed + first, seed + first + lanes.num_envs))
-                law = policy if rival is None else _law(rival, lanes, seeds, commissioned)
-                played = _play(lanes, law, seeds, commissioned)
+                seeds = list(range(seed + first, seed + first + envs.num_envs))
+                law = policy if rival is None else _law(rival, envs, seeds, commissioned)
+                played = _play(envs, law, seeds, commissioned)
                 found.append(played[: episodes - first])
                 if told is not None:
                     told((number + min(1.0, (first + LANES) / episodes)) / (1 + len(rivals)))
             kept = [episode for some in found for episode in some]
-            values = {row.name: np.array([row.compute(one, lanes.config) for one in kept])
-                      for row in figures(ENVIRONMENT, lanes.config)}  # fmt: skip
+            values = {row.name: np.array([row.compute(one, envs.config) for one in kept])
+                      for row in figures(ENVIRONMENT, envs.config)}  # fmt: skip
             rows[name] = {key: row for key, row in values.items() if np.isfinite(row).all()}
             fell += rival is None and sum(episode.terminated for episode in kept)
         finally:
-            lanes.close()
+            envs.close()
     own = rows.pop(None)
     compared = [row.name for row in FIGURES[ENVIRONMENT] if row.compute in COMPARED and row.name in own]
     ratios = {str(name): {key: ratio(own[key], row[key]) for key in compared} for name, row in rows.items()}
@@ -193,12 +193,12 @@ def tune(drives: EmulatedDrives, commissioned: NDArray[np.int64]) -> None:
     drives.write(velocity_p(drives.device), np.clip(np.rint(wanted), 1, RAW_MAX).astype(np.int64))
 
 
-def _law(rival: Rival, lanes: Any, seeds: Sequence[int], commissioned: NDArray[np.int64] | None) -> ControlLaw:
+def _law(rival: Rival, envs: Any, seeds: Sequence[int], commissioned: NDArray[np.int64] | None) -> ControlLaw:
     """Return a rival's feed-forward for the machines of these seeds."""
     if not rival.identified:
-        return feed_forward(lanes.config)
-    axes, config = lanes.single_action_space.shape[0], lanes.config
-    played = _play(lanes, nothing(axes), seeds, commissioned)
+        return feed_forward(envs.config)
+    axes, config = envs.single_action_space.shape[0], envs.config
+    played = _play(envs, nothing(axes), seeds, commissioned)
     rows = np.stack([one.observations[1:, : axes * AXIS_ENTRIES].reshape(-1, axes, AXIS_ENTRIES) for one in played], 1)
     error, speed = config.amplitude * rows[..., ERROR].astype(float), config.speed * rows[..., SPEED].astype(float)
     inner = slice(SPAN, len(speed) - SPAN)
@@ -207,20 +207,20 @@ def _law(rival: Rival, lanes: Any, seeds: Sequence[int], commissioned: NDArray[n
     return feed_forward(config, (lag, lag_of_speed + LATENCY * lag))
 
 
-def _play(lanes: Any, policy: Any, seeds: Sequence[int], commissioned: NDArray[np.int64] | None) -> tuple[Episode, ...]:
+def _play(envs: Any, policy: Any, seeds: Sequence[int], commissioned: NDArray[np.int64] | None) -> tuple[Episode, ...]:
     """Return an episode of every environment; given the commissioned velocity P, the cascades are tuned before."""
-    steps, count = lanes.config.steps, lanes.num_envs
-    observation, _ = lanes.reset(seed=list(seeds))
+    steps, count = envs.config.steps, envs.num_envs
+    observation, _ = envs.reset(seed=list(seeds))
     if commissioned is not None:
-        tune(lanes.drives, commissioned)
+        tune(envs.drives, commissioned)
     policy.reset(None)
     observations = np.zeros((steps + 1, *observation.shape), np.float32)
-    actions = np.zeros((steps, *lanes.action_space.shape), np.float32)
+    actions = np.zeros((steps, *envs.action_space.shape), np.float32)
     rewards, length, fell = np.zeros((steps, count)), np.full(count, steps), np.zeros(count, bool)
     observations[0] = observation
     for k in range(steps):
         actions[k] = policy.act(observations[k])
-        observations[k + 1], rewards[k], terminated, _, _ = lanes.step(actions[k])
+        observations[k + 1], rewards[k], terminated, _, _ = envs.step(actions[k])
         length = np.where(terminated & ~fell, k + 1, length)
         fell |= terminated
     return tuple(

@@ -22,10 +22,7 @@ HUGE = "1" + "0" * 29
 APPS = {"drive-env": env_app, "drive-tune": tune_app, "drive-agent": agent_app}
 COMMANDS = [
     *(
-        (
-            "drive-tune", (command, "--travel", travel),
-            "a travel of .* rad is impossible|must contain 0|must be LOW:HIGH",
-        )
+        ("drive-tune", (command, "--travel", travel), "rad is impossible|must contain 0|must be LOW:HIGH")
         for command in ("auto", "identify", "response", "rules", "optimise")
         for travel in ("-1e300:1e300", f"-{HUGE}:{HUGE}", "nan:nan", "-1:1e300")
     ),

@@ -50,7 +50,7 @@ def test_a_picture_shows_the_machine_and_the_scope(kind):
     environment, options, steps = KINDS[kind]
     lanes = environment(2, num_threads=1, render_mode="rgb_array", **options)
     lanes.reset(seed=0)
-    at_rest = lanes.render_lane(0)
+    at_rest = lanes.render_environment(0)
     lanes._pictures._record(1)
     assert at_rest.shape == (HEIGHT, WIDTH, 3) and at_rest.dtype == np.uint8
     rng = np.random.default_rng(3)
@@ -141,10 +141,10 @@ def test_human_shows_lane_0_while_time_passes(kind, monkeypatch):
     monkeypatch.setattr(window, "Window", FakeWindow)
     _, options, steps = KINDS[kind]
     env = gymnasium.make(f"ServoDrive/{kind}-v0", render_mode="human", num_threads=1, **options).unwrapped
-    shown = env.lanes._pictures._window
+    shown = env.vector._pictures._window
     assert shown.title == "drive-env: belt" and shown.size == (HEIGHT, WIDTH, 3)
     # Nobody calls render(): time that passes is shown. Drawing every picture would take long, so only the last is.
-    drawn = env.lanes._pictures._drawn()
+    drawn = env.vector._pictures._drawn()
     frame = drawn.frame
     drawn.frame = lambda recording: len(recording.t)
     env.reset(seed=0)
@@ -255,11 +255,11 @@ def test_a_display_that_opens_no_window_is_told_in_one_line(fakes, fails):
 def test_on_a_display_the_window_opens(kind):
     _, options, steps = KINDS[kind]
     env = gymnasium.make(f"ServoDrive/{kind}-v0", render_mode="human", num_threads=1, **options).unwrapped
-    env.lanes._pictures._drawn()
+    env.vector._pictures._drawn()
     env.reset(seed=0)
     for _ in range(min(steps, 20)):
         env.step(env.action_space.low * 0.3)
-    assert env.lanes._pictures._window.is_open
+    assert env.vector._pictures._window.is_open
     env.close()
 
 

@@ -159,7 +159,7 @@ def test_a_first_picture_after_60_steps_shows_them_and_what_was_followed(scope, 
     env.render()
     run = scope.recording
     assert len(run.t) == 61  # the reset, and the steps
-    amplitude = 2.0 * np.pi * env.unwrapped.lanes.config.amplitude
+    amplitude = 2.0 * np.pi * env.unwrapped.vector.config.amplitude
     assert np.isfinite(run.position_demand[1:]).all() and np.isfinite(run.velocity_demand[1:]).all()
     if mode != "csp":  # there the drive's own demand is drawn, which is what the action says
         # A drive tells a cycle late how it stands; the observation is of float32.

@@ -154,7 +154,7 @@ def emulated(
         seed: Seed of everything random.
         randomise: Parameters to draw per machine: True for all, or names or groups.
         parameters: True machine parameters [SI] that replace defaults and draws: one value or one per machine.
-        supply: Supply voltage [V]; the motor's by default. The machines have it, and the tuner is told.
+        supply: Supply voltage [V]; the motor's by default. The machines have it, and the tuner knows it.
         travel: How far the rotors may turn [rad], less than the load lets them: one (low, high), or one per axis of a
             machine; the load's own by default.
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.

@@ -79,7 +79,7 @@ def repeat(policy: Any, recording: EpisodeRecording, told: Callable[[float], Non
     Args:
         policy: What acts.
         recording: What it is compared with.
-        told: Is told the share that is done, episode by episode.
+        told: Called with the share that is done, episode by episode.
 
     Raises:
         PolicyStoppedError: If the policy fails on what was recorded, or gives another number of actions.

@@ -146,7 +146,7 @@ def evaluate(
         guard: Limits of the policy; by default those of guard.LIMITS on given drives, and guard.PATIENT on emulated
             machines.
         side: What the report calls the drives.
-        told: Is told the share that is done.
+        told: Called with the share that is done.
         at_once: Episodes side by side on emulated machines; by default `environments_for` as many.
 
     Raises:

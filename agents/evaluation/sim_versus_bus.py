@@ -66,7 +66,7 @@ def on_both_sides(
         name: Of the policy.
         lockstep: Serve them in lockstep instead of in real time.
         guard: Limits of the policy over the bus.
-        told: Is told the share that is done.
+        told: Called with the share that is done.
 
     Raises:
         PolicyStoppedError: If the policy did in this process what it must not.

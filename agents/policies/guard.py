@@ -107,7 +107,7 @@ class GuardedPolicy:
         """Return the policy's action.
 
         Raises:
-            PolicyStoppedError: If it took too long, is no number, or has been at the end of its range for too long.
+            PolicyStoppedError: If it took too long, is not a number, or has been at the end of its range for too long.
         """
         action = self._ask(self._policy.act, observation, within=self._limits.stall)
         rows = self._checked(action, len(observation))
@@ -132,7 +132,7 @@ class GuardedPolicy:
         """Return a tuner's choice after its last trial, as an action; None of a policy without a choice.
 
         Raises:
-            PolicyStoppedError: If it took too long, or is no number.
+            PolicyStoppedError: If it took too long, or is not a number.
         """
         answer = getattr(self._policy, "answer", None)
         if answer is None:

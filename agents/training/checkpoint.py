@@ -32,7 +32,7 @@ RUN, NORMALISER, BUFFER, RANDOM = "drive_agent.json", "normaliser.pkl", "replay_
 
 
 class CheckpointError(ValueError):
-    """A file is no checkpoint of ours, or damaged; the message says what to do."""
+    """The file is not a checkpoint of drive-agent, or damaged; the message has the remedy."""
 
 
 class UntrustedError(CheckpointError):

@@ -24,35 +24,35 @@ class CountedEnvironments:
         told: The info of the last reset or step, of all environments: Stable-Baselines3 gets none of it.
     """
 
-    def __init__(self, lanes: VectorEnvironment) -> None:
-        self.lanes = lanes
+    def __init__(self, vector: VectorEnvironment) -> None:
+        self.vector = vector
         self.episodes = self.steps = 0
         self.seconds = 0.0
         self.told: Mapping[str, Any] = {}
-        self._returns = np.zeros(lanes.num_envs)
-        self._lengths = np.zeros(lanes.num_envs, np.int64)
+        self._returns = np.zeros(vector.num_envs)
+        self._lengths = np.zeros(vector.num_envs, np.int64)
         self._ended: deque[tuple[float, int, bool]] = deque(maxlen=EPISODES)
         self._terms: dict[str, float] = {}
         self._term_steps = 0
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.lanes, name)
+        return getattr(self.vector, name)
 
     @property
     def stage(self) -> float:
         """Stage of the curriculum."""
-        return self.lanes.stage
+        return self.vector.stage
 
     @stage.setter
     def stage(self, stage: float) -> None:
-        self.lanes.stage = stage
+        self.vector.stage = stage
 
     def reset(self, **options: Any) -> Any:
         """Begin an episode in every environment; those that were under way do not count."""
         self._returns[:] = 0.0
         self._lengths[:] = 0
         start = time.perf_counter()
-        found = self.lanes.reset(**options)
+        found = self.vector.reset(**options)
         self.seconds += time.perf_counter() - start
         self.told = found[1]
         return found
@@ -60,7 +60,7 @@ class CountedEnvironments:
     def step(self, actions: Any) -> Any:
         """Act in every environment."""
         start = time.perf_counter()
-        stepped = self.lanes.step(actions)
+        stepped = self.vector.step(actions)
         self.seconds += time.perf_counter() - start
         _, reward, terminated, truncated, info = stepped
         self.told = info

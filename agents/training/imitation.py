@@ -39,7 +39,7 @@ def imitate(
         seed: Of the environments and of the noise.
         steps: Of all environments together.
         updates: Of the network.
-        told: Is told how much of it is done, 0...1.
+        told: Called with the share that is done, 0...1.
     """
     import torch
 

@@ -111,7 +111,7 @@ def search(
         trials: How many more.
         seed: Of trainings and of the search.
         episodes: Of a score.
-        told: Is told of each trial that is over, in their order, and of the best one; None before there is one.
+        told: Called with each completed trial, in their order, and the best one; None before there is one.
         pool: Where else trials run, ROUND at a time, which changes none of them.
 
     Raises:

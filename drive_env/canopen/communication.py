@@ -1,7 +1,7 @@
 """The objects that belong to the module and not to an axis: 1000h to 1FFFh, bit rate, node ID, boot loader.
 
 Each write is checked by the rule of its object before it changes anything; whoever owns the service behind an object is
-told that it changed.
+notified of the change.
 """
 
 from __future__ import annotations

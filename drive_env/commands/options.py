@@ -61,7 +61,7 @@ OF_A_BUS = ("interface", "channel", "node", "nodes", "bitrate", "lockstep")
 
 
 def was_typed(context: typer.Context, name: str) -> bool:
-    """Return whether an option stands on the command line: one in the environment must turn no motor by surprise."""
+    """Return whether an option is on the command line: one in the environment must not make a motor turn."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
 
@@ -195,7 +195,7 @@ def check_time(option: str, value: float | None) -> None:
 
 
 def check_free(file: Path, remedy: str = "choose another file") -> None:
-    """Raise ValueError for a file that is there already: no command replaces one. What is no file (/dev/null) is any.
+    """Raise ValueError for a file that exists already: no command replaces one. /dev/null and the like may exist.
 
     Call it before anything takes long, or is asked of a drive.
     """
@@ -216,10 +216,10 @@ def check_writable(file: Path) -> None:
 
 
 def ask(question: str, yes: bool) -> None:
-    """Go on if the user agrees; else each program's `errors_as_exit_codes` ends it under its own name.
+    """Continue if the user agrees; else each program's `errors_as_exit_codes` ends it under its own name.
 
     Raises:
-        ValueError: If nobody is there to ask.
+        ValueError: If there is no terminal to ask.
         RuntimeError: If the user says no.
     """
     if yes:

@@ -211,7 +211,7 @@ def device_of(kind: int, vendor: int | None, product: int | None) -> str | None:
     """Return the name of the device that a node says that it is, None of one that is not known.
 
     Args:
-        kind: Its 1000h; a device and its variants, which are one product, are told by it.
+        kind: Its 1000h; a device and its variants, which are one product, are identified by it.
         vendor: Its 1018h:01.
         product: Its 1018h:02.
     """

@@ -61,7 +61,7 @@ def trace_loops(
         play: As `record` takes it, one row per communication cycle.
 
     Raises:
-        ValueError: For drives on a bus, an unknown signal, or a time that is no whole number of cycles.
+        ValueError: For drives on a bus, an unknown signal, or a time that is not a whole number of cycles.
         ObjectAccessError: For an object that cannot be played, or a value out of range.
     """
     if drives.machine is None:

@@ -54,7 +54,7 @@ def configured(
         options: Fields that replace the source's.
 
     Raises:
-        ValueError: For a field that there is not, naming those that there are, or a file that is no TOML.
+        ValueError: For a field that there is not, naming those that there are, or a file that is not TOML.
     """
     if source is None:
         table: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Motion programmes, drawn per lane: smooth moves from point to point, or a sine, within what an axis can do."""
+"""Motion programmes, drawn per environment: smooth moves from point to point, or a sine, within what an axis can do."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Reach(NamedTuple):
 
 
 class Programme:
-    """A programme for each lane: all axes of an environment move in unison, from rest at the start.
+    """A programme for each environment: all axes of an environment move in unison, from rest at the start.
 
     Args:
         num_envs: Number of environments.

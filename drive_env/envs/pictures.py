@@ -1,4 +1,4 @@
-"""Pictures of lanes: the machine beside its scope, as a film shows them, while an episode runs."""
+"""Pictures of environments: the machine beside its scope, as a film shows them, while an episode runs."""
 
 from __future__ import annotations
 

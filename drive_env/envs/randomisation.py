@@ -129,7 +129,7 @@ class Curriculum(NamedTuple):
 
 
 class Distributions:
-    """Laws by the name of the parameter, and the curriculum that opens them.
+    """Distributions by the name of the parameter, and the curriculum that widens them.
 
     Names are those of `drives.machine.parameters` and of `BESIDE`. `faults` is the distribution of faults, None without
     any.
@@ -148,7 +148,7 @@ class Distributions:
     def load(cls, source: str | Path | Mapping[str, Any] | Distributions) -> Distributions:
         """Return a set of distributions: a shipped one by its name (`shipped()`), a TOML file, or a table like one.
 
-        Tables: `include`, names of sets whose laws come first; `parameters`, name -> law; `curriculum` with `steps`
+        Tables: `include`, names of sets that come first; `parameters`, name -> distribution; `curriculum` with `steps`
         and `stage`, and `opens`, group or parameter -> [from, to] in stages; `faults` with `probability`, `names` (of
         faults or groups), `at`, `duration` and `ranges`, as `RandomFaults` has them. A law false takes an included
         one away, and so does `faults = false`.

@@ -26,21 +26,21 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
         ValueError: For environments of another autoreset mode, which SB3 does not know.
     """
 
-    def __init__(self, lanes: VectorEnvironment) -> None:
-        if lanes.autoreset_mode is not AutoresetMode.SAME_STEP:
-            raise ValueError(f"Stable-Baselines3 needs autoreset_mode='SameStep', not {lanes.autoreset_mode.value!r}")
-        self.lanes = lanes
+    def __init__(self, vector: VectorEnvironment) -> None:
+        if vector.autoreset_mode is not AutoresetMode.SAME_STEP:
+            raise ValueError(f"Stable-Baselines3 needs autoreset_mode='SameStep', not {vector.autoreset_mode.value!r}")
+        self.vector = vector
         self._actions: Any = None
         self._steps = 0
-        self._follows = len(lanes.curriculum.steps) > 1
-        super().__init__(lanes.num_envs, lanes.single_observation_space, lanes.single_action_space)
+        self._follows = len(vector.curriculum.steps) > 1
+        super().__init__(vector.num_envs, vector.single_observation_space, vector.single_action_space)
 
     def reset(self) -> Any:
         """Begin an episode in every environment, with the seeds and options given before."""
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
         options = self._options[0] if self._options and self._options[0] else None
         self._follow_curriculum()
-        observation, told = self.lanes.reset(seed=seeds, options=options)
+        observation, told = self.vector.reset(seed=seeds, options=options)
         self.reset_infos = [_of_environment(told, lane) for lane in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
@@ -54,7 +54,7 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
         """Act in every environment."""
         self._steps += self.num_envs
         self._follow_curriculum()
-        observation, reward, terminated, truncated, info = self.lanes.step(self._actions)
+        observation, reward, terminated, truncated, info = self.vector.step(self._actions)
         ended = terminated | truncated
         infos: list[Info] = [{} for _ in range(self.num_envs)]
         if "final_obs" in info:
@@ -68,23 +68,23 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
 
     def _follow_curriculum(self) -> None:
         if self._follows:
-            self.lanes.stage = self.lanes.curriculum.stage_at(self._steps)
+            self.vector.stage = self.vector.curriculum.stage_at(self._steps)
 
     def close(self) -> None:
         """Give drives and pictures back."""
-        self.lanes.close()
+        self.vector.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the environments, once per environment asked for."""
-        return [getattr(self.lanes, attr_name)] * len(list(self._get_indices(indices)))
+        return [getattr(self.vector, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of the environments."""
-        setattr(self.lanes, attr_name, value)
+        setattr(self.vector, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of the environments once, and return its result once per environment asked for."""
-        result = getattr(self.lanes, method_name)(*method_args, **method_kwargs)
+        result = getattr(self.vector, method_name)(*method_args, **method_kwargs)
         return [result] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
@@ -93,7 +93,7 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
 
     def get_images(self) -> Sequence[Any]:
         """Return a picture of every environment."""
-        return list(self.lanes.render() or ())
+        return list(self.vector.render() or ())
 
 
 def _of_environment(info: Mapping[str, Any], lane: int) -> Info:

@@ -42,7 +42,7 @@ def tolerance(error, margin):
 
 @inlined
 def limited(value, high):
-    """Return a value within -high...high; what is no number is 0."""
+    """Return a value within -high...high; NaN becomes 0."""
     return min(max(value, -high), high) if value == value else 0.0
 
 

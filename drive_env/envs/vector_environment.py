@@ -53,7 +53,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any]):
 
     Raises:
         ValueError: For a mode that is none, or less than one environment; in a step for a reward of another shape, or
-            one that is no number.
+            one that is not a number.
     """
 
     config: Any
@@ -174,7 +174,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any]):
         Raises:
             gymnasium.error.ResetNeeded: Before the first reset, or, with autoreset disabled, while an environment has
             ended.
-            ValueError: For an action that is no finite number, before any drive is told anything; that of an
+            ValueError: For an action that is no finite number, before anything is sent to a drive; that of an
                 environment that has ended is ignored.
         """
         if not self._has_begun:
@@ -218,7 +218,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any]):
             return None
         return tuple(self._render_environment(lane) for lane in range(self.num_envs))
 
-    def render_lane(self, lane: int) -> NDArray[np.uint8] | None:
+    def render_environment(self, lane: int) -> NDArray[np.uint8] | None:
         """Return the picture of one environment; with "human", show it and return None."""
         return None if self.render_mode is None else self._render_environment(lane)
 
@@ -256,47 +256,49 @@ class SingleEnvironment(gymnasium.Env[Any, Any]):
     """A single environment as a gymnasium.Env: the same episode as environment 0 of a vectorised one with that seed.
 
     Args:
-        lanes: Environments with num_envs=1 and autoreset disabled.
+        vector: A vectorised environment with num_envs=1 and autoreset disabled.
     """
 
-    def __init__(self, lanes: VectorEnvironment) -> None:
-        if lanes.num_envs != 1 or lanes.autoreset_mode is not AutoresetMode.DISABLED:
+    def __init__(self, vector: VectorEnvironment) -> None:
+        if vector.num_envs != 1 or vector.autoreset_mode is not AutoresetMode.DISABLED:
             raise ValueError("a single environment needs num_envs=1 and autoreset_mode='Disabled'")
-        self.lanes = lanes
-        self.observation_space = lanes.single_observation_space
-        self.action_space = lanes.single_action_space
-        self.render_mode = lanes.render_mode
+        self.vector = vector
+        self.observation_space = vector.single_observation_space
+        self.action_space = vector.single_action_space
+        self.render_mode = vector.render_mode
         self.metadata = {"render_modes": list(RENDER_MODES), "render_fps": 50}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Info]:
         """Begin an episode."""
         super().reset(seed=seed)
-        observation, info = self.lanes.reset(seed=seed, options=options)
+        observation, info = self.vector.reset(seed=seed, options=options)
         return one_of(observation), one_of(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
-        """Act once; ValueError for an action that is no finite number, before the drive is told anything."""
-        lanes = self.lanes
-        if lanes._some_ended or not lanes._has_begun:
+        """Act once; ValueError for an action that is not finite, before anything is sent to the drive."""
+        vector = self.vector
+        if vector._some_ended or not vector._has_begun:
             raise gymnasium.error.ResetNeeded("the episode has ended or none has begun; call reset()")
         if not _are_finite(action):
             _finite_actions(_batch_of_one(action), np.zeros(1, bool))
         # A user's reward is of all environments' arrays; without one there is a way with less overhead.
         stepped = (
-            lanes._step_alone(action) if lanes.reward_function is None else VectorEnvironment._step_alone(lanes, action)
+            vector._step_alone(action)
+            if vector.reward_function is None
+            else VectorEnvironment._step_alone(vector, action)
         )
         if stepped[2] or stepped[3]:
-            lanes._ended = np.ones(1, bool)
-            lanes._some_ended = True
+            vector._ended = np.ones(1, bool)
+            vector._some_ended = True
         return stepped
 
     def render(self) -> Any:
         """Return the picture, uint8 of shape (height, width, 3); "human" shows it and returns None."""
-        return self.lanes.render_lane(0)
+        return self.vector.render_environment(0)
 
     def close(self) -> None:
         """Release drives and pictures."""
-        self.lanes.close()
+        self.vector.close()
 
 
 # --- arrays with environments first, and dicts of them

@@ -21,7 +21,7 @@ class Condition:
     """What a fault waits for, of the axes that it is of; any of them will do.
 
     quantity: "enabled": operation enabled. "position": true rotor angle [rad]; "speed": its rate without its sign
-        [rad/s]; these are compared with `limit`. "" is no condition.
+        [rad/s]; these are compared with `limit`. "" means none.
     above: Whether it has to be above the limit, or below.
     """
 

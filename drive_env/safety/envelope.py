@@ -305,7 +305,7 @@ class Envelope:
 
     # --- signals --------------------------------------------------------------------------------------------------
     def interrupt(self) -> bool:
-        """Begin to stop, since the program is told to end; return whether that is under way already.
+        """Begin to stop, since a signal ends the program; return whether that is under way already.
 
         Called from a signal handler, between any two instructions of the program: it only asks the supervisor.
         """

@@ -1,6 +1,6 @@
 """Signals that end a program: the motors are stopped first, and a second signal does not cut the stop short.
 
-A program that is told to end (SIGTERM, SIGHUP) would die on the spot and leave its motors to the drives' watchdogs.
+A program that gets SIGTERM or SIGHUP would end at once and leave its motors to the drives' watchdogs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Guarded(Protocol):
         """Begin to stop; return whether a stop that a signal before began is still under way."""
 
     def carry_on(self) -> None:
-        """Learn that the program goes on although it was told to end."""
+        """Note that the program continues in spite of the signal."""
 
 
 _guarded: list[Guarded] = []

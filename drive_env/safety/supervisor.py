@@ -25,7 +25,7 @@ class Supervisor:
     """Runs a turn every few milliseconds.
 
     Args:
-        turn: What to do; a BusError is told once, anything else ends it for good.
+        turn: What to do; a BusError is reported once, anything else ends the heartbeats.
         fail: Called when a turn failed for good.
     """
 

@@ -132,7 +132,7 @@ class Watch:
     def carry_on(self) -> None:
         """Have the program told that a signal has stopped it, since it goes on."""
         if self.is_told_to_end:
-            self._pending = SafetyError("the drives were stopped, since the program was told to end (a signal)")
+            self._pending = SafetyError("the drives were stopped, since a signal ended the program")
 
     def forget_signal(self) -> None:
         """Take note that the program goes on after a signal: it enables an axis."""

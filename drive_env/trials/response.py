@@ -253,8 +253,8 @@ def oscillation(t: ArrayLike, x: ArrayLike, *, amplitude: ArrayLike) -> tuple[ND
       2. its swing is at least 0.8 amplitudes and half the early one (not decaying),
       3. x reverses at least three times in the record, by 1.3 amplitudes each time (not one overshoot).
     It takes 3.5 periods in the record to be sure: 5 Hz needs 0.7 s, and 0.15 s shows 23 Hz and more; fewer may pass
-    for a transient. At 1 kHz it works up to 450 Hz. A ringing that decays is told from one that does not after 2.3
-    periods with a damping of 0.2 to 0.35, after 4 with 0.1. Noise must stay below 0.2 amplitudes rms. The frequency
+    for a transient. At 1 kHz it works up to 450 Hz. A ringing that decays is distinguished from one that does not after
+    2.3 periods with a damping of 0.2 to 0.35, after 4 with 0.1. Noise must stay below 0.2 amplitudes rms. The frequency
     is the highest line of the Hann spectrum, which takes the samples to be even.
 
     Args:

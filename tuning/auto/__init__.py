@@ -1,1 +1,1 @@
-"""One button: identify, compute, try, verify, keep or roll back."""
+"""Automatic tuning: identify, search gains, try, verify, store or roll back."""

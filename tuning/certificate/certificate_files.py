@@ -39,7 +39,7 @@ def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
     """Return the certificate of a JSON file, and whether it is unchanged since it was written.
 
     Raises:
-        CertificateError: If the file is no certificate.
+        CertificateError: If the file is not a certificate.
     """
     data = _read(Path(path))
     stated = data.pop(HASH)

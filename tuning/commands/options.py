@@ -219,7 +219,7 @@ def check_machines(option: str, machines: int) -> None:
 def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool, axes: str = APART) -> None:
     """Raise ValueError for options of a bus where --bus was not said.
 
-    Interface and channel may stand in the environment: alone they say nothing, and a motor must not turn by surprise.
+    Interface and channel may be set by the environment: alone they do not mean the bus, lest a motor turn unexpectedly.
     """
     if nodes or bitrate is not None or lockstep:
         raise ValueError("--node, --bitrate and --lockstep are for drives on a bus; add --bus, or leave them out")

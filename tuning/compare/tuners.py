@@ -144,7 +144,7 @@ def _rule_names() -> tuple[str, ...]:
 
 
 def _auto() -> Tuner:
-    """Return the one button of `tuning.auto.one_button`."""
+    """Return the tuner of `tuning.auto.one_button`."""
     found: Tuner = importlib.import_module("tuning.auto.one_button").tune
     return found
 

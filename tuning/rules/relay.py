@@ -96,7 +96,7 @@ def gains_from_swing(device: Device, plant: Plant, slope: float, ultimate: Ultim
     Args:
         device: The drive.
         plant: The axis; of it the winding and the supply matter, which a relay does not see, and the inertia, by which
-            it is told that the axis did not swing with its load's resonance.
+            it is checked that the axis did not swing at its load's resonance.
         slope: Acceleration per current [rad/(A*s^2)].
         ultimate: The point.
 

@@ -2,8 +2,8 @@
 
 The automaton is TRANSITIONS of `firmware/common/fsa.py`, what lives in which NMT state is SERVICES of `canopen/nmt.py`,
 and the heartbeat consumer's rule is that of `canopen/error_control.py`: watching begins with the first heartbeat, and a
-loss is told once. Time is counted in ticks. A tick is longer than the silence that the consumer allows and longer than
-any ramp, so that what a drive does by itself is done within one.
+loss is reported once. Time is counted in ticks. A tick is longer than the silence that the consumer allows and longer
+than any ramp, so that what a drive does by itself is done within one.
 """
 
 from __future__ import annotations
