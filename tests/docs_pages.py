@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 SHELL = ("bash", "sh", "console", "")
 PORT = 29636  # that of `drive-env serve`
-PATIENCE = 900.0  # s, of one command
+PATIENCE, SERVED = 900.0, 120.0  # s, of one command; until a drive is served
 END = "@@ended@@"
 
 FENCE = re.compile(r"^(?P<indent> *)```(?P<info>[^`\n]*)\n(?P<text>.*?)^(?P=indent)``` *$", re.M | re.S)
@@ -167,15 +167,15 @@ class Session:
         termios.tcflush(self._terminal, termios.TCIFLUSH)
         os.write(self._keyboard, b"y\n")
 
-    def answer(self, until: str = END) -> tuple[int, list[str]]:
+    def answer(self, until: str = END, patience: float = PATIENCE) -> tuple[int, list[str]]:
         """Return the exit code and what was printed."""
         lines: list[str] = []
-        ends = time.monotonic() + PATIENCE
+        ends = time.monotonic() + patience
         while True:
             try:
                 line = self._lines.get(timeout=max(ends - time.monotonic(), 0.01))
             except queue.Empty:
-                raise AssertionError(f"no end after {PATIENCE:g} s:\n" + "\n".join(lines)) from None
+                raise AssertionError(f"no {until} after {patience:g} s:\n" + "\n".join(lines)) from None
             if line is None:
                 raise AssertionError("it ended:\n" + "\n".join(lines))
             if until == END and END in line:
@@ -259,7 +259,7 @@ class Reader:
             self._shell.say(f"source {self._file} <{self._shell.terminal}; echo {END} $?")
             return self._shell.answer()
         self._shell.say(f"source {self._file} </dev/null")
-        return self._shell.answer(until="can.Bus(")
+        return self._shell.answer("can.Bus(", SERVED)
 
     def _run_python(self, block: Block) -> list[str]:
         if self._python is None:
@@ -341,15 +341,23 @@ def follow(page: Path, folder: Path, write: bool = False) -> list[tuple[Block, s
     return left
 
 
-def port_is_free() -> bool:
-    """Return whether `drive-env serve` can have its port."""
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", PORT)) != 0
+def port_is_free(wait: float = 0.0) -> bool:
+    """Return whether `drive-env serve` can have its port, within a time to wait [s]."""
+    ends = time.monotonic() + wait
+    while True:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", PORT)) != 0:
+                return True
+        if time.monotonic() > ends:
+            return False
+        time.sleep(1.0)
 
 
 if __name__ == "__main__":
     for name in sys.argv[1:]:
         began = time.monotonic()
+        if "drive-env serve" in Path(name).read_text(encoding="utf-8") and not port_is_free(PATIENCE):
+            raise SystemExit(f"port {PORT} is taken: end the program that serves there")
         with tempfile.TemporaryDirectory() as place:
             for one, reason in follow(Path(name).resolve(), Path(place), write=True):
                 print(f"{name}:{one.line}: not run: {reason}")
