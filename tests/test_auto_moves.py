@@ -374,7 +374,7 @@ def test_gains_that_shake_at_rest_are_eased_until_they_do_not(monkeypatch, tmp_p
     with emulated(load="belt", num_threads=1) as target:
         result = auto(target, tmp_path / "before.toml", experiments=standing_in)
     (axis,) = result.axes
-    assert axis.accepted and any("of the rated one (RMS)" in note for note in axis.notes), axis
+    assert axis.accepted and any("of the rated current (RMS)" in note for note in axis.notes), axis
     assert not result.shown.restless.any()
 
 
