@@ -386,7 +386,7 @@ def test_syncs_that_were_late_are_told(late, told):
     run = SimpleNamespace(target=SimpleNamespace(drives=drives, num_axes=1), axes=[axis], note=None)
     run.reserve = lambda where, text: AutoRun.reserve(run, where, text)
     tell_of_lateness(run)
-    wanted = "7 of 9000 SYNCs were more than a cycle late, the worst by 3.1 ms: this computer is busy"
+    wanted = "7 of 9000 SYNCs were more than a cycle late, the worst by 3.1 ms: this computer is too busy"
     assert [reservation.startswith(wanted) for reservation in axis.reservations] == [True] * told
     assert axis.verdict == ("accepted with reservations" if told else "accepted")
 
