@@ -1,0 +1,55 @@
+"""The mutation run: its table, what it changes, and a small sample of it."""
+
+from __future__ import annotations
+
+import mutation
+import pytest
+
+TABLE = mutation.read_table()
+QUICK = ["drive_env/safety/oscillation.py", "tuning/auto/trial_order.py", "tuning/identify/confidence.py"]
+
+
+@pytest.mark.parametrize("row", TABLE, ids=lambda row: row.files[0])
+def test_every_row_has_files_of_its_own_and_tests_that_are_there(row):
+    first = [next(other for other in TABLE if other.has(file)) for file in mutation.files_of([row])]
+    assert row in first
+    assert row.tests and all((mutation.HERE / name).is_file() for name in row.tests)
+
+
+def test_tests_that_name_a_file_come_first():
+    table = [mutation.Row(("tuning/*",), ("test_swings.py", "test_trial_order.py"), ("tuning/auto/*",))]
+    assert mutation.tests_of("tuning/target.py", table) == ("test_swings.py", "test_trial_order.py")
+    assert mutation.tests_of("tuning/auto/trial_order.py", table) == ()
+    named = [mutation.Row(("tuning/*",), ("test_swings.py", "test_trial_order.py"))]
+    assert mutation.tests_of("tuning/auto/trial_order.py", named) == ("test_trial_order.py", "test_swings.py")
+
+
+def test_what_is_only_read_by_a_type_checker_is_left_alone():
+    source = "@frozen(True)\ndef f(a: int | None = 1) -> int | None:\n    b: int | None = a + 1\n    return b\n"
+    silent = mutation._silent(source)
+    assert [any(first <= place < last for first, last in silent) for place in [(1, 8), (2, 13), (2, 31), (3, 11)]] == [
+        True
+    ] * 4
+    assert not any(first <= place < last for first, last in silent for place in [(2, 22), (3, 22), (4, 11)])
+
+
+def test_a_sample_is_the_same_for_a_seed_and_has_a_line_once():
+    pytest.importorskip("cosmic_ray", reason="install the extra 'mutation'")
+    found = mutation.sample(QUICK, 20, 3)
+    assert found == mutation.sample(QUICK, 20, 3) != mutation.sample(QUICK, 20, 4)
+    assert len({(mutant.file, mutant.line) for mutant in found}) == 20
+
+
+@pytest.mark.slow
+def test_a_sample_of_changes_is_noticed():
+    pytest.importorskip("cosmic_ray", reason="install the extra 'mutation'")
+    outcomes = list(mutation.run(mutation.sample(QUICK, 10, 0), TABLE))
+    survived = [f"{o.mutant.file}:{o.mutant.line} {o.before} -> {o.after}" for o in outcomes if not o.caught]
+    assert len(survived) <= 1, "\n".join(survived)
+
+
+def test_tests_that_fail_as_it_is_are_no_judges(monkeypatch):
+    monkeypatch.setattr(mutation.Copy, "passes", lambda self, tests: False)
+    mutant = mutation.Mutant("tuning/auto/trial_order.py", 1, "core/NumberReplacer", 0)
+    with pytest.raises(ValueError, match=r"tests/test_trial_order.py fails as the sources are; mend it first"):
+        next(mutation.run([mutant], TABLE))
