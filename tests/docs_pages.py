@@ -133,7 +133,9 @@ def environment() -> dict[str, str]:
     programs = str(Path(sys.executable).parent)
     ours = {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}", "PYTHONUNBUFFERED": "1", "MPLBACKEND": "Agg",
             "COLUMNS": "100"}  # fmt: skip
-    return {key: value for key, value in os.environ.items() if not key.startswith("DRIVE_ENV_CH")} | ours
+    theirs = {key: value for key, value in os.environ.items()
+              if not key.startswith("DRIVE_ENV_") or key == "DRIVE_ENV_CACHE"}  # fmt: skip
+    return theirs | ours
 
 
 class Session:
