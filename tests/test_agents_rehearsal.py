@@ -159,7 +159,7 @@ def test_a_node_that_is_stopped_stays_so(patient_masters):
         assert {frame.can_id for frame in frames} == {SDO_REQUEST + 1}
     assert (
         found.exit_code == 1
-        and "if it is stopped (NMT), a run without --dry-run takes it to pre-operational" in found.stderr
+        and "if it is in the NMT state stopped, a run without --dry-run takes it to pre-operational" in found.stderr
     )
 
 

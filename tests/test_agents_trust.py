@@ -58,7 +58,7 @@ def test_a_checkpoint_is_not_loaded_without_trust(arguments, folder):
     (folder / "x.ZIP").write_bytes((folder / "x.zip").read_bytes())
     found = run(*arguments)
     assert found.exit_code == 2, found.output
-    assert re.search(r"holds pickles: loading it runs code that its author put there.* say --trust", found.output)
+    assert re.search(r"holds pickles: loading it runs code that its author put there.* give --trust", found.output)
     assert not (folder / MARK).exists()
 
 

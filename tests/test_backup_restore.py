@@ -237,7 +237,7 @@ def test_a_dry_run_says_what_would_be_written_and_that_nothing_was(drive, file, 
     code, out, error = run(*arguments, "--dry-run", "--store")
     assert code == DONE, error
     said = out.splitlines()[-1]
-    assert re.fullmatch(r"\d+ parameters would be written to node 1, and stored (dry run: nothing was written)", said)
+    assert re.fullmatch(r"\d+ parameters would be written to node 1, and stored \(dry run: nothing was written\)", said)
     assert "verified" not in out
     assert (writes(drive), drive.get(PROFILE_VELOCITY)) == ([], 1000)
     told = json.loads(run(*arguments, "--dry-run", "--json")[1])

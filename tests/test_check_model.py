@@ -102,7 +102,7 @@ def test_late_and_early_are_told(capsys, shift, says):
     row = LogDifference(*(np.array([value]) for value in (0.123, shift, 0.0456)))
     _print({POSITION: row}, dictionary, None, None)
     assert capsys.readouterr().out == (
-        "6064h:00 Position actual value: off by 12.30 % of its range (RMS); " + says + ", 4.56 % with the shift "
+        "6064h:00 Position actual value: deviation 12.30 % of its range (RMS); " + says + ", 4.56 % with the shift "
         "removed\n"
     )
 
@@ -132,5 +132,5 @@ def test_a_log_that_is_none(tmp_path):
     assert "there is no log" in run(tmp_path / "nothing.csv")[2]
     written(tmp_path / "still.csv", Log(np.arange(20) * 1e-3, {POSITION: np.zeros((20, 1), int)}))
     code, _, err = run(tmp_path / "still.csv")
-    assert code == USER_ERROR and "holds no command" in err
+    assert code == USER_ERROR and "has no command" in err
     assert f"{TORQUE[0]:04X}h" in err

@@ -157,7 +157,7 @@ THERE = r"the model has the joints x, turn and the fixed tendons belt"
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({}, rf"load 'machine' does not say which joints its drives turn; {THERE}"),
+        ({}, rf"load 'machine' does not name the joints that its drives turn; {THERE}"),
         ({"joints": ("x", "y")}, rf"load 'machine' has no joint or fixed tendon 'y'; {THERE}"),
         ({"joints": "rope"}, rf"no joint or fixed tendon 'rope'; {THERE}"),
         ({"joints": ("x", "x")}, r"names a joint twice: x, x; a joint takes one drive"),

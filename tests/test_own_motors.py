@@ -72,9 +72,9 @@ def test_a_brushed_motor_has_one_winding():
         ({"inertia": 1e-5}, "'inertia' is not a number of a motor; did you mean 'inertia_kg_m2'"),
         (
             {"resistance_line_to_line_ohm": 0.4},
-            "resistance_phase_ohm and resistance_line_.* say the same twice",
+            "resistance_phase_ohm and resistance_line_.* are two forms of the same number",
         ),
-        ({"torque_constant_rms": 0.1}, "torque_constant_peak and torque_constant_rms say the same twice"),
+        ({"torque_constant_rms": 0.1}, "torque_constant_peak and torque_constant_rms are two forms of the same number"),
         ({"torque_constant_peak": None}, "torque_constant_peak or .* is missing, or the rated current"),
         (
             {"resistance_ohm": 0.4, "resistance_phase_ohm": None},

@@ -212,7 +212,7 @@ def test_a_file_that_is_no_log_is_told_why(tmp_path, text, message):
 
 
 def test_logs_that_cannot_be_replayed_are_refused(log):
-    with pytest.raises(ValueError, match=r"holds no command .* record one of 6062h, 607Ah, 60FFh, 6071h"):
+    with pytest.raises(ValueError, match=r"has no command .* record one of 6062h, 607Ah, 60FFh, 6071h"):
         command_of(Log(log.t, {POSITION: log.objects[POSITION]}))
     jump = np.where(np.arange(len(log.t)) < 50, 0, 5 * TURN)[:, None]
     with pytest.raises(ValueError, match="no command that changes step by step"):

@@ -157,8 +157,8 @@ def test_any_interface_serves(tmp_path):
     (["--listen", ""], "drive-env: --listen must be an address, e.g. 127.0.0.1; 0.0.0.0 lets the whole network in"),
     (["--listen", "0.0.0.0"], "drive-env: 0.0.0.0 is not a loopback address: it is open to the network, which needs a "
                               "token; give --token auto, --token TEXT of 8 characters or more, or --listen 127.0.0.1"),
-    (["--token", "short"], "drive-env: a token has 8 to 48 letters, digits, - and _; this one has 5 characters; say "),
-    (["--interface", "virtual", "--token", "auto"], "drive-env: --token is for the hub; --interface virtual cannot"),
+    (["--token", "short"], "drive-env: a token has 8 to 48 letters, digits, - and _; this one has 5 characters; give "),
+    (["--interface", "virtual", "--token", "auto"], "--token is for the hub; --interface virtual has no tokens"),
     (["--host", "127.0.0.1"], "No such option"),
     (["--seed", "-1"], "drive-env: seed = -1 must be 0 or more"),
     (["--bitrate", "123"], "drive-env: tmcm1636 has no bit rate of 123 bit/s; it has 20000, 50000"),
@@ -169,8 +169,8 @@ def test_any_interface_serves(tmp_path):
     (["--interface", "socketcan"], "drive-env: --interface socketcan needs --channel, e.g. --channel vcan0; without"),
     (["--interface", "nonsense", "--channel", "x"], "drive-env: cannot open --interface nonsense --channel x: "),
     (["--config", "none.toml"], "drive-env: cannot read the bus none.toml: No such file"),
-    (["--config", "two.toml", "--node", "3"], "drive-env: two.toml has 2 machines, so --node cannot say which"),
-    (["--store", "two.toml"], "drive-env: the store two.toml cannot be: "),
+    (["--config", "two.toml", "--node", "3"], "drive-env: two.toml has 2 machines, so --node is ambiguous"),
+    (["--store", "two.toml"], "drive-env: the store two.toml cannot be made: "),
     (["--lock"], "No such option"),
 ])  # fmt: skip
 def test_a_mistake_ends_with_code_2_and_one_clear_line(tmp_path, monkeypatch, arguments, message):

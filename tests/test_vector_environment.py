@@ -142,12 +142,12 @@ def test_a_mask_that_is_none_is_refused(mask):
         lanes.reset(options={"reset_mask": mask})
 
 
-def test_the_first_reset_begins_every_lane():
+def test_the_first_reset_begins_every_environment():
     with pytest.raises(ValueError, match="the first reset must be of all environments"):
         Counting(2).reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(gymnasium.error.ResetNeeded):
         Counting(1).step(np.zeros((1, 1), np.float32))
-    with pytest.raises(ValueError, match="3 seeds do not fit 2 lanes"):
+    with pytest.raises(ValueError, match="3 seeds do not fit 2 environments"):
         Counting(2).reset(seed=[1, 2, 3])
 
 
