@@ -93,7 +93,7 @@ def refusal(drives, name, value, **how):
         ((0x1010, 1), 0x65766173, NOT_STORED, ["1010h:01"]),
         (0x6081, 1.0, WRONG_TYPE, ["6081h:00 Profile velocity", "1.0", "float"]),
         (0x6081, np.float64(5), WRONG_TYPE, ["6081h:00", "float"]),
-        (0x6081, True, WRONG_TYPE, ["6081h:00", "True", "truth"]),
+        (0x6081, True, WRONG_TYPE, ["6081h:00", "True", "boolean"]),
         (0x6081, "1000", WRONG_TYPE, ["6081h:00", "'1000'", "text"]),
         (0x6081, None, WRONG_TYPE, ["6081h:00", "None"]),
         (0x6081, 1 + 0j, WRONG_TYPE, ["6081h:00", "complex"]),
