@@ -371,7 +371,7 @@ def test_gains_that_shake_at_rest_are_eased_until_they_do_not(monkeypatch, tmp_p
     with emulated(load="belt", num_threads=1) as target:
         result = auto(target, tmp_path / "before.toml", experiments=standing_in)
     (axis,) = result.axes
-    assert axis.accepted and any("of the rated one (RMS)" in note for note in axis.notes), axis
+    assert axis.accepted and any("of the rated current (RMS)" in note for note in axis.notes), axis
     assert not result.shown.restless.any()
 
 
@@ -383,7 +383,7 @@ def test_syncs_that_were_late_are_told(late, told):
     run = SimpleNamespace(target=SimpleNamespace(drives=drives, num_axes=1), axes=[axis], note=None)
     run.reserve = lambda where, text: AutoRun.reserve(run, where, text)
     tell_of_lateness(run)
-    wanted = "7 of 9000 SYNCs were more than a cycle late, the worst by 3.1 ms: this computer is busy"
+    wanted = "7 of 9000 SYNCs were more than a cycle late, the worst by 3.1 ms: this computer is too busy"
     assert [reservation.startswith(wanted) for reservation in axis.reservations] == [True] * told
     assert axis.verdict == ("accepted with reservations" if told else "accepted")
 

@@ -32,7 +32,7 @@ def bus(drive):
 @pytest.mark.parametrize(
     ("given", "text"),
     [
-        ({"silence": 0.0004}, r"silence = 0.0004 s cannot be: .* choose 0.02 to 65.535 s"),
+        ({"silence": 0.0004}, r"silence = 0.0004 s is impossible: .* choose 0.02 to 65.535 s"),
         ({"silence": 66.0}, "silence = 66.0 s cannot be"),
         ({"silence": math.nan}, "silence = nan s cannot be"),
         ({"stall": math.inf}, "stall must be above 0 s, not inf"),
