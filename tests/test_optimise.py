@@ -530,7 +530,7 @@ def test_what_there_is_not_is_not_resumed(tmp_path, monkeypatch):
     code, error = drive_tune(*search)
     assert code == 0, error
     assert drive_tune(*search, "--resume") == (
-        2, "drive-tune: the search of run is finished, and its results are there: nothing is left to resume",
+        2, "drive-tune: the search in run is finished, and its results are there: nothing is left to resume",
     )  # fmt: skip
 
 
