@@ -280,7 +280,7 @@ def test_a_drive_fresh_from_the_factory_is_commissioned_first(tmp_path):
         assert gains(drives).all()
         assert drives.read(0x2050)[0] == 3
         assert drives.read(0x2056)[0] == motor.n_p
-        assert any("fresh from the factory" in note for note in result.axes[0].notes)
+        assert any("factory-fresh drive" in note for note in result.axes[0].notes)
         assert any("both limit switches were active" in note for note in result.axes[0].notes)
         assert np.ptp(result.shown.actual) > 0.1, "it did not move"
         motion.enable(drives, mode="pv", timeout=5.0)

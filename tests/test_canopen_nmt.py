@@ -38,7 +38,7 @@ def test_a_node_boots_into_pre_operational(drives):
 
 @pytest.mark.parametrize("node_id", [0, 128, -1])
 def test_a_node_has_a_number_that_canopen_knows(drives, node_id):
-    with pytest.raises(ValueError, match=f"node {node_id} cannot be: CANopen numbers nodes 1 to 127"):
+    with pytest.raises(ValueError, match=f"node {node_id} is impossible: CANopen has nodes 1 to 127"):
         Node(node_id, drives, send=print)
 
 

@@ -53,7 +53,7 @@ def test_an_axis_that_could_not_be_proved_off_is_not_commanded_again(bus, drive,
     with CanDrives(bus=bus, pace="lockstep") as drives:
         motion.enable(drives, mode="csv")
         drives.safety._axes.lost.add(0)
-        with pytest.raises(SafetyError, match="axis 0 could not be proved to be off"):
+        with pytest.raises(SafetyError, match="axis 0 could not be confirmed to be off"):
             command(drives)
         drives.safety._axes.lost.clear()
 

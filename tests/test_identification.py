@@ -373,7 +373,7 @@ def test_no_torque_is_commanded_with_wiring_that_cannot_be_checked():
     found = identify(target)[0]
     for name in ("resistance", "inertia", "pole_pairs"):
         assert "begin in the middle of the travel" in found.estimates[name].reason, name
-    assert "not checked" in found.estimates["inertia"].reason
+    assert "without this check" in found.estimates["inertia"].reason
     assert abs(float(target.drives.machine.rotor_angle[0])) < 0.01
 
 

@@ -32,7 +32,7 @@ def test_values_intervals_and_reasons_are_shown_and_written(tmp_path):
     rows = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
     resistance = rows[0]["estimates"]["resistance"]
     assert resistance["low"] < 0.36 < resistance["high"]
-    assert "winding resistance" in done.stdout
+    assert "phase resistance" in done.stdout
     assert "no resonance between" in done.stdout  # of the resonance
     assert rows[0]["estimates"]["resonance"]["value"] is None
     assert rows[0]["drive_time"] < 20.0

@@ -91,7 +91,7 @@ def test_a_damaged_file_is_told_removed_and_written_anew(cache, tmp_path, damage
     first = run(SMALL, copy)
     assert first.returncode == 0, first.stderr
     assert first.stdout == "compiled 1 kept 0\n"
-    assert "is damaged or of another version; it is compiled anew" in first.stderr
+    assert "is damaged or of another version; it is compiled again" in first.stderr
     assert first.stderr.count("\n") == 1
     second = run(SMALL, copy)
     assert (second.stdout, second.stderr) == ("compiled 0 kept 1\n", "")
@@ -155,8 +155,8 @@ def test_a_full_disk_costs_the_cache_alone(tmp_path, monkeypatch, caplog):
         files.save("key", "kernel")
         files.save("other", "kernel")
     assert [record.getMessage() for record in caplog.records] == [
-        f"compiled kernels cannot be kept in {tmp_path}: No space left on device; every program compiles them anew. "
-        "Make room, or name another folder in DRIVE_ENV_CACHE"
+        f"compiled kernels cannot be stored in {tmp_path}: No space left on device; every program compiles them again. "
+        "Make room, or set DRIVE_ENV_CACHE to another folder"
     ]
     assert list(tmp_path.iterdir()) == []
 

@@ -493,7 +493,7 @@ def is_interrupted(monkeypatch):
     ("more", "says"),
     [
         ((), "the trials made so far are lost: on a bus they are kept only with --journal FILE"),
-        (("--journal", "kept.log"), "the trials made are in kept.log: the same command goes on from there"),
+        (("--journal", "kept.log"), "the trials made are in kept.log: the same command continues from there"),
     ],
 )
 def test_ctrl_c_on_a_bus_says_what_the_drives_have_and_what_is_kept(node, monkeypatch, more, says):
@@ -530,7 +530,7 @@ def test_what_there_is_not_is_not_resumed(tmp_path, monkeypatch):
     code, error = drive_tune(*search)
     assert code == 0, error
     assert drive_tune(*search, "--resume") == (
-        2, "drive-tune: the search of run is finished, and its results are there: nothing is left to resume",
+        2, "drive-tune: the search in run is finished, and its results are there: nothing is left to resume",
     )  # fmt: skip
 
 
@@ -544,7 +544,7 @@ def test_what_an_emulated_search_keeps_in_its_journal_is_told(tmp_path, monkeypa
     search = ("optimise", "--load", "inertia", "--out", "run")
     assert drive_tune(*search) == (130, "drive-tune: interrupted; nothing was written")
     assert drive_tune(*search, "--journal", "kept.log") == (
-        130, "drive-tune: interrupted; the trials made are in kept.log: the same command goes on from there",
+        130, "drive-tune: interrupted; the trials made are in kept.log: the same command continues from there",
     )  # fmt: skip
 
 

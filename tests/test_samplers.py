@@ -98,7 +98,7 @@ def test_several_objectives_are_for_samplers_that_know_them():
         (point,) = proposer.ask(1)
         proposer.tell([[bowl(point), -bowl(point)]], [{}])
     assert proposer.told == 10
-    with pytest.raises(ValueError, match=r"CMA-ES knows one objective; take tpe or gp"):
+    with pytest.raises(ValueError, match=r"CMA-ES has one objective only; take tpe or gp"):
         new_proposer("cmaes", LOW, HIGH, seed=0, objectives=2)
 
 

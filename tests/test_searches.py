@@ -131,7 +131,7 @@ def test_trials_of_another_search_are_not_taken(tmp_path):
         optimise(target, FEW, shared=True, anew=True, log=log)
         with pytest.raises(ShardLogError, match="holds trials of another search; remove it"):
             optimise(target, replace(FEW, seed=8), shared=True, anew=True, log=log)
-        with pytest.raises(ValueError, match="if every trial begins anew, and if it has no journal besides"):
+        with pytest.raises(ValueError, match="only if every trial starts from rest, and if it has no journal"):
             optimise(target, FEW, shared=True, log=log)
 
 

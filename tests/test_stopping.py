@@ -90,18 +90,18 @@ def swing(share, lasting):
             0.2,
         ),
         # It does not.
-        (down(0.0), RAMP, "it does not slow down as its ramp says", 0.04, 0.1),
-        (down(0.0), 0.0, "it does not slow down as its ramp says", 0.04, 0.1),
-        (down(-RAMP), RAMP, "it does not slow down as its ramp says", 0.04, 0.1),
-        (down(0.05 * RAMP), RAMP, "it does not slow down as its ramp says", 0.04, 0.1),  # two seconds and more
-        (down(RAMP, to=0.1 * SPEED), RAMP, "it does not slow down as its ramp says", 0.24, 0.28),
+        (down(0.0), RAMP, "it does not slow down by its ramp", 0.04, 0.1),
+        (down(0.0), 0.0, "it does not slow down by its ramp", 0.04, 0.1),
+        (down(-RAMP), RAMP, "it does not slow down by its ramp", 0.04, 0.1),
+        (down(0.05 * RAMP), RAMP, "it does not slow down by its ramp", 0.04, 0.1),  # two seconds and more
+        (down(RAMP, to=0.1 * SPEED), RAMP, "it does not slow down by its ramp", 0.24, 0.28),
         # Slower and slower, always fast enough to stand within a second, and never at rest.
         (lambda t: 0.1 * SPEED + 0.9 * SPEED * math.exp(-t), RAMP / 20.0, "it is still turning after 2 s", 2.0, 2.05),
         # Past rest and back.
         (swing(0.12, 0.2), RAMP, "", 0.3, 0.4),
-        (swing(-0.4, 0.2), RAMP, "it does not slow down as its ramp says", 0.1, 0.25),  # on again, not back
-        (swing(0.4, 0.2), RAMP, "it does not slow down as its ramp says", 0.1, 0.22),
-        (down(RAMP, to=-0.1 * SPEED), RAMP, "it does not slow down as its ramp says", 0.22, 0.28),  # it stays there
+        (swing(-0.4, 0.2), RAMP, "it does not slow down by its ramp", 0.1, 0.25),  # on again, not back
+        (swing(0.4, 0.2), RAMP, "it does not slow down by its ramp", 0.1, 0.22),
+        (down(RAMP, to=-0.1 * SPEED), RAMP, "it does not slow down by its ramp", 0.22, 0.28),  # it stays there
     ],
 )
 def test_an_axis_keeps_its_voltage_while_it_slows_down(speed, ramp, why, earliest, latest):

@@ -311,7 +311,7 @@ def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, 
             configuration,
             drives=evaluation.as_on_a_bus(drives),
             sensor=sensor,
-            side="emulator without access to the machine",
+            side="emulator as on a bus",
             told=show,
             **options,
         )
