@@ -173,7 +173,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any]):
 
         Raises:
             gymnasium.error.ResetNeeded: Before the first reset, or, with autoreset disabled, while an environment has
-            ended.
+                ended.
             ValueError: For an action that is no finite number, before anything is sent to a drive; that of an
                 environment that has ended is ignored.
         """
