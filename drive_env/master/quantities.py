@@ -92,7 +92,7 @@ def parse(text: str, entry: Entry, increments: float | None) -> int:
         pass
     found = _QUANTITY.match(text)
     if found is None:
-        raise ValueError(f"{text!r} is no number for {entry.label}; give an integer, or a number and a unit")
+        raise ValueError(f"{text!r} is not a number for {entry.label}; give an integer, or a number and a unit")
     number, name = float(found[1]), found[2]
     if not math.isfinite(number):
         raise ValueError(_too_large(text, entry))
