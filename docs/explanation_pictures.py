@@ -226,10 +226,10 @@ def _score():  # type: ignore[no-untyped-def]
     from drive_env.gains import rule_gains
     from drive_env.motors import MOTORS
     from drive_env.trials.positioning import plan_move, reach
-    from drive_env.trials.score import HiddenScore
+    from drive_env.trials.score import RobustScore
 
     motor = MOTORS["qbl4208"]
-    scorer = HiddenScore("tmcm1636", "belt", "qbl4208", 1, num_threads=1)
+    scorer = RobustScore("tmcm1636", "belt", "qbl4208", 1, num_threads=1)
     with EmulatedDrives(load="belt", num_machines=1, num_threads=1) as drives:
         scorer.set_machines(drives.machine.parameters, drives.machine.supply)
     scorer.set_moves(plan_move(motor, np.full(1, BELT_INERTIA), 65536, reach("belt")))
@@ -252,7 +252,7 @@ def worked_example() -> list[tuple[str, list[int], dict[str, float]]]:
             "noise": float(terms.noise[0, 0]),
             "overshoot": float(terms.overshoot[0, 0]),
             **{variant.name: float(j) for variant, j in zip(scorer.variants, scores.j[0], strict=True)},
-            "robust": float(scores.hidden[0]),
+            "robust": float(scores.robust_cost[0]),
         }
         found.append((name, [int(gain) for gain in gains[0]], figures))
     scorer.close()

@@ -126,7 +126,7 @@ def test_search(tmp_path):
 
 
 def test_comparison(tmp_path):
-    run("rank", "-t", "fitted", "--count", 1, "--out", tmp_path / "out")
+    run("rank", "-t", "baseline", "--count", 1, "--out", tmp_path / "out")
     assert fields("tuners") == header(tmp_path / "out" / "tuners.csv")
 
 
@@ -146,7 +146,7 @@ def test_machines_for_comparisons():
 def test_backup(tmp_path, monkeypatch):
     drive = ScriptedDrive(values={(0x1018, 4): (4711, 4), (0x6081, 0): (1000, 4)})
     monkeypatch.setattr("drive_env.master.can_drives.open_bus", lambda *_, **__: ScriptedBus(drive))
-    monkeypatch.setattr("drive_env.master.port.open_bus", lambda *_, **__: ScriptedBus(drive))
+    monkeypatch.setattr("drive_env.master.can.port.open_bus", lambda *_, **__: ScriptedBus(drive))
     file = tmp_path / "drive.toml"
     result = CliRunner().invoke(drive_env_app, ["backup", str(file), "--channel", "any", "--interface", "virtual"])
     assert result.exit_code == 0, result.output
