@@ -34,6 +34,7 @@ SENSITIVITY = 4.0  # greatest |1/(1+L)| that a measured loop may have
 CLOSE = {"phase": 14.0, "gain": 2.5}  # margins that this leaves at least [degrees, dB]
 SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # factors of gains by which a lively loop is calmed
 CALMED = {"velocity": ("velocity", "position"), "position": ("position",)}  # whose P is lowered for a loop
+OVERTIME = 0.5  # s beyond the budget for a response: so near to the end margins are worth more than the time
 LONGER = 2  # times as long it is shaken where too little was seen
 LEAST_WAY = 1e-3  # rad; an axis without any way is shaken as little as can be, and its response says so
 ALONE = (
@@ -48,7 +49,7 @@ def measure(run: AutoRun) -> None:
     """Measure the velocity loop's response with the new gains; lower gains that are too near to instability."""
     going = run.going
     # A move with the gains before matters more: without it nobody knows whether the new ones are better.
-    late = going & ~run.affordable(run.response_time + run.look_back_time)
+    late = going & ~run.affordable(run.response_time + run.look_back_time - OVERTIME)
     _without_response(run, late, "the drive time of the run was used up")
     going &= ~late
     if not going.any():

@@ -48,8 +48,7 @@ SHORTEST = 16.0  # counts of the encoder: a move that is shorter proves nothing
 # edge swings between two counts in one place, and stands in another. Windows of 25 ms in each, how many of them pass
 # before, and what the current may swing (RMS about its mean, over the rated one), without the noise of its measurement.
 PLACES, REST, SETTLED, RESTLESS = 3, 6, 2, 0.05
-# Cycles with slow outer loops until an axis is quiet, and windows that show the noise, of so many cycles.
-QUIETENING, NOISE_WINDOWS, NOISE_WINDOW = 100, 2, 100
+QUIETENING, NOISE_CYCLES = 50, 100  # with slow outer loops: until an axis is quiet, and that show the noise
 
 
 class Proof(NamedTuple):
@@ -276,13 +275,10 @@ class ProvingGround:
         slow[:, outer] = self.safe[:, outer]
         write_gains(drives, slow, where)
         drives.advance(QUIETENING * CYCLE)
-        shown = []
-        for _ in range(NOISE_WINDOWS):
-            current = drives.record([cia402.TORQUE_ACTUAL], NOISE_WINDOW * CYCLE)[cia402.TORQUE_ACTUAL] * 1e-3
-            change = np.sqrt(0.5 * np.mean(np.diff(current, axis=0) ** 2, axis=0))
-            shown.append(np.minimum(current.std(axis=0), change))
+        current = drives.record([cia402.TORQUE_ACTUAL], NOISE_CYCLES * CYCLE)[cia402.TORQUE_ACTUAL] * 1e-3
+        change = np.sqrt(0.5 * np.mean(np.diff(current, axis=0) ** 2, axis=0))
         write_gains(drives, gains, where)
-        return np.where(where, np.min(shown, axis=0) / self.target.motor.rated_current, noise)
+        return np.where(where, np.minimum(current.std(axis=0), change) / self.target.motor.rated_current, noise)
 
     def _swing(self, at: Integers, where: Mask) -> Floats:
         """Return how much the current swings at rest, over the rated one (RMS), the most of several places.
