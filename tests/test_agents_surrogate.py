@@ -290,7 +290,7 @@ def test_a_tuner_that_answers_the_rules_gains_has_the_rules_hidden_j_and_one_tha
 @pytest.mark.slow
 def test_training_from_nothing_makes_a_tuner_repeats_and_goes_on_from_kept_trials(tmp_path):
     rounds = (training.Round(sets=1, trials=8), training.Round(sets=1, trials=10))
-    options = {"rounds": rounds, "lanes": 2, "rows": [("inertia", "ec_i_40")]}
+    options = {"rounds": rounds, "machines_at_once": 2, "rows": [("inertia", "ec_i_40")]}
     first = training.train(3, **options, kept=tmp_path)
     (tmp_path / "trials_3_1_0_0.npz").unlink()  # stopped in its second round
     for other in (training.train(3, **options, kept=tmp_path), training.train(3, **options)):

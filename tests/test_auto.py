@@ -103,7 +103,7 @@ def test_gains_are_all_that_is_changed_and_the_drives_are_off(five):
 
 @pytest.mark.parametrize(
     ("axis", "words"),
-    [(SHORT, "travel is too short: 0.008 rad, and 0.2 are needed")],
+    [(SHORT, "travel is too short: 0.008 rad (0.0013 turns), and 0.2 rad")],
 )
 def test_what_cannot_be_tuned_gets_its_gains_back_and_the_reason_is_named(five, axis, words):
     _, result, before, after, _ = five
@@ -181,7 +181,7 @@ def test_gains_are_safe_to_move_with_if_every_loop_has_its_margins(gains_before,
     motor, device = find_motor("qbl4208"), find_device("tmcm1636")
     plant = Plant.from_data_sheet(device, motor, 24.0, 3.0 * motor.inertia)
     why = unsafe_gains(device, plant, Gains(*gains_before))
-    assert why.startswith(words)
+    assert words in why
     assert bool(why) == bool(words)
 
 

@@ -54,7 +54,7 @@ def test_the_picture_says_loop_gains_margins_and_source(response):
 
 def test_a_margin_that_was_not_seen_is_called_so(response):
     blind = dataclasses.replace(response, coherence=np.zeros_like(response.coherence))
-    assert "phase margin not seen" in bode_figure(blind).get_suptitle()
+    assert "phase margin not measured" in bode_figure(blind).get_suptitle()
 
 
 def test_a_picture_is_written(response, tmp_path):

@@ -681,7 +681,9 @@ def test_importing_the_package_imports_no_bus():
 def test_homing_that_the_drive_gives_up_is_told(bus, drive):
     with CanDrives(bus=bus, pace="lockstep") as drives:
         drive.motion = lambda d: d.set(0x6041, 0x0637)  # bit 10 without bit 12
-        with pytest.raises(RuntimeError, match=r"axis 0 gave up homing: statusword 0637h; check the method 6098h"):
+        with pytest.raises(
+            RuntimeError, match=r"axis 0 did not complete homing: statusword 0637h; check the method 6098h"
+        ):
             motion.home(drives)
         drive.motion = lambda d: d.set(0x6041, 0x1637)
         motion.home(drives)

@@ -73,7 +73,7 @@ def test_a_fault_is_given_to_a_running_server_listed_and_cleared():
             assert (given.exit_code, given.stdout) == (0, "1\n")
             wait_until(lambda: drives.read(0x6041)[0] & 0x4F == 0x08, "the drive did not trip")
             status = fault("--status", "--control", control)
-            assert status.stdout == "1: enable_lost node 1, for ever, is there\n"
+            assert status.stdout == "1: enable_lost node 1, permanent, active\n"
             assert fault("--clear", 1, "--control", control).exit_code == 0
             wait_until(lambda: fault("--status", "--control", control).stdout == "", "the fault did not end")
             wait_until(lambda: int(drives.read(0x60FD)[0]) & 8, "the input did not close")

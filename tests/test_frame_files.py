@@ -102,7 +102,7 @@ def test_a_channel_has_no_blanks(tmp_path):
 def test_replay_names_the_formats_that_it_reads(tmp_path):
     (tmp_path / "a.pcap").write_bytes(b"")
     done = CliRunner().invoke(app, ["replay", str(tmp_path / "a.pcap")])
-    assert done.exit_code == 2 and "'.pcap' is none of .log, .blf, .asc" in done.stderr
+    assert done.exit_code == 2 and "'.pcap' is not one of .log, .blf, .asc" in done.stderr
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are otherwise there")

@@ -307,7 +307,7 @@ def test_a_travel_of_a_few_degrees_is_too_short():
 def test_too_little_current_is_too_weak():
     found = identify(emulated(load="inertia", current=0.1, num_threads=1))[0]
     assert not found.estimates["resistance"].is_known
-    assert "too weak" in found.estimates["resistance"].reason
+    assert "current is too low" in found.estimates["resistance"].reason
 
 
 def test_a_rigid_axis_has_no_resonance():

@@ -112,8 +112,8 @@ def test_one_lane_earns_what_lane_0_does():
 
 
 @pytest.mark.parametrize(("reward", "says"), [
-    (lambda *_: 1.0, "it must return 2 numbers, one for each lane"),
-    (lambda *_: np.array([0.0, np.nan]), "it must return 2 numbers, one for each lane"),
+    (lambda *_: 1.0, "it must return 2 numbers, one for each environment"),
+    (lambda *_: np.array([0.0, np.nan]), "it must return 2 numbers, one for each environment"),
 ])  # fmt: skip
 def test_a_reward_that_is_none_is_told(reward, says):
     lanes = Tracking(2, load="inertia", reward=reward, **SHORT)

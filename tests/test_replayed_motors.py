@@ -368,7 +368,7 @@ def test_a_drive_that_is_not_proved_off_keeps_its_watchdog(bus, tmp_path, monkey
         plain(index, value or 15, sub) if index == 0x6040 else plain(index, value, sub)
     )
     code, _, error = replay(recorded(tmp_path / "a.log", enabled_by_sdo()))
-    assert code == REFUSED and "its motor may run" in error
+    assert code == REFUSED and "its motor may be running" in error
     assert drive.get(0x1016, 1) & 0xFFFF == 500  # and no heartbeat comes any more
 
 

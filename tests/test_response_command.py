@@ -21,7 +21,7 @@ def test_it_prints_margins_plant_and_drive_time(run):
     _, done = run
     assert done.returncode == 0, done.stderr
     assert all(word in done.stdout for word in ("margin", "[deg]", "crossover"))
-    assert "axis 0: inertia " in done.stdout
+    assert "axis 0: total inertia " in done.stdout
     assert "no resonance between 5 and" in done.stdout
     assert "s of drive time; written to out" in done.stdout
 

@@ -383,7 +383,9 @@ def bare_cluster():
 
 
 def test_a_worker_without_the_package_is_told_before_and_when_it_joins_late(bare_cluster):
-    told = r" of the cluster at tcp://.* cannot run this: .*tuning.*; install drive-env where it runs, and go on with"
+    told = (
+        r" of the cluster at tcp://.* cannot run this: .*tuning.*; install drive-env where it runs, and continue with"
+    )
     with open_pool(cluster=bare_cluster.scheduler_address) as pool:
         with pytest.raises(PoolError, match=rf"^worker tcp://127\.0\.0\.1:\d+{told}"):
             pool.differences()

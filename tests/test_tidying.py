@@ -106,7 +106,7 @@ def test_a_node_that_is_gone_costs_a_few_waits_and_a_line_for_each_matter(drive,
     drive.receive = lambda can_id, data, remote: asked.append(can_id) or []
     drives.close()
     lines = [record.getMessage() for record in caplog.records]
-    assert "node 1 could not be proved to be off: its watchdog stays on and gets no more heartbeats" in lines[-1]
+    assert "node 1 could not be proved to be off: its watchdog stays on and it gets no more heartbeats" in lines[-1]
     assert len(lines) <= 6
     beats = sum(0x760 <= can_id <= 0x77F for can_id in asked)
     assert asked.count(0x601) <= 400 and beats <= 10  # quick stop and voltage off go on being sent blindly

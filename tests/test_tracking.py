@@ -406,7 +406,7 @@ def test_on_a_bus_what_needs_a_machine_is_refused():
             Tracking(1, drives=drives, load="cart_pendulum", distributions="cart_pendulum", sensor=lambda: [0.0])
         lanes = Tracking(1, drives=drives, load="cart_pendulum", sensor=lambda: [0.25])
         assert lanes.reset(seed=0)[0][0, 8] == 0.25
-        with pytest.raises(ValueError, match="1 axes cannot be shared by 2 lanes"):
+        with pytest.raises(ValueError, match="1 axes cannot be shared by 2 environments"):
             Tracking(2, drives=drives)
 
 

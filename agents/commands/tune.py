@@ -250,9 +250,9 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
         if not json:
             print(what, flush=True)
             if what == "trials":
-                print("The cost J (less is better) counts settling time, stiffness, noise and overshoot of")
-                print("a move, its reversal and a move with 1.5 times velocity P, which shows how near")
-                print("the gains are to oscillation.")
+                print("The cost J (less is better) counts settling time, stiffness, noise and")
+                print("overshoot of a move, its reversal and a move with 1.5 times velocity P, which")
+                print("shows how near the gains are to oscillation.")
                 names = (f" {title:>{width}}" for title, width in zip(titles, widths, strict=True))
                 print(f"trial{''.join(names)} {'J':>8}")
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from tuning.identify.estimate import Identification
 K_T_NOTE = (
-    "Inertia, friction and load are measured as current: an inertia is the measured J/K_t times the data sheet's K_t."
+    "Inertia, friction and load are measured as current: an inertia is the measured\nJ/K_t times the data sheet's K_t."
 )
 
 
