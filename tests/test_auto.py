@@ -150,7 +150,7 @@ def test_the_certificate_says_what_was_done(five):
     assert (old.tuned, new.tuned, old_position.tuned, new_position.tuned) == (False, True, False, True)
     assert [shown.name for shown in tuned.frequency_responses] == ["velocity loop"] * 2 + ["position loop"] * 2
     for shown in (new, new_position):
-        assert f"Ms {shown.margins['Ms']:.1f} of the {shown.name}" in tuned.reason
+        assert f"{shown.name} Ms {shown.margins['Ms']:.1f}" in tuned.reason
         assert 1.0 < shown.margins["Ms"] <= auto_margins.SENSITIVITY
     assert np.isnan(old.coherence).all()
     assert "model" in old.source
