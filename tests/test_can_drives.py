@@ -655,7 +655,7 @@ def test_quantities_become_integers_and_are_shown_back(name, text, raw):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        (0x6081, "fast", "is no number"),
+        (0x6081, "fast", "is not a number for 6081h:00 Profile velocity"),
         (0x6081, "3 A", "it takes pps, rev/s, rpm, rad/s, deg/s"),
         (0x6081, "1.5", "takes integers in pps; 1.5 is none, choose 2"),
         ((0x2042, 1), "3 rpm", "has no unit that rpm could be turned into"),

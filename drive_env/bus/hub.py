@@ -45,6 +45,10 @@ LOG_LINES, LOG_TIME = 20, 10.0  # warnings in so many seconds; a crowd of client
 logger = logging.getLogger(__name__)
 
 
+def _is_loopback(address: str) -> bool:
+    return ipaddress.ip_address(address).is_loopback
+
+
 class _Client:
     """One connection: the socket, its channel, frames that have come, and what could not be sent yet.
 
@@ -119,6 +123,8 @@ class Hub:
     ) -> None:
         if token is not None:
             check_token(token)
+        elif not _is_loopback(socket.gethostbyname(host)):
+            raise ValueError(f"{host} is not a loopback address: it is open to the network, which needs a token")
         self._bit_rate = bit_rate
         self._token = token
         self._clients: list[_Client] = []
@@ -130,8 +136,6 @@ class Hub:
                 self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._listener.bind((host, port))
             self.host, self.port = self._listener.getsockname()[:2]
-            if self.is_public and token is None:
-                raise ValueError(f"{host} is not a loopback address: it is open to the network, which needs a token")
             if self._too_high(self._listener):
                 raise OSError(errno.EMFILE, "this program has too many files open")
             self._listener.listen(MAX_CLIENTS)
@@ -143,7 +147,7 @@ class Hub:
     @property
     def is_public(self) -> bool:
         """Whether other computers reach it."""
-        return not ipaddress.ip_address(self.host).is_loopback
+        return not _is_loopback(self.host)
 
     @property
     def channel(self) -> str:
