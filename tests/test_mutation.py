@@ -43,9 +43,9 @@ def test_a_sample_is_the_same_for_a_seed_and_has_a_line_once():
 @pytest.mark.slow
 def test_a_sample_of_changes_is_noticed():
     pytest.importorskip("cosmic_ray", reason="install the extra 'mutation'")
-    outcomes = list(mutation.run(mutation.sample(QUICK, 10, 0), TABLE))
+    outcomes = list(mutation.run(mutation.sample(QUICK, 20, 0), TABLE))
     survived = [f"{o.mutant.file}:{o.mutant.line} {o.before} -> {o.after}" for o in outcomes if not o.caught]
-    assert len(survived) <= 1, "\n".join(survived)
+    assert len(survived) <= 2, "\n".join(survived)
 
 
 def test_tests_that_fail_as_it_is_are_no_judges(monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tuning.auto.trial_order import BOLD, MOST_TRIALS, SLIPPERY, Ladder, Rung
+from tuning.auto.trial_order import BOLD, SLIPPERY, Ladder, Rung
 
 
 def climb(outcomes, fallbacks=3):
@@ -78,7 +78,6 @@ def test_nothing_at_or_above_what_failed_is_tried_again():
         ladder.step(not fails, not fails, loud=False)
     factors = [rung.factor for rung in tried]
     assert factors == pytest.approx([1.0, 0.6, 0.8])
-    assert len(set(factors)) == len(factors) <= MOST_TRIALS
     assert ladder.passed
 
 

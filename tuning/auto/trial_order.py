@@ -9,7 +9,6 @@ SLOWER, DOWN, UP = 0.6, 0.8, 1.15
 # Beside the gains that serve on all twins: the best if everything is as it was identified, and if friction is less.
 BOLD, SLIPPERY = range(2)
 OTHERS = ("the best gains for the axis exactly as identified", "the best gains for less friction")
-MOST_TRIALS = 3  # of an axis on which gains pass
 
 
 class Rung(NamedTuple):
@@ -49,10 +48,6 @@ class Ladder:
         self.failures: list[Rung] = []
         self._fallbacks = fallbacks
         self._owed = coupled  # a trial of the first fallback
-        self._trials = 0
-        self._best = 1.0  # factor
-        self._tried: list[float] = []
-        self._ceiling = float("inf")  # a factor that failed
 
     def step(self, passed: bool, better: bool, loud: bool) -> None:
         """Record the result of a trial, and choose the next.
@@ -64,25 +59,20 @@ class Ladder:
         """
         rung = self.rung
         assert rung is not None, "nothing was to be tried"
-        self._trials += 1
-        if rung.other is None:
-            self._tried.append(rung.factor)
-            if not passed:
-                self._ceiling = min(self._ceiling, rung.factor)
         self._owed &= rung.fallback is None
         if self.passed:
-            self.rung = self._beside(rung, better) if rung.fallback is None else None
+            # Beyond the bold ones lies what not even the twin that is as identified takes for better.
+            self.rung = None if better or rung.other is None else Rung(UP)
         elif not passed:
             self.failures.append(rung)
             self.rung = self._below(rung)
         else:
             self.passed = True
-            self._best = rung.factor
             if rung.fallback is not None:
                 self.rung = None
             else:
                 # Below gains that failed: half way up again.
-                self.rung = self._open(DOWN) if self.failures else Rung(other=SLIPPERY if loud else BOLD)
+                self.rung = Rung(DOWN) if self.failures else Rung(other=SLIPPERY if loud else BOLD)
         if self.rung is None and self.passed and self._owed:
             self.rung = Rung(fallback=0)
 
@@ -91,20 +81,3 @@ class Ladder:
         if rung.fallback is None:
             return Rung(SLOWER) if rung.factor > SLOWER else Rung(fallback=0)
         return Rung(fallback=rung.fallback + 1) if rung.fallback + 1 < self._fallbacks else None
-
-    def _beside(self, rung: Rung, better: bool) -> Rung | None:
-        """Return a neighbour of the best: farther in the same direction if that was better, else in the other."""
-        if self._trials >= MOST_TRIALS:
-            return None
-        if rung.other is not None:
-            # Beyond the bold ones lies what not even the twin that is as identified takes for better.
-            return None if better else self._open(UP)
-        before, self._best = self._best, rung.factor if better else self._best
-        if better:
-            return self._open(rung.factor * rung.factor / before)
-        return self._open(self._best * (DOWN if rung.factor > before else UP))
-
-    def _open(self, factor: float) -> Rung | None:
-        """Return a factor as a rung, None if it was tried or is no lower than one that failed."""
-        known = any(abs(factor - tried) < 0.02 for tried in self._tried)
-        return None if known or factor >= self._ceiling else Rung(factor)
