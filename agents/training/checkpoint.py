@@ -62,8 +62,9 @@ def read_run(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: If it is none.
     """
+    text = _read(path, RUN)
     try:
-        run: Any = parse_json(_read(path, RUN))
+        run: Any = parse_json(text)
     except ValueError as error:
         raise CheckpointError(f"{path} is not a checkpoint of drive-agent: {error}") from None
     if not isinstance(run, dict) or any(not isinstance(run.get(name), kind) for name, kind in _OF_A_RUN.items()):
@@ -186,7 +187,7 @@ def _read(path: Path, name: str) -> bytes:
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error.strerror}") from None
     except ValueError as error:
-        raise CheckpointError(f"{path} is not a checkpoint: it is not a .zip, or incomplete ({error})") from None
+        raise CheckpointError(f"{error}; give a checkpoint (.zip) that drive-agent wrote") from None
     except KeyError:
         raise CheckpointError(
             f"{path} is not a checkpoint of drive-agent: it holds no {name}. A bare file of Stable-Baselines3 lacks "
