@@ -229,7 +229,7 @@ class Envelope:
         self._checked_stop = self._stops.current
 
     def _check_place(self, entry: Entry) -> None:
-        """Raise SafetyError for an object of a further axis by its own index, by which nothing would monitor that axis."""
+        """Raise SafetyError for a further axis' object by its own index, by which nothing would monitor that axis."""
         found = self._of_further_axes.get((entry.index, entry.sub))
         if found is not None:
             first, axis = found
