@@ -5,7 +5,8 @@ drive-env serve tmcm1636 --load inertia &
 python examples/python_canopen.py --eds tmcm1636.eds
 
 Nothing of drive-env is imported: with `--interface socketcan --channel can0` it is the program for a real drive.
-No safety envelope watches here: a real motor must be free to turn, and an emergency stop in reach.
+The drive watches over this program by its heartbeats, and Ctrl-C ends in a quick stop. No safety envelope watches
+limits here: a real motor must be free to turn, and an emergency stop in reach.
 """
 
 import argparse
@@ -15,6 +16,18 @@ import canopen
 from canopen.profiles.p402 import BaseNode402
 
 TURN = 65536  # increments of a revolution
+MASTER, SILENCE = 0x7D, 500  # node-ID of our heartbeats; ms without them after which the drive stops
+
+
+def switch_off(node: BaseNode402) -> None:
+    """Bring the motor to rest by a quick stop, take its voltage, and give up the watchdog where 6041h shows it off."""
+    node.sdo[0x6040].raw = 0x02
+    end = time.monotonic() + 2.0
+    while node.sdo[0x6041].raw & 0x6F == 0x07 and time.monotonic() < end:  # quick stop active
+        time.sleep(0.02)
+    node.sdo[0x6040].raw = 0x00
+    if node.sdo[0x6041].raw & 0x4F == 0x40:  # switch on disabled
+        node.sdo[0x1016][1].raw = 0
 
 
 def main() -> None:
@@ -28,6 +41,7 @@ def main() -> None:
     # slcan over TCP needs no pause after opening, which python-can makes for serial adapters.
     extra = {"sleep_after_open": 0} if options.interface == "slcan" else {"bitrate": 1_000_000}
     network.connect(interface=options.interface, channel=options.channel, **extra)
+    node = None
     try:
         network.scanner.search()
         time.sleep(0.5)
@@ -49,7 +63,11 @@ def main() -> None:
         node.nmt.state = "OPERATIONAL"
         node.setup_402_state_machine(read_pdos=False)
 
-        node.sdo[0x6060].raw = 3  # profile velocity
+        # Before a frame that enables: the drive's own watchdog, and the heartbeats that it waits for.
+        network.send_periodic(0x700 + MASTER, b"\x05", 1e-3 * SILENCE / 3)
+        node.sdo[0x1016][1].raw = MASTER << 16 | SILENCE
+        if node.sdo[0x6061].raw != 3:  # a TMCM-1636 refuses the mode that it has
+            node.sdo[0x6060].raw = 3  # profile velocity
         for state in ("READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"):
             node.state = state
         print("state:", node.state)
@@ -59,10 +77,14 @@ def main() -> None:
         print(f"speed: {node.tpdo[1][0x606C].raw * 60 / TURN:.0f} rpm")
         node.sdo[0x60FF].raw = 0
         time.sleep(1.0)
-        node.state = "SWITCH ON DISABLED"
+        switch_off(node)
         print("state:", node.state)
     finally:
-        network.disconnect()
+        try:
+            if node is not None:
+                switch_off(node)
+        finally:
+            network.disconnect()
 
 
 if __name__ == "__main__":

@@ -344,6 +344,9 @@ class ImageWatch:
     def is_in_force(self, node):
         return self._link.bus.nodes[node].watchdog == self._time and self._objects[node].are_in_force()
 
+    def holds(self, key):
+        return any(ours and o.holds(key) for ours, o in zip(self._is_ours, self._objects, strict=True))
+
     def restore(self, node):
         self._objects[node].restore()
         self._link.bus.nodes[node].watchdog, self._is_ours[node] = 0.0, False

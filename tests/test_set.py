@@ -79,6 +79,34 @@ def test_a_controlword_that_stops_goes_through_without_a_question_and_first(driv
     assert not {"r6041", "r2058"} & set(asked[: asked.index("w6040")])
 
 
+@pytest.mark.parametrize("word", [0, 6])
+def test_what_takes_the_voltage_from_a_motor_that_turns_brings_it_to_rest_first(drive, word):
+    """It brakes by 1,000 increments every 50 ms or so; its voltage stays until it stands."""
+    left, words, plain = [3], [], drive.set
+
+    def write(index, value, sub=0):
+        if index == 0x6040:
+            words.append((value, left[0]))
+        plain(index, value, sub)
+        if index == 0x6040 and value == 2 and left[0]:
+            drive.values[0x6041, 0] = (QUICK_STOP, 2)
+
+    class Braking(dict):
+        def __getitem__(self, key):
+            if key == (0x6064, 0) and left[0]:
+                left[0] -= 1
+                self[key] = (1000 * (4 - left[0]), 4)
+            return super().__getitem__(key)
+
+    drive.set, drive.values = write, Braking(drive.values)
+    plain(0x6041, ENABLED)
+    code, _, error = put("6040", word)
+    assert code == DONE, error
+    assert words[0] == (2, 3)
+    assert all(value == 2 or rest == 0 for value, rest in words)
+    assert words[-1] == (word, 0)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [("60FF", 1000), ("607A", 1000), ("6071", 10), ("6060", 3), ("2003", 5000), ("2042:1", 500), ("1016:1", 0)],

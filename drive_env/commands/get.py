@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -87,7 +88,8 @@ def set_object(
     """Write an object over SDO, read it back and show its value.
 
     Put -- before a negative value: drive-env set 60FF -- -1000. If an axis is enabled it asks first. A controlword that
-    enables is refused, since nothing would monitor the motor; one that stops (0, 2, 6, 7) is always sent.
+    enables is refused, since nothing would monitor the motor; one that stops (0, 2, 6, 7) is always sent, after a quick
+    stop to rest where it takes the voltage away (0, 6).
     """
     from drive_env.master import quantities
     from drive_env.master.parameters import command
@@ -114,6 +116,8 @@ def set_object(
             return
         if not is_controlword:
             _ask_where_live(drives, f"{entry.label} = {value}", yes)
+        elif cia402.cuts_voltage(wanted[0]):
+            _bring_to_rest(drives, entry)
         drives.write((entry.index, entry.sub), wanted if drives.description.is_number(entry) else value)
         rows = []
         readable = entry.access != "wo"
@@ -163,6 +167,24 @@ def _refuse_to_enable(entry: Any, controlword: int) -> None:
             f"{entry.label} = {controlword} would enable the axis, and nothing would monitor the motor after this "
             "command ends. Turn it with `drive-env jog`, or from Python with CanDrives; to stop it, set 2 or 0"
         )
+
+
+def _bring_to_rest(drives: BusDrives, controlword: Entry) -> None:
+    """Stop what a controlword takes the voltage from: a motor that turns would coast."""
+    from drive_env.commands.replayed_motors import Stopped, name, stop_axes
+    from drive_env.master.can_drives import CanDrives
+
+    assert isinstance(drives, CanDrives), "a command's drives are on CAN"
+    first = (controlword.index - cia402.CONTROLWORD) // cia402.AXIS_OFFSET
+    parts = [first] if first else range(drives.description.num_axes)
+    axes = [(node, part) for node in drives.nodes for part in parts]
+    clients = {node: drives.sdo(k) for k, node in enumerate(drives.nodes)}
+    for outcome in stop_axes(drives.port, clients, axes, drives.description.answer_timeout):
+        if not isinstance(outcome, Stopped):
+            print(f"drive-env: {outcome}", file=sys.stderr)
+        elif outcome.cut:
+            axis = name((outcome.node, outcome.axis))
+            print(f"drive-env: {axis}: its voltage was switched off while it turned: {outcome.cut}", file=sys.stderr)
 
 
 def _ask_where_live(drives: BusDrives, what: str, yes: bool) -> None:

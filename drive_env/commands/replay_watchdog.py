@@ -22,6 +22,7 @@ MOST_CONSUMERS = 8  # entries of 1016h that are looked at
 MAX_AXES = 8
 CONSUMERS, GUARD_TIME, LIFE_FACTOR, ERROR_BEHAVIOUR = 0x1016, 0x100C, 0x100D, (0x1029, 1)
 QUICK_STOP, NO_ACTION = 3, 0  # of 6007h
+RAMPS, COASTS = 2, 0  # of 605Ah, the quick stop's option
 # NMT commands; nothing of 1016h is left after the resets.
 START, RESETS = 0x01, (0x81, 0x82)
 
@@ -72,9 +73,8 @@ class ReplayWatchdog:
         problems: list[str] = []
         for node in nodes:
             objects, tidying = SdoClient(self._port, node), Tidying()
-            for (index, sub), data in reversed(self._before.pop(node, {}).items()):
-                label = f"{index:04X}h:{sub:02X}"
-                tidying.step(partial(objects.put_back, index, sub, data, label, self._timeout))
+            for key, data in reversed(self._before.pop(node, {}).items()):
+                tidying.step(partial(self._put_back, node, objects, key, data))
             try:
                 tidying.end()
             except (BusError, ObjectAccessError) as error:
@@ -83,6 +83,12 @@ class ReplayWatchdog:
         if self._thread is not None:
             self._thread.join()
         return problems
+
+    def _put_back(self, node: int, objects: SdoClient, key: Key, data: bytes) -> None:
+        label = f"{key[0]:04X}h:{key[1]:02X}"
+        objects.put_back(*key, data, label, self._timeout)
+        if (found := objects.read(*key, label, self._timeout)[: len(data)]) != data:
+            raise BusError(f"node {node}: {label} should have {data.hex()} again, and has {found.hex()}")
 
     def _beat(self) -> None:
         assert self._heartbeats is not None
@@ -111,6 +117,9 @@ class ReplayWatchdog:
                 option = (cia402.ABORT_CONNECTION_OPTION + cia402.AXIS_OFFSET * axis, 0)
                 if self._read(objects, option) == NO_ACTION.to_bytes(2, "little"):
                     self._change(node, objects, option, QUICK_STOP.to_bytes(2, "little"))
+                option = (cia402.QUICK_STOP_OPTION + cia402.AXIS_OFFSET * axis, 0)
+                if self._read(objects, option) == COASTS.to_bytes(2, "little"):
+                    self._change(node, objects, option, RAMPS.to_bytes(2, "little"))
         except (BusError, ObjectAccessError) as error:
             return str(error)
         return ""
@@ -137,6 +146,8 @@ class ReplayWatchdog:
         # Remembered first: an answer that is lost says nothing of whether it was taken.
         self._before.setdefault(node, {})[key] = before
         objects.write(*key, data, label, self._timeout)
+        if (found := objects.read(*key, label, self._timeout)[: len(data)]) != data:
+            raise BusError(f"node {node} took {data.hex()} for {label} and has {found.hex()}")
 
 
 def nodes_watched_by(frames: Iterable[Any]) -> tuple[set[int], dict[int, str]]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, NamedTuple
@@ -21,6 +21,7 @@ from drive_env.master.can.network import MAX_NODE, PRE_OPERATIONAL
 from drive_env.master.can.port import Port
 from drive_env.master.can.sdo import SdoClient
 from drive_env.master.errors import BusError, NoAnswerError
+from drive_env.master.link import ObjectClient
 
 ANSWER_TIMEOUT = 0.5  # s
 MAX_AXES = 8  # of a node (CiA 301: eight profile areas)
@@ -117,7 +118,9 @@ class ReplayedMotors:
                 for node in nodes
                 if known and (node, 0) not in status and node not in self._no_drives
             ]
-            for outcome in self._stop_axes([axis for axis, word in status.items() if cia402.is_live(word)]):
+            live = [axis for axis, word in status.items() if cia402.is_live(word)]
+            clients = {node: SdoClient(self._port, node) for node, _ in live}
+            for outcome in stop_axes(self._port, clients, live, self._timeout):
                 if isinstance(outcome, Stopped):
                     stopped.append(outcome)
                 else:
@@ -160,25 +163,36 @@ class ReplayedMotors:
         self._port.wait(lambda: len(answers) == len(asked), self._timeout)
         return answers
 
-    def _stop_axes(self, live: list[Axis]) -> list[Stopped | str]:
-        clients = {node: SdoClient(self._port, node) for node, _ in live}
-        stops = [_Stop(self._port, clients[axis[0]], axis, self._timeout) for axis in live]
-        for stop in stops:  # all of them first
-            stop.begin()
+
+def stop_axes(
+    port: Port, clients: Mapping[int, ObjectClient], axes: Sequence[Axis], timeout: float
+) -> list[Stopped | str]:
+    """Quick-stop axes, all at once, and switch each off at rest; return how each ended, or in words what is not off.
+
+    Args:
+        port: The bus.
+        clients: The clients of their nodes.
+        axes: Those that may be live.
+        timeout: Longest wait for an answer [s].
+    """
+    stops = [_Stop(port, clients[axis[0]], axis, timeout) for axis in axes]
+    for stop in stops:  # all of them first
+        stop.begin()
+    for stop in stops:
+        stop.read_scale()
+    while True:
         for stop in stops:
-            stop.read_scale()
-        while any(stop.outcome is None for stop in stops):
-            for stop in stops:
-                if stop.outcome is None:
-                    stop.look()
-            time.sleep(LOOK)
-        return [stop.outcome for stop in stops if stop.outcome is not None]
+            if stop.outcome is None:
+                stop.look()
+        if all(stop.outcome is not None for stop in stops):
+            return [stop.outcome for stop in stops if stop.outcome is not None]
+        time.sleep(LOOK)
 
 
 class _Stop:
     """One axis on its way to rest and off; a lost answer is no reason to leave off."""
 
-    def __init__(self, port: Port, sdo: SdoClient, axis: Axis, timeout: float) -> None:
+    def __init__(self, port: Port, sdo: ObjectClient, axis: Axis, timeout: float) -> None:
         self._port, self._sdo, self._axis, self._timeout = port, sdo, axis, timeout
         self._offset = cia402.AXIS_OFFSET * axis[1]
         self._rest = REST_INC

@@ -124,8 +124,13 @@ class BusDrives:
         raw = checked_values(entry, value, self.num_axes)
         if self.safety is not None:
             self.safety.before_write(entry, raw, axes)
-        for axis in np.flatnonzero(axes):
-            self.write_axis(entry, int(axis), int(raw[axis]))
+        try:
+            for axis in np.flatnonzero(axes):
+                self.write_axis(entry, int(axis), int(raw[axis]))
+        except BaseException:
+            if self.safety is not None:
+                self.safety.after_failed_write(entry)
+            raise
         if self.safety is not None:
             self.safety.after_write(entry, raw, axes)
 

@@ -6,6 +6,7 @@ from functools import partial
 
 from drive_env import cia402
 from drive_env.master.description import Description, Key
+from drive_env.master.errors import BusError
 from drive_env.master.link import NoWatchdogError, ObjectClient
 from drive_env.master.tidying import Tidying
 
@@ -32,6 +33,10 @@ class ChangedObjects:
 
     def __contains__(self, key: Key) -> bool:
         return key in self._before
+
+    def holds(self, key: Key) -> bool:
+        """Return whether a watchdog that was set with these objects depends on one, changed or found right (6007h)."""
+        return key in self or key == _ABORT_CONNECTION
 
     def read(self, key: Key) -> bytes:
         """Return the bytes of an object."""
@@ -86,10 +91,15 @@ class ChangedObjects:
         before, self._before = self._before, {}
         self._set.clear()
         tidying = Tidying()
-        for (index, sub), data in before.items():
-            label = f"{index:04X}h:{sub:02X}"
-            tidying.step(partial(self._sdo.put_back, index, sub, data, label, self._description.answer_timeout))
+        for key, data in before.items():
+            tidying.step(partial(self._put_back, key, data))
         tidying.end()
+
+    def _put_back(self, key: Key, data: bytes) -> None:
+        label = f"{key[0]:04X}h:{key[1]:02X}"
+        self._sdo.put_back(*key, data, label, self._description.answer_timeout)
+        if (now := self.read(key)[: len(data)]) != data:
+            raise BusError(f"node {self._node}: {label} should have {data.hex()} again, and has {now.hex()}")
 
     def forget(self) -> None:
         """Forget what was: the node was reset."""

@@ -176,7 +176,12 @@ class CycleRunner:
             outputs = self._process.outputs(played)
             samples = self._process.samples()
             epoch = None if any((entry.index, entry.sub) == CONTROLWORD for entry in played) else _NOW
-            found = self._run(cycles, outputs, samples, envelope, epoch=epoch)
+            try:
+                found = self._run(cycles, outputs, samples, envelope, epoch=epoch)
+            except BaseException:
+                if envelope is not None:
+                    envelope.after_failed_play(played)
+                raise
         if envelope is not None and cycles:
             envelope.after_play(played)
         return found

@@ -91,6 +91,16 @@ class Description:
                 return entry.index + axis * offset.step, entry.sub
         return entry.index, entry.sub
 
+    def of_further_axes(self) -> dict[Key, tuple[Entry, int]]:
+        """Return the listed objects of further axes: key -> entry of the first axis, and which axis it is of."""
+        found: dict[Key, tuple[Entry, int]] = {}
+        for entry in self.dictionary:
+            for axis in range(1, self.num_axes):
+                key = self.key(entry, axis)
+                if key != (entry.index, entry.sub) and self.has(key) and (entry.index, entry.sub) not in found:
+                    found.setdefault(key, (entry, axis))
+        return found
+
     def shown_by(self, entry: Entry) -> Entry:
         """Return the entry that shows another one: 6061h shows a 6060h that can only be written (CiA 402)."""
         if entry.access == "wo" and (entry.index, entry.sub) == MODE and self.has(MODE_DISPLAY):

@@ -204,6 +204,9 @@ class MasterWatch(Protocol):
             BusError: If it does not answer.
         """
 
+    def holds(self, key: Key) -> bool:
+        """Return whether the watchdogs that are set depend on an object, which nobody else may change meanwhile."""
+
     def restore(self, node: int) -> None:
         """Put a node's watchdog back as it was found. Whoever calls has proved that its axes are off.
 

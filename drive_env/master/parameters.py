@@ -156,7 +156,7 @@ def check_at_rest(drives: BusDrives, wanted: Iterable[Key], axis: int = 0) -> No
 def _affected(drives: BusDrives, wanted: Iterable[Key], axis: int) -> Iterable[int]:
     """Return the axes that a change touches: how a node talks is of all its axes."""
     count = drives.description.num_axes
-    if all(index >= _DEVICE_OBJECTS for index, _ in wanted):
+    if all(index >= _DEVICE_OBJECTS and cia402.of_first_axis(index) == index for index, _ in wanted):
         return (axis,)
     return range(axis - axis % count, axis - axis % count + count)
 

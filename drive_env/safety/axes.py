@@ -80,6 +80,7 @@ class Axes:
         self.clock = 0.0
         self.rotor = RotorAngle(count)
         self._placed = np.zeros(count, bool)  # whether a position was seen
+        self._kept: Floats | None = None  # where the rotors were before what moves the scale was written [rev]
         self.has_scale = np.zeros(count, bool)
         self._position_time = np.full(count, -math.inf)  # when it was there [s]
         self._current_time = np.zeros(count)  # [s]
@@ -126,6 +127,10 @@ class Axes:
             for mask in (self.live, self.assumed, self.in_flight):
                 mask &= ~axes
 
+    def keep_place(self) -> None:
+        """Have the next `place` find the rotors where they are now: samples until then may be of another scale."""
+        self._kept = self.rotor.turns(self.position)
+
     def place(self, position: Integers, scale: Floats) -> None:
         """Take positions [inc] and scales [inc/rev] that were read: what moved scale or zero has not moved the rotors.
 
@@ -133,9 +138,9 @@ class Axes:
             position: What 6064h shows now.
             scale: Increments of a revolution; nan where the drive does not say.
         """
-        turns = self.rotor.turns(self.position) if self.rotor.is_placed and self._placed.any() else None
-        if turns is not None:
-            turns = np.where(self._placed, turns, 0.0)
+        turns, self._kept = self._kept, None
+        if turns is None and self.rotor.is_placed and self._placed.any():
+            turns = np.where(self._placed, self.rotor.turns(self.position), 0.0)
         self.has_scale = ~np.isnan(scale)
         self.rotor.place(position, np.where(self.has_scale, scale, 1.0), turns)
         self.position = position.copy()

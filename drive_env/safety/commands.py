@@ -97,6 +97,7 @@ class Commands:
             key = (entry.index, entry.sub)
             if rows.shape[0] == 0:
                 continue
+            self._check_meaning(entry, self._axes.everywhere, is_played=True)
             if key in (TARGET_POSITION, POSITION_OFFSET):
                 if not relative:
                     self._check_sum(entry, rows, played)
@@ -112,9 +113,12 @@ class Commands:
         """Take note of a set-point that was written."""
         self._set_points[key] = np.where(where, raw, self._set_points.get(key, 0))
 
-    def forget(self) -> None:
-        """Forget all set-points: a node was reset."""
-        self._set_points.clear()
+    def forget(self, key: Key | None = None) -> None:
+        """Forget a set-point, by default all: a node was reset, or nobody knows whether it took the last one."""
+        if key is None:
+            self._set_points.clear()
+        else:
+            self._set_points.pop(key, None)
 
     def note_start(self, words: Integers, where: Mask) -> None:
         """Take note of where moves in pp lead that a controlword has started."""
@@ -206,10 +210,12 @@ class Commands:
         else:
             self._check_magnitude(entry, raw, where, played or {})
 
-    def _check_meaning(self, entry: Entry, where: Mask) -> None:
+    def _check_meaning(self, entry: Entry, where: Mask, *, is_played: bool = False) -> None:
         """Raise SafetyError for what would change the meaning of positions at the wrong time."""
         key = (entry.index, entry.sub)
         moves_scale = key in scale_objects(self._drives.description)
+        if moves_scale and is_played:
+            raise SafetyError(f"{entry.label} changes the scale of positions, and is not played; write it")
         if moves_scale and np.any(where & self._axes.may_turn):
             raise SafetyError(
                 f"{entry.label} changes the scale of positions, and the axis is enabled; nothing was sent. Disable "

@@ -42,6 +42,7 @@ from drive_env.safety.bounds import (
 )
 from drive_env.safety.commands import Commands
 from drive_env.safety.errors import SafetyError as SafetyError
+from drive_env.safety.errors import logged
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits import Limits
 from drive_env.safety.limits_in_force import LimitsInForce
@@ -101,6 +102,7 @@ class Envelope:
         self._commands = Commands(drives, self._axes, self._limits, self._watch.modes)
         self._checked_stop: Stop | None = None  # when the controlword that is being written was checked
         self._is_closing = False
+        self._of_further_axes = drives.description.of_further_axes()
 
     @property
     def limits(self) -> Limits:
@@ -136,17 +138,40 @@ class Envelope:
     def before_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
         """Raise SafetyError for a value that would pass a limit; make ready for motion before it is commanded."""
         key = (entry.index, entry.sub)
+        self._check_place(entry)
         self._watch.await_stop()
         if key == CONTROLWORD:
             self._before_controlword(raw, where)
             return
+        self._watchdogs.check_not_held(entry)
         if entry.index >= DEVICE_OBJECTS and not self._axes.is_armed and self._finds_live(where):
             self._arm()
         self._commands.check_write(entry, raw, where)
         if key in SET_POINTS:
             self._arm()
+        if self._axes.is_armed:
+            self._stops.keep_ramps(key, raw, where)
         if entry.index == STORE and self._axes.is_armed:
+            if self._stops.lends_ramps() and self._watch.look_for_live():
+                raise SafetyError(
+                    f"{entry.label}: what the drives store is their own, by which a stop would let an axis that is "
+                    "enabled coast meanwhile; nothing was sent. Disable it first"
+                )
             self._lending.give_back(set(range(self._drives.num_axes)))
+        if key in scale_objects(self._drives.description):
+            self._limits.keep_place()
+
+    def after_failed_write(self, entry: Entry) -> None:
+        """Take note that a drive may have taken what was written, or not."""
+        key = (entry.index, entry.sub)
+        self._commands.forget(key)
+        if key in scale_objects(self._drives.description):
+            self._limits.place_again()
+        elif key in _BOUNDS or key == self._drives.description.role(Role.CURRENT_LIMIT):
+            self._limits.forget()
+        if entry.index == STORE and self._axes.is_armed:
+            with logged():
+                self._lend()
 
     def after_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
         """Take note of what was written."""
@@ -164,7 +189,7 @@ class Envelope:
             if key == HOME_OFFSET and self._axes.is_armed:
                 self._limits.lend()  # it corrects software limits
         elif entry.index == STORE and self._axes.is_armed:
-            self._limits.lend()
+            self._lend()
 
     def write_lent(self, entry: Entry, axis: int, value: int) -> bool:
         """Take a value for an object that has another one meanwhile; False if it has not."""
@@ -185,12 +210,15 @@ class Envelope:
         self._watch.await_stop()
         if not played:
             return
+        for entry in played:
+            self._check_place(entry)
+            self._watchdogs.check_not_held(entry)
         words = next((rows for entry, rows in played.items() if (entry.index, entry.sub) == CONTROLWORD), None)
         self._commands.check_play(played, words)
         enables = self._axes.everywhere if words is None else cia402.may_enable(words).any(axis=0)
-        if words is not None and cia402.cuts_voltage(words).any():
-            self._check_cuts(words)
-            self._brake(cia402.cuts_voltage(words).any(axis=0))
+        if words is not None and (cuts := self._stops.cuts(words)).any():
+            self._check_cuts(words, cuts)
+            self._brake(np.asarray(cuts.any(axis=0)))
         if words is not None or any((entry.index, entry.sub) in SET_POINTS for entry in played):
             self._arm()
         if words is not None and enables.any():
@@ -200,10 +228,20 @@ class Envelope:
             self._axes.assume(enables)
         self._checked_stop = self._stops.current
 
-    def _check_cuts(self, words: Integers) -> None:
+    def _check_place(self, entry: Entry) -> None:
+        """Raise SafetyError for a further axis' object by its own index, by which nothing would monitor that axis."""
+        found = self._of_further_axes.get((entry.index, entry.sub))
+        if found is not None:
+            first, axis = found
+            raise SafetyError(
+                f"{entry.label} is {first.label} of axis {axis} of a node, and is not monitored by this index; nothing "
+                f"was sent. Write {first.index:04X}h, with one value per axis or where=..."
+            )
+
+    def _check_cuts(self, words: Integers, cuts: Mask) -> None:
         """Raise SafetyError for rows that take the voltage from an axis which an earlier row lets turn."""
         after = np.cumsum(cia402.may_enable(words), axis=0) > 0
-        if (wrong := np.flatnonzero((after & cia402.cuts_voltage(words)).any(axis=0))).size:
+        if (wrong := np.flatnonzero((after & cuts).any(axis=0))).size:
             raise SafetyError(
                 f"axis {int(wrong[0])}: these rows take the voltage away after they have enabled it, and it may turn "
                 "by then; nothing was sent. Play a quick stop (6040h = 2), and write 0 afterwards"
@@ -214,6 +252,11 @@ class Envelope:
         for entry, rows in played.items():
             if len(rows):
                 self.after_write(entry, rows[-1], self._axes.everywhere)
+
+    def after_failed_play(self, played: Mapping[Entry, Integers]) -> None:
+        """Take note that the drives may have taken any of the rows."""
+        for entry in played:
+            self.after_failed_write(entry)
 
     def before_reset(self, nodes: Sequence[int]) -> None:
         """Bring axes of nodes, by position, to rest and switch them off: a reset takes their voltage away."""
@@ -338,7 +381,7 @@ class Envelope:
             self._commands.check_modes(enables)
             self._prove_watchdogs(enables)
             self._axes.assume(enables)
-        if np.any(cuts := where & cia402.cuts_voltage(words)):
+        if np.any(cuts := where & self._stops.cuts(words)):
             self._brake(cuts)
         self._checked_stop = self._stops.current
 
@@ -394,8 +437,7 @@ class Envelope:
         try:
             if not self._drives.is_dry:
                 self._watchdogs.set()
-            self._limits.lend()
-            self._stops.make_sure_of_a_ramp()
+            self._lend()
             self._watch.first_look()
         except BaseException:
             with self._uninterrupted():
@@ -406,6 +448,11 @@ class Envelope:
         self._axes.is_armed = True
         self._watch.begin()
         signals.guard(self)
+
+    def _lend(self) -> None:
+        """Lend the drives limits that are tighter than their own, and ramps where a stop would let them coast."""
+        self._limits.lend()
+        self._stops.make_sure_of_ramps()
 
     def _end_watching(self) -> None:
         self._watch.end()

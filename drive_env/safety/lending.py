@@ -22,10 +22,10 @@ logger = logging.getLogger(__name__)
 
 
 class Loan(NamedTuple):
-    """What an object had, and what it has meanwhile."""
+    """What an object had, and what it may have meanwhile: several values where an answer was lost."""
 
     own: int
-    lent: int
+    lent: frozenset[int]
 
 
 class Lending:
@@ -41,13 +41,16 @@ class Lending:
 
     def lend(self, key: Key, axis: int, value: int) -> bool:
         """Give an object of an axis a value for a while; return whether the drive, read back, has it."""
-        entry = self._drives.description.dictionary.find(key)
+        entry, loan = self._drives.description.dictionary.find(key), self._loans.get((key, axis))
         try:
-            loan = self._loans.get((key, axis))
             own = int(self._drives.read_raw(entry, axis)) if loan is None else loan.own
-            self._loans[key, axis] = Loan(own, value)
+            # Noted first: an answer that is lost does not say which of them the drive has.
+            self._loans[key, axis] = Loan(own, frozenset({value}) | (frozenset() if loan is None else loan.lent))
             self._drives.write_raw(entry, axis, value)
-            if int(self._drives.read_raw(entry, axis)) == value:
+            found = int(self._drives.read_raw(entry, axis))
+            # What a drive makes of a value, at the end of its own range say, is lent as well, and taken back.
+            self._loans[key, axis] = Loan(own, frozenset({found}))
+            if found == value:
                 return True
             logger.warning(
                 "axis %d does not accept %s = %d; this limit is monitored by this computer only",
@@ -57,13 +60,16 @@ class Lending:
             )
         except ObjectAccessError as error:
             logger.warning("axis %d: %s; this limit is monitored by this computer only", axis, error)
-            self._loans.pop((key, axis), None)
+            if loan is None:
+                self._loans.pop((key, axis), None)
+            else:
+                self._loans[key, axis] = loan
         return False
 
     def own(self, key: Key, axis: int, found: int) -> int:
         """Return what the program sees of an object that has `found`."""
         loan = self._loans.get((key, axis))
-        return loan.own if loan is not None and loan.lent == found else found
+        return loan.own if loan is not None and found in loan.lent else found
 
     def owned(self, key: Key, axis: int) -> int:
         """Return what an object had that has another value meanwhile."""
@@ -106,7 +112,7 @@ class Lending:
 
     def _return(self, entry: Entry, axis: int, loan: Loan) -> None:
         # Who else has changed it meanwhile had a reason.
-        if int(self._drives.read_raw(entry, axis)) == loan.lent:
+        if int(self._drives.read_raw(entry, axis)) in loan.lent:
             self._drives.write_raw(entry, axis, loan.own)
             if (found := int(self._drives.read_raw(entry, axis))) != loan.own:
                 raise BusError(f"axis {axis}: {entry.label} should have {loan.own} again, and has {found}")

@@ -61,6 +61,7 @@ class LimitsInForce:
         self.user = user
         self.latest: Bounds | None = None
         self._generation = 0
+        self._must_place = False  # before a limit is used
         self._drives = drives
         self._axes = axes
         self._lending = lending
@@ -79,6 +80,18 @@ class LimitsInForce:
         self._generation += 1
         self.latest = None
 
+    def keep_place(self) -> None:
+        """Note where the rotors are before an object is written that moves their scale; `place` is called after it."""
+        position, scale = read_own(self._drives, POSITION, 0), read_scale(self._drives)
+        with self._axes.lock:
+            self._axes.place(position, scale)
+            self._axes.keep_place()
+
+    def place_again(self) -> None:
+        """Have the rotors placed before a limit is used again: nobody knows which scale a drive has."""
+        self._must_place = True
+        self.forget()
+
     def _capture(self) -> RotorLimits:
         """Return the user's limits as the rotors' own, at the scale and zero of now."""
         user = self.user
@@ -92,6 +105,7 @@ class LimitsInForce:
         scale = read_scale(self._drives)
         with self._axes.lock:
             self._axes.place(position, scale)
+            self._must_place = False
             self.forget()
         if self._axes.is_armed:
             self.lend()
@@ -100,7 +114,7 @@ class LimitsInForce:
         """Return the limits of every axis as integers of its drive; what the user left open is read from the drives."""
         bounds, generation = self.latest, self._generation
         if bounds is None:
-            if not self._axes.rotor.is_placed:
+            if self._must_place or not self._axes.rotor.is_placed:
                 self.place()
             bounds = read_bounds(self.user, self._drives, self._axes.rotor, self._of_rotors)
             # A whole number of counts, but for rounding where they are rpm.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
+from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import read_own
 from drive_env.safety.errors import SafetyError, logged
@@ -17,7 +18,13 @@ from drive_env.safety.lending import Lending
 from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.limits_in_force import LimitsInForce
 from drive_env.safety.looks import answer_time
-from drive_env.safety.objects import CONTROLWORD, QUICK_STOP_OPTION
+from drive_env.safety.objects import (
+    CONTROLWORD,
+    DISABLE_OPERATION_OPTION,
+    FAULT_REACTION_OPTION,
+    HALT_OPTION,
+    QUICK_STOP_OPTION,
+)
 from drive_env.safety.stopping import AxisStop, Phase, Sample, Stop
 
 if TYPE_CHECKING:
@@ -25,11 +32,14 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 WEIGHT_LOOK, WEIGHT_SHARE = 0.06, 0.03  # s at rest; of the current limit, above which it may be a weight
 WAKE_PERIOD = 0.2  # s
-COASTS, RAMPS = 0, 2  # option codes of 605Ah
+COASTS = 0  # the option code that lets an axis coast
+# By which an axis stops or is stopped, and the code that ramps instead.
+RAMPS = {QUICK_STOP_OPTION: 2, DISABLE_OPERATION_OPTION: 1, HALT_OPTION: 1, FAULT_REACTION_OPTION: 2}
 # Option codes of 605Ah that end in switch on disabled, and those with the same ramp that end in quick stop active.
 _ENDS_HELD = {1: 5, 2: 6}
 
@@ -62,20 +72,66 @@ class StopRunner:
         self._told_of: set[int] = set()  # axes that are held under a weight
         self._held: set[int] = set()  # axes whose quick stop option was looked at in this stop
 
-    def make_sure_of_a_ramp(self) -> None:
-        """Have quick stops ramp: 605Ah = 0 would let an axis coast.
+    def make_sure_of_ramps(self) -> None:
+        """Have quick stops ramp, and what else stops an axis: an option code of 0 would let it coast.
 
         Raises:
-            SafetyError: If a drive does not take another option.
+            SafetyError: If a drive takes no other option for its quick stop.
         """
-        if not self._drives.description.has(QUICK_STOP_OPTION):
+        for key, ramp in RAMPS.items():
+            if not self._drives.description.has(key) or (key != QUICK_STOP_OPTION and self._cannot_coast(key)):
+                continue
+            for axis, option in enumerate(read_own(self._drives, key, ramp).tolist()):
+                if option != COASTS or self._lending.lend(key, axis, ramp):
+                    continue
+                if key == QUICK_STOP_OPTION:
+                    raise SafetyError(
+                        f"axis {axis}: its quick stop lets it coast (605Ah = 0), and it takes no other option; write "
+                        "605Ah = 2 where the drive allows it"
+                    )
+                logger.warning("axis %d: %s = 0 lets it coast", axis, self._known.find(key).label)
+
+    def keep_ramps(self, key: Key, raw: Integers, where: Mask) -> None:
+        """Lend axes a ramp where an option code that lets them coast is about to be written, as theirs for afterwards.
+
+        Raises:
+            SafetyError: If a drive does not take the ramp.
+        """
+        if key not in RAMPS:
             return
-        for axis, option in enumerate(read_own(self._drives, QUICK_STOP_OPTION, RAMPS).tolist()):
-            if option == COASTS and not self._lending.lend(QUICK_STOP_OPTION, axis, RAMPS):
+        for axis in np.flatnonzero(where & (raw == COASTS) & ~self._is_lent(key)).tolist():
+            if not self._lending.lend(key, axis, RAMPS[key]):
                 raise SafetyError(
-                    f"axis {axis}: its quick stop lets it coast (605Ah = 0), and it takes no other option; write 605Ah "
-                    "= 2 where the drive allows it"
+                    f"axis {axis}: {self._known.find(key).label} = 0 would let it coast, and it takes no other option; "
+                    "nothing was sent"
                 )
+
+    def lends_ramps(self) -> bool:
+        """Return whether a drive whose own option lets an axis coast has another one meanwhile."""
+        return any(
+            self._lending.is_lent(key, axis) and self._lending.owned(key, axis) == COASTS
+            for key in RAMPS
+            for axis in range(self._drives.num_axes)
+        )
+
+    def cuts(self, words: Integers) -> Mask:
+        """Return where controlwords take the voltage away at once, by the option of 605Ch that each axis has now."""
+        cuts: Mask = cia402.cuts_voltage(words)
+        disables = cia402.matches(words, cia402.COMMANDS["disable operation"])
+        key = DISABLE_OPERATION_OPTION
+        if disables.any() and self._drives.description.has(key) and not self._cannot_coast(key):
+            entry = self._known.find(key)
+            options = [self._drives.read_raw(entry, axis) for axis in range(self._drives.num_axes)]
+            cuts = cuts | disables & (np.array(options) == COASTS)
+        return cuts
+
+    def _cannot_coast(self, key: Key) -> bool:
+        """Return whether the EDS has no option that coasts."""
+        low = self._known.find(key).low
+        return low is not None and low > COASTS
+
+    def _is_lent(self, key: Key) -> Mask:
+        return np.array([self._lending.is_lent(key, axis) for axis in range(self._drives.num_axes)])
 
     def end_hold(self, axis: int) -> None:
         """Give an axis that is enabled anew its quick stop option again, if that is a ramp."""
@@ -83,7 +139,7 @@ class StopRunner:
             return
         with logged():
             if self._lending.owned(QUICK_STOP_OPTION, axis) == COASTS:
-                self._lending.lend(QUICK_STOP_OPTION, axis, RAMPS)
+                self._lending.lend(QUICK_STOP_OPTION, axis, RAMPS[QUICK_STOP_OPTION])
             else:
                 self._lending.give_back_one(QUICK_STOP_OPTION, axis)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.entries import Entry
 from drive_env.master.errors import BusError
 from drive_env.master.link import NoWatchdogError
 from drive_env.safety.axes import Axes
@@ -60,6 +61,14 @@ class Watchdogs:
         for k in range(len(self._drives.nodes)):
             if not self._watch.is_in_force(k):
                 self._axes.is_armed = False
+
+    def check_not_held(self, entry: Entry) -> None:
+        """Raise SafetyError for an object that a watchdog depends on: it is never changed while it is set."""
+        if self._watch.holds((entry.index, entry.sub)):
+            raise SafetyError(
+                f"{entry.label} belongs to the watchdog by which the drive notices that this process is dead; nothing "
+                "was sent. Write it before the first command, or without this program"
+            )
 
     def keep(self) -> None:
         """Have the drives hear that this process lives, when it is due."""
@@ -153,7 +162,12 @@ class Watchdogs:
                 "pace='lockstep' is for an emulator that is served with --lockstep, and time passes by itself on this "
                 "bus: nothing would monitor the drives between two calls; open them with pace='real-time'"
             )
-        self._is_lockstep_proved = passes is not None
+        if passes is None:
+            raise SafetyError(
+                "pace='lockstep' is for an emulator that is served with --lockstep, and this drive has no producer "
+                "heartbeat (1017h) that would show that time waits on this bus; open it with pace='real-time'"
+            )
+        self._is_lockstep_proved = True
 
     def give_up(self) -> None:
         """Give drives back what they had and their watchdogs; what is not proved off keeps them and hears no more."""

@@ -139,6 +139,10 @@ class ErrorControl:
             return False
         return self._objects.are_in_force()
 
+    def holds(self, key: tuple[int, int]) -> bool:
+        """Return whether the watchdog, if it is set, depends on an object."""
+        return self.kind != "none" and (key == _ERROR_BEHAVIOUR or self._objects.holds(key))
+
     def beat(self) -> None:
         """Ask for the node's life, where it has no heartbeat consumer."""
         if self.kind == "life guarding":
@@ -299,6 +303,10 @@ class ErrorControls:
             BusError: If it does not answer.
         """
         return self._controls[node].is_in_force()
+
+    def holds(self, key: tuple[int, int]) -> bool:
+        """Return whether a watchdog that is set depends on an object."""
+        return any(control.holds(key) for control in self._controls)
 
     def restore(self, node: int) -> None:
         """Put a node's objects back as they were.
