@@ -25,6 +25,7 @@ from agents.training.hyperparameters import ALGORITHMS, HyperparameterError, rea
 from agents.training.imitation import imitate
 from agents.training.tasks import ENVIRONMENTS, environment_name, make_environments
 from agents.training.train import AGENT, CHECKPOINT, TABLE, DivergedError, TrainingRun, train
+from tuning.runs import provenance
 from tuning.runs.pools import PoolError
 
 TINY = {"ServoDrive/Tracking-v0": {"duration": 0.01}, "ServoDrive/GainScheduling-v0": {"duration": 0.02},
@@ -490,6 +491,31 @@ def test_trials_that_an_error_ends_are_over_for_the_next_search(tmp_path, monkey
     with pytest.raises(PoolError):
         search.search(run.environment, "ppo", run.hyperparameters, tmp_path, trials=3, episodes=2, pool=Lost())
     assert [state for state, _, _ in drawn_in(tmp_path)] == ["COMPLETE", "FAIL", "FAIL"]
+
+
+def test_a_run_of_other_sources_is_not_gone_on_with(tmp_path, monkeypatch):
+    """Half of its agent would be another program's."""
+    train(tiny(timesteps=32), tmp_path)
+    before, here = (tmp_path / CHECKPOINT).read_bytes(), provenance.SOURCES
+    monkeypatch.setattr(provenance, "SOURCES", "0123456789abcdef")
+    refused = f"checkpoint.zip holds results of sources {here}, these are 0123456789abcdef.*or begin a new run"
+    with pytest.raises(ValueError, match=refused):
+        train(tiny(), tmp_path, resume=True, trust=True)
+    assert (tmp_path / CHECKPOINT).read_bytes() == before
+
+
+def test_a_study_of_other_sources_is_not_gone_on_with(tmp_path, monkeypatch):
+    """Its scores would be those of two programs, and the best of them nobody's."""
+    run, trained = tiny(timesteps=32), []
+    monkeypatch.setattr(search, "train", lambda one, folder: trained.append(folder) or train(one, folder))
+    options = {"trials": 1, "seed": 4, "episodes": 2}
+    search.search(run.environment, "ppo", run.hyperparameters, tmp_path, **options)
+    here = provenance.SOURCES
+    monkeypatch.setattr(provenance, "SOURCES", "0123456789abcdef")
+    refused = f"study.log holds results of sources {here}, these are 0123456789abcdef.*or give another --out"
+    with pytest.raises(ValueError, match=refused):
+        search.search(run.environment, "ppo", run.hyperparameters, tmp_path, **options)
+    assert len(trained) == 1
 
 
 def test_there_is_nothing_to_resume(tmp_path):

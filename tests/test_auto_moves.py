@@ -214,6 +214,28 @@ def fitted(target):
     return np.array([rule_gains(target.device, target.motor, J, supply=24.0)[0] for J in inertia])
 
 
+def test_a_trial_that_a_fault_ends_names_the_emergency(monkeypatch):
+    """Of a machine's axes each has its own: the one that only stopped with it has none."""
+    with emulated(load="gantry", num_threads=1) as target:
+        drives, good = target.drives, fitted(target)
+        ground = proving(target, good)
+        both = np.ones(2, bool)
+        assert ground.run(good, both).reason == ("", "")
+        trial = ground._trials.run
+
+        def faulty(*arguments):
+            drives.machine.fault("enable_lost", duration=0.02, axis=0)
+            return trial(*arguments)
+
+        with monkeypatch.context() as during:
+            during.setattr(ground._trials, "run", faulty)
+            first, second = ground.run(good, both).reason
+        assert first.startswith("stopped in the move")
+        assert first.endswith("; the drive reported shutdown switch (5441h)")
+        assert second.startswith("stopped in the move") and second.endswith("(cut off within 50 ms)")
+        assert ground.run(good, both).reason == ("", ""), "what was told of one trial is not told of the next"
+
+
 @pytest.mark.parametrize("what", ["run", "show", "recover"])
 def test_axes_that_pull_at_one_thing_move_together_or_not_at_all(what):
     """Of two gantries one drive is to be tried: the other end of its bridge goes along, the other gantry stands."""

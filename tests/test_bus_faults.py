@@ -56,7 +56,7 @@ class Bus:
     def send(self, frame):
         self.world.receive(frame)
 
-    def write(self, index, sub, value, size, patience=20):
+    def write(self, index, sub, value, size, patience=50):
         """Write an object by expedited SDO; return the answer's data, None where none came."""
         data = bytes([0x23 | (4 - size) << 2]) + index.to_bytes(2, "little") + bytes([sub])
         self.carried.clear()

@@ -418,5 +418,38 @@ def test_the_picture_shows_the_trials_of_every_search():
     assert [line.get_ydata().tolist() for line in axes.lines] == pytest.approx(np.exp([[2.0] * 3, [1.0] * 3]))
 
 
-def row(search, number, cost):
-    return TrialRow(search, number, np.ones((1, 5), int), cost, (0.0, 0.0, 0.0), False)
+def test_the_best_so_far_is_of_accepted_trials_alone():
+    """A trial that was stopped, or after which the axis went on shaking, is no gain, however little it cost."""
+    rows = (
+        row(0, 0, -1.0, aborted=True),
+        row(0, 1, 2.0),
+        row(0, 2, 0.5, fragile=True),
+        row(0, 3, 1.0),
+        row(0, 4, -2.0, aborted=True),
+    )
+    (line,) = trials_figure(searched(rows), Settings()).axes[0].lines
+    np.testing.assert_allclose(line.get_ydata(), [np.nan, *np.exp([2.0, 2.0, 1.0, 1.0])])
+
+
+def test_the_front_is_of_accepted_trials_and_its_axes_have_units():
+    """The search's own objectives are logarithms: of the settling time over t_0, and of a ratio."""
+    rows = (
+        row(0, 0, 0.0, objectives=(np.log(2.0), np.log(3.0), 4.0)),
+        row(0, 1, 0.0, objectives=(0.0, np.log(5.0), 4.0)),
+        row(0, 2, -1.0, objectives=(-1.0, 0.0, 1.0), aborted=True),
+    )
+    axes = trials_figure(searched(rows), Settings(objectives=("speed", "robustness"))).axes[0]
+    (front,) = axes.lines
+    np.testing.assert_allclose(sorted(front.get_xydata().tolist()), [[10.0, 5.0], [20.0, 3.0]])  # t_0 is 10 ms
+    assert axes.get_xlabel() == "settling time, the slower of move and reversal [ms]"
+    assert axes.get_ylabel() == "J of the worst phase over that of the moves"
+
+
+def searched(rows):
+    """Return what a search of one machine has found, with a t_0 of 10 ms."""
+    none = np.zeros(1, int)
+    return Optimised(np.ones((1, 5), int), np.ones((1, 5), int), np.ones(1), rows, 0.0, none, none, ("",), 0.01)
+
+
+def row(search, number, cost, *, objectives=(0.0, 0.0, 0.0), aborted=False, fragile=False):
+    return TrialRow(search, number, np.ones((1, 5), int), cost, objectives, aborted, fragile)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tuning.runs import provenance
 from tuning.search import samplers
 from tuning.search.samplers import check_installed, new_proposer
 
@@ -90,6 +91,17 @@ def test_a_search_that_was_broken_off_goes_on_as_if_it_had_not_been(sampler, gen
     np.testing.assert_allclose([fact["point"] for fact in resumed.history()], first)
     rest = search(resumed, 12, generation)
     np.testing.assert_array_equal(np.concatenate([first, rest]), whole)
+
+
+def test_a_journal_of_other_sources_is_not_gone_on_with(tmp_path, monkeypatch):
+    file = tmp_path / "kept.log"
+    search(new_proposer("random", LOW, HIGH, seed=7, journal=file), 2, 1)
+    here = provenance.SOURCES
+    refused = f"kept.log holds results of sources {here}, these are 0123456789abcdef.*or give another --journal"
+    with monkeypatch.context() as other, pytest.raises(ValueError, match=refused):
+        other.setattr(provenance, "SOURCES", "0123456789abcdef")
+        new_proposer("random", LOW, HIGH, seed=7, journal=file)
+    assert new_proposer("random", LOW, HIGH, seed=7, journal=file).told == 2
 
 
 def test_several_objectives_are_for_samplers_that_know_them():

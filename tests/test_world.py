@@ -413,6 +413,80 @@ def test_a_node_that_is_reset_boots_after_its_time_and_is_deaf_until_then(comman
     world.close()
 
 
+READ, SAVE = "40 01 10 00 00 00 00 00", "23 10 10 01 73 61 76 65"  # 1001h; 1010h:01 = "save"
+
+
+def answered(world, *requests):
+    """Send SDO requests; return each answer, and the time [s] to it from when its request was on the bus."""
+    ends, answers = [], []
+
+    def listen(ended):
+        if ended.frame.can_id == 0x585:
+            answers.append((world.time, ended.frame.data.hex(" ").upper()))
+        elif ended.frame.can_id == 0x605:
+            ends.append(world.time)
+
+    world.listeners.append(listen)
+    for request in requests:
+        world.receive(Frame(0x605, bytes.fromhex(request)))
+    if not world.lockstep:
+        world.run_until(world.time + 0.1)
+    world.listeners.remove(listen)
+    return [(time - end, data) for (time, data), end in zip(answers, ends, strict=True)]
+
+
+@pytest.mark.parametrize(("request_", "role"), [(READ, "sdo_time"), (SAVE, "store_time")])
+def test_an_sdo_answer_takes_the_time_of_the_device(request_, role):
+    world = World(lockstep=False)
+    drives = EmulatedDrives(load="inertia", num_threads=1)
+    world.add(drives, [5])
+    world.power_on()
+    world.run_until(0.0101)
+    ((took, data),) = answered(world, request_)
+    assert data[:2] in ("4F", "60")
+    frame = 130e-6  # s on the wire at 1 Mbit/s, for the answer itself
+    assert took == pytest.approx(getattr(drives.device.canopen, role) + frame, abs=30e-6)
+    world.close()
+
+
+def test_requests_are_answered_one_after_the_other():
+    world = World(lockstep=False)
+    drives = EmulatedDrives(load="inertia", num_threads=1)
+    world.add(drives, [5])
+    world.power_on()
+    world.run_until(0.01)
+    (_, saved), (took, read) = answered(world, SAVE, READ)
+    assert (saved[:2], read[:2]) == ("60", "4F")
+    assert took > drives.device.canopen.store_time
+    world.close()
+
+
+@pytest.mark.parametrize("command", [0x02, 0x81, 0x82])
+def test_an_answer_that_is_under_way_ends_with_its_service(command):
+    """Stopped has no SDO, and a node that boots has forgotten what it was asked."""
+    world = World(lockstep=False)
+    drives = EmulatedDrives(load="inertia", num_threads=1)
+    world.add(drives, [5])
+    world.power_on()
+    world.run_until(0.01)
+    heard = []
+    world.listeners.append(lambda ended: heard.append(ended.frame.can_id))
+    world.receive(Frame(0x605, bytes.fromhex(SAVE)))
+    world.run_until(0.015)
+    world.receive(Frame(0x000, bytes((command, 5))))
+    world.run_until(0.2)
+    assert 0x585 not in heard and {0x605, 0x000} <= set(heard)
+    world.close()
+
+
+def test_in_lockstep_an_sdo_answer_takes_no_time():
+    world = World()
+    world.add(EmulatedDrives(load="inertia", num_threads=1), [5])
+    world.power_on()
+    assert [(took, data[:2]) for took, data in answered(world, SAVE, READ)] == [(0.0, "60"), (0.0, "4F")]
+    world.close()
+
+
 def test_a_reset_switches_the_motor_off_at_once_however_long_the_node_boots():
     world = World(lockstep=False)
     drives = EmulatedDrives(load="inertia", num_threads=1)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from drive_env.drives.interface import Drives
 
+UNTOLD = "no emergency message with the cause was received"
+
 
 def stop_causes(drives: Drives) -> list[str]:
     """Return what each axis of the drives has told since its emergencies were read last, most important for a message.
@@ -14,5 +16,5 @@ def stop_causes(drives: Drives) -> list[str]:
     told: list[dict[str, None]] = [{} for _ in range(drives.num_axes)]
     for message in drives.emergencies():
         if message.code:
-            told[message.axis][f"{message.name} ({message.code:04X}h)"] = None
-    return [", ".join(axis) or "no emergency message with the cause was received" for axis in told]
+            told[message.axis][f"{message.name.replace('_', ' ')} ({message.code:04X}h)"] = None
+    return [", ".join(axis) or UNTOLD for axis in told]

@@ -20,6 +20,7 @@ import yaml
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import merge
 from agents.training.train import DivergedError, TrainingRun, train
+from tuning.runs.provenance import check_study
 
 if TYPE_CHECKING:
     from tuning.runs.pools import Pool
@@ -116,6 +117,7 @@ def search(
 
     Raises:
         DivergedError: If no training at all gave an agent.
+        ValueError: For a study that was begun with other sources.
     """
     import optuna
     from optuna.storages import JournalStorage
@@ -127,6 +129,7 @@ def search(
     base = TrainingRun(environment, algorithm, hyperparameters)
     storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
     study = optuna.create_study(storage=storage, study_name=f"{base.environment} {algorithm}", load_if_exists=True)
+    check_study(study, folder / JOURNAL, "give another --out")
     states = optuna.trial.TrialState
 
     def begun(known: Any) -> tuple[Any, _TrainingTask]:

@@ -29,6 +29,7 @@ from agents.training.learning_curve import draw_learning_curve
 from agents.training.networks import bundle_of
 from agents.training.tasks import ENVIRONMENTS, configuration_of, environment_name, make_environments
 from agents.training.training_table import TrainingTable
+from tuning.runs.provenance import SOURCES, check_begun
 
 logger = logging.getLogger(__name__)
 
@@ -117,7 +118,8 @@ def train(
         trust: Its writer is trusted; needed to resume, see `agents.training.checkpoint`.
 
     Raises:
-        CheckpointError: If there is nothing to resume, or it is not trusted; MissingPackageError without the extra
+        CheckpointError: If there is nothing to resume, or it is not trusted, or ValueError if it was begun with other
+            sources; MissingPackageError without the extra
             `agents`.
         HyperparameterError: For hyper-parameters that the algorithm does not take.
         DivergedError: If the networks come to hold what nothing can act with; the last checkpoint is from before.
@@ -130,6 +132,7 @@ def train(
     if resume:
         run = run_to_resume(folder)
         checkpoint.check_trust(path, trust)
+        check_begun(path, checkpoint.read_run(path).get("sources"), "begin a new run")
     threads = torch.get_num_threads()
     torch.set_num_threads(run.torch_threads)
     lanes, env = make_env(run)
@@ -448,6 +451,7 @@ def _segments_class() -> Any:
                     "configuration": configuration_of(self._lanes),
                     "timesteps": self.num_timesteps,
                     "run": plain(asdict(self._run)),
+                    "sources": SOURCES,
                 },
             )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -76,6 +77,7 @@ class World:
         self.before_cycle: list[Callable[[], None]] = []
         self.time = 0.0
         self.cycles = 0
+        self._answering: list[Node] = []  # whose SDO answers take time
         self._sync_objects: list[ObjectPort] = []  # 1005h of each node
         self._on: set[int] = set()
         self._overflowed: set[int] = set()
@@ -117,6 +119,7 @@ class World:
             self.attach(node_id, make)
             self._sync_objects.append(nodes[-1].dictionary.port(*SYNC_OBJECT))
         self.drives.append(drives)
+        self._answering += nodes
         return nodes
 
     def attach(self, node_id: int, make: Callable[[Callable[[Frame], None]], BusNode]) -> None:
@@ -161,8 +164,12 @@ class World:
         """
         until = now + early
         while True:
-            cycle, event = self.next_cycle, self.wire.next_event()
-            if event <= until and event <= cycle:
+            cycle, event, answer = self.next_cycle, self.wire.next_event(), self._next_answer()
+            if answer <= until and answer <= min(cycle, event):
+                self.time = max(self.time, answer)
+                for node in self._answering:
+                    node.answer(self.time)
+            elif event <= until and event <= cycle:
                 self.time = max(self.time, event)
                 self._pass_on(self.wire.take(event))
             elif cycle <= until:
@@ -180,7 +187,7 @@ class World:
 
     def next_event(self) -> float:
         """Return when `run_until` has something to do next [s]."""
-        return min(self.next_cycle, self.wire.next_event())
+        return min(self.next_cycle, self.wire.next_event(), self._next_answer())
 
     def cycle(self) -> None:
         """Let one communication cycle of 1 ms pass."""
@@ -224,6 +231,10 @@ class World:
             drives.close()
 
     # --- inside ---------------------------------------------------------------------------------------------------
+    def _next_answer(self) -> float:
+        """Return when the next SDO answer is ready [s]."""
+        return min((node.next_answer for node in self._answering), default=math.inf)
+
     def _send(self, node_id: int, frame: Frame) -> None:
         sender = ("node", node_id)
         if self.wire.waiting(sender) < TRANSMIT_BUFFER:

@@ -51,8 +51,8 @@ class Node:
         store: The file that is its non-volatile memory; without one it lasts as long as the node.
         bit_rate: That of the bus [bit/s], and the node's own while it has stored none. With another one stored the node
             is mute and deaf, as its controller understands nothing. None: the factory's, and whatever is stored fits.
-        takes_time: Its firmware takes no more frames in a cycle than it can, the next wait in its receive buffer; and
-            from an NMT reset to the boot-up message it needs the device's time, deaf and mute.
+        takes_time: Its firmware takes no more frames in a cycle than it can, the next wait in its receive buffer; from
+            an NMT reset to the boot-up message it needs the device's time, deaf and mute, and so does an SDO answer.
 
     Raises:
         ValueError: For a number that no node can have, axes that the drives do not have, a bit rate that the device
@@ -113,9 +113,12 @@ class Node:
         self._make_services(sorted({entry.index for entry in entries}))
         self._handlers: dict[int, tuple[Callable[[bytes, float], None], ...]] = {}
         self._frames_left = self._frames_per_cycle = device.canopen.frames_per_cycle if takes_time else math.inf
+        self._takes_time = takes_time
         self._boot_time = device.canopen.boot_time if takes_time else 0.0
         self._boots_at: float | None = None  # while it boots
         self._boot: Callable[[float], None] = self._reset_communication
+        self._answers: deque[tuple[float, Frame]] = deque()  # of SDO, and when they are ready [s]
+        self._work = 0.0  # s that the present request takes
         self._received: deque[Frame] = deque()
         self._has_lost = False  # frames, since its receive buffer was last half empty
 
@@ -159,6 +162,17 @@ class Node:
         elif not self._has_lost:
             self._has_lost = True
             self.overrun(now, "receive")
+
+    @property
+    def next_answer(self) -> float:
+        """When its next SDO answer is ready [s]; infinite while none is under way."""
+        return self._answers[0][0] if self._answers else math.inf
+
+    def answer(self, now: float) -> None:
+        """Send the SDO answers that are ready at `now` [s]."""
+        self._now = now
+        while self._answers and self._answers[0][0] <= now + EPSILON:
+            self._transmit(self._answers.popleft()[1])
 
     def _accepts(self, frame: Frame) -> bool:
         """Return whether a frame passes the controller's filters."""
@@ -237,6 +251,7 @@ class Node:
             return
         self._is_online = False
         self._received.clear()
+        self._answers.clear()
         for axis in self._axes:
             axis.trip()
         self._react(COMMUNICATION_ERROR)
@@ -289,7 +304,7 @@ class Node:
         self.state = NmtState.INITIALISING
         self._leaves_for_bootloader = False
         self._received.clear()
-        self._sdo.close()
+        self._close_sdo()
         self._emergency.clear()
         self._conditions.clear()
         self._guarding.reset()
@@ -369,6 +384,7 @@ class Node:
         self.state = NmtState.INITIALISING
         self._is_online = False
         self._received.clear()
+        self._answers.clear()
         self._boots_at, self._boot = now + self._boot_time, boot
 
     def _enter(self, state: NmtState, *, is_commanded: bool = False) -> None:
@@ -381,7 +397,7 @@ class Node:
             for sent in self._tpdos:
                 sent.start()
         elif state is NmtState.STOPPED:
-            self._sdo.close()
+            self._close_sdo()
             # The one link between the two automata (manual, section 2.2). A stop after an error has been told already.
             tripped = [axis.trip() for axis in self._axes]
             if any(tripped) and is_commanded:
@@ -390,18 +406,29 @@ class Node:
     def _on_sdo(self, data: bytes, now: float) -> None:
         if not nmt.SERVICES[self.state].sdo:
             return
+        self._work = self._device.canopen.sdo_time
         try:
             answer = self._sdo.request(data, now)
         except PowerLostError:
             self.power_on(now)
             return
         if answer is not None:
-            self._transmit(Frame(frames.SDO_RESPONSE + self.node_id, answer))
+            frame = Frame(frames.SDO_RESPONSE + self.node_id, answer)
+            if self._takes_time and not self._leaves_for_bootloader:
+                begins = max(now, self._answers[-1][0]) if self._answers else now  # one request after the other
+                self._answers.append((begins + self._work, frame))
+            else:
+                self._transmit(frame)
         if self._leaves_for_bootloader:
             # The boot loader does not speak CANopen, and under it no firmware drives the motor: until power-on.
             self._is_online = False
             self.state = NmtState.INITIALISING
             self._objects.restart(self._mask)
+
+    def _close_sdo(self) -> None:
+        """Forget an open transfer, and the answers that are under way."""
+        self._sdo.close()
+        self._answers.clear()
 
     def _on_sync(self, data: bytes, now: float) -> None:
         # CiA 301: without or with a counter. This device's table of emergencies has none for another length (8240h).
@@ -535,6 +562,7 @@ class Node:
         self._commit({name: {} for name in names})
 
     def _commit(self, changed: dict[str, Section]) -> None:
+        self._work = self._device.canopen.store_time
         try:
             self._store.save(changed)
         except OSError as error:

@@ -67,6 +67,8 @@ class CanopenBehaviour(NamedTuple):
     Attributes:
         sdo_timeout: Time after which the server gives a transfer up.
         boot_time: From an NMT reset to the boot-up message, where time is real.
+        sdo_time: From an SDO request to its answer, where time is real.
+        store_time: The same of a request that stores or restores parameters (1010h, 1011h).
         frames_per_cycle: Frames that the firmware takes in a communication cycle of 1 ms, where time is real.
         receive_buffer: Frames that wait until it does; more are lost.
         inhibit_unit: Unit of a TPDO's inhibit time.
@@ -81,6 +83,8 @@ class CanopenBehaviour(NamedTuple):
 
     sdo_timeout: float
     boot_time: float
+    sdo_time: float
+    store_time: float
     frames_per_cycle: int
     receive_buffer: int
     inhibit_unit: float
@@ -353,6 +357,8 @@ def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
     return CanopenBehaviour(
         sdo_timeout=data["sdo_timeout"],
         boot_time=data["boot_time"],
+        sdo_time=data["sdo_time"],
+        store_time=data["store_time"],
         frames_per_cycle=data["frames_per_cycle"],
         receive_buffer=data["receive_buffer"],
         inhibit_unit=data["inhibit_unit"],

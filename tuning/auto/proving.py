@@ -22,6 +22,7 @@ from drive_env.trials.gain_trial import PHASES, Trial, Trials, measured_cost, so
 from drive_env.trials.oscillation import OSCILLATION, shakes
 from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
 from drive_env.trials.score import TRIP, Terms, cost
+from tuning.stop_causes import UNTOLD, stop_causes
 
 if TYPE_CHECKING:
     from tuning.response.linear_model import Plant
@@ -156,6 +157,7 @@ class ProvingGround:
         self._origin = drives.read(cia402.POSITION_ACTUAL)
         self._direction = np.ones(target.num_axes, np.int64)
         self._shaken = np.zeros(target.num_axes, bool)
+        self.causes = [UNTOLD] * target.num_axes  # emergencies of each axis in the last trial
         self.moves = np.zeros(target.num_axes, np.int64)
         self.aborts = np.zeros(target.num_axes, np.int64)
         self.violations = np.zeros(target.num_axes, np.int64)
@@ -340,6 +342,7 @@ class ProvingGround:
     def _run(self, gains: Integers, where: Mask) -> Trial:
         self._begin(where)
         self.moves[where] += len(PHASES)
+        stop_causes(self.target.drives)  # of before
         tried = self._trials.run(gains, self.safe, self.move, self._origin, self._direction, where)
         # A trial ends where its move did, and the next one goes the other way.
         self._origin = np.where(where, self._origin + self._direction * self.move.distance, self._origin)
@@ -427,6 +430,7 @@ class ProvingGround:
         known = self.target.device.gains
         costs = measured_cost(tried.costs(softness(known, gains) / softness(known, self._reference)))
         stopped: Mask = np.asarray(tried.aborted.any(axis=0))
+        self.causes = stop_causes(self.target.drives)
         self.aborts[where & stopped] += 1
         self._shaken |= where & stopped
         overshoot = terms.overshoot[:2].max(axis=0)
@@ -439,19 +443,22 @@ class ProvingGround:
             costs,
             stopped,
             tried.culprit,
-            self._reasons(tried.aborted, overshoot, left),
+            self._reasons(tried.aborted, overshoot, left, self.causes),
             terms.noise.max(axis=0),
             overshoot,
             terms.settling[:2].mean(axis=0),
         )
 
-    def _reasons(self, stopped: Mask, overshoot: Floats, left: Floats) -> tuple[str, ...]:
+    def _reasons(
+        self, stopped: Mask, overshoot: Floats, left: Floats, causes: Sequence[str] | None = None
+    ) -> tuple[str, ...]:
         """Return why axes do not pass, "" where they do.
 
         Args:
             stopped: Whether they were stopped, a row for each phase, (phases, num_axes).
             overshoot: Of the move, (num_axes,).
             left: Of the move, what was missing at its end, (num_axes,).
+            causes: What the drives have told meanwhile, if that was read.
         """
         counts = np.maximum(np.abs(self.move.distance) / self.move.increments * self.move.counts, 1.0)
         reasons = []
@@ -459,6 +466,8 @@ class ProvingGround:
             if stopped[:, axis].any():
                 phase = PHASES[int(stopped[:, axis].argmax())]
                 reason = f"stopped in the {phase}: it oscillated or went into fault (cut off within 50 ms)"
+                if causes is not None and causes[axis] != UNTOLD:
+                    reason += f"; the drive reported {causes[axis]}"
             elif overshoot[axis] > OVERSHOOT:
                 reason = (
                     f"its overshoot was {100.0 * overshoot[axis]:.0f} % of the move; {100.0 * OVERSHOOT:.0f} % is "

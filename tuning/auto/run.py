@@ -16,7 +16,7 @@ from drive_env.trials.positioning import wrapped
 from tuning.auto.result import AxisRun, Result
 from tuning.auto.trial_order import OTHERS
 from tuning.identify.wiring import Key, write_wiring
-from tuning.stop_causes import stop_causes
+from tuning.stop_causes import UNTOLD, stop_causes
 
 if TYPE_CHECKING:
     from tuning.auto.proving import ProvingGround, Shown
@@ -150,6 +150,9 @@ class AutoRun:
         drives = self.target.drives
         faulted = self.going & cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
         causes = stop_causes(drives)
+        if self.ground is not None:  # which has read those of its last trial
+            both = zip(causes, self.ground.causes, strict=True)
+            causes = [before if cause == UNTOLD else cause for cause, before in both]
         return {axis: causes[axis] for axis in map(int, np.flatnonzero(faulted))}
 
     def drop_faults(self, meanwhile: str) -> None:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from drive_env import __version__
 from drive_env.own_packages import ROOT
@@ -37,6 +38,28 @@ def hash_of_sources(folders: Iterable[Path] = _OURS) -> str:
 
 # As this process was loaded: a file that is edited later changes what it reads, but not what it runs.
 SOURCES = hash_of_sources()
+
+
+def check_begun(what: object, recorded: object, remedy: str) -> None:
+    """Raise ValueError, with both hashes, if what is to be continued was begun with other sources.
+
+    Args:
+        what: The file or folder that keeps it.
+        recorded: The hash in it, if any.
+        remedy: What else its user can do.
+    """
+    if recorded != SOURCES:
+        raise ValueError(
+            f"{what} holds results of sources {recorded or 'unknown'}, these are {SOURCES}, and they are not mixed; "
+            f"continue with the sources that it was begun with, or {remedy}"
+        )
+
+
+def check_study(study: Any, file: Path, remedy: str) -> None:
+    """Have an Optuna study carry the hash of the sources; `check_begun` of one that has trials already."""
+    if not study.trials:
+        study.set_user_attr("sources", SOURCES)
+    check_begun(file, study.user_attrs.get("sources"), remedy)
 
 
 def check_sources(expected: str) -> None:

@@ -86,12 +86,10 @@ class ShardLog:
             first = _header(file)
             if first is None:
                 return 0  # killed before the first line was complete
-            if first.get("sources") != provenance.SOURCES:
-                raise ShardLogError(
-                    f"{self.path} holds results of sources {first.get('sources', 'unknown')}, these are "
-                    f"{provenance.SOURCES}, and they are not mixed; continue with the sources that it was begun with, "
-                    "or remove it"
-                )
+            try:
+                provenance.check_begun(self.path, first.get("sources"), "remove it")
+            except ValueError as error:
+                raise ShardLogError(str(error)) from None
             if first.get("run") != self._key:
                 raise ShardLogError(
                     f"{self.path} holds results of another experiment, or of another version; give the experiment that "

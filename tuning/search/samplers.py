@@ -19,6 +19,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tuning.runs.provenance import check_study
+
 Floats = NDArray[np.float64]
 
 SAMPLERS = ("random", "grid", "tpe", "cmaes", "gp")
@@ -153,6 +155,8 @@ class _Optuna:
         self._study = optuna.create_study(
             storage=storage, study_name=name, directions=["minimize"] * objectives, load_if_exists=True
         )
+        if journal is not None:
+            check_study(self._study, journal, "give another --journal")
         # Points that were asked for when the study was broken off come first.
         running = optuna.trial.TrialState.RUNNING
         self._running = [trial._trial_id for trial in self._study.get_trials(deepcopy=False, states=(running,))]
