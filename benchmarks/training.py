@@ -17,7 +17,8 @@ CORES = 2
 def training(environment: str, section: str | None, rollouts: int) -> dict[str, float]:
     """Return steps/s of the fastest rollout with its update, and the share of its time that the environment took."""
     from agents.training import hyperparameters
-    from agents.training.train import Progress, TrainingRun, train
+    from agents.training.train import train
+    from agents.training.training_run import Progress, TrainingRun
 
     given = hyperparameters.load(environment, "ppo", "quick", section=section)
     given["n_timesteps"] = rollouts * given["n_envs"] * given["n_steps"]

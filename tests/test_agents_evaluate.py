@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from agents.commands.cli import app
 from agents.evaluation import episode_log, evaluation_plots, gap
-from agents.evaluation.evaluation import Evaluation, as_on_a_bus, evaluate
+from agents.evaluation.evaluation import Evaluation, GivenDrives, as_on_a_bus, evaluate
 from agents.evaluation.evaluation_shards import Written, evaluate_elsewhere
 from agents.evaluation.on_the_bus import target_for
 from agents.evaluation.scores import interval
@@ -239,13 +239,13 @@ def test_over_can_in_lockstep_actions_and_figures_are_the_same():
     found = {}
     with EmulatedDrives(load="two_mass", num_threads=1) as emulated:
         found["emulator"] = evaluate(
-            Gentle(), "tracking", SHORT, drives=as_on_a_bus(emulated), episodes=2, side="one", guard=PATIENT
+            Gentle(), "tracking", SHORT, on=GivenDrives(as_on_a_bus(emulated), guard=PATIENT, side="one"), episodes=2
         )
     world = World(lockstep=True)
     world.add(EmulatedDrives(load="two_mass", num_threads=1), [1])
     bus = WorldBus(world)
     with CanDrives(bus=bus, pace="lockstep", safety=Limits(velocity=100 * TURN)) as drives:
-        found["bus"] = evaluate(Gentle(), "tracking", SHORT, drives=drives, episodes=2, guard=PATIENT)
+        found["bus"] = evaluate(Gentle(), "tracking", SHORT, on=GivenDrives(drives, guard=PATIENT), episodes=2)
     bus.shutdown()
     world.close()
     for one, two in zip(found["emulator"].episodes, found["bus"].episodes, strict=True):

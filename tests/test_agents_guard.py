@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from test_parity import WorldBus
 
-from agents.evaluation.evaluation import as_on_a_bus, evaluate
+from agents.evaluation.evaluation import GivenDrives, as_on_a_bus, evaluate
 from agents.policies.deadline import Deadline, DeadlineError
 from agents.policies.guard import KEPT, GuardedPolicy, GuardLimits, PolicyStoppedError, stop
 from agents.policies.policy import PolicyError
@@ -104,7 +104,7 @@ def test_over_can_the_drive_is_stopped_and_left_disabled(wrong, guard, message):
         CanDrives(bus=bus, pace="lockstep", safety=Limits(velocity=100 * TURN)) as drives,
         pytest.raises(PolicyStoppedError, match=message),
     ):
-        evaluate(Scripted(wrong), "tracking", OPTIONS, drives=drives, episodes=1, guard=guard)
+        evaluate(Scripted(wrong), "tracking", OPTIONS, on=GivenDrives(drives, guard=guard), episodes=1)
     assert max(speeds) > 2 * TURN  # it turned
     assert is_disabled(emulated) and abs(int(emulated.read(0x606C)[0])) < TURN // 4
     bus.shutdown()
@@ -115,7 +115,9 @@ def test_over_can_the_drive_is_stopped_and_left_disabled(wrong, guard, message):
 def test_drives_in_this_process_are_stopped_too(wrong, guard, message):
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
         with pytest.raises(PolicyStoppedError, match=message):
-            evaluate(Scripted(wrong), "tracking", OPTIONS, drives=as_on_a_bus(emulated), episodes=1, guard=guard)
+            evaluate(
+                Scripted(wrong), "tracking", OPTIONS, on=GivenDrives(as_on_a_bus(emulated), guard=guard), episodes=1
+            )
         assert is_disabled(emulated) and abs(int(emulated.read(0x606C)[0])) < TURN // 4
 
 
@@ -136,7 +138,7 @@ def test_a_policy_that_fails_at_once_enables_nothing():
 
         emulated.write = watch
         with pytest.raises(PolicyStoppedError, match="IndexError"):
-            evaluate(Scripted(fail, after=0), "tracking", OPTIONS, drives=as_on_a_bus(emulated), episodes=1)
+            evaluate(Scripted(fail, after=0), "tracking", OPTIONS, on=GivenDrives(as_on_a_bus(emulated)), episodes=1)
         assert {value for name, value in words if name == 0x6040} <= {0x00, 0x02}  # disable voltage, quick stop
 
 
@@ -151,9 +153,8 @@ def test_a_first_answer_may_take_its_time():
 
     policy.then = load_first
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
-        limits = GuardLimits(stall=0.4)
-        found = evaluate(policy, "tracking", OPTIONS | {"duration": 0.01}, drives=as_on_a_bus(emulated), episodes=1,
-                         guard=limits)  # fmt: skip
+        on = GivenDrives(as_on_a_bus(emulated), guard=GuardLimits(stall=0.4))
+        found = evaluate(policy, "tracking", OPTIONS | {"duration": 0.01}, on=on, episodes=1)
     assert len(found.seeds) == 1
 
 
@@ -201,7 +202,11 @@ def test_the_stop_is_a_ramp_and_not_a_coasting():
 def test_after_the_evaluation_the_drive_is_at_rest_and_disabled():
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
         found = evaluate(
-            Scripted(None, after=10**6), "tracking", OPTIONS, drives=as_on_a_bus(emulated), episodes=2, guard=PATIENT
+            Scripted(None, after=10**6),
+            "tracking",
+            OPTIONS,
+            on=GivenDrives(as_on_a_bus(emulated), guard=PATIENT),
+            episodes=2,
         )
         assert is_disabled(emulated) and len(found.seeds) == 2 and not found.violations
 
@@ -222,7 +227,7 @@ def test_gains_offsets_and_mode_are_as_before(environment, options, then):
         policy = Acting(then, after=10**6 if then is None else 5)
         options = {"load": "inertia", "duration": 0.1, **options}
         with contextlib.nullcontext() if then is None else pytest.raises(PolicyStoppedError):
-            evaluate(policy, environment, options, drives=as_on_a_bus(emulated), episodes=1, guard=PATIENT)
+            evaluate(policy, environment, options, on=GivenDrives(as_on_a_bus(emulated), guard=PATIENT), episodes=1)
         assert [int(emulated.read(name)[0]) for name in KEPT] == before and is_disabled(emulated)
 
 
@@ -232,7 +237,13 @@ def test_an_interrupt_stops_the_drive_too():
 
     with EmulatedDrives(load="inertia", num_threads=1) as emulated:
         with pytest.raises(KeyboardInterrupt):
-            evaluate(Scripted(interrupt), "tracking", OPTIONS, drives=as_on_a_bus(emulated), episodes=1, guard=PATIENT)
+            evaluate(
+                Scripted(interrupt),
+                "tracking",
+                OPTIONS,
+                on=GivenDrives(as_on_a_bus(emulated), guard=PATIENT),
+                episodes=1,
+            )
         assert is_disabled(emulated)
 
 
@@ -250,7 +261,7 @@ def test_in_real_time_the_drive_stops_while_the_policy_still_stalls():
             CanDrives(channel=hub.channel, safety=Limits(velocity=100 * TURN, stall=1.0)) as drives,
         ):
             with pytest.raises((PolicyStoppedError, SafetyError), match=r"gave no answer|quick-stopped"):
-                evaluate(policy, "tracking", OPTIONS, drives=drives, episodes=1, guard=GuardLimits(stall=1.0))
+                evaluate(policy, "tracking", OPTIONS, on=GivenDrives(drives, guard=GuardLimits(stall=1.0)), episodes=1)
             assert is_disabled(emulated) and not stopped.is_set()
     finally:
         stopped.set()

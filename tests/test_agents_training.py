@@ -24,7 +24,8 @@ from agents.training import train as training
 from agents.training.hyperparameters import ALGORITHMS, HyperparameterError, read_value
 from agents.training.imitation import imitate
 from agents.training.tasks import ENVIRONMENTS, environment_name, make_environments
-from agents.training.train import AGENT, CHECKPOINT, TABLE, DivergedError, TrainingRun, train
+from agents.training.train import DivergedError, train
+from agents.training.training_run import AGENT, CHECKPOINT, TABLE, TrainingRun
 from tuning.runs import provenance
 from tuning.runs.pools import PoolError
 
@@ -73,7 +74,7 @@ class StoppedError(Exception):
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_resumed_run_equals_an_uninterrupted_one(algorithm, tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "ROWS", 1000)  # a row for each of the few rollouts
+    monkeypatch.setattr("agents.training.segments.ROWS", 1000)  # a row for each of the few rollouts
     run = tiny(algorithm=algorithm, timesteps=480)
     whole = train(run, tmp_path / "whole")
     seen = []

@@ -8,7 +8,7 @@ from matplotlib.colors import to_hex
 from matplotlib.image import imread
 
 from tuning.response.bode import GREY, MEASURED, TRACED, bode_figure, write_bode
-from tuning.response.frequency_response import measure
+from tuning.response.frequency_response import Signal, measure
 from tuning.target import emulated
 
 
@@ -16,7 +16,9 @@ from tuning.target import emulated
 def response():
     with np.errstate(all="raise", under="ignore"):
         found = measure(
-            emulated(load="inertia", parameters={"motor.encoder_interpolation": 16.0}), traced=True, high=400
+            emulated(load="inertia", parameters={"motor.encoder_interpolation": 16.0}),
+            traced=True,
+            signal=Signal(high=400),
         )
     coherence = found.coherence.copy()
     coherence[10:15] = 0.5

@@ -12,7 +12,7 @@ from drive_env.devices import find_device
 from drive_env.gains import BASELINE_RULE, rule_gains, write_gains
 from drive_env.motors import find_motor
 from tuning.identify.true_plant import true_plant
-from tuning.response.frequency_response import measure
+from tuning.response.frequency_response import Signal, measure
 from tuning.response.held_samples import seen_by_bus
 from tuning.response.linear_model import Plant, position_open_loop, velocity_open_loop
 from tuning.response.margins import margins
@@ -41,7 +41,7 @@ def measured():
         found = {}
         for load in ("inertia", "two_mass"):
             target, plants, gains = tuned(load, num_machines=4, seed=1, randomise=["load"], parameters=FINE)
-            found[load] = target, plants, gains, measure(target, high=400.0, traced=True)
+            found[load] = target, plants, gains, measure(target, signal=Signal(high=400.0), traced=True)
         return found
 
 
@@ -84,14 +84,14 @@ def test_images_of_held_set_points_are_taken_out(measured):
 
 
 def test_what_lies_above_the_frequencies_looked_at_gives_no_gain_margin():
-    response = measure(tuned("inertia", parameters=FINE)[0], high=150.0)
+    response = measure(tuned("inertia", parameters=FINE)[0], signal=Signal(high=150.0))
     assert math.isnan(response.margins().gain_db)
     assert math.isfinite(response.margins().phase_deg)
 
 
 def test_the_position_loop_has_the_model_s_margin():
     target, plants, gains = tuned("two_mass", num_machines=2, parameters=FINE)
-    response = measure(target, "position", high=30.0)
+    response = measure(target, "position", signal=Signal(high=30.0))
     for axis, plant in enumerate(plants):
         f = np.geomspace(2.0, 400.0, 2000)
         expected = margins(f, position_open_loop(target.device, plant, gains[axis], f))
@@ -104,7 +104,7 @@ def test_the_position_loop_has_the_model_s_margin():
 def test_a_chirp_says_what_a_multisine_says():
     target, plants, gains = tuned("inertia", parameters=FINE)
     expected = margins(GRID, velocity_open_loop(target.device, plants[0], gains[0], GRID))
-    found = measure(target, kind="chirp").margins()
+    found = measure(target, signal=Signal("chirp")).margins()
     assert found.phase_deg == pytest.approx(expected.phase_deg, abs=4.0)
     assert found.crossover_hz == pytest.approx(expected.crossover_hz, rel=0.06)
 
@@ -150,7 +150,7 @@ def test_inertia_delay_and_filter_are_found(measured, load):
 
 def test_a_filter_that_is_another_is_told_apart():
     target, _, _ = tuned("inertia", num_machines=2, parameters=FINE | {"stage.velocity_filter": [250.0, 600.0]})
-    response = measure(target, high=400.0)
+    response = measure(target, signal=Signal(high=400.0))
     for axis, corner in enumerate((250.0, 600.0)):
         assert response.estimates(axis)["velocity_filter"].value == pytest.approx(corner, rel=0.08)
 
@@ -175,7 +175,7 @@ def test_over_a_bus_nine_lines_in_ten_are_coherent_in_two_seconds(interpolation,
         target = Target(
             drives, find_device("tmcm1636"), motor, supply, -free, free, motor.rated_speed, motor.rated_current
         )
-        response = measure(target, high=high)
+        response = measure(target, signal=Signal(high=high))
     assert response.f[0] == 5.0
     assert response.f[-1] == high
     assert np.mean(response.coherence[:, 0] > COHERENT) >= 0.9
@@ -183,7 +183,7 @@ def test_over_a_bus_nine_lines_in_ten_are_coherent_in_two_seconds(interpolation,
     assert response.peak_current[0] < 1.15 * motor.rated_current  # what is asked for; the sensor's noise comes on top
     assert not response.traced.any()
     # And it is what the emulator says without a bus, to the bit.
-    own = measure(emulated(**machine), high=high)
+    own = measure(emulated(**machine), signal=Signal(high=high))
     assert np.array_equal(own.open_loop, response.open_loop)
 
 
@@ -200,15 +200,15 @@ def test_a_bus_cannot_be_traced_nor_asked_beyond_400_hz():
         with pytest.raises(ValueError, match="exists on emulated drives only; on a bus up to 400 Hz can be measured"):
             measure(target, traced=True)
         with pytest.raises(ValueError, match="450 Hz must be at most 400 Hz"):
-            measure(target, high=450.0)
+            measure(target, signal=Signal(high=450.0))
 
 
 # --- what is not truth ------------------------------------------------------------------------------------------------
 def test_noise_is_not_coherent():
     noisy = {"stage.adc_noise": 3.0, "motor.cogging_torque": 0.03}
     target, _, _ = tuned("inertia", parameters=noisy, current=0.3)
-    response = measure(target, high=200.0)
-    quiet = measure(tuned("inertia", parameters=FINE)[0], high=200.0)
+    response = measure(target, signal=Signal(high=200.0))
+    quiet = measure(tuned("inertia", parameters=FINE)[0], signal=Signal(high=200.0))
     assert response.trusted.mean() < 0.5
     assert quiet.trusted.mean() > 0.95
     assert np.isfinite(response.open_loop).all()
@@ -274,7 +274,7 @@ def test_an_offset_of_the_user_changes_nothing():
 
 def test_axes_of_one_machine_are_shaken_one_after_the_other():
     target = emulated(load="gantry")
-    response = measure(target, high=100.0)
+    response = measure(target, signal=Signal(high=100.0))
     assert response.drive_time > 3.0
     assert np.isfinite(response.open_loop).all()
     assert all(fit is not None for fit in response.fits)
@@ -384,8 +384,8 @@ def test_a_loop_that_oscillates_is_no_response():
     ("arguments", "message"),
     [
         ({"loop": "current"}, "no loop is named 'current'; there are velocity, position"),
-        ({"kind": "noise"}, "no excitation is named 'noise'; there are multisine, chirp"),
-        ({"resolution": 3.3}, "must divide 1000 Hz"),
+        ({"signal": Signal("noise")}, "no excitation is named 'noise'; there are multisine, chirp"),
+        ({"signal": Signal(resolution=3.3)}, "must divide 1000 Hz"),
         ({"where": np.array([False])}, "no axis is chosen"),
     ],
 )

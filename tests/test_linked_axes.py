@@ -9,7 +9,7 @@ from drive_env import cia402, motion
 from mechanics.loads import LOADS, find_load
 from mechanics.shaft import one
 from tuning.identify.linked_axes import are_linked
-from tuning.response.frequency_response import measure
+from tuning.response.frequency_response import Signal, measure
 from tuning.target import emulated
 
 STATUS, CURRENT, MODE = 0x6041, 0x6077, 0x6060
@@ -28,7 +28,7 @@ def test_axes_under_gravity_hold_their_places_while_another_one_is_shaken():
         assert not target.linked
         motion.select_mode(target.drives, "pp")
         before = target.drives.read(MODE)
-        response = measure(target, "velocity", high=200.0)
+        response = measure(target, "velocity", signal=Signal(high=200.0))
         assert not enabled(target.drives).any()
         np.testing.assert_array_equal(target.drives.read(MODE), before)
     good = response.trusted.mean(axis=0)
@@ -43,7 +43,7 @@ def test_axes_that_pull_at_one_thing_run_along(were_on):
         assert target.linked
         if were_on:
             motion.enable(target.drives, mode="csv")
-        response = measure(target, "velocity", high=200.0)
+        response = measure(target, "velocity", signal=Signal(high=200.0))
         assert enabled(target.drives).all() == were_on
         if were_on:  # and nothing is left that one pulls at another with, beside friction
             target.drives.advance(0.3)

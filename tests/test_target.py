@@ -18,7 +18,7 @@ from drive_env.bus.world import World
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.errors import refused
 from mechanics.loads import LOADS
-from tuning.commands.options import errors_as_exit_codes, open_target, parse_travel
+from tuning.commands.options import TargetOptions, errors_as_exit_codes, open_target, parse_travel
 from tuning.target import FREE, emulated, on_bus, timed
 
 TURN = 2.0 * math.pi
@@ -138,11 +138,11 @@ def test_travel_is_given_in_turns(text, ends):
 
 
 def test_every_axis_of_a_machine_may_have_its_own_travel():
-    with open_target(load="gantry", travel="-0.2:0.1, 0:0.3", machines=2) as target:
+    with open_target(TargetOptions(load="gantry", travel="-0.2:0.1, 0:0.3", machines=2)) as target:
         assert target.low == pytest.approx(TURN * np.array([-0.2, 0.0, -0.2, 0.0]))
         assert target.high == pytest.approx(TURN * np.array([0.1, 0.3, 0.1, 0.3]))
     with pytest.raises(ValueError, match="3 ranges of travel are given"):
-        open_target(load="gantry", travel="-1:1,-1:1,-1:1")
+        open_target(TargetOptions(load="gantry", travel="-1:1,-1:1,-1:1"))
 
 
 @pytest.mark.parametrize("text", ["", "0.3", "a:b", "1:2", "-2:-1", "0:0", "0.1:-0.1", "nan:1", "1:"])
@@ -153,7 +153,7 @@ def test_a_travel_that_is_none_is_refused(text):
 
 def test_without_bus_the_drives_are_emulated_whatever_the_environment_says(monkeypatch):
     monkeypatch.setenv("DRIVE_ENV_CHANNEL", "can0")
-    with open_target(load="inertia", travel="-1:1", machines=2) as target:
+    with open_target(TargetOptions(load="inertia", travel="-1:1", machines=2)) as target:
         assert target.drives.machine is not None
         assert target.high.tolist() == [TURN, TURN]
 
@@ -169,7 +169,7 @@ def test_without_bus_the_drives_are_emulated_whatever_the_environment_says(monke
 ])  # fmt: skip
 def test_a_mistake_in_the_options_says_what_to_do(options, message):
     with pytest.raises(ValueError, match=message):
-        open_target(**options)
+        open_target(TargetOptions(**options))
 
 
 @pytest.mark.parametrize(("error", "code"), [

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -135,8 +135,6 @@ def emulated(
     *,
     num_machines: int = 1,
     seed: int = 0,
-    randomise: bool | Collection[str] = False,
-    parameters: Mapping[str, ArrayLike] | None = None,
     supply: float | None = None,
     travel: Travel | Iterable[Travel] | None = None,
     speed: float | None = None,
@@ -152,15 +150,13 @@ def emulated(
         motor: Name of the motor; the drives come up commissioned for it.
         num_machines: Machines, each with its drives.
         seed: Seed of everything random.
-        randomise: Parameters to draw per machine: True for all, or names or groups.
-        parameters: True machine parameters [SI] that replace defaults and draws: one value or one per machine.
         supply: Supply voltage [V]; the motor's by default. The machines have it, and the tuner knows it.
         travel: How far the rotors may turn [rad], less than the load lets them: one (low, high), or one per axis of a
             machine; the load's own by default.
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
         factory_fresh: Leave the drives as they come out of the box, all gains 0; of the emulator's default motor only.
-        options: What `EmulatedDrives` takes besides.
+        options: What `EmulatedDrives` takes besides, such as `randomise` and `parameters`.
 
     Raises:
         ValueError: For an unknown name, a machine that cannot be, or a travel that does not hold 0.
@@ -179,8 +175,6 @@ def emulated(
         motor=None if factory_fresh else motor,
         num_machines=num_machines,
         seed=seed,
-        randomise=randomise,
-        parameters=parameters,
         supply=supply,
         **options,
     )

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -31,6 +32,11 @@ from agents.commands.options import (
 from drive_env.commands.options import DeviceName, Yes, was_typed
 from drive_env.commands.tables import print_lines
 from tuning.commands.options import ask_to_turn
+
+if TYPE_CHECKING:
+    from agents.evaluation.evaluation import Evaluation, GivenDrives
+    from agents.policies.guard import GuardLimits
+    from agents.policies.open_policy import LoadedPolicy
 
 EMULATOR = "emulator"
 BUS_EPISODES, EPISODES = 8, 64
@@ -131,29 +137,11 @@ def evaluate(
     programs disturb: on Linux, `chrt -f 10 drive-agent evaluate ...` goes before them.
     """
     with errors_as_exit_codes():
-        for name, value in (("--episodes", episodes), ("--gap", gap), ("--seed", seed + 1)):
-            if value is not None and value < 1:
-                least = 0 if name == "--seed" else 1
-                raise ValueError(f"{name} {value - 1 + least} is too small; give {least} or more")
-        for name, limit in (("--stall", stall), ("--saturation", saturation)):
-            if limit is not None and not 0.0 <= limit < math.inf:
-                raise ValueError(f"{name} {limit:g} must be a time [s], 0 for no limit")
+        _check_numbers(episodes, gap, seed, {"--stall": stall, "--saturation": saturation})
         if card:
             _tell_card(policy, json)
             return
-        on_bus = any(was_typed(context, one) for one in BUS_OPTIONS)
-        if lockstep and not on_bus and gap is None:
-            raise ValueError("--lockstep is for a bus; give its --channel, or --gap")
-        for name in OF_A_BUS_ALONE:
-            if not on_bus and gap is None and was_typed(context, name):
-                raise ValueError(f"--{name} is for a bus; give its --channel, or leave --{name} out")
-        away = [name for name in ELSEWHERE if was_typed(context, name)]
-        if away and (on_bus or gap is not None or replay is not None):
-            raise ValueError(
-                f"--{away[0]} is for episodes on the emulator; leave it out on a bus, with --gap and with --replay"
-            )
-        if gap is not None and (extra := [one for one in NOT_OF_A_GAP if was_typed(context, one)]):
-            raise ValueError(f"--gap serves its own machines, one episode each; leave --{extra[0]} out")
+        _check_side(context, lockstep, gap, replay)
         recording = None if replay is None or replay.suffix.lower() == ".csv" else _recording(replay)
         recorded = None if recording is None else recording.environment
         loaded, configuration = _open(policy, environment, load, config, recorded, trust)
@@ -165,26 +153,83 @@ def evaluate(
         if gap is not None:
             _both_sides(loaded, configuration, gap, seed, lockstep, guard, folder, json)
             return
-        count = episodes or (BUS_EPISODES if on_bus else EPISODES)
-        options = {"episodes": count, "seed": seed, "guard": guard, "name": policy}
-        before = _way_back(out) if on_bus else None
-        if on_bus and not lockstep:  # what waits for SYNC is emulated
-            ask_to_turn(node, yes)
-        found = (
-            _on_bus(loaded, configuration, options, sensor, before, device=device, interface=interface,
-                    channel=channel, nodes=node or (1,), lockstep=lockstep,
-                    **({} if bitrate is None else {"bitrate": bitrate}))
-            if before
-            else _on_emulator(loaded, configuration, options)
-            if not away
-            else _elsewhere(loaded, configuration, options, trust, workers, cluster)
-        )  # fmt: skip
-        gaps: list[str] = []
-        if against is not None:
-            gaps = _against(loaded, configuration, options, against, found)
+        on_bus = bool(_typed(context, BUS_OPTIONS))
+        run = _Run(loaded, configuration, policy, episodes or (BUS_EPISODES if on_bus else EPISODES), seed, guard)
+        before = None
+        if on_bus:
+            before = _way_back(out)
+            if not lockstep:  # what waits for SYNC is emulated
+                ask_to_turn(node, yes)
+            found = _on_bus(run, sensor, before, device=device, interface=interface, channel=channel,
+                            nodes=node or (1,), lockstep=lockstep,
+                            **({} if bitrate is None else {"bitrate": bitrate}))  # fmt: skip
+        elif _typed(context, ELSEWHERE):
+            found = _elsewhere(run, trust, workers, cluster)
+        else:
+            found = _on_emulator(run)
+        gaps = [] if against is None else _against(run, against, found)
         _tell(found, gaps, json, before=before)
         if folder is not None:
             _save(found, folder, gaps, json)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What is evaluated, wherever: a policy in its environment, by so many episodes."""
+
+    loaded: LoadedPolicy
+    configuration: dict[str, Any]
+    name: str  # of the policy, as it was typed
+    episodes: int
+    seed: int
+    guard: GuardLimits  # on given drives
+
+    @property
+    def environment(self) -> str:
+        """Name of the environment."""
+        assert self.loaded.environment is not None, "_open fills it in"
+        return self.loaded.environment
+
+    def evaluate(self, told: Callable[[float], None], on: GivenDrives | None = None) -> Evaluation:
+        """Run the episodes, on given drives or on emulated machines of the environment's own."""
+        from agents.evaluation import evaluation
+
+        return evaluation.evaluate(
+            self.loaded.policy, self.environment, self.configuration, name=self.name, episodes=self.episodes,
+            seed=self.seed, on=on, told=told,
+        )  # fmt: skip
+
+
+def _typed(context: typer.Context, names: Iterable[str]) -> list[str]:
+    """Return which of these options the user typed."""
+    return [name for name in names if was_typed(context, name)]
+
+
+def _check_numbers(episodes: int | None, gap: int | None, seed: int, limits: Mapping[str, float | None]) -> None:
+    """Raise ValueError for a number that cannot be; limits are times by their options' names."""
+    for name, value in (("--episodes", episodes), ("--gap", gap), ("--seed", seed + 1)):
+        if value is not None and value < 1:
+            least = 0 if name == "--seed" else 1
+            raise ValueError(f"{name} {value - 1 + least} is too small; give {least} or more")
+    for name, limit in limits.items():
+        if limit is not None and not 0.0 <= limit < math.inf:
+            raise ValueError(f"{name} {limit:g} must be a time [s], 0 for no limit")
+
+
+def _check_side(context: typer.Context, lockstep: bool, gap: int | None, replay: Path | None) -> None:
+    """Raise ValueError for options of a side, bus or emulator, on which the episodes do not run."""
+    on_bus = bool(_typed(context, BUS_OPTIONS))
+    if not on_bus and gap is None:
+        if lockstep:
+            raise ValueError("--lockstep is for a bus; give its --channel, or --gap")
+        if alone := _typed(context, OF_A_BUS_ALONE):
+            raise ValueError(f"--{alone[0]} is for a bus; give its --channel, or leave --{alone[0]} out")
+    if (on_bus or gap is not None or replay is not None) and (away := _typed(context, ELSEWHERE)):
+        raise ValueError(
+            f"--{away[0]} is for episodes on the emulator; leave it out on a bus, with --gap and with --replay"
+        )
+    if gap is not None and (extra := _typed(context, NOT_OF_A_GAP)):
+        raise ValueError(f"--gap serves its own machines, one episode each; leave --{extra[0]} out")
 
 
 def _way_back(out: Path | None) -> Path:
@@ -233,18 +278,12 @@ def _open(
     return loaded, configuration
 
 
-def _against(
-    loaded: Any, configuration: dict[str, Any], options: dict[str, Any], against: str, found: Any
-) -> list[str]:
+def _against(run: _Run, against: str, found: Evaluation) -> list[str]:
     """Return the gap of what was found to the emulator, or to an earlier report."""
     from agents.evaluation import gap
     from agents.evaluation.evaluation import Evaluation
 
-    other = (
-        _on_emulator(loaded, configuration, options, as_on_a_bus=True)
-        if against == EMULATOR
-        else Evaluation.load(against)
-    )
+    other = _as_on_a_bus(run) if against == EMULATOR else Evaluation.load(against)
     return gap.text(gap.compare(other, found), other.side, found.side)
 
 
@@ -284,77 +323,57 @@ def _both_sides(
         )
 
 
-def _on_emulator(loaded: Any, configuration: dict[str, Any], options: dict[str, Any], as_on_a_bus: bool = False) -> Any:
-    from agents.evaluation import evaluation
+def _on_emulator(run: _Run) -> Evaluation:
+    with progress_bar(f"{run.loaded.name} on the emulator") as show:
+        return run.evaluate(show)
 
-    title = f"{loaded.name} on the emulator"
-    if not as_on_a_bus:
-        with progress_bar(title) as show:
-            return evaluation.evaluate(
-                loaded.policy, loaded.environment, configuration, **{**options, "guard": None}, told=show
-            )
+
+def _as_on_a_bus(run: _Run) -> Evaluation:
+    """Evaluate on an emulated machine that the environment does not see, as it does not see what is on a bus."""
+    from agents.evaluation.evaluation import GivenDrives, as_on_a_bus
     from agents.training.tasks import make_environments
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
-    lanes: Any = make_environments(loaded.environment, 1, configuration)
+    lanes: Any = make_environments(run.environment, 1, run.configuration)
     config = lanes.config
     lanes.close()
     with (
         EmulatedDrives(config.device, config.load, config.motor, 1, friction=config.friction) as drives,
-        progress_bar(title) as show,
+        progress_bar(f"{run.loaded.name} on the emulator") as show,
     ):
         joint = getattr(getattr(config, "task", None), "joint", None)
         sensor = None if joint is None else lambda: drives.machine.joint_positions[:, joint]
-        return evaluation.evaluate(
-            loaded.policy,
-            loaded.environment,
-            configuration,
-            drives=evaluation.as_on_a_bus(drives),
-            sensor=sensor,
-            side="emulator as on a bus",
-            told=show,
-            **options,
-        )
+        return run.evaluate(show, GivenDrives(as_on_a_bus(drives), sensor, run.guard, "emulator as on a bus"))
 
 
-def _elsewhere(
-    loaded: Any,
-    configuration: dict[str, Any],
-    options: dict[str, Any],
-    trust: bool,
-    workers: int | None,
-    cluster: str | None,
-) -> Any:
+def _elsewhere(run: _Run, trust: bool, workers: int | None, cluster: str | None) -> Evaluation:
     from agents.evaluation.evaluation_shards import Written, evaluate_elsewhere
 
-    given = {key: options[key] for key in ("name", "episodes", "seed")}
-    written = Written.of(options["name"], trust)
+    written = Written.of(run.name, trust)
     with (
         elsewhere(workers, cluster, "give the command again") as pool,
-        progress_bar(f"{loaded.name}, elsewhere") as show,
+        progress_bar(f"{run.loaded.name}, elsewhere") as show,
     ):
         assert pool is not None
-        return evaluate_elsewhere(written, loaded.environment, configuration, pool, told=show, **given)
+        return evaluate_elsewhere(
+            written, run.environment, run.configuration, pool, name=run.name, episodes=run.episodes,
+            seed=run.seed, told=show,
+        )  # fmt: skip
 
 
-def _on_bus(
-    loaded: Any, configuration: dict[str, Any], options: dict[str, Any], sensor: str | None, before: Path, **where: Any
-) -> Any:
-    from agents.evaluation import evaluation
+def _on_bus(run: _Run, sensor: str | None, before: Path, **where: Any) -> Evaluation:
+    from agents.evaluation.evaluation import GivenDrives
     from agents.evaluation.on_the_bus import target_for
     from agents.policies.open_policy import find_object
     from tuning.snapshot import put_back
 
     function = None if sensor is None else find_object(sensor)
     with (
-        target_for(loaded.environment, configuration, options["guard"], **where) as target,
+        target_for(run.environment, run.configuration, run.guard, **where) as target,
         put_back(target, before, "drive-agent"),
-        progress_bar(f"{loaded.name} on the bus") as show,
+        progress_bar(f"{run.loaded.name} on the bus") as show,
     ):
-        return evaluation.evaluate(
-            loaded.policy, loaded.environment, configuration, drives=target.drives, sensor=function, told=show,
-            **options,
-        )  # fmt: skip
+        return run.evaluate(show, GivenDrives(target.drives, function, run.guard))
 
 
 def _recording(path: Path) -> Any:

@@ -27,7 +27,7 @@ from agents.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from agents.training.train import Progress, Report
+    from agents.training.training_run import Progress, Report
 
 EPISODES = 64  # for the card
 LINES = 10  # of progress where nobody watches a terminal
@@ -56,8 +56,9 @@ def train(
     """
     with errors_as_exit_codes():
         from agents.training.tasks import ENVIRONMENTS
-        from agents.training.train import AGENT, CHECKPOINT, CURVE, TrainingRun, clear, run_to_resume, with_figures
+        from agents.training.train import clear, run_to_resume, with_figures
         from agents.training.train import train as run_training
+        from agents.training.training_run import AGENT, CHECKPOINT, CURVE, TrainingRun
 
         if resume is None:
             if trust:

@@ -26,7 +26,7 @@ from agents.commands.options import (
 )
 from drive_env.commands.options import DeviceName, Yes, look_first, names_a_bus
 from drive_env.commands.tables import print_lines
-from tuning.commands.options import MotorName, Supply, TravelRange, ask_to_turn
+from tuning.commands.options import DriveOptions, MotorName, Supply, TravelRange, ask_to_turn, open_target
 
 MOST_TRIALS = 10_000
 PATIENCE = 30.0  # s, for a node in this process: one that is slow says that the computer is busy, not that it is gone
@@ -76,22 +76,10 @@ def tune(
     before.toml, with which `drive-tune undo` restores the state before, certificate.json and report.html.
     """
     with errors_as_exit_codes():
-        from agents.policies.policy import load_policy
-        from agents.shipped import find_agent
-
         bus = names_a_bus(context)
         if bus and seed is not None:
             raise ValueError("--seed draws an emulated machine; leave it out on a bus")
-        if trials is not None and not 1 <= trials <= MOST_TRIALS:
-            raise ValueError(f"--trials {trials} must be 1 or more, and {MOST_TRIALS} at most: each turns the motor")
-        policy = load_policy(find_agent(agent))
-        if policy.bundle.environment != "ServoDrive/GainTuning-v0":
-            raise ValueError(
-                f"agent {agent} acts in {policy.bundle.environment}; a tuner acts in ServoDrive/GainTuning-v0"
-            )
-        _check_gains(policy, device)
-        if trials is not None:
-            policy.bundle.configuration["trials"] = trials
+        policy = _tuner(agent, device, trials)
         folder = new_folder(out, "agent-tune")
         with ExitStack() as stack:
             if not bus:
@@ -99,8 +87,11 @@ def tune(
             else:
                 if dry_run:
                     look_first(interface, channel, node or [1], bitrate, device)
-                target = stack.enter_context(_on_bus(interface, channel, node, bitrate, lockstep, device, motor, supply,
-                                                     travel))  # fmt: skip
+                drive = DriveOptions(
+                    bus=True, device=device, motor=motor, interface=interface, channel=channel, nodes=node,
+                    bitrate=bitrate, lockstep=lockstep, supply=supply, travel=travel,
+                )  # fmt: skip
+                target = stack.enter_context(open_target(drive))
             if dry_run:
                 if not _tell_plan(target, policy, store, json):
                     fail("a run would not start: see the lines with 'no'", REFUSED)
@@ -109,6 +100,22 @@ def tune(
                 ask_to_turn(node, yes)
             result = _run(target, policy, folder, agent, store, json)
         _report(result, folder, json, bus)
+
+
+def _tuner(agent: str, device: str, trials: int | None) -> Any:
+    """Return the agent's policy, with so many trials if they are given; ValueError unless it can tune the device."""
+    from agents.policies.policy import load_policy
+    from agents.shipped import find_agent
+
+    if trials is not None and not 1 <= trials <= MOST_TRIALS:
+        raise ValueError(f"--trials {trials} must be 1 or more, and {MOST_TRIALS} at most: each turns the motor")
+    policy = load_policy(find_agent(agent))
+    if policy.bundle.environment != "ServoDrive/GainTuning-v0":
+        raise ValueError(f"agent {agent} acts in {policy.bundle.environment}; a tuner acts in ServoDrive/GainTuning-v0")
+    _check_gains(policy, device)
+    if trials is not None:
+        policy.bundle.configuration["trials"] = trials
+    return policy
 
 
 def _check_gains(policy: Any, device: str) -> None:
@@ -162,27 +169,6 @@ def _emulated_node(
             yield replace(target, machine=f"{name}, emulated, node 1 of {hub.channel}")
     finally:
         world.close()
-
-
-@contextmanager
-def _on_bus(
-    interface: str | None,
-    channel: str | None,
-    nodes: list[int] | None,
-    bitrate: int | None,
-    lockstep: bool,
-    device: str,
-    motor: str,
-    supply: float | None,
-    travel: str | None,
-) -> Iterator[Target]:
-    from tuning.commands.options import open_target
-
-    with open_target(
-        bus=True, device=device, motor=motor, interface=interface, channel=channel, nodes=nodes, bitrate=bitrate,
-        lockstep=lockstep, supply=supply, travel=travel,
-    ) as target:  # fmt: skip
-        yield target
 
 
 def _tell_plan(target: Target, policy: Any, keep: bool, json: bool) -> bool:

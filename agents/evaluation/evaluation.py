@@ -116,6 +116,23 @@ def as_on_a_bus(drives: Drives) -> Drives:
     return ObservedDrives(drives, _NoMachine())
 
 
+@dataclass(frozen=True)
+class GivenDrives:
+    """Drives that a policy acts on, in place of emulated machines of the environment's own.
+
+    Attributes:
+        drives: The drives; their gains, offsets and mode are as before after an evaluation.
+        sensor: As `Tracking` takes it.
+        guard: Limits of the policy; those of guard.LIMITS by default.
+        side: What the report calls the drives.
+    """
+
+    drives: Drives
+    sensor: Any = None
+    guard: GuardLimits | None = None
+    side: str = "bus"
+
+
 def evaluate(
     policy: Any,
     environment: str,
@@ -124,10 +141,7 @@ def evaluate(
     name: str = "policy",
     episodes: int = 64,
     seed: int = FIRST_SEED,
-    drives: Drives | None = None,
-    sensor: Any = None,
-    guard: GuardLimits | None = None,
-    side: str | None = None,
+    on: GivenDrives | None = None,
     told: Callable[[float], None] = lambda share: None,
     at_once: int | None = None,
 ) -> Evaluation:
@@ -140,12 +154,7 @@ def evaluate(
         name: Of the policy, for the report.
         episodes: How many; each has a seed of its own, `seed`, `seed` + 1, ...
         seed: Of the first one.
-        drives: Drives to act on, whose gains, offsets and mode are as before afterwards; emulated machines of the
-            environment's own by default.
-        sensor: As `Tracking` takes it.
-        guard: Limits of the policy; by default those of guard.LIMITS on given drives, and guard.PATIENT on emulated
-            machines.
-        side: What the report calls the drives.
+        on: Drives to act on; emulated machines of the environment's own by default.
         told: Called with the share that is done.
         at_once: Episodes side by side on emulated machines; by default `environments_for` as many.
 
@@ -154,56 +163,82 @@ def evaluate(
         ValueError: For a configuration that is none.
     """
     environment = environment_name(environment)
-    given = drives is not None
     options = dict(configuration or {})
-    if given:  # machines are drawn on emulators alone
+    if on is None:
+        count, how = at_once or environments_for(episodes), {"autoreset_mode": "NextStep"}
+    else:
+        # Machines are drawn on emulators alone.
         options = {key: value for key, value in options.items() if key not in ("distributions", "privileged", "stage")}
-    lanes: Any
-    count = (at_once or environments_for(episodes)) if drives is None else _num_envs_of(environment, drives, options)
-    more = {"drives": drives, "autoreset_mode": "Disabled"} if given else {"autoreset_mode": "NextStep"}
-    if sensor is not None:
-        more["sensor"] = sensor
-    recorded: list[Episode] = []
-    spent, due = 0.0, 0.0
+        count, how = _num_envs_of(environment, on.drives, options), _how_to_act_on(on)
     with ExitStack() as care:
-        if drives is not None:
-            care.enter_context(unchanged(drives))
-            care.enter_context(stopping(drives))
-        lanes = make_environments(environment, count, options, **more)
-        if drives is not None and not drives.time_waits:
+        if on is not None:
+            care.enter_context(unchanged(on.drives))
+            care.enter_context(stopping(on.drives))
+        lanes: Any = make_environments(environment, count, options, **how)
+        if on is not None and not on.drives.time_waits:
             care.enter_context(undisturbed())
         try:
-            space: Any = lanes.single_action_space
-            limits = guard or (LIMITS[environment] if given else PATIENT)
-            step = STEP_SECONDS[environment](lanes.config)
-            watched = GuardedPolicy(policy, space.low, space.high, step, limits)
+            watched = _guarded(policy, lanes, environment, on)
             care.callback(watched.close)
-            if given:
+            if on is not None:
                 watched.warm_up(np.zeros(lanes.observation_space.shape, np.float32))
-            for first in range(0, episodes, count):
-                seeds = [seed + first + lane for lane in range(count)]
-                wanted = min(count, episodes - first)
-                steps = ENVIRONMENTS[environment].steps(lanes.config)
-
-                def tell(done: int, first: int = first, wanted: int = wanted, steps: int = steps) -> None:
-                    told((first + wanted * min(done / steps, 1.0)) / episodes)
-
-                found_now, seconds = _episodes(watched, lanes, seeds, all_end=given, told=tell)
-                recorded += found_now[:wanted]
-                spent += seconds
-                due += step * max(len(episode.rewards) for episode in found_now)
-            if drives is not None:
-                come_to_rest(drives)
+            seeds = range(seed, seed + episodes)
+            recorded, pace = _all_rounds(watched, lanes, environment, seeds, all_end=on is not None, told=told)
+            if on is not None:
+                come_to_rest(on.drives)
             config = lanes.config
             found = configuration_of(lanes)
         finally:
             lanes.close()
-    evaluation = summary(recorded, config, found, environment, name, side or ("bus" if given else "emulator"))
-    if drives is not None and not drives.time_waits and drives.bus is not None:
-        timing = drives.bus.total_timing
+    evaluation = summary(recorded, config, found, environment, name, "emulator" if on is None else on.side)
+    if on is not None and not on.drives.time_waits and on.drives.bus is not None:
+        timing = on.drives.bus.total_timing
         evaluation.late = timing.late / max(timing.cycles, 1)
-        evaluation.pace = spent / due if environment in FIXED_STEPS else 1.0
+        evaluation.pace = pace if environment in FIXED_STEPS else 1.0
     return evaluation
+
+
+def _how_to_act_on(on: GivenDrives) -> dict[str, Any]:
+    """Return the options of environments on given drives."""
+    how = {"drives": on.drives, "autoreset_mode": "Disabled"}
+    return how if on.sensor is None else how | {"sensor": on.sensor}
+
+
+def _guarded(policy: Any, lanes: Any, environment: str, on: GivenDrives | None) -> GuardedPolicy:
+    """Return the policy with its limits: those of given drives, and hardly any where nothing can break."""
+    limits = PATIENT if on is None else on.guard or LIMITS[environment]
+    space = lanes.single_action_space
+    return GuardedPolicy(policy, space.low, space.high, STEP_SECONDS[environment](lanes.config), limits)
+
+
+def _all_rounds(
+    policy: Any, lanes: Any, environment: str, seeds: range, all_end: bool, told: Callable[[float], None]
+) -> tuple[list[Episode], float]:
+    """Return an episode of every seed, as many at a time as there are environments, and the steps' time over its due.
+
+    Args:
+        policy: What acts.
+        lanes: The environments.
+        environment: Their name.
+        seeds: Of the episodes.
+        all_end: As `_episodes` has it.
+        told: Called with the share that is done.
+    """
+    step, steps = STEP_SECONDS[environment](lanes.config), ENVIRONMENTS[environment].steps(lanes.config)
+    recorded: list[Episode] = []
+    spent, due = 0.0, 0.0
+    for first in range(0, len(seeds), lanes.num_envs):
+        wanted = min(lanes.num_envs, len(seeds) - first)
+
+        def tell(done: int, first: int = first, wanted: int = wanted) -> None:
+            told((first + wanted * min(done / steps, 1.0)) / len(seeds))
+
+        own = [seeds.start + first + lane for lane in range(lanes.num_envs)]  # the last round's have more than `seeds`
+        found, seconds = _episodes(policy, lanes, own, all_end=all_end, told=tell)
+        recorded += found[:wanted]
+        spent += seconds
+        due += step * max(len(episode.rewards) for episode in found)
+    return recorded, spent / due if recorded else 1.0
 
 
 def environments_for(episodes: int) -> int:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from agents.evaluation.evaluation import Evaluation, as_on_a_bus, evaluate, joined
+from agents.evaluation.evaluation import Evaluation, GivenDrives, as_on_a_bus, evaluate, joined
 from agents.evaluation.on_the_bus import drives_for
 from agents.evaluation.served import Served, draw_machines, emulated, in_lockstep, in_real_time
 from agents.policies.guard import LIMITS, GuardLimits, PolicyStoppedError
@@ -94,12 +94,8 @@ def on_both_sides(
         sides = []
         for noise in noises:
             with emulated(machine, seed + noise) as drives:
-                sides.append(
-                    evaluate(
-                        policy, environment, configuration, drives=as_on_a_bus(drives), sensor=_sensor(drives, joint),
-                        seed=seed + k, side="emulator as on a bus", **options,
-                    )
-                )  # fmt: skip
+                own = GivenDrives(as_on_a_bus(drives), _sensor(drives, joint), side="emulator as on a bus")
+                sides.append(evaluate(policy, environment, configuration, on=own, seed=seed + k, **options))
         with serve(machine, seed) as there:
             try:
                 bus = _over_the_bus(
@@ -132,10 +128,8 @@ def _over_the_bus(
         environment, dict(configuration or {}), limits, device=config.device, interface="slcan", channel=there.channel,
         nodes=there.nodes, lockstep=lockstep, **({"timeout": PATIENCE} if lockstep else {}),
     ) as drives:  # fmt: skip
-        return evaluate(
-            policy, environment, configuration, drives=drives, sensor=_sensor(there.drives, joint), guard=limits,
-            **options,
-        )  # fmt: skip
+        on = GivenDrives(drives, _sensor(there.drives, joint), limits)
+        return evaluate(policy, environment, configuration, on=on, **options)
 
 
 def _sensor(drives: Drives | None, joint: int | None) -> Callable[[], Any] | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,7 +19,8 @@ import yaml
 
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import merge
-from agents.training.train import DivergedError, TrainingRun, train
+from agents.training.train import DivergedError, train
+from agents.training.training_run import TrainingRun
 from tuning.runs.provenance import check_study
 
 if TYPE_CHECKING:
@@ -73,6 +74,9 @@ class SearchTrial(NamedTuple):
     drawn: Mapping[str, Any]
 
 
+Told = Callable[[SearchTrial, SearchTrial | None], None]  # a trial that is over, and the best one if there is one
+
+
 class _TrainingTask(NamedTuple):
     """A training and its score, for whatever process; without a folder its files come back with the score."""
 
@@ -97,7 +101,7 @@ def search(
     trials: int,
     seed: int = 0,
     episodes: int = 64,
-    told: Callable[[SearchTrial, SearchTrial | None], None] | None = None,
+    told: Told | None = None,
     pool: Pool | None = None,
 ) -> dict[str, Any]:
     """Try hyper-parameters and return the best, RL-Zoo's way; the folder gets the study, and best.yaml, trial by trial.
@@ -119,73 +123,115 @@ def search(
         DivergedError: If no training at all gave an agent.
         ValueError: For a study that was begun with other sources.
     """
-    import optuna
-    from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend
-
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    optuna.logging.set_verbosity(optuna.logging.ERROR)  # what failed is told, in a line
-    base = TrainingRun(environment, algorithm, hyperparameters)
-    storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
-    study = optuna.create_study(storage=storage, study_name=f"{base.environment} {algorithm}", load_if_exists=True)
-    check_study(study, folder / JOURNAL, "give another --out")
-    states = optuna.trial.TrialState
+    study = _Study(TrainingRun(environment, algorithm, hyperparameters), folder, seed, episodes, told)
+    for first in range(0, trials, ROUND):
+        _make_round(study, min(ROUND, trials - first), pool)
+    return study.best()
 
-    def begun(known: Any) -> tuple[Any, _TrainingTask]:
-        """Return a trial, drawn from what was known when its round began, and what is to be done."""
-        study.sampler = optuna.samplers.RandomSampler()  # draws nothing yet
-        trial = study.ask()
+
+def _make_round(study: _Study, count: int, pool: Pool | None) -> None:
+    """Make trials that are drawn from the same knowledge; those that an error or Ctrl-C ends have failed."""
+    known = study.known()
+    waiting: list[Any] = []
+    try:
+        if pool is None:
+            for _ in range(count):
+                trial, task = study.begin(known, writes_there=True)
+                waiting = [trial]
+                study.end(trial, _trained(task))
+        else:
+            begun = [study.begin(known, writes_there=pool.shares_disk) for _ in range(count)]
+            waiting = [trial for trial, _ in begun]
+            for scored in _in_turn(pool.unordered(_trained, [task for _, task in begun])):
+                study.end(waiting[0], scored)
+                del waiting[0]
+    except (Exception, KeyboardInterrupt):
+        study.fail(waiting)
+        raise
+
+
+class _Study:
+    """A search's study of Optuna, in the journal of its folder."""
+
+    def __init__(self, base: TrainingRun, folder: Path, seed: int, episodes: int, told: Told | None) -> None:
+        import optuna
+        from optuna.storages import JournalStorage
+        from optuna.storages.journal import JournalFileBackend
+
+        self._base, self._folder, self._seed, self._episodes, self._told = base, folder, seed, episodes, told
+        optuna.logging.set_verbosity(optuna.logging.ERROR)  # what failed is told, in a line
+        storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
+        name = f"{base.environment} {base.algorithm}"
+        self._study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
+        check_study(self._study, folder / JOURNAL, "give another --out")
+        self._states = optuna.trial.TrialState
+
+    def known(self) -> Any:
+        """Return what is known now, as a study of its own."""
+        import optuna
+
+        known = optuna.create_study()
+        known.add_trials(self._study.get_trials(states=(self._states.COMPLETE,)))
+        return known
+
+    def begin(self, known: Any, writes_there: bool) -> tuple[Any, _TrainingTask]:
+        """Return a trial, drawn from what was known when its round began, and what is to be done.
+
+        Args:
+            known: As `known` returned it.
+            writes_there: Whether who does it writes into this folder.
+        """
+        import optuna
+
+        self._study.sampler = optuna.samplers.RandomSampler()  # draws nothing yet
+        trial = self._study.ask()
         # Seeded by trial: a search that is gone on with, or a second process, would draw the first ones again.
-        own = np.random.SeedSequence((seed, trial.number)).generate_state(1)[0]
-        study.sampler = _sampler(known, int(own))
-        given = drawn(algorithm, hyperparameters, trial)
-        here = pool is None or pool.shares_disk
-        run = TrainingRun(environment, algorithm, given, seed=seed, preset="search")
-        return trial, _TrainingTask(run, _folder_of(folder, trial.number) if here else None, episodes)
+        own = np.random.SeedSequence((self._seed, trial.number)).generate_state(1)[0]
+        self._study.sampler = _sampler(known, int(own))
+        base = self._base
+        run = TrainingRun(base.environment, base.algorithm, self._drawn(trial), seed=self._seed, preset="search")
+        return trial, _TrainingTask(run, self._folder_of(trial) if writes_there else None, self._episodes)
 
-    def over(trial: Any, scored: _Scored) -> None:
+    def end(self, trial: Any, scored: _Scored) -> None:
+        """Keep what came of a trial, and tell it."""
         for name, content in scored.files.items():
-            path = _folder_of(folder, trial.number) / name
+            path = self._folder_of(trial) / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content)
         # A training that diverges is a trial that failed: the next ones go elsewhere.
-        found = study.tell(trial, scored.score, state=states.FAIL if scored.score is None else states.COMPLETE)
-        best = study.best_trial if study.get_trials(deepcopy=False, states=(states.COMPLETE,)) else None
+        state = self._states.FAIL if scored.score is None else self._states.COMPLETE
+        found = self._study.tell(trial, scored.score, state=state)
+        best = self._study.best_trial if self._completed() else None
         if best is not None:
-            _write(folder / BEST, base.environment, drawn(algorithm, hyperparameters, best), study, best)
-        if told is not None:
-            last, first = (
-                None if one is None else SearchTrial(one.number, one.value, one.params) for one in (found, best)
-            )
-            assert last is not None
-            told(last, first)
+            _write(self._folder / BEST, self._base.environment, self._drawn(best), self._study, best)
+        if self._told is not None:
+            last = SearchTrial(found.number, found.value, found.params)
+            self._told(last, None if best is None else SearchTrial(best.number, best.value, best.params))
 
-    for first in range(0, trials, ROUND):
-        count = min(ROUND, trials - first)
-        known = optuna.create_study()
-        known.add_trials(study.get_trials(states=(states.COMPLETE,)))
-        waiting: list[Any] = []
-        try:
-            if pool is None:
-                for _ in range(count):
-                    trial, task = begun(known)
-                    waiting = [trial]
-                    over(trial, _trained(task))
-            else:
-                tasks = [begun(known) for _ in range(count)]
-                waiting = [trial for trial, _ in tasks]
-                for scored in _in_turn(pool.unordered(_trained, [task for _, task in tasks])):
-                    over(waiting[0], scored)
-                    del waiting[0]
-        except (Exception, KeyboardInterrupt):
-            for trial in waiting:
-                study.tell(trial, state=states.FAIL, skip_if_finished=True)
-            raise
-    if not study.get_trials(deepcopy=False, states=(states.COMPLETE,)):
-        raise DivergedError(f"all {len(study.trials)} trainings diverged; give a smaller learning_rate (--config)")
-    best: dict[str, Any] = drawn(algorithm, hyperparameters, study.best_trial)
-    return best
+    def fail(self, trials: Sequence[Any]) -> None:
+        """Keep that trials did not come to their end."""
+        for trial in trials:
+            self._study.tell(trial, state=self._states.FAIL, skip_if_finished=True)
+
+    def best(self) -> dict[str, Any]:
+        """Return the best hyper-parameters; DivergedError if no training gave an agent."""
+        if not self._completed():
+            raise DivergedError(
+                f"all {len(self._study.trials)} trainings diverged; give a smaller learning_rate (--config)"
+            )
+        return self._drawn(self._study.best_trial)
+
+    def _completed(self) -> list[Any]:
+        found: list[Any] = self._study.get_trials(deepcopy=False, states=(self._states.COMPLETE,))
+        return found
+
+    def _drawn(self, trial: Any) -> dict[str, Any]:
+        return drawn(self._base.algorithm, self._base.hyperparameters, trial)
+
+    def _folder_of(self, trial: Any) -> Path:
+        return self._folder / f"trial-{trial.number:03d}"
 
 
 def _sampler(known: Any, seed: int) -> Any:
@@ -231,10 +277,6 @@ def _in_turn(results: Iterator[tuple[int, _Scored]]) -> Iterator[_Scored]:
         while given in early:
             yield early.pop(given)
             given += 1
-
-
-def _folder_of(folder: Path, number: int) -> Path:
-    return folder / f"trial-{number:03d}"
 
 
 def _write(path: Path, environment: str, best: Mapping[str, Any], study: Any, trial: Any) -> None:

@@ -11,32 +11,27 @@ from __future__ import annotations
 import importlib
 import inspect
 import logging
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from agents.policies.agent_file import AgentFile, plain
 from agents.training import checkpoint
-from agents.training.algorithms import ALGORITHMS, algorithm_class, need
+from agents.training.algorithms import algorithm_class, need
 from agents.training.counted_environments import CountedEnvironments
 from agents.training.hyperparameters import RUN_KEYS, HyperparameterError, schedule
-from agents.training.learning_curve import draw_learning_curve
 from agents.training.networks import bundle_of
-from agents.training.tasks import ENVIRONMENTS, configuration_of, environment_name, make_environments
-from agents.training.training_table import TrainingTable
-from tuning.runs.provenance import SOURCES, check_begun
+from agents.training.tasks import configuration_of, make_environments
+from agents.training.training_run import AGENT, CHECKPOINT, TABLE, Progress, Report, TrainingRun, segment_seed
+from tuning.runs.provenance import check_begun
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT, AGENT, TABLE, CURVE = "checkpoint.zip", "agent.npz", "training.csv", "learning_curve.png"
-ROWS = 200  # of the table, about
 IMITATION = 1_000_000  # a segment's number that no run has, for seeds
-EPISODES_PER_SEGMENT = 3  # of every environment, at least
 # "constant" is SB3's word for SAC's automatic entropy and others.
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 # Keys whose value SB3 wants as a whole number, though YAML may say 1e5.
@@ -45,62 +40,6 @@ _WHOLE = ("n_steps", "batch_size", "n_epochs", "buffer_size", "learning_starts",
 
 class DivergedError(ValueError):
     """The networks hold what nothing can act with: the training is lost; the message says what to change."""
-
-
-@dataclass(frozen=True)
-class TrainingRun:
-    """What is trained.
-
-    Attributes:
-        environment: Name of the environment.
-        algorithm: A row of ALGORITHMS.
-        hyperparameters: As agents.training.hyperparameters.load returns them.
-        seed: Of all random numbers.
-        preset: Which preset the hyper-parameters came from, for the card.
-        segments: Checkpoints over the run, at whose ends the environments begin anew.
-        torch_threads: Threads of torch; small networks are fastest with 1.
-    """
-
-    environment: str
-    algorithm: str
-    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
-    seed: int = 0
-    preset: str = "full"
-    segments: int = 10
-    torch_threads: int = 1
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "environment", environment_name(self.environment))
-        if self.algorithm not in ALGORITHMS:
-            raise ValueError(f"there is no algorithm {self.algorithm!r}; there are {', '.join(ALGORITHMS)}")
-        if self.segments < 1:
-            raise ValueError(f"segments must be 1 or more, not {self.segments}")
-        if self.seed < 0:
-            raise ValueError(f"the seed must be 0 or more, not {self.seed}")
-
-    @property
-    def total(self) -> int:
-        """Steps of all environments together."""
-        return int(self.hyperparameters["n_timesteps"])
-
-
-class Progress(NamedTuple):
-    """The progress of a training: means of the last episodes and of each term per step; speed [steps/s]; time's shares.
-
-    `imitated` is the share of what comes before it, if the policy begins as a teacher: all else is 0 until that is 1.
-    """
-
-    timesteps: int
-    total: int
-    episodes: int
-    means: Mapping[str, float]
-    terms: Mapping[str, float]
-    speed: float
-    environment_share: float
-    imitated: float = 1.0
-
-
-Report = Callable[[Progress], None]
 
 
 def train(
@@ -127,6 +66,8 @@ def train(
     import torch
     from stable_baselines3.common.logger import configure
 
+    from agents.training.segments import Segments
+
     folder = Path(folder)
     path = folder / CHECKPOINT
     if resume:
@@ -146,7 +87,7 @@ def train(
                 _imitate(run, model, lanes, report)
         folder.mkdir(parents=True, exist_ok=True)
         model.set_logger(configure(str(folder), ["tensorboard"]))
-        segments = _segments_class()(run, folder, lanes, normaliser, report, resume)
+        segments = Segments(run, folder, lanes, normaliser, report, resume)
         if resume:
             # SB3 would reset the environments before the segment does, and count that in the normaliser.
             model._last_obs = np.zeros(0)
@@ -287,17 +228,6 @@ def is_sound(model: Any) -> bool:
     return all(bool(weight.isfinite().all()) for weight in weights)
 
 
-def segment_length(run: TrainingRun, lanes: CountedEnvironments) -> int:
-    """Return the steps of a segment: a share of the run, but at least some episodes of every environment."""
-    episode: int = ENVIRONMENTS[run.environment].steps(lanes.config) * lanes.num_envs
-    return max(int(run.total // run.segments), EPISODES_PER_SEGMENT * episode)
-
-
-def segment_seed(seed: int, segment: int) -> int:
-    """Return the seed of environment 0 in a segment; the others' follow by one."""
-    return int(np.random.SeedSequence([seed, segment]).generate_state(1)[0]) >> 1
-
-
 def _count_from(env: Any, steps: int) -> None:
     """Have the curriculum's steps be those of the run: neither an imitation's nor those since it was resumed."""
     while hasattr(env, "venv"):
@@ -375,124 +305,3 @@ def _with_classes(value: Any) -> Any:
         except AttributeError:
             raise HyperparameterError(f"torch.nn has no {value[3:]!r}; activations are nn.Tanh, nn.ReLU, ...") from None
     return value
-
-
-def _segments_class() -> Any:
-    """Return the callback; its base is Stable-Baselines3's, which must not be imported before it is needed."""
-    from stable_baselines3.common.callbacks import BaseCallback
-
-    class Segments(BaseCallback):  # type: ignore[misc]
-        """Writes checkpoints, begins segments, tells how far it is."""
-
-        def __init__(
-            self,
-            run: TrainingRun,
-            folder: Path,
-            lanes: CountedEnvironments,
-            normaliser: Any,
-            report: Report | None,
-            resumed: bool,
-        ) -> None:
-            super().__init__()
-            self._run, self._folder, self._lanes, self._normaliser = run, folder, lanes, normaliser
-            self._report, self._resumed = report, resumed
-            self._length = segment_length(run, lanes)
-            self._row_length = max(1, run.total // ROWS)
-            self._segment = 0
-            self._next_row = 0
-            self._table: TrainingTable | None = None
-            self._began = self._row_began = time.perf_counter()
-            self._row_steps, self._row_seconds = 0, 0.0
-
-        def _on_training_start(self) -> None:
-            self._segment = self.num_timesteps // self._length
-            self._next_row = self.num_timesteps + self._row_length
-            self._table = TrainingTable(self._folder / TABLE, keep=self.num_timesteps if self._resumed else 0)
-            self._began = self._row_began = time.perf_counter()
-            # An imitation's steps and the first reset are no part of the training's speed.
-            self._row_steps, self._row_seconds = self._lanes.steps, self._lanes.seconds
-
-        def _on_rollout_start(self) -> None:
-            if self._resumed:
-                self._resumed = False
-                checkpoint.restore_random_states(self._folder / CHECKPOINT, self.model)
-                self._begin_segment()
-            elif self.num_timesteps // self._length > self._segment:
-                self._segment = self.num_timesteps // self._length
-                self._save()
-                self._draw()
-                self._begin_segment()
-            if self.num_timesteps >= self._next_row:
-                self._next_row = self.num_timesteps + self._row_length
-                self._tell()
-
-        def _on_step(self) -> bool:
-            return True
-
-        def finish(self) -> None:
-            """Write what the end of the run leaves."""
-            self._save()
-            if self.num_timesteps and self._lanes.steps > self._row_steps:
-                self._tell()
-            self._draw()
-
-        def _draw(self) -> None:
-            title = f"{self._run.environment}, {self._run.algorithm}, {self._run.preset}, seed {self._run.seed}"
-            draw_learning_curve(self._folder / TABLE, self._folder / CURVE, title)
-
-        def _save(self) -> None:
-            checkpoint.save(
-                self._folder / CHECKPOINT,
-                self.model,
-                self._normaliser,
-                {
-                    "algorithm": self._run.algorithm,
-                    "environment": self._run.environment,
-                    "configuration": configuration_of(self._lanes),
-                    "timesteps": self.num_timesteps,
-                    "run": plain(asdict(self._run)),
-                    "sources": SOURCES,
-                },
-            )
-
-        def _begin_segment(self) -> None:
-            """Begin an episode in every environment, with the segment's seeds."""
-            model = self.model
-            env = model.get_env()
-            env.seed(segment_seed(self._run.seed, self._segment))
-            model._last_obs = env.reset()
-            model._last_episode_starts = np.ones(env.num_envs, bool)
-            if getattr(model, "_vec_normalize_env", None) is not None:
-                model._last_original_obs = model._vec_normalize_env.get_original_obs()
-
-        def _tell(self) -> None:
-            now = time.perf_counter()
-            spent = max(now - self._row_began, 1e-9)
-            lanes = self._lanes
-            progress = Progress(
-                self.num_timesteps,
-                self._run.total,
-                lanes.episodes,
-                lanes.episode_means(),
-                lanes.take_terms(),
-                (lanes.steps - self._row_steps) / spent,
-                (lanes.seconds - self._row_seconds) / spent,
-            )
-            self._row_began, self._row_steps, self._row_seconds = now, lanes.steps, lanes.seconds
-            for name, value in progress.means.items():
-                self.logger.record(f"episode/{name}", value)
-            for name, value in progress.terms.items():
-                self.logger.record(f"reward_terms/{name}", value)
-            self.logger.record("time/steps_per_s", progress.speed)
-            self.logger.record("time/environment_share", progress.environment_share)
-            if self._table is not None:
-                self._table.add(
-                    {"timesteps": progress.timesteps, "seconds": round(now - self._began, 2)}
-                    | {"episodes": progress.episodes, **progress.means}
-                    | {f"term {name}": value for name, value in progress.terms.items()}
-                    | {"steps/s": progress.speed, "environment share": progress.environment_share}
-                )
-            if self._report is not None:
-                self._report(progress)
-
-    return Segments

@@ -12,9 +12,10 @@ from agents.policies.policy import load_policy
 from agents.shipped import TUNER, shipped
 
 if TYPE_CHECKING:
-    from agents.policies.guard import GuardLimits
+    from agents.policies.guard import GuardedPolicy, GuardLimits
     from drive_env.devices import Device
     from drive_env.drives.interface import Drives
+    from drive_env.envs.gain_tuning import GainTuning
     from tuning.outcome import Outcome
     from tuning.target import Target
 
@@ -92,60 +93,23 @@ def tune_target(
     from agents.policies.guard import GuardedPolicy, stopping
     from drive_env import motion
     from drive_env.drives.observed import ObservedDrives
-    from drive_env.envs.gain_tuning import GainTuning
     from drive_env.gains import write_gains
     from tuning.auto.fallback_gains import FallbackGains
     from tuning.search.trial_bench import first_gains
 
-    axes = target.axes_per_machine
     fallback = FallbackGains(target.num_axes, target.motor.rated_current, windows=PATIENCE)
     fallback.calm = first_gains(target) if calm is None else calm
     drives = ObservedDrives(target.drives, fallback)
-    configuration = dict(policy.bundle.configuration) | ({} if trials is None else {"trials": trials})
-    configuration["gains"] = gains_for(policy.bundle.configuration, target.device)
-    write_gains(drives, first_gains(target))  # before anything is enabled: the drives may have any
-    reach = np.where(target.high >= -target.low, target.high, target.low)
-    env = GainTuning(
-        target.num_axes // axes,
-        drives=drives,
-        reach=reach,
-        device=target.device.name,
-        motor=target.motor,
-        **{name: value for name, value in configuration.items() if name not in NOT_OF_DRIVES},
-    )
+    env = _environment(target, drives, policy.bundle.configuration, trials)
     space: Any = env.single_action_space
     watched = GuardedPolicy(policy, space.low, space.high, TRIAL_SECONDS, _limits_of(drives))
-    shown = []
     try:
         watched.warm_up(np.zeros(env.observation_space.shape or (), np.float32))
         with stopping(drives):
-            observation, info = env.reset(seed=0)
-            watched.reset()
-            better = ~info["aborted"]
-            shown.append(
-                TrialShown(0, _flat(info["gains"]), info["measured"], info["aborted"], better, ((),) * env.num_envs)
-            )
-            show(shown[-1])
-            for number in range(1, env.config.trials + 1):
-                action = watched.act(observation)
-                before = info["measured"]
-                observation, _, terminated, _, info = env.step(action)
-                shown.append(
-                    TrialShown(
-                        number,
-                        _flat(info["trial_gains"]),
-                        info["trial_measured"],
-                        info["aborted"],
-                        info["measured"] < before,
-                        tuple(info["faults"]),
-                    )
-                )
-                show(shown[-1])
-                if terminated.all():
-                    names = ", ".join(shown[-1].faults[0]) or "it stays disabled"
-                    raise RuntimeError(f"the drive's fault cannot be reset after trial {number}: {names}")
+            shown, observation = _make_trials(env, watched, show)
             answer = watched.answer(observation)
             wanted = None if answer is None else _flat(env.gains_of(answer))
+            axes = target.axes_per_machine
             answers = np.array([_answer(shown, machine, axes, wanted) for machine in range(env.num_envs)])
             gains = np.stack([shown[answers[axis // axes]].gains[axis] for axis in range(target.num_axes)])
             motion.disable(drives)
@@ -156,6 +120,66 @@ def tune_target(
     same = np.ones(target.num_axes, bool) if wanted is None else np.all(wanted == gains, axis=1)
     overruled = np.logical_not(same.reshape(-1, axes).all(axis=1))
     return Tuned(gains, tuple(shown), answers, overruled)
+
+
+def _environment(target: Target, drives: Drives, trained: Mapping[str, Any], trials: int | None) -> GainTuning:
+    """Return the environment of a tuner's training, on a target's drives, which get the rule's gains.
+
+    Args:
+        target: The target.
+        drives: Its drives, watched.
+        trained: The agent's configuration.
+        trials: How many instead of its own number.
+    """
+    from drive_env.envs.gain_tuning import GainTuning
+    from drive_env.gains import write_gains
+    from tuning.search.trial_bench import first_gains
+
+    configuration = dict(trained) | ({} if trials is None else {"trials": trials})
+    configuration["gains"] = gains_for(trained, target.device)
+    write_gains(drives, first_gains(target))  # before anything is enabled: the drives may have any
+    return GainTuning(
+        target.num_axes // target.axes_per_machine,
+        drives=drives,
+        reach=np.where(target.high >= -target.low, target.high, target.low),
+        device=target.device.name,
+        motor=target.motor,
+        **{name: value for name, value in configuration.items() if name not in NOT_OF_DRIVES},
+    )
+
+
+def _make_trials(
+    env: GainTuning, policy: GuardedPolicy, show: Callable[[TrialShown], None]
+) -> tuple[list[TrialShown], Floats]:
+    """Return all trials of an episode, the baseline rule's first, and what the policy sees at its end.
+
+    Raises:
+        RuntimeError: If a drive cannot be cleared any more.
+    """
+    observation, info = env.reset(seed=0)
+    policy.reset()
+    no_faults = ((),) * env.num_envs
+    shown = [TrialShown(0, _flat(info["gains"]), info["measured"], info["aborted"], ~info["aborted"], no_faults)]
+    show(shown[-1])
+    for number in range(1, env.config.trials + 1):
+        action = policy.act(observation)
+        before = info["measured"]
+        observation, _, terminated, _, info = env.step(action)
+        shown.append(
+            TrialShown(
+                number,
+                _flat(info["trial_gains"]),
+                info["trial_measured"],
+                info["aborted"],
+                info["measured"] < before,
+                tuple(info["faults"]),
+            )
+        )
+        show(shown[-1])
+        if terminated.all():
+            names = ", ".join(shown[-1].faults[0]) or "it stays disabled"
+            raise RuntimeError(f"the drive's fault cannot be reset after trial {number}: {names}")
+    return shown, observation
 
 
 def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ...]:

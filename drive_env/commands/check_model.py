@@ -54,16 +54,7 @@ def check_model(
     range as a set of distributions for environments.
     """
     with errors_as_exit_codes():
-        if out is not None and not fit:
-            raise ValueError("--out is for the fitted distributions; name the parameters to fit with --fit")
-        if fit and machines < LEAST:
-            raise ValueError(f"--machines {machines} is too few for a fit; give {LEAST} or more")
-        if rounds < 1:
-            raise ValueError(f"--rounds {rounds} must be 1 or more")
-        if out is not None and not out.absolute().parent.is_dir():
-            raise ValueError(f"the folder {out.parent} does not exist; create it")
-        if out is not None:
-            check_free(out, "choose another --out")
+        _check(fit, machines, rounds, out)
         from drive_env.trials.replay import read_log
 
         recorded = read_log(log)
@@ -94,6 +85,20 @@ def check_model(
             print_json(_as_json(report, dictionary, found, out))
         else:
             _print(report, dictionary, found, out)
+
+
+def _check(fit: list[str] | None, machines: int, rounds: int, out: Path | None) -> None:
+    """Raise ValueError for options that cannot be, before anything is computed."""
+    if out is not None and not fit:
+        raise ValueError("--out is for the fitted distributions; name the parameters to fit with --fit")
+    if fit and machines < LEAST:
+        raise ValueError(f"--machines {machines} is too few for a fit; give {LEAST} or more")
+    if rounds < 1:
+        raise ValueError(f"--rounds {rounds} must be 1 or more")
+    if out is not None and not out.absolute().parent.is_dir():
+        raise ValueError(f"the folder {out.parent} does not exist; create it")
+    if out is not None:
+        check_free(out, "choose another --out")
 
 
 def _print(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -31,6 +32,7 @@ from drive_env.commands.options import (
 from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
 
 if TYPE_CHECKING:
+    from drive_env.dictionary.entries import ObjectDictionary
     from drive_env.master.bus_drives import BusDrives
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
@@ -72,7 +74,6 @@ def jog(
     """
     with errors_as_exit_codes():
         from drive_env import motion
-        from drive_env.dictionary.access import check_limits
         from drive_env.master import quantities
         from drive_env.master.description import describe
         from drive_env.safety.limits import Limits
@@ -89,21 +90,7 @@ def jog(
             look_first(interface, channel, [node], bitrate, device, eds, timeout)
         with connect(interface, channel, [node], device, eds, safety=Limits(current=current), **options) as drives:
             scale = increments_per_revolution(drives)[0]
-            velocity = quantities.parse(speed, known.find(cia402.TARGET_VELOCITY), scale)
-            if velocity == 0:
-                raise ValueError("a speed of 0 does not move the axis; give one, e.g. '60 rpm'")
-            distance = None if by is None else quantities.parse(by, known.find(cia402.TARGET_POSITION), scale)
-            # Told before the axis is enabled.
-            check_limits(known.find(cia402.TARGET_VELOCITY), velocity)
-            check_limits(known.find(cia402.TARGET_POSITION), distance or 0)
-            if (
-                drives.description.has(cia402.PROFILE_ACCELERATION)
-                and int(drives.read(cia402.PROFILE_ACCELERATION)[0]) == 0
-            ):
-                raise ValueError(
-                    "the drive's profile acceleration 6083h is 0, so nothing would move; set it "
-                    "(drive-env set 6083 '500 rev/s^2'), or commission the drive"
-                )
+            movement = _asked_for(drives, known, scale, speed, by, duration)
             start = int(drives.read(cia402.POSITION_ACTUAL)[0])
             if dry_run:
                 _tell_plan(motion, drives, speed, by, duration, start, scale, json=json)
@@ -111,21 +98,15 @@ def jog(
             reasons: list[str] = []
             trace: Any = None
             with _what_stops(reasons):
-                if distance is None:
-                    trace = _turn(motion, drives, velocity, round(duration, 3), files is not None)
-                else:
-                    trace = _go(motion, drives, abs(velocity), distance, files is not None)
+                trace = movement.run(motion, drives, is_recorded=files is not None)
             with _what_stops([]):
                 motion.disable(drives)
             drives.advance(0.1)
             moved = int(drives.read(cia402.POSITION_ACTUAL)[0]) - start
             emergencies = [message._asdict() for message in drives.emergencies()]
             if files is not None and trace is not None:
-                entries = [known.find(object_name(name)) for name in DEFAULT]
-                rows = {entry: trace[entry.index, entry.sub] for entry in entries}
-                write_table(files[0], entries, [""], trace.t, rows)
-                draw(files[1], entries, [""], [scale], trace.t, rows)
-        stopped = _verdict(moved, velocity * duration if distance is None else distance, reasons, emergencies)
+                _write(files, trace, known, scale)
+        stopped = _verdict(moved, movement.way, reasons, emergencies)
         if json:
             print_json({"moved": moved, "start": start, "emergencies": emergencies, "stopped": stopped})
         else:
@@ -136,6 +117,56 @@ def jog(
                 print("nothing was recorded" if trace is None else f"recorded in {files[0]} and {files[1]}")
         if stopped:
             fail(stopped, REFUSED)
+
+
+@dataclass(frozen=True)
+class _Movement:
+    """What an axis shall do, in the drive's units: turn at a speed for a time [s], or by a distance if there is one."""
+
+    velocity: int
+    duration: float
+    distance: int | None
+
+    @property
+    def way(self) -> float:
+        """How far the axis turns if nothing stops it."""
+        return self.velocity * self.duration if self.distance is None else self.distance
+
+    def run(self, motion: Any, drives: BusDrives, is_recorded: bool) -> Any:
+        """Enable the axis and move it; return the samples that were wanted of it."""
+        if self.distance is None:
+            return _turn(motion, drives, self.velocity, round(self.duration, 3), is_recorded)
+        return _go(motion, drives, abs(self.velocity), self.distance, is_recorded)
+
+
+def _asked_for(
+    drives: BusDrives, known: ObjectDictionary, scale: float | None, speed: str, by: str | None, duration: float
+) -> _Movement:
+    """Return the movement that the arguments ask for, before the axis is enabled; ValueError for one that cannot be."""
+    from drive_env.dictionary.access import check_limits
+    from drive_env.master import quantities
+
+    velocity = quantities.parse(speed, known.find(cia402.TARGET_VELOCITY), scale)
+    if velocity == 0:
+        raise ValueError("a speed of 0 does not move the axis; give one, e.g. '60 rpm'")
+    distance = None if by is None else quantities.parse(by, known.find(cia402.TARGET_POSITION), scale)
+    check_limits(known.find(cia402.TARGET_VELOCITY), velocity)
+    check_limits(known.find(cia402.TARGET_POSITION), distance or 0)
+    has_acceleration = drives.description.has(cia402.PROFILE_ACCELERATION)
+    if has_acceleration and int(drives.read(cia402.PROFILE_ACCELERATION)[0]) == 0:
+        raise ValueError(
+            "the drive's profile acceleration 6083h is 0, so nothing would move; set it "
+            "(drive-env set 6083 '500 rev/s^2'), or commission the drive"
+        )
+    return _Movement(velocity, duration, distance)
+
+
+def _write(files: tuple[Path, Path], trace: Any, known: ObjectDictionary, scale: float | None) -> None:
+    """Write a recorded movement as table and picture, as scope does."""
+    entries = [known.find(object_name(name)) for name in DEFAULT]
+    rows = {entry: trace[entry.index, entry.sub] for entry in entries}
+    write_table(files[0], entries, [""], trace.t, rows)
+    draw(files[1], entries, [""], [scale], trace.t, rows)
 
 
 @contextlib.contextmanager

@@ -165,6 +165,53 @@ def _fires(trigger: Trigger, values: Any, scales: list[float | None]) -> Any:
     return relation(values, level).any(axis=1)
 
 
+class _Samples:
+    """Samples of objects at every SYNC: rows of each entry, (n, axes), as long as no other master is at work."""
+
+    def __init__(self, drives: BusDrives, entries: list[Any]) -> None:
+        self._drives = drives
+        self._entries = list(dict.fromkeys(entries))
+        self._others = drives.link.other_masters()
+
+    def none(self) -> dict[Any, Any]:
+        """Return no rows."""
+        import numpy as np
+
+        return {entry: np.empty((0, self._drives.num_axes), np.int64) for entry in self._entries}
+
+    def record(self, seconds: float) -> dict[Any, Any]:
+        """Return the next rows."""
+        from drive_env.master.errors import BusError
+
+        names = [(entry.index, entry.sub) for entry in self._entries]
+        try:
+            trace = self._drives.record(names, round(seconds, 3))
+        except BusError:
+            self._others.check()  # samples that stay out are another master's doing, if there is one
+            raise
+        self._drives.link.drain()
+        self._others.check()
+        return {entry: trace[name] for entry, name in zip(self._entries, names, strict=True)}
+
+    def complete(self, rows: dict[Any, Any], missing: int) -> tuple[dict[Any, Any], BaseException | None]:
+        """Return these rows and as many more, or those that came before Ctrl-C or the loss of the bus, and which."""
+        from drive_env.master.errors import BusError
+
+        pieces, broken, piece = [rows], None, round(PIECE / 0.001)
+        try:
+            for first in range(0, missing, piece):
+                pieces.append(self.record(min(piece, missing - first) * 0.001))
+        except (BusError, KeyboardInterrupt) as error:
+            broken = error
+        return self.joined(pieces), broken
+
+    def joined(self, pieces: list[dict[Any, Any]]) -> dict[Any, Any]:
+        """Return rows one after the other."""
+        import numpy as np
+
+        return {entry: np.concatenate([part[entry] for part in pieces]) for entry in self._entries}
+
+
 def _record(
     drives: BusDrives,
     entries: list[Any],
@@ -175,59 +222,40 @@ def _record(
     wait: float,
 ) -> tuple[dict[Any, Any], int, BaseException | None]:
     """Return rows of each entry, the number of the row at which the trigger fired, and what broke the rest off."""
+    count, keep = round(duration / 0.001), round(before / 0.001)
+    if trigger is None:
+        samples = _Samples(drives, entries)
+        rows, broken = samples.complete(samples.none(), count)
+        return rows, 0, broken
+    samples = _Samples(drives, [*entries, trigger.entry])
+    rows, fired = _wait_for(trigger, samples, scales, keep, wait)
+    begin, end = max(0, fired - keep), fired + count
+    rows, broken = samples.complete(rows, end - len(rows[trigger.entry]))
+    return {entry: rows[entry][begin:end] for entry in entries}, fired - begin, broken
+
+
+def _wait_for(
+    trigger: Trigger, samples: _Samples, scales: list[float | None], keep: int, wait: float
+) -> tuple[dict[Any, Any], int]:
+    """Return the rows around the trigger, at least `keep` before it if there were so many, and at which row it fired.
+
+    Where it does not fire within `wait` [s] the command ends.
+    """
     import numpy as np
 
-    from drive_env.master.errors import BusError
-
-    wanted = list(dict.fromkeys([*entries, trigger.entry] if trigger else entries))
-    names = [(entry.index, entry.sub) for entry in wanted]
-
-    others = drives.link.other_masters()
-
-    def record(seconds: float) -> dict[Any, Any]:
-        try:
-            trace = drives.record(names, round(seconds, 3))
-        except BusError:
-            others.check()  # samples that stay out are another master's doing, if there is one
-            raise
-        drives.link.drain()
-        others.check()
-        return {entry: trace[name] for entry, name in zip(wanted, names, strict=True)}
-
-    def rest(rows: dict[Any, Any], missing: int) -> tuple[dict[Any, Any], BaseException | None]:
-        """Return these rows and as many more, or those that came before Ctrl-C or the loss of the bus."""
-        pieces, broken, piece = [rows], None, round(PIECE / 0.001)
-        try:
-            for first in range(0, missing, piece):
-                pieces.append(record(min(piece, missing - first) * 0.001))
-        except (BusError, KeyboardInterrupt) as error:
-            broken = error
-        return {entry: np.concatenate([part[entry] for part in pieces]) for entry in wanted}, broken
-
-    nothing: dict[Any, Any] = {entry: np.empty((0, drives.num_axes), np.int64) for entry in wanted}
-    if trigger is None:
-        rows, broken = rest(nothing, round(duration / 0.001))
-        return rows, 0, broken
-    _fires(trigger, np.zeros((1, drives.num_axes), np.int64), scales)  # a wrong level is told before the wait
-    keep = round(before / 0.001)
-    rows = nothing
+    rows = samples.none()
+    _fires(trigger, np.zeros((1, len(scales)), np.int64), scales)  # a wrong level is told before the wait
     held = True  # a condition that holds from the start must end first
     for _ in range(max(1, round(wait / CHUNK))):
-        chunk = record(CHUNK)
+        chunk = samples.record(CHUNK)
         holds = _fires(trigger, chunk[trigger.entry], scales)
         first = np.flatnonzero(holds & ~np.concatenate([[held], holds[:-1]]))
         held = bool(holds[-1])
         old = len(rows[trigger.entry])
-        rows = {entry: np.concatenate([rows[entry], chunk[entry]]) for entry in wanted}
+        rows = samples.joined([rows, chunk])
         if first.size:
-            fired = old + int(first[0])
-            begin, end = max(0, fired - keep), fired + round(duration / 0.001)
-            rows, broken = rest(rows, end - len(rows[trigger.entry]))
-            return {entry: rows[entry][begin:end] for entry in entries}, fired - begin, broken
-        if keep:
-            rows = {entry: rows[entry][-keep:] for entry in wanted}
-        else:
-            rows = {entry: rows[entry][:0] for entry in wanted}
+            return rows, old + int(first[0])
+        rows = {entry: values[max(0, len(values) - keep) :] for entry, values in rows.items()}
     fail(f"the trigger {trigger.entry.label} {trigger.relation} {trigger.text} did not fire within {wait:g} s", REFUSED)
 
 

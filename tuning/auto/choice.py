@@ -7,17 +7,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.dictionary.roles import Role
-from tuning.auto.loop_margins import SENSITIVITY, sensitivity
+from drive_env.safety.envelope import SafetyError
+from tuning.auto.calmer_gains import cost_on_twins
+from tuning.auto.measured_margins import SENSITIVITY, sensitivity
 from tuning.auto.moves import show
 from tuning.auto.run import MOVE_TIME
-from tuning.auto.twin import Twins, known_of
 
 if TYPE_CHECKING:
     from tuning.auto.run import AutoRun
 
 Mask = NDArray[np.bool_]
 
+BAD = 8.0  # measured cost J of a move, above which another is made with the rule's gains
 CLEARLY = 0.98  # of the robust cost on the twins: what is less than that is worth another move
 
 
@@ -26,6 +27,7 @@ def choose(run: AutoRun) -> None:
 
     The gains found are better on the twins before they are slowed; afterwards they need not be.
     """
+    _try_rule_where_bad(run)
     better = _rule_is_better(run)
     if not better.any():
         return
@@ -36,6 +38,36 @@ def choose(run: AutoRun) -> None:
             "search are worse once slowed"
         )
     show(run, better)
+
+
+def _try_rule_where_bad(run: AutoRun) -> None:
+    """Record a move with the rule's gains on axes that moved badly, and keep what moved better."""
+    if run.shown is None or run.ground is None:
+        return
+    where = run.going & run.shown.where & (run.shown.cost > BAD) & (run.gains != run.reference).any(axis=1)
+    where = run.whole_machines(where & run.affordable(MOVE_TIME))
+    if not where.any():
+        return
+    try:
+        with run.spending(where):
+            with_rule = run.ground.show(run.reference, where)
+    except SafetyError as error:
+        run.note(where, f"the envelope stopped the move with the baseline rule's gains: {error}")
+        return
+    faulted = np.isin(np.arange(run.target.num_axes), list(run.faults()))
+    if faulted.any():
+        with run.spending(run.target.together(faulted)):
+            run.ground.recover(faulted)
+        run.drop_faults("moving with the baseline rule's gains, and the fault cannot be reset")
+    passed = np.array([not reason for reason in with_rule.reason])
+    better = run.whole_machines(where & passed & ~with_rule.restless & (with_rule.cost < run.shown.cost))
+    for k in map(int, np.flatnonzero(better)):
+        run.gains[k], run.spare[k] = run.reference[k], 0
+        run.axes[k].notes.append(
+            f"the gains of the baseline rule are kept: the measured cost J of a move was {with_rule.cost[k]:.2f} with "
+            f"them and {run.shown.cost[k]:.2f} with the gains found by search"
+        )
+    run.shown = run.shown.replaced(with_rule._replace(where=better))
 
 
 def _rule_is_better(run: AutoRun) -> Mask:
@@ -49,16 +81,7 @@ def _rule_is_better(run: AutoRun) -> Mask:
     if response is None or not chosen.size:
         return better
     axes = chosen.tolist()
-    low, high = run.room()
-    reach = np.where(high >= -low, high, low)
-    known = []
-    for k in axes:
-        plant, identified = run.axes[k].plant, run.axes[k].identified
-        assert plant is not None and identified is not None, "an axis in the run has both"
-        known.append(known_of(plant, identified, float(reach[k])))
-    scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[chosen]
-    with Twins(target.device, target.motor, known, scaler, 2) as twins:
-        cost = twins.score(np.stack([run.gains[chosen], run.reference[chosen]], axis=1))
+    cost = cost_on_twins(run, axes, np.stack([run.gains[chosen], run.reference[chosen]], axis=1))
     for k, (own, rule) in zip(axes, cost, strict=True):
         better[k] = rule < CLEARLY * own and sensitivity(run, response, run.reference[k], k) <= SENSITIVITY
     return better

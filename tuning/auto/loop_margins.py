@@ -15,25 +15,24 @@ from drive_env.dictionary.roles import Role
 from drive_env.gains import write_gains
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError
+from tuning.auto.measured_margins import CALMED, SENSITIVITY, judged_loops, margins_with, sensitivity
 from tuning.auto.moves import show
 from tuning.auto.run import MOVE_TIME, TRIAL_TIME
-from tuning.auto.trials import BY_TRIAL, watch_following
-from tuning.response.margins import Margins, margins
+from tuning.auto.trials import BY_TRIAL, faster, watch_following
 from tuning.response.measured_loop import merged
 
 if TYPE_CHECKING:
     from tuning.auto.result import AxisRun
     from tuning.auto.run import AutoRun
+    from tuning.response.margins import Margins
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
 
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 LEAST_LINES = 10  # of a frequency response, that are worth a judgement
-SENSITIVITY = 4.0  # greatest |1/(1+L)| that a measured loop may have
 CLOSE = {"phase": 14.0, "gain": 2.5}  # margins that this leaves at least [degrees, dB]
 SOFTER = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2)  # factors of gains by which a lively loop is calmed
-CALMED = {"velocity": ("velocity", "position"), "position": ("position",)}  # whose P is lowered for a loop
 OVERTIME = 0.5  # s beyond the budget for a response: so near to the end margins are worth more than the time
 LONGER = 2  # times as long it is shaken where too little was seen
 LEAST_WAY = 1e-3  # rad; an axis without any way is shaken as little as can be, and its response says so
@@ -97,7 +96,7 @@ def _unclear(run: AutoRun, response: MeasuredLoop, going: Mask) -> Mask:
     left = run.affordable(LONGER * run.response_time + run.response_time + run.look_back_time)
     unclear = np.zeros(run.target.num_axes, bool)
     for k in map(int, np.flatnonzero(going & left)):
-        found = _margins(run, response, run.gains[k], k)["velocity"] if _seen(response, k) >= LEAST_LINES else None
+        found = margins_with(run, response, run.gains[k], k)["velocity"] if _seen(response, k) >= LEAST_LINES else None
         unclear[k] = found is None or not math.isfinite(found.phase_deg)
     return unclear
 
@@ -105,6 +104,20 @@ def _unclear(run: AutoRun, response: MeasuredLoop, going: Mask) -> Mask:
 def _seen(response: MeasuredLoop, k: int) -> int:
     """Return how many lines of an axis are coherent, together with their neighbours where a model fits."""
     return round(float(response.refined(k)[2].mean()) * len(response.f))
+
+
+def _rule_instead(run: AutoRun, k: int, response: MeasuredLoop, why: str) -> bool:
+    """Take the baseline rule's gains, slowed as far as needed, for an axis whose own cannot be calmed; or reject it."""
+    axis = run.axes[k]
+    for factor in SOFTER:
+        gains = faster(run.target.device.gains, run.reference[k], factor)
+        if sensitivity(run, response, gains, k) <= SENSITIVITY:
+            slowed = "" if factor == 1.0 else f", slowed to {100.0 * factor:.0f} %,"
+            axis.notes.append(f"the gains of the baseline rule{slowed} are kept: with those found by search {why}")
+            run.gains[k], run.spare[k] = gains, 0
+            return True
+    axis.reason = f"{why}; {SENSITIVITY:g} is allowed"
+    return False
 
 
 def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
@@ -118,18 +131,17 @@ def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
     gains, known = run.gains[k], run.target.device.gains
     for loop, lowered in CALMED.items():
         calmed = [column for column in known.columns_of(*lowered) if known.rows[column].part == "P"]
-        if loop not in _loops(run):
+        if loop not in judged_loops(run):
             continue
         for factor in SOFTER:
             softer = known.scaled(gains, factor, calmed)
-            found = _margins(run, response, softer, k)[loop]
+            found = margins_with(run, response, softer, k)[loop]
             if found.ms <= SENSITIVITY:
                 break
         else:
-            axis.reason = (
-                f"the measured {loop} loop has a sensitivity peak Ms of {found.ms:.1f}; {SENSITIVITY:g} is allowed"
+            return _rule_instead(
+                run, k, response, f"the measured {loop} loop has a sensitivity peak Ms of {found.ms:.1f}"
             )
-            return False
         if factor != 1.0:
             names = " and ".join(known.titles[column] for column in calmed)
             axis.notes.append(
@@ -143,25 +155,6 @@ def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
     return True
 
 
-def _loops(run: AutoRun) -> tuple[str, ...]:
-    """Return the loops whose margins a measured velocity loop gives; of linked axes only the velocity loop."""
-    return ("velocity",) if run.target.linked else tuple(CALMED)
-
-
-def _margins(run: AutoRun, response: MeasuredLoop, gains: Integers, k: int) -> dict[str, Margins]:
-    """Return the margins of both outer loops of an axis, by its measured velocity loop."""
-    f, velocity, position, trusted = response.loops(gains, k, plant=run.axes[k].plant)
-    found = {"velocity": margins(f, velocity, trusted), "position": margins(f, position, trusted)}
-    # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
-    return {loop: one if math.isfinite(one.gain_db) else one._replace(gain_db=math.nan) for loop, one in found.items()}
-
-
-def sensitivity(run: AutoRun, response: MeasuredLoop, gains: Integers, k: int) -> float:
-    """Return Ms of the outer loops of an axis by its measured velocity loop, the greater."""
-    found = _margins(run, response, gains, k)
-    return max(found[loop].ms for loop in _loops(run))
-
-
 def judge(run: AutoRun) -> None:
     """Write down the margins of the final gains: as measured, or their lower bound."""
     response = run.response
@@ -170,10 +163,10 @@ def judge(run: AutoRun) -> None:
     for k in map(int, np.flatnonzero(run.going & ~run.unseen)):
         axis = run.axes[k]
         gains = run.gains[k]
-        found = _margins(run, response, gains, k)
-        axis.margins = {loop: found[loop] for loop in _loops(run)}
-        axis.at_least = {loop: response.at_least(loop, gains, k) for loop in _loops(run)}
-        for loop in _loops(run):
+        found = margins_with(run, response, gains, k)
+        axis.margins = {loop: found[loop] for loop in judged_loops(run)}
+        axis.at_least = {loop: response.at_least(loop, gains, k) for loop in judged_loops(run)}
+        for loop in judged_loops(run):
             _tell(axis, loop, axis.margins[loop], axis.at_least[loop])
         axis.notes += [note for note in response.notes[k] if note not in axis.notes]
         if run.target.linked:

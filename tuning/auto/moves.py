@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
+from tuning.auto.calmer_gains import calmer
 from tuning.auto.load_step import NOISE, SWING, load_step
 from tuning.auto.proving import RESTLESS, without_noise
 from tuning.auto.run import MOVE_TIME, TRIAL_TIME
@@ -90,15 +91,16 @@ def _ease(run: AutoRun, k: int, swing: float, why: str) -> None:
         why: What it did, in words.
     """
     axis, rule, known = run.axes[k], run.reference[k], run.target.device.gains
-    outer = known.columns_of("velocity", "position")
     factor = float(np.clip(EASED_TO * RESTLESS / swing, EASED_LEAST, EASED))
-    slowed = faster(known, run.gains[k], factor)
     is_rule = np.array_equal(run.gains[k], rule)
-    is_slow = bool(np.all(slowed[outer] <= rule[outer]))
-    if not is_rule and (swing > LIMIT_CYCLE or axis.eased == EASINGS - 1 or is_slow):
+    if not is_rule and swing > LIMIT_CYCLE:
         run.gains[k] = rule
         axis.notes.append(f"the gains of the baseline rule are kept: with faster ones {why}")
+    elif axis.eased < EASINGS - 1:
+        run.gains[k] = calmer(run, k, factor)
+        axis.notes.append(f"velocity P lowered to {100.0 * factor:.0f} %, and gains that suit it taken: {why}")
     else:
+        slowed = faster(known, run.gains[k], factor)
         run.gains[k] = slowed
         axis.notes.append(f"gains lowered to {100.0 * factor:.0f} %: {why}")
     run.spare[k] = 0  # about as fast as the best, which shook

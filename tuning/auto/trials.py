@@ -41,6 +41,7 @@ def prove(run: AutoRun) -> None:
     best, cost, last = run.fallbacks[-1].copy(), np.full(n, np.inf), [""] * n
     second = cost.copy()
     while True:
+        _recover_from_faults(run, ground)
         passed = np.array([ladder.passed for ladder in ladders])
         open_ = run.going & np.array([ladder.rung is not None for ladder in ladders])
         # Time for a response and two moves is kept, unless there is nothing yet to make them with.
@@ -76,6 +77,15 @@ def prove(run: AutoRun) -> None:
             failed = ", ".join(rung.words for rung in ladder.failures)
             axis.notes.append(f"failed trials: {failed}; the last: {last[k]}")
     run.gains = best
+
+
+def _recover_from_faults(run: AutoRun, ground: ProvingGround) -> None:
+    """Reset faults that have come since a trial; an axis that stays in one takes no further part."""
+    faulted = np.isin(np.arange(run.target.num_axes), list(run.faults()))
+    if faulted.any():
+        with run.spending(run.target.together(faulted)):
+            ground.recover(faulted)
+        run.drop_faults("gains were tried, and the fault cannot be reset")
 
 
 def _to_blame(run: AutoRun, proof: Proof, where: Mask) -> Mask:

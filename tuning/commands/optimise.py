@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -27,6 +27,9 @@ from tuning.commands.options import (
     takes,
     what_an_interrupt_leaves,
 )
+
+if TYPE_CHECKING:
+    from tuning.search.optimise import Settings
 
 MOST_SEARCHES = 10_000
 STALL = 60.0  # s: so long a sampler may think while an axis stands still, enabled
@@ -123,51 +126,77 @@ def optimise(
                 "continued with --journal"
             )
         from drive_env.devices import find_device
-        from tuning.runs import provenance, unfinished
+        from tuning.runs import provenance
         from tuning.search.optimise import Settings
-        from tuning.snapshot import file_before
 
         folder = provenance.run_folder("optimise") if out is None else out
         if resume:
             _check_unfinished(folder, journal)
         provenance.check_folder(folder)
         known = find_device(drive.device).gains
-        chosen: dict[str, Any] = {"gains": tuple(gains) if gains else known.outer}
-        known.columns(chosen["gains"])  # before anything moves
-        if width is not None:
-            chosen["width"] = width
+        searched = tuple(gains) if gains else known.outer
+        known.columns(searched)  # before anything moves
         settings = Settings(
             sampler=sampler,
             trials=trials,
             objectives=tuple(objectives) if objectives else ("cost",),
+            gains=searched,
             safe=drive.bus if safe is None else safe,
             seed=drive.seed,
             journal=journal,
-            **chosen,
+            **({} if width is None else {"width": width}),
         )
-        where = "the bus" if drive.bus else f"an emulated {drive.load}"
-        common = {name: getattr(drive, name) for name in ("device", "motor", "supply", "travel")}
-        if not drive.bus:
-            machine = drive.machine() | {"num_machines": copies}
-            try:
-                found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
-            except KeyboardInterrupt:
-                fail(what_an_interrupt_leaves(folder) if journal is None else _kept_in(journal), INTERRUPTED)
-            emulated = common | {"load": drive.load, "copies": copies, "searches": searches}
-            _save(found, settings, folder, emulated)
-            _report(found, settings, folder, None, where, emulated, json)
-            unfinished.discard(folder)
-            return
-        before = file_before("optimise", folder)
-        with drive.open() as target:
-            given = {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
-            on_bus = common | given | dict(target.bus)
-            try:
-                found = _search_bus(target, settings, before, folder, on_bus)
-            except KeyboardInterrupt:
-                lost = "interrupted; the trials made so far are lost: on a bus they are kept only with --journal FILE"
-                fail(lost if journal is None else _kept_in(journal), INTERRUPTED)
-        _report(found, settings, folder, before, where, on_bus, json)
+        if drive.bus:
+            _on_bus(drive, settings, folder, json)
+        else:
+            _on_machine(drive, settings, copies, searches, folder, workers, cluster, resume, json)
+
+
+def _on_machine(
+    drive: DriveOptions,
+    settings: Settings,
+    copies: int,
+    searches: int,
+    folder: Path,
+    workers: int | None,
+    cluster: str | None,
+    resume: bool,
+    json: bool,
+) -> None:
+    """Search on an emulated machine, write and print what was found."""
+    from tuning.runs import unfinished
+
+    machine = drive.machine() | {"num_machines": copies}
+    try:
+        found = _search_machine(machine, settings, searches, folder, workers, cluster, resume)
+    except KeyboardInterrupt:
+        kept = what_an_interrupt_leaves(folder) if settings.journal is None else _kept_in(settings.journal)
+        fail(kept, INTERRUPTED)
+    options = _named(drive) | {"load": drive.load, "copies": copies, "searches": searches}
+    _save(found, settings, folder, options)
+    _report(found, settings, folder, None, f"an emulated {drive.load}", options, json)
+    unfinished.discard(folder)
+
+
+def _on_bus(drive: DriveOptions, settings: Settings, folder: Path, json: bool) -> None:
+    """Search on the drives of a bus, write and print what was found."""
+    from tuning.snapshot import file_before
+
+    before = file_before("optimise", folder)
+    with drive.open() as target:
+        given = {"nodes": drive.nodes or [1], "bitrate": drive.bitrate, "lockstep": drive.lockstep}
+        options = _named(drive) | given | dict(target.bus)
+        try:
+            found = _search_bus(target, settings, before, folder, options)
+        except KeyboardInterrupt:
+            lost = "interrupted; the trials made so far are lost: on a bus they are kept only with --journal FILE"
+            fail(lost if settings.journal is None else _kept_in(settings.journal), INTERRUPTED)
+    _report(found, settings, folder, before, "the bus", options, json)
+
+
+def _named(drive: DriveOptions) -> dict[str, Any]:
+    """Return what settings.toml tells of any drive."""
+    return {name: getattr(drive, name) for name in ("device", "motor", "supply", "travel")}
 
 
 def _search_machine(

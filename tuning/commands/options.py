@@ -118,9 +118,13 @@ class DriveOptions:
     axes: Axes = APART
     yes: Yes = False
 
+    def check(self) -> None:
+        """Raise ValueError for a number that cannot be."""
+        check_seed(self.seed)
+
     def machine(self) -> dict[str, Any]:
         """Return what `tuning.target.emulated` takes of these options; raises as `open_target` does."""
-        check_seed(self.seed)
+        self.check()
         check_no_bus(self.nodes, self.bitrate, self.lockstep, self.axes)
         named = {name: getattr(self, name) for name in ("device", "load", "motor", "seed", "supply")}
         return named | {"travel": None if self.travel is None else parse_travels(self.travel)}
@@ -129,7 +133,7 @@ class DriveOptions:
         """Return the drives, once the user lets a motor of a bus turn; raises as `open_target` does."""
         if self.bus and self.travel is not None:
             ask_to_turn(self.nodes, self.yes)
-        return open_target(**{name: value for name, value in vars(self).items() if name != "yes"})
+        return open_target(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +142,15 @@ class TargetOptions(DriveOptions):
 
     machines: Machines = 1
     randomise: Randomise = False
+
+    def check(self) -> None:
+        """Raise ValueError for a number that cannot be."""
+        super().check()
+        check_machines("--machines", self.machines)
+
+    def machine(self) -> dict[str, Any]:
+        """Return what `tuning.target.emulated` takes of these options; raises as `open_target` does."""
+        return super().machine() | {"num_machines": self.machines, "randomise": self.randomise}
 
 
 def takes(options: type[DriveOptions]) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -234,53 +247,31 @@ def ask_to_turn(nodes: list[int] | None, yes: bool) -> None:
     ask(f"The motor of node {', '.join(map(str, nodes or [1]))} will turn. Is its way clear?", yes)
 
 
-def open_target(
-    *,
-    bus: bool = False,
-    device: str = "tmcm1636",
-    motor: str = "qbl4208",
-    load: str = "two_mass",
-    seed: int = 0,
-    machines: int = 1,
-    randomise: bool = False,
-    interface: str | None = None,
-    channel: str | None = None,
-    nodes: list[int] | None = None,
-    bitrate: int | None = None,
-    lockstep: bool = False,
-    supply: float | None = None,
-    travel: str | None = None,
-    axes: str = APART,
-) -> Target:
-    """Return what a command's options name: drives on a bus if any of the bus's options is given, or emulated ones.
+def open_target(drive: DriveOptions) -> Target:
+    """Return what a command's options name, drives on a bus or emulated ones, without asking.
 
     Raises:
         ValueError: For a name that does not exist, or a bus without a travel; BusError if a node does not answer.
     """
     from tuning.target import LOCKSTEP_PATIENCE, emulated, on_bus
 
-    check_seed(seed)
-    check_machines("--machines", machines)
-    if not bus:
-        check_no_bus(nodes, bitrate, lockstep, axes)
-        ends = None if travel is None else parse_travels(travel)
-        return emulated(
-            device, load, motor, num_machines=machines, seed=seed, randomise=randomise, supply=supply, travel=ends
-        )
-    if travel is None:
+    drive.check()
+    if not drive.bus:
+        return emulated(**drive.machine())
+    if drive.travel is None:
         raise ValueError("--travel is missing: give how far the motor may turn, LOW:HIGH in turns, or free")
-    options: dict[str, Any] = {} if bitrate is None else {"bitrate": bitrate}
-    if lockstep:
+    options: dict[str, Any] = {} if drive.bitrate is None else {"bitrate": drive.bitrate}
+    if drive.lockstep:
         options |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE}
     return on_bus(
-        device,
-        motor,
-        interface=interface,
-        channel=channel,
-        nodes=nodes or (1,),
-        supply=supply,
-        travel=parse_travels(travel),
-        axes=axes,
+        drive.device,
+        drive.motor,
+        interface=drive.interface,
+        channel=drive.channel,
+        nodes=drive.nodes or (1,),
+        supply=drive.supply,
+        travel=parse_travels(drive.travel),
+        axes=drive.axes,
         **options,
     )
 

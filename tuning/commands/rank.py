@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -22,6 +23,11 @@ from tuning.commands.options import (
     progress_bar,
     what_an_interrupt_leaves,
 )
+
+if TYPE_CHECKING:
+    from tuning.compare.comparison import Comparison
+    from tuning.compare.suite import SuiteMachine
+    from tuning.outcome import Tuner
 
 
 def rank(
@@ -66,45 +72,40 @@ def rank(
             return
         if resume and out is None:
             raise ValueError("--resume needs --out: the folder into which the comparison was to write")
-        from tuning.runs import provenance
+        from tuning.runs import provenance, unfinished
 
         folder = provenance.run_folder("rank") if out is None else out
         try:
-            _compare(suite, tuners, seed, drawn, count, trials, folder, slow, resume, json, workers, cluster)
+            from tuning.compare.comparison_files import save
+            from tuning.compare.suite import load_suite
+
+            check_seed(seed)
+            if trials is not None and trials < 1:
+                raise ValueError(f"--trials must be 1 or more, not {trials}")
+            provenance.check_folder(folder)
+            machines = load_suite(suite, seed if drawn else None, count)
+            compared, left_out = _find_tuners(tuners, trials, slow)
+            settings: dict[str, Any] = {
+                "suite": suite,
+                "tuners": list(compared),
+                "seed": seed,
+                "drawn": drawn,
+                "count": count,
+                "trials": trials,
+            } | provenance.versions()
+            comparison = _compare(machines, compared, settings, folder, resume, workers, cluster)
+            with provenance.new_folder(folder) as partial:
+                save(comparison, partial, settings)
+            unfinished.discard(folder)
+            _report(comparison, folder, left_out, json)
         except KeyboardInterrupt:
             fail(what_an_interrupt_leaves(folder), INTERRUPTED)
 
 
-def _compare(
-    suite: str,
-    names: list[str] | None,
-    seed: int,
-    drawn: bool,
-    count: int | None,
-    trials: int | None,
-    folder: Path,
-    slow: bool,
-    resume: bool,
-    json: bool,
-    workers: int | None,
-    cluster: str | None,
-) -> None:
-    import hashlib
-    from dataclasses import asdict
-
-    from tuning.compare.against_best import all_rivals
-    from tuning.compare.comparison import compare as run
-    from tuning.compare.comparison_files import save, settings_text
-    from tuning.compare.suite import groups, load_suite
+def _find_tuners(names: list[str] | None, trials: int | None, slow: bool) -> tuple[dict[str, Tuner], list[str]]:
+    """Return the tuners that are compared, and which were left out since a package of theirs is not installed."""
     from tuning.compare.tuners import MissingTunerError, find_tuner, tuner_rows
-    from tuning.runs import provenance, unfinished
-    from tuning.runs.pools import open_pool
 
-    check_seed(seed)
-    if trials is not None and trials < 1:
-        raise ValueError(f"--trials must be 1 or more, not {trials}")
-    provenance.check_folder(folder)
-    machines = load_suite(suite, seed if drawn else None, count)
     tuners, left_out = {}, []
     for name in names or [row.name for row in tuner_rows().values() if slow or not row.slow]:
         try:
@@ -113,36 +114,57 @@ def _compare(
             if names:  # asked for by name
                 raise
             left_out.append(str(error))
-    settings = {"suite": suite, "tuners": list(tuners), "seed": seed, "drawn": drawn, "count": count}
-    settings |= {"trials": trials}
-    settings |= provenance.versions()
+    return tuners, left_out
+
+
+def _compare(
+    machines: Sequence[SuiteMachine],
+    tuners: Mapping[str, Tuner],
+    settings: Mapping[str, Any],
+    folder: Path,
+    resume: bool,
+    workers: int | None,
+    cluster: str | None,
+) -> Comparison:
+    """Compare tuners on machines; what is done of a run that is stopped is kept beside the folder."""
+    import hashlib
+
+    from tuning.compare.comparison import compare
+    from tuning.compare.comparison_files import settings_text
+    from tuning.compare.suite import groups
+    from tuning.runs import unfinished
+    from tuning.runs.pools import open_pool
+
     # The machines themselves, not the suite's name alone: its file may have been edited since.
-    run_text = settings_text(settings | {"machines": hashlib.sha256(repr(machines).encode()).hexdigest()})
+    run_text = settings_text({**settings, "machines": hashlib.sha256(repr(machines).encode()).hexdigest()})
     with unfinished.shard_log(folder, run_text, resume=resume) as log:
         if log.done:
-            print(f"note: continues a stopped run; {len(log.done)} of {len(tuners) * len(groups(machines))} steps are "
-                  f"done",
-                  file=sys.stderr)  # fmt: skip
+            steps = len(tuners) * len(groups(machines))
+            print(f"note: continues a stopped run; {len(log.done)} of {steps} steps are done", file=sys.stderr)
         with open_pool(workers, cluster) as pool:
             for line in pool.differences():
                 print(f"note: {line}", file=sys.stderr)
             elsewhere = workers is not None or cluster is not None
             with progress_bar(f"{len(tuners)} tuners on {len(machines)} machines") as show:
-                comparison = run(
-                    machines, tuners, seed=seed, log=log, progress=lambda what, share: show(share),
-                    pool=pool if elsewhere else None, trials=trials,
+                return compare(
+                    machines, tuners, seed=settings["seed"], log=log, progress=lambda what, share: show(share),
+                    pool=pool if elsewhere else None, trials=settings["trials"],
                 )  # fmt: skip
-    with provenance.new_folder(folder) as partial:
-        save(comparison, partial, settings)
-    unfinished.discard(folder)
-    if json:
-        rivals = [asdict(row) for row in all_rivals(comparison)]
-        print_json({"tuners": [asdict(row) for row in comparison.tuners], "rivals": rivals, "folder": str(folder)})
+
+
+def _report(comparison: Comparison, folder: Path, left_out: list[str], json: bool) -> None:
+    from dataclasses import asdict
+
+    from tuning.compare.against_best import all_rivals
+
+    if not json:
+        _print(comparison, folder, left_out)
         return
-    _print(comparison, folder, left_out)
+    rivals = [asdict(row) for row in all_rivals(comparison)]
+    print_json({"tuners": [asdict(row) for row in comparison.tuners], "rivals": rivals, "folder": str(folder)})
 
 
-def _print(comparison: Any, folder: Path, left_out: list[str]) -> None:
+def _print(comparison: Comparison, folder: Path, left_out: list[str]) -> None:
     from tuning.compare.against_best import all_rivals
 
     machines = comparison.tuners[0].machines

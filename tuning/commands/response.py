@@ -61,7 +61,7 @@ def response(
     --out or in runs/.
     """
     with errors_as_exit_codes():
-        from tuning.response.frequency_response import measure
+        from tuning.response.frequency_response import Signal, measure
         from tuning.runs import provenance
 
         if out is not None:
@@ -72,9 +72,7 @@ def response(
             )
         file = way_back(drive, "response", out)
         with drive.open() as target, unchanged(target, file), progress_bar("shaking") as show:
-            measured = measure(
-                target, loop, kind=signal, low=low, high=high, resolution=resolution, traced=trace, progress=show
-            )
+            measured = measure(target, loop, signal=Signal(signal, low, high, resolution), traced=trace, progress=show)
         if out is not None:
             _write(out, measured)
         if json:

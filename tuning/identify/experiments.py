@@ -34,7 +34,7 @@ from tuning.identify.working_state import (
     working_state,
 )
 from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken, watch_of
-from tuning.response.frequency_response import measure
+from tuning.response.frequency_response import Signal, measure
 from tuning.stop_causes import stop_causes
 from tuning.target import Target, timed
 
@@ -267,7 +267,7 @@ class Experiments:
         here = replace(target, low=np.minimum(down, 0.0), high=np.maximum(up, 1e-3))
         with swinging_allowed(drives):
             response = measure(
-                here, "velocity", where=able, high=HIGHEST, confirmed=True, softened=True,
+                here, "velocity", where=able, signal=Signal(high=HIGHEST), confirmed=True, softened=True,
                 progress=lambda share: self.progress("resonance, delay, filter", 0.7 + 0.29 * share),
             )  # fmt: skip
         for k in np.flatnonzero(able):

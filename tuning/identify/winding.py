@@ -204,25 +204,51 @@ def _levels(repeats: int) -> tuple[Floats, NDArray[np.int64]]:
     return np.array(levels), np.array(blocks)
 
 
+class _Regulator(NamedTuple):
+    """The current loop of an axis, as it is simulated."""
+
+    P: float  # duty per ampere
+    share: float  # of P e, by which the integrator grows every tick
+    supply: float  # V
+    dt: float  # s, of a tick
+    ticks: int  # in a millisecond
+
+
+class _WindingModel(NamedTuple):
+    """The winding of an axis, as a round of the fit takes it."""
+
+    R: float
+    L: float
+    emf: float  # K_e
+    lost: float  # V, by dead time
+    saturation: float  # A, from which on dead time loses that
+    brushed: bool
+
+
 def _winding(working: Working, axis: _AxisWinding, k: int, electrical: float, pole_pairs: float) -> Winding:
-    target, motor = working.target, working.target.motor
+    target, motor, device = working.target, working.target.motor, working.target.device
     supply = float(target.supply[k])
     P_raw, I_raw = loop_gains(working)
-    per = per_chip(target.device)
-    P = P_raw[k] / per["current", "P"] / (256.0 * target.device.current_full_scale)
-    share = I_raw / per["current", "I"] / 65536.0
-    emf = motor.torque_constant / (1.0 if motor.kind == "dc" else 1.5)
-    row = target.device.stage["dead_time_current"]
+    per = per_chip(device)
+    regulator = _Regulator(
+        P=P_raw[k] / per["current", "P"] / (256.0 * device.current_full_scale),
+        share=I_raw / per["current", "I"] / 65536.0,
+        supply=supply,
+        dt=1.0 / device.current_rate,
+        ticks=round(CYCLE * device.current_rate),
+    )
+    brushed = motor.kind == "dc"
+    emf = motor.torque_constant / (1.0 if brushed else 1.5)
+    angle = electrical + pole_pairs * (0.5 * (axis.angle[1:] + axis.angle[:-1]) - axis.angle[0])
+    row = device.stage["dead_time_current"]
     results: list[_Solved] = []
     R, L, lost = motor.R_s, motor.L_q, 0.0
-    for saturation in np.geomspace(row.low, row.high, SATURATIONS):
+    for saturation in map(float, np.geomspace(row.low, row.high, SATURATIONS)):
         # What happens within a millisecond is modelled with the values of the round before, until they stay.
         for _ in range(MOST_ROUNDS):
             before = np.array([R, L, lost])
-            window = _window(
-                working, axis, P, share, supply, R, L, emf, lost, float(saturation), electrical, pole_pairs
-            )
-            solved = _fit(working, window, axis.block, supply, emf, float(saturation))
+            window = _window(working, axis, regulator, _WindingModel(R, L, emf, lost, saturation, brushed), angle)
+            solved = _fit(working, window, axis.block, supply, emf, saturation)
             R, L = max(float(solved.mean[0]), 0.2 * motor.R_s), max(float(solved.mean[1]), 0.2 * motor.L_q)
             lost = float(solved.mean[3])
             moved = np.abs(np.array([R, L, lost]) - before) / np.array([R, L, max(abs(lost), 0.01 * supply)])
@@ -233,23 +259,20 @@ def _winding(working: Working, axis: _AxisWinding, k: int, electrical: float, po
 
 
 def _window(
-    working: Working, axis: _AxisWinding, P: float, share: float, supply: float, R: float, L: float, emf: float,
-    lost: float, saturation: float, electrical: float, pole_pairs: float,
-) -> _Window:  # fmt: skip
-    device, motor = working.target.device, working.target.motor
-    dt, ticks = 1.0 / device.current_rate, round(CYCLE * device.current_rate)
+    working: Working, axis: _AxisWinding, regulator: _Regulator, model: _WindingModel, angle: Floats
+) -> _Window:
+    """Return the balance of every millisecond; `angle` is the electrical angle in its middle [rad], shape (n,)."""
+    device = working.target.device
+    P, share, supply, dt, ticks = regulator
     turn = np.diff(axis.angle)
-    middle = electrical + pole_pairs * (0.5 * (axis.angle[1:] + axis.angle[:-1]) - axis.angle[0])
     r, s_0 = axis.demand, axis.duty_sum[:-1]
     errors = np.diff(axis.duty_sum) / (P * share)  # sum over the ticks
     # What happens tick by tick, by the model: from where the last millisecond ended.
     start = axis.current[:-1].copy()
     # A count is a large part of a millisecond's turn: smoothed, where it is only used to model.
-    back = emf * np.convolve(np.pad(turn, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid") / CYCLE
+    back = model.emf * np.convolve(np.pad(turn, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid") / CYCLE
     for _ in range(2):
-        path = _simulate(
-            r, s_0, start, back, P, share, supply, R, L, lost, saturation, middle, dt, ticks, motor.kind == "dc"
-        )
+        path = _simulate(axis, start, back, angle, regulator, model)
         start = np.append(axis.current[0], path[:-1, ticks])
     creep = np.append(0.0, path[:, ticks] - path[:, ticks - 1])  # between the last sample and the end
     ends = axis.current + creep
@@ -268,18 +291,29 @@ def _window(
     other = turn - CYCLE * (np.cumsum(gained) - 0.5 * gained)
     turn = turn + lag * gained + lag / CYCLE * np.diff(other, append=other[-1])
     # The supply line sags with what the stage draws; braking does not feed back.
-    factor = 1.0 if motor.kind == "dc" else 1.5
+    factor = 1.0 if model.brushed else 1.5
     mean_duty, mean = duty / ticks, charge / CYCLE
     drawn = np.maximum(factor * mean_duty * mean, 0.0) + SUPPLY_IDLE
     link = supply - device.stage["supply_resistance"].default * drawn
-    return _Window(link * dt * duty, charge, np.diff(ends), turn, path, middle)
+    return _Window(link * dt * duty, charge, np.diff(ends), turn, path, angle)
 
 
 def _simulate(
-    r: Floats, s_0: Floats, start: Floats, back: Floats, P: float, share: float, supply: float, R: float, L: float,
-    lost: float, saturation: float, angle: Floats, dt: float, ticks: int, brushed: bool,
-) -> Floats:  # fmt: skip
-    """Return the current at every tick of every millisecond and at its end, shape (n, ticks + 1)."""
+    axis: _AxisWinding, start: Floats, back: Floats, angle: Floats, regulator: _Regulator, model: _WindingModel
+) -> Floats:
+    """Return the current at every tick of every millisecond and at its end, shape (n, ticks + 1).
+
+    Args:
+        axis: The demand, and the integrator at the start of every millisecond.
+        start: Current there [A], shape (n,).
+        back: Back-EMF [V], likewise.
+        angle: Electrical angle [rad], likewise.
+        regulator: The current loop.
+        model: The winding.
+    """
+    P, share, supply, dt, ticks = regulator
+    R, L, _, lost, saturation, brushed = model
+    r, s_0 = axis.demand, axis.duty_sum[:-1]
     path = np.empty((len(r), ticks + 1))
     decay = np.exp(-R * dt / L)
     i, s = start.copy(), s_0.copy()

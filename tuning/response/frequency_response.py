@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -64,15 +64,34 @@ TRAVEL = 0.85
 OVER_NOISE = 5.0  # least RMS of the shaken velocity over the encoder's noise, also where the motion then reverses
 
 
+@dataclass(frozen=True)
+class Signal:
+    """What a loop is shaken with.
+
+    Attributes:
+        kind: "multisine" or "chirp".
+        low: Lowest frequency [Hz]; the loop's own by default, as for `high`.
+        high: Highest frequency [Hz], at most 400; a traced measurement always goes beyond. With 4,096 counts per turn
+            little is coherent above 200 Hz, and what excites there is missing below; what stands out there, as
+            resonances do, is still found.
+        resolution: Between two frequencies [Hz]; a period lasts its inverse.
+    """
+
+    kind: str = "multisine"
+    low: float | None = None
+    high: float | None = None
+    resolution: float = RESOLUTION
+
+
+MULTISINE = Signal()
+
+
 def measure(
     target: Target,
     loop: str = "velocity",
     *,
     where: Mask | None = None,
-    kind: str = "multisine",
-    low: float | None = None,
-    high: float | None = None,
-    resolution: float = RESOLUTION,
+    signal: Signal = MULTISINE,
     traced: bool = False,
     confirmed: bool = False,
     softened: bool = False,
@@ -88,12 +107,7 @@ def measure(
         target: The axes.
         loop: "velocity", in csv, or "position", in csp.
         where: Axes that are measured; all by default. The others get nan.
-        kind: "multisine" or "chirp".
-        low: Lowest frequency [Hz].
-        high: Highest frequency [Hz], at most 400; a traced measurement always goes beyond. With 4,096 counts per turn
-            little is coherent above 200 Hz, and what excites there is missing below; what stands out there, as
-            resonances do, is still found.
-        resolution: Between two frequencies [Hz]; a period lasts its inverse.
+        signal: What it is shaken with.
         traced: Look above 400 Hz too, through the emulator's trace at the velocity loop's rate.
         confirmed: Look longer, and again with half the strength: a resonance that is then another is refused.
         softened: Quarter the velocity gains, twice at most, of an axis that oscillates in the trial, and leave them so;
@@ -113,13 +127,14 @@ def measure(
         raise ValueError(
             "a trace at the velocity loop's rate exists on emulated drives only; on a bus up to 400 Hz can be measured"
         )
-    bounds = RANGE[loop]
+    lowest, highest = RANGE[loop]
     # A trace begins where a bus ends; a gap between the two could hide a margin.
-    top = BUS_LIMIT if traced else bounds[1] if high is None else high
+    top = BUS_LIMIT if traced else highest if signal.high is None else signal.high
     if top > BUS_LIMIT:
         raise ValueError(f"highest frequency {top:g} Hz must be at most {BUS_LIMIT:g} Hz, the limit on a bus")
     # In a trace, what is held at f is seen at 1000 Hz - f, too: lines up to nearly half of it leave no gap.
-    lines = plan_lines(bounds[0] if low is None else low, TRACED_TOP if traced else top, resolution, 1.0 / CYCLE)
+    low = lowest if signal.low is None else signal.low
+    lines = plan_lines(low, TRACED_TOP if traced else top, signal.resolution, 1.0 / CYCLE)
     axes = np.ones(target.num_axes, bool) if where is None else np.asarray(where, bool)
     if not axes.any():
         raise ValueError("no axis is chosen")
@@ -135,7 +150,9 @@ def measure(
             chosen = axes & closed & (position == k)
             if not chosen.any():
                 continue
-            measurement = _Measurement(target, loop, chosen, lines, top, kind, traced, confirmed, softened, periods)
+            measurement = _Measurement(
+                target, loop, chosen, lines, top, signal.kind, traced, confirmed, softened, periods
+            )
 
             def show(share: float, k: int = k) -> None:
                 if progress is not None:

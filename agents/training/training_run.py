@@ -1,0 +1,83 @@
+"""A run of a training: what is trained, its files, its segments, and how it tells of its progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.training.algorithms import ALGORITHMS
+from agents.training.counted_environments import CountedEnvironments
+from agents.training.tasks import ENVIRONMENTS, environment_name
+
+CHECKPOINT, AGENT, TABLE, CURVE = "checkpoint.zip", "agent.npz", "training.csv", "learning_curve.png"
+EPISODES_PER_SEGMENT = 3  # of every environment, at least
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """What is trained.
+
+    Attributes:
+        environment: Name of the environment.
+        algorithm: A row of ALGORITHMS.
+        hyperparameters: As agents.training.hyperparameters.load returns them.
+        seed: Of all random numbers.
+        preset: Which preset the hyper-parameters came from, for the card.
+        segments: Checkpoints over the run, at whose ends the environments begin anew.
+        torch_threads: Threads of torch; small networks are fastest with 1.
+    """
+
+    environment: str
+    algorithm: str
+    hyperparameters: Mapping[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    preset: str = "full"
+    segments: int = 10
+    torch_threads: int = 1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "environment", environment_name(self.environment))
+        if self.algorithm not in ALGORITHMS:
+            raise ValueError(f"there is no algorithm {self.algorithm!r}; there are {', '.join(ALGORITHMS)}")
+        if self.segments < 1:
+            raise ValueError(f"segments must be 1 or more, not {self.segments}")
+        if self.seed < 0:
+            raise ValueError(f"the seed must be 0 or more, not {self.seed}")
+
+    @property
+    def total(self) -> int:
+        """Steps of all environments together."""
+        return int(self.hyperparameters["n_timesteps"])
+
+
+class Progress(NamedTuple):
+    """The progress of a training: means of the last episodes and of each term per step; speed [steps/s]; time's shares.
+
+    `imitated` is the share of what comes before it, if the policy begins as a teacher: all else is 0 until that is 1.
+    """
+
+    timesteps: int
+    total: int
+    episodes: int
+    means: Mapping[str, float]
+    terms: Mapping[str, float]
+    speed: float
+    environment_share: float
+    imitated: float = 1.0
+
+
+Report = Callable[[Progress], None]
+
+
+def segment_length(run: TrainingRun, lanes: CountedEnvironments) -> int:
+    """Return the steps of a segment: a share of the run, but at least some episodes of every environment."""
+    episode: int = ENVIRONMENTS[run.environment].steps(lanes.config) * lanes.num_envs
+    return max(int(run.total // run.segments), EPISODES_PER_SEGMENT * episode)
+
+
+def segment_seed(seed: int, segment: int) -> int:
+    """Return the seed of environment 0 in a segment; the others' follow by one."""
+    return int(np.random.SeedSequence([seed, segment]).generate_state(1)[0]) >> 1

@@ -1,0 +1,83 @@
+"""Gains for an axis that shakes at rest: of those that amplify its noise less, the best on its digital twins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.dictionary.roles import Role
+from drive_env.gains import cascade_columns
+from tuning.auto.checks import sound_gains
+from tuning.auto.measured_margins import SENSITIVITY, sensitivity
+from tuning.auto.twin import Twins, known_of
+
+if TYPE_CHECKING:
+    from tuning.auto.run import AutoRun
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# Powers of the factor of velocity P by which velocity I and position P are lowered beside it.
+BESIDE = (0.0, 0.5, 1.0)
+# Twins know less of an axis that shakes than of others: what was found by search on them must be better by so much.
+WELL = 0.8
+
+
+def cost_on_twins(run: AutoRun, axes: Sequence[int], gains: Integers) -> Floats:
+    """Return the robust cost of gains on the digital twins of axes.
+
+    Args:
+        run: The run.
+        axes: Which; they are identified.
+        gains: Raw integers, (axes, sets, count).
+
+    Returns:
+        Shape (axes, sets).
+    """
+    low, high = run.room()
+    reach = np.where(high >= -low, high, low)
+    known = []
+    for k in axes:
+        plant, identified = run.axes[k].plant, run.axes[k].identified
+        assert plant is not None and identified is not None, "an axis in the run has both"
+        known.append(known_of(plant, identified, float(reach[k])))
+    scaler = np.asarray(run.target.drives.read(Role.POSITION_SCALE), float)[list(axes)]
+    with Twins(run.target.device, run.target.motor, known, scaler, gains.shape[1]) as twins:
+        return twins.score(gains)
+
+
+def calmer(run: AutoRun, k: int, factor: float) -> Integers:
+    """Return the best gains of an axis, by its twins, whose velocity P is a factor of the present one or less.
+
+    An encoder's noise, and its counts at standstill, go into the current by velocity P. The other gains of the outer
+    loops are lowered with it as far as that is better; those of the baseline rule are looked at as well.
+    """
+    device, plant = run.target.device, run.axes[k].plant
+    assert plant is not None, "an axis in the run has one"
+    _, _, velocity_p, velocity_i, position_p = cascade_columns(device)
+    most = factor * run.gains[k, velocity_p]
+    rows = []
+    for base in (run.gains[k], run.reference[k]):
+        share = min(1.0, most / base[velocity_p])
+        for integral in BESIDE:
+            for position in BESIDE:
+                row = base.astype(float)
+                row[velocity_p] *= share
+                row[velocity_i] *= share**integral
+                row[position_p] *= share**position
+                whole = np.maximum(np.rint(row), 1).astype(np.int64)
+                rows.append(sound_gains(device, plant, tuple(map(int, whole))))
+    candidates = np.array(rows, np.int64)
+    cost = cost_on_twins(run, [k], candidates[None])[0]
+    response = run.response
+    if response is not None and not run.unseen[k]:
+        near = np.array([sensitivity(run, response, row, k) > SENSITIVITY for row in candidates])
+        if not near.all():
+            cost = np.where(near, np.inf, cost)
+    own, rule = np.split(cost, 2)
+    if own.min() < WELL * rule.min():
+        return np.asarray(candidates[int(own.argmin())])
+    return np.asarray(candidates[len(own) + int(rule.argmin())])
