@@ -52,24 +52,28 @@ def cost_on_twins(run: AutoRun, axes: Sequence[int], gains: Integers) -> Floats:
 def calmer(run: AutoRun, k: int, factor: float) -> Integers:
     """Return the best gains of an axis, by its twins, whose velocity P is a factor of the present one or less.
 
-    An encoder's noise, and its counts at standstill, go into the current by velocity P. The other gains of the outer
-    loops are lowered with it as far as that is better; those of the baseline rule are looked at as well.
+    An encoder's noise, and its counts at standstill, go into the current by velocity P; what the current's own
+    measurement adds goes by those of the current loop, which are the baseline rule's when the axis has been eased
+    before. The other gains of the outer loops are lowered with it as far as that is better; those of the rule are
+    looked at as well.
     """
-    device, plant = run.target.device, run.axes[k].plant
+    device, plant, own, rule = run.target.device, run.axes[k].plant, run.gains[k], run.reference[k]
     assert plant is not None, "an axis in the run has one"
-    _, _, velocity_p, velocity_i, position_p = cascade_columns(device)
-    most = factor * run.gains[k, velocity_p]
+    torque_p, torque_i, velocity_p, velocity_i, position_p = cascade_columns(device)
+    present = own.copy()
+    if run.axes[k].eased and own[torque_p] > rule[torque_p]:
+        present[[torque_p, torque_i]] = rule[[torque_p, torque_i]]
+    most = factor * own[velocity_p]
     rows = []
-    for base in (run.gains[k], run.reference[k]):
+    for base in (present, rule):
         share = min(1.0, most / base[velocity_p])
         for integral in BESIDE:
             for position in BESIDE:
                 row = base.astype(float)
-                row[velocity_p] *= share
-                row[velocity_i] *= share**integral
-                row[position_p] *= share**position
-                whole = np.maximum(np.rint(row), 1).astype(np.int64)
-                rows.append(sound_gains(device, plant, tuple(map(int, whole))))
+                row[[velocity_p, velocity_i, position_p]] *= share, share**integral, share**position
+                gains = tuple(map(int, np.maximum(np.rint(row), 1)))
+                together = integral == position == 1.0
+                rows.append(gains if together else sound_gains(device, plant, gains))
     candidates = np.array(rows, np.int64)
     cost = cost_on_twins(run, [k], candidates[None])[0]
     response = run.response
@@ -77,7 +81,7 @@ def calmer(run: AutoRun, k: int, factor: float) -> Integers:
         near = np.array([sensitivity(run, response, row, k) > SENSITIVITY for row in candidates])
         if not near.all():
             cost = np.where(near, np.inf, cost)
-    own, rule = np.split(cost, 2)
-    if own.min() < WELL * rule.min():
-        return np.asarray(candidates[int(own.argmin())])
-    return np.asarray(candidates[len(own) + int(rule.argmin())])
+    of_own, of_rule = np.split(cost, 2)
+    if of_own.min() < WELL * of_rule.min():
+        return np.asarray(candidates[int(of_own.argmin())])
+    return np.asarray(candidates[len(of_own) + int(of_rule.argmin())])
