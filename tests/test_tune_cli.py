@@ -195,6 +195,16 @@ def test_a_grid_without_a_usable_pair_says_so(tmp_path):
     assert rows(tmp_path / "run/results.csv")[0]["score [s]"] == "inf"
 
 
+@pytest.mark.slow
+def test_a_sweep_that_leaves_the_loads_travel_names_the_excitation(tmp_path):
+    text = DEFAULT.read_text(encoding="utf-8").replace("count = 32", "count = 1").replace("low = 60\n", "low = 1000\n")
+    (tmp_path / "long.toml").write_text(text, encoding="utf-8")
+    done = drive_tune("sweep", "--config", "long.toml", "--load", "belt", "--out", "run", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "1 end in fault" in done.stdout
+    assert "lower velocity_rpm or duration" in " ".join(done.stdout.split())
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_an_interrupt_ends_with_code_130_and_writes_nothing(tmp_path):
     # Minutes; and not one of its shards is done after seconds, which would be kept (test_scale.py).

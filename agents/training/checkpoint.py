@@ -64,6 +64,8 @@ def read_run(path: Path) -> dict[str, Any]:
     """
     try:
         run: Any = parse_json(_read(path, RUN))
+    except CheckpointError:
+        raise
     except ValueError as error:
         raise CheckpointError(f"{path} is not a checkpoint of drive-agent: {error}") from None
     if not isinstance(run, dict) or any(not isinstance(run.get(name), kind) for name, kind in _OF_A_RUN.items()):
@@ -190,5 +192,6 @@ def _read(path: Path, name: str) -> bytes:
     except KeyError:
         raise CheckpointError(
             f"{path} is not a checkpoint of drive-agent: it holds no {name}. A bare file of Stable-Baselines3 lacks "
-            "the environment and the normaliser: `drive-agent evaluate` reads it with --environment"
+            "the environment and the normaliser: `drive-agent evaluate` runs it with --environment and --config, here "
+            "and on a bus; to continue or export an agent train it with `drive-agent train`"
         ) from None
