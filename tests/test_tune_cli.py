@@ -237,7 +237,7 @@ def test_a_travel_that_is_too_short_is_told_in_turns_with_its_remedy(tmp_path):
         "axis 0 was not tuned: the travel is too short: 0.13 rad (0.02 turns), and 0.2 rad (0.032 turns) are needed; "
         "allow more with --travel"
     ) in done.stdout
-    assert "rolled back" not in done.stdout
+    assert "rejected" not in done.stdout
 
 
 def test_the_picture_of_a_comparison_names_its_colour_and_has_every_median_at_its_tuner(tmp_path, monkeypatch):
