@@ -2,7 +2,7 @@
 
     python examples/own_load.py --steps 100000
 
-`load` is the path of an MJCF; its one actuated joint gets a drive. What varies is a table of distributions.
+`load` is the path of an MJCF; its only joint gets a drive. What varies is a table of distributions.
 """
 
 import argparse

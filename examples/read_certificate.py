@@ -1,4 +1,4 @@
-"""Read a certificate: is it as it was written, what is the verdict, which reservations, which figures.
+"""Read a certificate: is it as it was written, what is the verdict, which reservations, figures before and after.
 
 python examples/read_certificate.py tuned/certificate.json
 
@@ -10,6 +10,15 @@ import math
 import sys
 
 from tuning.certificate.certificate_files import load_certificate
+
+GAINS = {False: "gains before", True: "new gains"}
+
+
+def listed(figures: dict[str, float]) -> str:
+    """Return figures as a line; a dash stands for what was not measured, or did not come."""
+    if not any(map(math.isfinite, figures.values())):
+        return "not measured"
+    return ", ".join(f"{name} {value:.3g}" if math.isfinite(value) else f"{name} -" for name, value in figures.items())
 
 
 def main() -> int:
@@ -28,13 +37,9 @@ def main() -> int:
         for text in axis.reservations:
             print(f"  reservation: {text}")
         for loop in axis.frequency_responses:
-            if loop.tuned:
-                figures = {name: value for name, value in loop.margins.items() if math.isfinite(value)}
-                print(f"  {loop.name}: " + ", ".join(f"{name} {value:.3g}" for name, value in figures.items()))
+            print(f"  {loop.name}, {GAINS[loop.tuned]}: {listed(loop.margins)}")
         for step in axis.steps:
-            if step.tuned:
-                figures = {name: value for name, value in step.figures.items() if math.isfinite(value)}
-                print(f"  {step.name}: " + ", ".join(f"{name} {value:.3g}" for name, value in figures.items()))
+            print(f"  {step.name}, {GAINS[step.tuned]}: {listed(step.figures)}")
     return 0 if all(axis.verdict == "accepted" for axis in certificate.axes) else 1
 
 

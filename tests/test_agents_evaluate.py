@@ -360,6 +360,17 @@ def test_the_command_on_both_sides_and_the_gap(tmp_path, served):
     assert json.loads(found.output)["gap"][0].startswith("gap of RMS following error")
 
 
+def test_a_profile_velocity_beyond_the_tasks_limit_is_lowered_and_put_back(tmp_path, served, caplog):
+    channel, emulated = served
+    before = int(emulated.read("Profile velocity")[0])
+    path = agent(tmp_path / "agent.npz", speed=10.0)  # limit 20 rev/s, the preset's is 33
+    assert before > 20 * TURN
+    found = run("evaluate", path, "--episodes", 2, "--channel", channel, "--lockstep", "--stall", 30)
+    assert found.exit_code == 0, found.output
+    assert "could not be restored" not in caplog.text
+    assert int(emulated.read("Profile velocity")[0]) == before
+
+
 def test_an_interface_in_the_environment_moves_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("DRIVE_ENV_CHANNEL", "socket://127.0.0.1:9")
     found = run("evaluate", agent(tmp_path / "agent.npz"), "--episodes", 1)
@@ -419,7 +430,9 @@ def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
     ("arguments", "message"),
     [
         (("nowhere.npz",), "there is no file nowhere.npz"),
-        (("agent.tflite",), "is not a policy; give an agent"),
+        (("agent.tflite",), "or a baseline (feed_forward, nothing, state_feedback, surrogate)"),
+        (("feed_forward", "-e", "tracking"), "adds to the profile, and action is 'direct'"),
+        (("state_feedback", "-e", "tracking"), "is for load inverted_pendulum, mode cst and action direct alone"),
         (("nowhere:policy",), "module 'nowhere' cannot be imported"),
         (("json:nothing",), "json has no 'nothing'; it has"),
         (("test_agents_evaluate:gentle",), "does not name its environment; give --environment"),

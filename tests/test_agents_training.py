@@ -523,5 +523,5 @@ def test_there_is_nothing_to_resume(tmp_path):
     with pytest.raises(ValueError, match=r"no file .*checkpoint\.zip to continue from: a run writes its first"):
         train(tiny(), tmp_path, resume=True, trust=True)
     (tmp_path / CHECKPOINT).write_bytes(b"no")
-    with pytest.raises(ValueError, match="is not a complete .zip"):
+    with pytest.raises(ValueError, match=r"is not a complete \.zip"):
         train(tiny(), tmp_path, resume=True, trust=True)

@@ -459,7 +459,7 @@ def test_a_slow_axis_passes_and_a_probe_that_shakes_is_told_from_a_move_that_doe
         proof = ground.run(tried, np.ones(3, bool))
     assert proof.stopped.tolist() == [False, True, True]
     assert proof.culprit.tolist() == [False, True, True]
-    assert "in the probe" in proof.reason[1]
+    assert "in the move with 1.5 times velocity P" in proof.reason[1]
     assert "in the move" in proof.reason[2]
     assert proof.cost[0] < proof.cost[1] < proof.cost[2]
 

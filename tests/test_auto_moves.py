@@ -36,6 +36,7 @@ from tuning.rules.rules_by_name import propose
 from tuning.target import emulated
 
 VELOCITY_P = Gains._fields.index("velocity_p")
+FAILED = "gains that failed in a trial before: the gains found"
 
 
 def finds(monkeypatch, wanted):
@@ -274,7 +275,7 @@ def test_who_stops_a_machine_is_told_from_who_is_stopped_with_it(monkeypatch, tm
         monkeypatch.setattr(ProvingGround, "run", noted)
         result = auto(target, tmp_path / "before.toml", experiments=gantry_known, budget=4.0)
     assert result.accepted.all(), [axis.reason for axis in result.axes]
-    failed = [any(note.startswith("failed trials: the gains found") for note in axis.notes) for axis in result.axes]
+    failed = [any(note.startswith(FAILED) for note in axis.notes) for axis in result.axes]
     assert failed == [False, False, False, True, False, False]
     # Who is through holds its place with what it keeps, not with what its last trial ended with.
     (idle, having) = holding[-1]

@@ -200,7 +200,10 @@ def test_commands_and_services_of_a_file_are_refused_before_anything_is_written(
     file.write_text(f'[parameters]\n"6081:00" = 5\n{line}\n"6083:00" = 9\n', encoding="utf-8")
     code, _, error = run("restore", file, "--yes", "--unchecked", "--other-drive")
     assert (code, drive.buses) == (USER_ERROR, [])
-    assert error == f"drive-env: {file} holds what is no parameter: {words}. Nothing was written; take it out\n"
+    assert (
+        error
+        == f"drive-env: {file} holds objects that are not parameters: {words}. Nothing was written; take them out\n"
+    )
 
 
 def test_nor_does_a_program_write_them_among_parameters(drive):

@@ -286,11 +286,11 @@ def test_pdos_are_as_before_when_closed(drive, bus):
 
 def test_what_cannot_be_mapped_is_told_with_what_can(drives, bus):
     with pytest.raises(
-        ObjectAccessError, match=r"2003h:00 .* cannot be recorded: .* in no TPDO; it has .*6064h:00"
+        ObjectAccessError, match=r"2003h:00 .* cannot be recorded: no TPDO of .* carries it; they carry .*6064h:00"
     ) as e:
         drives.record([0x2003], 0.001)
     assert e.value.abort_code == 0x06040041
-    with pytest.raises(ObjectAccessError, match=r"6081h:00 .* cannot be played: .* in no RPDO; it has .*60FFh:00"):
+    with pytest.raises(ObjectAccessError, match=r"6081h:00 .* cannot be played: no RPDO .*; they carry .*60FFh:00"):
         drives.record([0x6041], 0.001, play={0x6081: [1]})
     assert bus.log == []
 
@@ -434,7 +434,7 @@ def test_closed_drives_say_so(bus):
         ({"channel": "can0"}, "channel 'can0' needs an interface"),
         ({"interface": "nonsense", "channel": "can0"}, "cannot open interface 'nonsense'"),
         ({"channel": "socket://127.0.0.1:9"}, "nobody answers at socket://127.0.0.1:9: .*; start `drive-env serve`"),
-        ({"channel": "socket://nowhere"}, "is no address; write it as socket://127.0.0.1:PORT"),
+        ({"channel": "socket://nowhere"}, "is not an address; write it as socket://127.0.0.1:PORT"),
     ],
 )
 def test_a_bus_that_cannot_be_opened_is_told(options, text, monkeypatch):
@@ -595,7 +595,7 @@ def test_time_outs_are_the_devices_unless_given(bus, patient_masters, options, n
 
 @pytest.mark.parametrize("options", [{"timeout": 0.0}, {"timeout": float("nan")}, {"timeouts": {0x6041: float("inf")}}])
 def test_a_time_out_that_cannot_be_is_told(bus, options):
-    with pytest.raises(ValueError, match=r"a time-out of .* s cannot be; give one above 0 s"):
+    with pytest.raises(ValueError, match=r"a time-out of .* s is impossible; give one above 0 s"):
         CanDrives(bus=bus, pace="lockstep", **options)
 
 
@@ -657,7 +657,7 @@ def test_quantities_become_integers_and_are_shown_back(name, text, raw):
     [
         (0x6081, "fast", "is not a number for 6081h:00 Profile velocity"),
         (0x6081, "3 A", "it takes pps, rev/s, rpm, rad/s, deg/s"),
-        (0x6081, "1.5", "takes integers in pps; 1.5 is none, choose 2"),
+        (0x6081, "1.5", "takes integers in pps; 1.5 is not one, choose 2"),
         ((0x2042, 1), "3 rpm", "has no unit that rpm could be turned into"),
     ],
 )

@@ -354,7 +354,7 @@ def test_a_drive_that_watches_a_living_master_is_refused(bus, drive):
 
     bus._recv_internal = beating
     with CanDrives(bus=bus) as drives:
-        with pytest.raises(SafetyError, match=r"node 1 has another master that lives \(node-ID 5, 1016h\)"):
+        with pytest.raises(SafetyError, match=r"another master, whose heartbeats still come \(node-ID 5, 1016h\)"):
             motion.enable(drives, mode="csv")
         assert drive.get(0x1016, 1) == 5 << 16 | 1000
         assert drive.get(0x6040) != 0x0F
@@ -472,7 +472,7 @@ def test_the_end_of_the_travel_is_kept_by_the_way_that_a_stop_takes(bus, drive, 
         drive.set(0x6064, TURN)
         drive.set(0x606C, speed)
         if stops:
-            with pytest.raises(SafetyError, match="could not stop before it is"):
+            with pytest.raises(SafetyError, match="its stop would end"):
                 drives.advance(0.005)
         else:
             drives.advance(0.005)

@@ -348,7 +348,7 @@ def test_a_ratio_that_is_no_whole_number_fails_the_check_and_no_torque_is_comman
     found = identify(target)[0]
     assert not found.estimates["pole_pairs"].is_known
     for name in ("pole_pairs", "resistance", "inertia", "resonance"):
-        ratio = re.search(r"electrical turns are ([\d.]+) \(", found.estimates[name].reason)
+        ratio = re.search(r"the field made ([\d.]+) electrical turns \(", found.estimates[name].reason)
         assert float(ratio[1]) == pytest.approx(4.0 * steps / 4096.0, rel=0.02), name
         assert "not a whole number: check the encoder's counts per turn" in found.estimates[name].reason, name
     # The field turned it there and back; torque with half an angle too much would have sent it away.

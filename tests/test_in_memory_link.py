@@ -200,7 +200,7 @@ def test_a_limit_that_is_passed_stops_the_axis_as_over_can():
     with linked(limits) as (drives, _):
         found = passes_a_limit(drives)
     assert found == expected
-    assert re.match(r"axis 0: the axis could not stop before it is \d+ beyond the limits -65536 to 131072", found[0])
+    assert re.match(r"axis 0: its stop would end \d+ increments beyond the limits -65536 to 131072", found[0])
 
 
 def test_an_exception_stops_the_axis_and_switches_it_off():

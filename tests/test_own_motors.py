@@ -166,6 +166,10 @@ def test_a_motor_that_no_drive_of_ours_can_turn_is_told(tmp_path):
             ["own.toml", "--kind", "pmsm", "--source", "x"],
             "resistance_.* is missing; give it with --number",
         ),
+        (
+            ["own.toml", "--kind", "pmsm", "--source", "x", *options({**FORMS[0], "pole_pairs": 4})],
+            "inertia_kg_m2 is missing; .* take that of a motor of the same size",
+        ),
         (["own.toml"], "kind of motor, pmsm .* is missing; give it as an option"),
         ([], "name the file to write: drive-env motor new my_motor.toml"),
     ],

@@ -37,3 +37,12 @@ def test_every_decision_is_in_the_index():
     folder = ROOT / "docs" / "decisions"
     index = (folder / "README.md").read_text(encoding="utf-8")
     assert {path.name for path in folder.glob("*.md")} - {"README.md"} == set(re.findall(r"\]\((\S+\.md)\)", index))
+
+
+def test_every_file_with_a_placeholder_is_in_the_maintainers_list():
+    listed = (
+        (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Placeholders")[2].partition("\n## ")[0]
+    )
+    files = [path for path in ROOT.iterdir() if path.suffix in (".md", ".toml", ".yml", ".cff", ".txt")]
+    found = {path.name for path in files if "example.org" in path.read_text(encoding="utf-8")} - {"CONTRIBUTING.md"}
+    assert found and all(f"`{name}`" in listed for name in found), found

@@ -47,7 +47,7 @@ def test_a_name_that_is_none_is_told_with_the_nearest():
 
 
 @pytest.mark.parametrize("kind", [PPO, A2C, SAC])
-def test_its_own_file_is_evaluated_if_its_writer_is_trusted(kind, tmp_path):
+def test_its_own_file_is_evaluated_if_its_writer_is_trusted(kind, tmp_path, caplog):
     env = make_vec_env(TRACKING, 1, load="inertia", **SHORT)
     model = kind("MlpPolicy", env, seed=1, device="cpu")
     file = tmp_path / "mine.zip"
@@ -67,6 +67,7 @@ def test_its_own_file_is_evaluated_if_its_writer_is_trusted(kind, tmp_path):
     told = CliRunner().invoke(app, [*arguments, "--trust"])
     assert told.exit_code == 0, told.output
     assert "RMS following error" in told.output
+    assert "does not say with which options of the environment it was trained" in caplog.text
     told = CliRunner().invoke(app, ["evaluate", str(file), "--trust", "--episodes", "2"])
     assert told.exit_code == 2 and "does not name its environment; give --environment" in told.output
 

@@ -23,7 +23,7 @@ import agents.commands.cli
 import drive_env.commands.cli
 import tuning.commands.cli
 from drive_env.commands import compile_bar, compiling, progress
-from drive_env.commands.program import Quiet, Verbose, say_as_much
+from drive_env.commands.program import AGAIN, Quiet, Repeated, Verbose, say_as_much
 from drive_env.commands.progress import progress_on
 from mechanics import kernel_files
 
@@ -32,6 +32,18 @@ APPS = {
     "drive-tune": tuning.commands.cli.app,
     "drive-agent": agents.commands.cli.app,
 }
+
+
+def test_a_line_that_was_printed_a_moment_ago_is_left_out():
+    repeated = Repeated()
+
+    def passes(at, text):
+        record = logging.LogRecord("drive_env", logging.WARNING, "", 0, text, (), None)
+        record.created = at
+        return repeated.filter(record)
+
+    assert [passes(0.0, "lost"), passes(0.1, "lost"), passes(0.2, "stopped"), passes(0.2, "lost")] == [1, 0, 1, 0]
+    assert passes(AGAIN, "lost") and not passes(AGAIN + 0.1, "lost")
 
 
 @pytest.mark.parametrize("name", APPS)

@@ -143,7 +143,7 @@ def ramp(index, step):
     [
         (Limits(velocity=100), 0x606C, 10, "csv", 11, "606Ch:00 Velocity actual value is 110, and its limit is 100"),
         (Limits(velocity=100), 0x606C, -10, "csv", 11, "is 110"),
-        (Limits(position=(-1000, 1000)), 0x6064, 100, "csv", 13, "position is 300 beyond the limits -1000 to 1000"),
+        (Limits(position=(-1000, 1000)), 0x6064, 100, "csv", 13, "is 300 increments beyond the limits -1000 to 1000"),
         (Limits(following_error=50), 0x6062, 10, "csp", 6, "the following error is 60, and its limit is 50"),
         (Limits(current=100), 0x6077, 20, "cst", 7 + 9, "the current is 320 for 10 cycles, and its limit is 100"),
     ],

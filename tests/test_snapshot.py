@@ -406,7 +406,11 @@ def test_the_way_back_is_read_again_before_anything_is_changed(target, tmp_path,
         (lambda text: text.replace('"2003:00" = 7000', '"2003:00" = 9000'), "was changed since it was written", 0),
         (lambda text: text[: text.index('"2042')], "is incomplete: it ends before its check sum", 2),
         (lambda text: text[: text.index("[check]")].replace("format = 2\n", ""), "has no check sum", 0),
-        (lambda text: text.replace('"2003:00"', '"6040:00" = 15\n"2003:00"'), "holds what is no parameter: 6040h", 2),
+        (
+            lambda text: text.replace('"2003:00"', '"6040:00" = 15\n"2003:00"'),
+            "holds objects that are not parameters: 6040h",
+            2,
+        ),
     ],
     ids=["changed", "torn", "old", "a command"],
 )

@@ -42,7 +42,7 @@ def test_a_unit_is_asked_for_beside_the_name(drives, trace, name, unit, per_coun
 
 
 @pytest.mark.parametrize(("name", "unit", "message"), [
-    (SPEED, "A", r"606Ch:00 Velocity actual value is no quantity in 'A'; it takes pps, rev/s, rpm, rad/s, deg/s"),
+    (SPEED, "A", r"606Ch:00 Velocity actual value is not a quantity in 'A'; it takes pps, rev/s, rpm, rad/s, deg/s"),
     (STATUS, "rpm", r"6041h:00 Statusword has no unit that rpm could be turned into; give its integer"),
 ])  # fmt: skip
 def test_a_unit_that_does_not_fit_is_refused(trace, name, unit, message):
@@ -102,7 +102,7 @@ def test_a_quantity_is_written_as_the_command_line_takes_it(drives, text):
 
 def test_a_quantity_of_another_kind_changes_nothing(drives):
     before = drives.read("Profile velocity")
-    with pytest.raises(ValueError, match=r"6081h:00 Profile velocity is no quantity in 'A'"):
+    with pytest.raises(ValueError, match=r"6081h:00 Profile velocity is not a quantity in 'A'"):
         drives.write("Profile velocity", "5 A")
     assert drives.read("Profile velocity").tolist() == before.tolist()
 

@@ -14,7 +14,8 @@ from test_parity import WorldBus
 from drive_env import CanDrives, EmulatedDrives
 from drive_env.bus.world import World
 from drive_env.devices import find_device
-from drive_env.envs.tracking import OBJECTS, TASKS, Tracking, TrackingConfig
+from drive_env.envs import tracking_cycle as cycle
+from drive_env.envs.tracking import OBJECTS, OTHER, TASKS, WEIGHTS, Tracking, TrackingConfig
 from drive_env.envs.trajectories import TRAJECTORIES, draw
 from drive_env.gains import Gains, bandwidths_from_gains
 from mechanics.loads import LOADS as ALL_LOADS
@@ -44,6 +45,37 @@ def run(lanes, given, seed=0):
     rows = [(first, np.zeros(lanes.num_envs), np.zeros(lanes.num_envs, bool), np.zeros(lanes.num_envs, bool))]
     rows += [lanes.step(action)[:4] for action in given]
     return [np.stack(column) for column in zip(*rows, strict=True)]
+
+
+# --- what the page says -----------------------------------------------------------------------------------------------
+def test_the_page_has_the_terms_of_the_reward_with_their_margins_and_weights():
+    rows = {
+        "tracking": f"g(position error, {cycle.TRACKING_MARGIN:g} amplitude)",
+        "speed": f"g(velocity error, {cycle.SPEED_MARGIN:g} speed)",
+        "load": f"g(angle of the pendulum, {cycle.LOAD_MARGIN:g} rad); 0 of a load without sensor",
+        "effort": "g(torque actual value, current limit)",
+        "smoothness": f"g(change of the action, {cycle.SMOOTHNESS_MARGIN:g})",
+        "trip": "1 in the step in which a drive tripped or the pole fell",
+    }
+    assert tuple(rows) == cycle.TERMS
+    assert cycle.EFFORT_MARGIN == 1.0
+    for name, value in rows.items():
+        assert f"| {name} | {value} | {WEIGHTS[name]:g}" in Tracking.__doc__
+    assert cycle.tolerance(0.3, 0.3) == pytest.approx(0.1)
+
+
+def test_the_page_has_what_each_load_follows_by_default():
+    said = " ".join(TrackingConfig.__doc__.split())
+    for name in ("two_mass", "gantry", "cart_pendulum"):
+        assert f"{name} {TASKS[name].amplitude:g} and {TASKS[name].speed:g}" in said
+    assert f"every other load {OTHER.amplitude:g} and {OTHER.speed:g}" in said
+    pole = TASKS["inverted_pendulum"]
+    assert f"{pole.trajectory}, {pole.amplitude:g} rev and {pole.speed:g} rev/s for inverted_pendulum" in said
+    assert {name for name, task in TASKS.items() if task.mode == "csv"} == {
+        "gantry",
+        "cart_pendulum",
+        "inverted_pendulum",
+    }
 
 
 # --- the interface ----------------------------------------------------------------------------------------------------

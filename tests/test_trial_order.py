@@ -83,6 +83,6 @@ def test_nothing_at_or_above_what_failed_is_tried_again():
 
 def test_what_failed_before_is_known():
     _, ladder = climb((FAIL, FAIL, BEST))
-    assert [rung.words for rung in ladder.failures] == ["the gains found, times 1.00", "the gains found, times 0.60"]
+    assert [rung.words for rung in ladder.failures] == ["the gains found", "these lowered to 60 %"]
     assert ladder.passed
     assert not climb((FAIL,) * 5)[1].passed

@@ -195,6 +195,16 @@ def test_a_grid_without_a_usable_pair_says_so(tmp_path):
     assert rows(tmp_path / "run/results.csv")[0]["score [s]"] == "inf"
 
 
+@pytest.mark.slow
+def test_a_sweep_that_leaves_the_loads_travel_names_the_excitation(tmp_path):
+    text = DEFAULT.read_text(encoding="utf-8").replace("count = 32", "count = 1").replace("low = 60\n", "low = 1000\n")
+    (tmp_path / "long.toml").write_text(text, encoding="utf-8")
+    done = drive_tune("sweep", "--config", "long.toml", "--load", "belt", "--out", "run", cwd=tmp_path)
+    assert done.returncode == 0
+    assert "1 end in fault" in done.stdout
+    assert "lower velocity_rpm or duration" in " ".join(done.stdout.split())
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_an_interrupt_ends_with_code_130_and_writes_nothing(tmp_path):
     # Minutes; and not one of its shards is done after seconds, which would be kept (test_scale.py).
@@ -227,7 +237,7 @@ def test_a_travel_that_is_too_short_is_told_in_turns_with_its_remedy(tmp_path):
         "axis 0 was not tuned: the travel is too short: 0.13 rad (0.02 turns), and 0.2 rad (0.032 turns) are needed; "
         "allow more with --travel"
     ) in done.stdout
-    assert "rolled back" not in done.stdout
+    assert "rejected" not in done.stdout
 
 
 def test_the_picture_of_a_comparison_names_its_colour_and_has_every_median_at_its_tuner(tmp_path, monkeypatch):

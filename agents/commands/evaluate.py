@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
     from agents.policies.guard import GuardLimits
     from agents.policies.open_policy import LoadedPolicy
 
+logger = logging.getLogger(__name__)
+
 EMULATOR = "emulator"
 BUS_EPISODES, EPISODES = 8, 64
 # Times the time that steps should take; share of SYNCs (each tears a hole into a move): from here on worth a word.
@@ -54,7 +57,7 @@ def evaluate(
         str,
         typer.Argument(
             help="The policy: name of an agent that ships, agent.npz, checkpoint.zip, agent.onnx, module:function, or "
-            "a baseline (nothing, feed_forward, state_feedback)."
+            "a baseline (nothing, feed_forward, state_feedback, surrogate)."
         ),
     ],
     environment: Annotated[
@@ -249,7 +252,7 @@ def _open(
     """Return the policy, its environment filled in (`otherwise` if nobody says it), and the environment's options."""
     import tomllib
 
-    from agents.policies.open_policy import LoadedPolicy, is_baseline, open_policy, opened
+    from agents.policies.open_policy import LoadedPolicy, is_baseline, is_checkpoint, open_policy, opened
     from agents.training.tasks import environment_name
     from drive_env.envs.randomisation import shipped as shipped_distributions
     from mechanics.untrusted import read_toml
@@ -262,8 +265,14 @@ def _open(
         loaded.environment = wanted
     loaded.environment = loaded.environment or otherwise
     if loaded.environment is None:
-        raise ValueError(f"{text} does not name its environment; give --environment")
+        raise ValueError(f"policy {text} does not name its environment; give --environment")
     configuration = dict(loaded.configuration)
+    if config is None and is_checkpoint(text) and not configuration:
+        logger.warning(
+            "%s does not say with which options of the environment it was trained: the defaults are used; if it was "
+            "trained with others, give them with --config FILE.toml",
+            text,
+        )
     if config is not None:
         try:
             configuration = read_toml(config)
@@ -363,7 +372,7 @@ def _elsewhere(run: _Run, trust: bool, workers: int | None, cluster: str | None)
 
 def _on_bus(run: _Run, sensor: str | None, before: Path, **where: Any) -> Evaluation:
     from agents.evaluation.evaluation import GivenDrives
-    from agents.evaluation.on_the_bus import target_for
+    from agents.evaluation.on_the_bus import lower_profile_velocity, target_for
     from agents.policies.open_policy import find_object
     from tuning.snapshot import put_back
 
@@ -373,6 +382,7 @@ def _on_bus(run: _Run, sensor: str | None, before: Path, **where: Any) -> Evalua
         put_back(target, before, "drive-agent"),
         progress_bar(f"{run.loaded.name} on the bus") as show,
     ):
+        lower_profile_velocity(target.drives)  # put_back restores it, once the axes are off
         return run.evaluate(show, GivenDrives(target.drives, function, run.guard))
 
 

@@ -254,7 +254,11 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
 def _report(done: TunerRun, folder: Path, json: bool, bus: bool) -> None:
     result, rule = done.result, float(done.trials[0].measured[0]) if done.trials else None
     axis, seconds = result.axes[0], float(result.drive_seconds[0])
-    refused = [f"axis {k} was rolled back: {one.reason}" for k, one in enumerate(result.axes) if not one.accepted]
+    refused = [
+        f"axis {k}: rejected, and its gains from before are restored: {one.reason}"
+        for k, one in enumerate(result.axes)
+        if not one.accepted
+    ]
     if json:
         print_json(
             {

@@ -12,8 +12,10 @@ from agents.policies.guard import GuardLimits
 from agents.training.tasks import environment_name, make_environments
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.safety.limits import given
 
 if TYPE_CHECKING:
+    from drive_env.drives.interface import Drives
     from tuning.target import Target
 
 # increments of a revolution
@@ -76,6 +78,16 @@ def target_for(
     limits = Limits(position=position, velocity=velocity, oscillation=oscillation, stall=guard.stall)
     with on_bus(travel=FREE, safety=limits, **more) as target:
         yield target
+
+
+def lower_profile_velocity(drives: Drives) -> None:
+    """Lower 6081h where it is beyond the envelope's limit, with which nobody could write it back between episodes."""
+    if not drives.safety:
+        return
+    limit = given(drives.safety.limits.velocity, drives.num_axes)
+    now = drives.read(cia402.PROFILE_VELOCITY)
+    if np.any(beyond := now > limit):  # nan, where there is no limit, compares false
+        drives.write(cia402.PROFILE_VELOCITY, np.where(beyond, np.floor(limit), now).astype(np.int64), where=beyond)
 
 
 def warm_up(environment: str, configuration: Mapping[str, Any]) -> None:

@@ -54,7 +54,11 @@ class ControlLaw:
 def state_feedback(configuration: Any) -> ControlLaw:
     """Return the law that holds the inverted pendulum through cst: BALANCE on its state."""
     if configuration.load != "inverted_pendulum" or configuration.mode != "cst" or configuration.action != "direct":
-        raise ValueError("state_feedback holds the load inverted_pendulum in mode cst with action = 'direct'")
+        raise ValueError(
+            "the baseline state_feedback is for load inverted_pendulum, mode cst and action direct alone; here they "
+            f"are {configuration.load}, {configuration.mode} and {configuration.action}: give a baseline of this task "
+            "(nothing, or feed_forward with action = 'offset')"
+        )
     entries, weights = list(BALANCE), np.array(list(BALANCE.values()))
     return ControlLaw(lambda rows: (rows[:, entries] @ weights)[:, None])
 
@@ -68,7 +72,10 @@ def feed_forward(configuration: Any, lags: Any = None) -> ControlLaw:
     """
     mode, offset = configuration.mode, configuration.offset
     if configuration.action != "offset":
-        raise ValueError("the baselines of Tracking add to the profile: configure action = 'offset'")
+        raise ValueError(
+            f"the baseline feed_forward adds to the profile, and action is {configuration.action!r}: give a --config "
+            "file with action = 'offset' (in Python the environment's option), or the baseline nothing"
+        )
     speed, amplitude = configuration.speed, configuration.amplitude
     lag, lag_of_speed = LAGS.get(str(configuration.load), LAG) if lags is None else lags
 
@@ -101,7 +108,11 @@ def surrogate(configuration: Any) -> Any:
     bundle = AgentFile.load(shipped(TUNER))
     own = tuple(bundle.configuration["gains"])
     if tuple(configuration.gains) != own or configuration.waveform:
-        raise ValueError(f"surrogate changes the gains {', '.join(own)} and sees no waveform; configure that")
+        raise ValueError(
+            f"the baseline surrogate changes the gains {', '.join(own)} and observes no waveform, and here gains are "
+            f"{', '.join(configuration.gains)} and waveform is {configuration.waveform}: configure these gains, and "
+            "waveform = 0"
+        )
     return policy_of(replace(bundle, settings={**bundle.settings, "step": configuration.step}))
 
 

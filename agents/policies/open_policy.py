@@ -66,9 +66,13 @@ def open_policy(text: str, *, trust: bool = False) -> LoadedPolicy:
         return _callable(text)
     if text in shipped_names():
         return replace(_bundle(str(shipped(text))), name=text)
+    from agents.policies.baselines import BASELINES
+
+    baselines = sorted({name for rows in BASELINES.values() for name in rows})
     raise PolicyNotFoundError(
         f"{text!r} is not a policy; give an agent that ships ({', '.join(shipped_names())}), a file "
-        f"({', '.join((*OPENERS, CHECKPOINT))}) or a Python function (module:function)"
+        f"({', '.join((*OPENERS, CHECKPOINT))}), a Python function (module:function) or a baseline "
+        f"({', '.join(baselines)})"
     )
 
 
@@ -89,7 +93,7 @@ def opened(
     if not is_baseline(text):
         return open_policy(text, trust=trust)
     if environment is None:
-        raise ValueError(f"{text} does not name its environment; give --environment")
+        raise ValueError(f"policy {text} does not name its environment; give --environment")
     lanes: Any = make_environments(environment, 1, configuration)
     actions, config = lanes.single_action_space.shape[0], lanes.config
     lanes.close()

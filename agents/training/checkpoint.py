@@ -191,5 +191,6 @@ def _read(path: Path, name: str) -> bytes:
     except KeyError:
         raise CheckpointError(
             f"{path} is not a checkpoint of drive-agent: it holds no {name}. A bare file of Stable-Baselines3 lacks "
-            "the environment and the normaliser: `drive-agent evaluate` reads it with --environment"
+            "the environment and the normaliser: `drive-agent evaluate` runs it with --environment and --config, here "
+            "and on a bus; to continue or export an agent train it with `drive-agent train`"
         ) from None

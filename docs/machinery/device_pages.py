@@ -19,9 +19,10 @@ The drives that are emulated, and that the commands know on a bus. Each page is 
 and the tables beside it.
 
 {table}
-Any other CiA 402 drive is addressed by its EDS: `CanDrives(eds="vendor.eds", ...)`, or `--eds` of the commands. A
-variant (`--device my_variant.toml`) or a whole device of your own (`--device my_drive/`) is data as well;
-`CONTRIBUTING.md` names the files.
+Any other CiA 402 drive is addressed [by its EDS](../../how-to/drive-env.md#a-drive-that-drive-env-does-not-know). A
+variant (`my_variant.toml`) or a whole device of your own (the folder `my_drive/`) is data as well, and its path stands
+wherever a device's name does: `drive-env serve my_variant.toml`, `--device my_drive/`. The files are in
+[file formats](../file-formats.md#device).
 """
 
 

@@ -15,8 +15,9 @@ GENERAL = ("common", "bus")  # what every load's set includes
 PAGE = """# Random machines
 
 `distributions="belt"` of an environment draws the machine of each episode from a set of this page; a set of your own is
-a TOML file like these (`drive_env/envs/distributions/`), which may `include` them. A parameter that has no law stays at
-its default. `stage`, from 0 to 1, widens all laws from the defaults to their whole ranges during training.
+a TOML file like these ([its keys](../file-formats.md#distributions)), which may `include` them. `law` is the
+probability distribution of a parameter; one that has none stays at its default.
+`stage`, from 0 to 1, widens the ranges from the defaults to what stands here during training.
 
 Most sets include `common`, what belongs to every machine, and `bus`, what a CAN bus does to set-points and
 measurements.

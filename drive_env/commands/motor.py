@@ -25,6 +25,13 @@ def motor() -> None:
     """Motors that the catalogue does not have; --motor takes the path of such a file wherever it takes a name."""
 
 
+# What to do where a data sheet lacks a number that is needed.
+ESTIMATES = {
+    "inertia_kg_m2": "where the data sheet lacks it, take that of a motor of the same size: tuning measures the "
+    "inertia of motor and load together"
+}
+
+
 @motor_app.command("new")
 def new_motor(
     file: Annotated[
@@ -46,12 +53,11 @@ def new_motor(
     peak or RMS, or a back-EMF; each has a number of its own, and is converted. Friction and cogging, which data sheets
     do not give, are taken from motors of its class; correct them in the file.
     """
-    from drive_env.motors import NUMBERS, MotorError, load_motor, motor_of
+    from drive_env.motors import MotorError, load_motor, motor_of
 
     with errors_as_exit_codes():
         if list_numbers:
-            for name, row in NUMBERS.items():
-                print(f"{name}: {row.meaning}" + (f" [{row.unit}]" if row.unit else ""))
+            _list_numbers()
             return
         if file is None:
             raise ValueError("name the file to write: drive-env motor new my_motor.toml")
@@ -63,7 +69,8 @@ def new_motor(
             kind = _asked("kind of motor, pmsm (brushless) or dc (brushed)", "pmsm")
         missing = _missing(kind, given)
         if missing and not _is_answered():
-            raise ValueError(f"{' or '.join(missing[0])} is missing; give it with --number (--list describes it)")
+            hint = f"; {ESTIMATES[missing[0][0]]}" if missing[0][0] in ESTIMATES else ""
+            raise ValueError(f"{' or '.join(missing[0])} is missing; give it with --number (--list describes it){hint}")
         for choice in missing:
             name, value = _ask_for(choice)
             given[name] = value
@@ -76,6 +83,30 @@ def new_motor(
             raise ValueError(f"{error}; nothing was written") from None
         _write(file, data)
         _tell(file, load_motor(file))
+
+
+def _list_numbers() -> None:
+    """Print the numbers, those of each kind of motor together."""
+    from drive_env import motors
+
+    brushed = motors.OF_DC
+    phases = (*motors.RESISTANCE, *motors.INDUCTANCE, *motors.TORQUE_CONSTANT, *motors.RATED_CURRENT, "pole_pairs")
+    brushless = tuple(name for name in phases if name not in brushed)
+    needed = motors.NEEDED
+    groups = {
+        "every motor, all of them:": needed,
+        "a brushless motor (pmsm), pole_pairs and one each of resistance, inductance, and torque constant, back-EMF or "
+        "rated current:": brushless,
+        "a brushed motor (dc), all of them:": brushed,
+        "what may be left out; then values of motors of its class are taken:": tuple(
+            name for name in motors.NUMBERS if name not in (*needed, *brushless, *brushed)
+        ),
+    }
+    for title, names in groups.items():
+        print(title)
+        for name in names:
+            row = motors.NUMBERS[name]
+            print(f"  {name}: {row.meaning}" + (f" [{row.unit}]" if row.unit else ""))
 
 
 def _given(texts: list[str]) -> dict[str, float]:

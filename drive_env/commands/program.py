@@ -12,6 +12,23 @@ from drive_env import __version__
 from drive_env.commands.compile_bar import show_compiling
 
 PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
+AGAIN = 10.0  # s, after which a line that was printed is printed again
+
+
+class Repeated(logging.Filter):
+    """Leaves out a line that was printed a moment ago: a bus that is gone fails every frame of a stop with the same."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._printed: dict[str, float] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a record is to be printed."""
+        text, now = record.getMessage(), record.created
+        self._printed = {one: at for one, at in self._printed.items() if now - at < AGAIN}
+        is_new = text not in self._printed
+        self._printed.setdefault(text, now)
+        return is_new
 
 
 def _tell_version(context: typer.Context, asked: bool) -> None:
@@ -40,6 +57,9 @@ def say_as_much(quiet: bool, verbose: bool) -> None:
         logging.disable(logging.WARNING)
     else:  # a program that is silent for half a minute seems to hang
         show_compiling()
+    printer = logging.lastResort  # what prints warnings while no handler is set up
+    if printer is not None and not any(isinstance(one, Repeated) for one in printer.filters):
+        printer.addFilter(Repeated())
     if verbose:
         logging.basicConfig(format="%(message)s")
         for name in PACKAGES:

@@ -38,7 +38,9 @@ def serve(
     load: Annotated[str | None, typer.Option(help="Load on the motor; two_mass by default.")] = None,
     motor: Annotated[
         str | None,
-        typer.Option(help="Motor, a name or a TOML file; qbl4208 by default. none: factory values, not commissioned."),
+        typer.Option(
+            help="Motor, a name or a TOML file; qbl4208 by default. none: that, with factory values, not commissioned."
+        ),
     ] = None,
     node: Annotated[
         list[int] | None,

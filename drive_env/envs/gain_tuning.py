@@ -47,8 +47,8 @@ class GainTuningConfig:
         velocity_i, position_p. None is those of the velocity and the position loop.
     trials: Of an episode.
     step: Largest change of a gain's logarithm; the reach of gains, 10.4, is the most that makes sense.
-    distributions: The machines, as `randomisation.Distributions` takes them; None is the load's shipped set,
-        {"parameters": {}} the default machine in every episode.
+    distributions: The machines, as `randomisation.Distributions` takes them; None is the load's shipped set, and of a
+        load of your own the default machine in every episode, as {"parameters": {}} is.
     stage: Of its curriculum, 0...1.
     abort_cost: What a stopped trial takes from the reward.
     waveform: Points of the last move's error that are observed besides, 0...250.

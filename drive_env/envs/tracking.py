@@ -88,7 +88,8 @@ class TrackingConfig:
     """Configuration of Tracking; None takes the load's own (TASKS).
 
     load, device, motor, friction: As `EmulatedDrives` takes them.
-    mode: "csp", "csv" or "cst".
+    mode: "csp", "csv" or "cst". None: csv for gantry, cart_pendulum and inverted_pendulum,
+        else cst.
     action: "direct": the action is the target, of a full scale: current limit, 1.25 times speed or amplitude.
         "offset": the target follows the profile, and the action is 60B0h, 60B1h or 60B2h besides, up to `offset` times
         that full scale. The profile of cst is the current that the commissioned inertia needs.
@@ -97,8 +98,12 @@ class TrackingConfig:
     duration: Of an episode [s].
     delay: From the drive's sample to the action's effect [communication cycles], 1 or more: an agent on a real bus
         has one cycle to answer.
-    trajectory, amplitude [rev], speed [rev/s]: What is followed.
-    distributions: What is drawn anew in each episode, as `randomisation.Distributions` takes it; None: noise alone.
+    trajectory, amplitude [rev], speed [rev/s]: What is followed, drawn anew in each episode. "hold": the start;
+        "moves": to random places within the amplitude, with rests of up to 0.1 s; "sines": three sines of 0.5 to 5 Hz.
+        None: hold, 5 rev and 25 rev/s for inverted_pendulum, else moves: two_mass 2 and 20, gantry 3 and 15,
+        cart_pendulum 5 and 15, every other load 1 and 10.
+    distributions: What else is drawn anew in each episode, as `randomisation.Distributions` takes it; None: noise
+        alone, on the machine with its default parameters.
     stage: Of its curriculum, 0...1.
     weights: Of the reward's terms; those left out keep theirs.
     num_threads: As `EmulatedDrives` takes it.
@@ -161,6 +166,9 @@ class TrackingConfig:
 class Tracking(VectorEnvironment):
     """`ServoDrive/Tracking-v0`: follow a trajectory, or stabilise the load.
 
+    A step is one action: 1 ms at the default `rate` of 1000 Hz; an episode is `duration` times `rate` steps. It begins
+    at rest at 0, enabled (on a bus: where the axes stood at first), with a trajectory drawn from the seed.
+
     Action, float32, one entry per axis a = 0, 1, ... of the machine:
 
     | index | name | unit | low | high |
@@ -168,7 +176,7 @@ class Tracking(VectorEnvironment):
     | a | target or offset, see `TrackingConfig.action` | full scale | -1 | 1 |
 
     Observation, float32, for each axis a of the machine (8 entries each), of the drive's sample that the agent has
-    when it acts:
+    when it acts; amplitude and speed are those of the configuration:
 
     | index | name | unit | low | high |
     | --- | --- | --- | --- | --- |
@@ -188,10 +196,22 @@ class Tracking(VectorEnvironment):
     | 8A + 0 | angle of the pendulum | rad | -pi | pi |
     | 8A + 1 | its rate | rad/s | -50 | 50 |
 
-    The reward is the sum of weighted terms, each in 0...1 (`info["reward_terms"]`). `terminated`: a drive tripped, its
-    machine left physics, or the pole fell; `truncated`: time ran out. `info`: "reward_terms"; "parameters" of
-    environments that begin, the true machine, not on a bus; "fault" once an environment ended so, a name or several, ""
-    of the others.
+    The reward is the sum of terms in 0...1 (`info["reward_terms"]`) times their weights, less the last. Those of axes
+    are means over them; g(e, m) = 1 / (1 + 9 (e/m)²) is 1 without an error and 0.1 at e = m:
+
+    | term | value | weight |
+    | --- | --- | --- |
+    | tracking | g(position error, 0.25 amplitude) | 1 |
+    | speed | g(velocity error, 0.5 speed) | 0.2 |
+    | load | g(angle of the pendulum, 0.2 rad); 0 of a load without sensor | 1 |
+    | effort | g(torque actual value, current limit) | 0.05 |
+    | smoothness | g(change of the action, 1) | 0.05 |
+    | trip | 1 in the step in which a drive tripped or the pole fell | 10, subtracted |
+
+    `terminated`: a drive tripped, its machine left physics, or the pole fell; `truncated`: time ran out.
+
+    `info`: "reward_terms"; "parameters" of environments that begin, the true machine, not on a bus; "fault" once an
+    environment ended so, a name or several, "" of the others.
 
     Args:
         num_envs: Number of environments.

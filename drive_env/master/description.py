@@ -229,5 +229,5 @@ def _read_types(path: Path | EdsText) -> dict[Key, ODVariable]:
 def check_timeout(timeout: float) -> float:
     """Return a time-out [s]; ValueError for one that is not above 0 s or has no end."""
     if not 0.0 < timeout <= LONGEST_TIMEOUT:
-        raise ValueError(f"a time-out of {timeout:g} s cannot be; give one above 0 s, e.g. 0.5, up to an hour")
+        raise ValueError(f"a time-out of {timeout:g} s is impossible; give one above 0 s, e.g. 0.5, up to an hour")
     return timeout

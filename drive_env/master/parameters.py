@@ -77,7 +77,7 @@ def check_no_commands(keys: Iterable[Key], where: object, hints: MasterHints) ->
     found = dict.fromkeys(f"{index:04X}h ({command(index, hints)})" for index, _ in keys if command(index, hints))
     if found:
         raise CommandObjectError(
-            f"{where} holds what is no parameter: {', '.join(found)}. Nothing was written; take it out"
+            f"{where} holds objects that are not parameters: {', '.join(found)}. Nothing was written; take them out"
         )
 
 

@@ -98,7 +98,9 @@ def parse(text: str, entry: Entry, increments: float | None) -> int:
         raise ValueError(_too_large(text, entry))
     if name is None or name == entry.unit:
         if number != int(number):
-            raise ValueError(f"{entry.label} takes integers{_counted(entry)}; {text} is none, choose {round(number)}")
+            raise ValueError(
+                f"{entry.label} takes integers{_counted(entry)}; {text} is not one, choose {round(number)}"
+            )
         return int(number)
     count = number / _factor(entry, name, increments)
     if not math.isfinite(count):
@@ -156,7 +158,7 @@ def _factor(entry: Entry, name: str, increments: float | None) -> float:
         raise ValueError(f"{entry.label} has no unit that {name} could be turned into; give its integer")
     if given is None or given.dimension != own.dimension:
         fitting = [other for other, unit in UNITS.items() if unit.dimension == own.dimension]
-        raise ValueError(f"{entry.label} is no quantity in {name!r}; it takes {', '.join([entry.unit, *fitting])}")
+        raise ValueError(f"{entry.label} is not a quantity in {name!r}; it takes {', '.join([entry.unit, *fitting])}")
     return own.factor / given.factor
 
 
@@ -165,7 +167,9 @@ def parse_raw(text: str, entry: Entry) -> int:
     try:
         return int(text, 0)
     except ValueError:
-        raise ValueError(f"{text!r} is no integer for {entry.label}; --raw takes integers, as 1000 or 0x3E8") from None
+        raise ValueError(
+            f"{text!r} is not an integer for {entry.label}; --raw takes integers, as 1000 or 0x3E8"
+        ) from None
 
 
 def show(raw: int, entry: Entry, increments: float | None) -> str:

@@ -106,10 +106,10 @@ class Judging:
         if wrong.any() and np.any(wrong & (bounds.given | (self._modes() != HM))):
             axis = int(np.flatnonzero(wrong & (bounds.given | (self._axes.mode != HM)))[0])
             there = outside.max(axis=0)[axis] > bounds.settled[axis] + max(self._axes.outside[axis], 0)
-            what = "the position is" if there else "the axis could not stop before it is"
+            what = "the position is" if there else "its stop would end"
             by = outside.max(axis=0)[axis] if there else farthest[axis]
             self._stop_for(
-                f"axis {axis}: {what} {int(by)} beyond the limits {bound_text(bounds.low[axis])} to "
+                f"axis {axis}: {what} {int(by)} increments beyond the limits {bound_text(bounds.low[axis])} to "
                 f"{bound_text(bounds.high[axis])}",
                 f"move it back, or widen {self._limits.origin(self._limits.user.position, 'position', '607Dh')}",
             )

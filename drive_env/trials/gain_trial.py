@@ -30,6 +30,7 @@ Mask = NDArray[np.bool_]
 
 PHASES = ("move", "reversal", "probe")
 PROBE = 1.5  # velocity P of the probe over that of the trial
+PHASE_TITLES = ("move", "reversal", f"move with {PROBE:g} times velocity P")  # as messages name them
 
 # The watch looks every 25 ms at what has passed since its last look: what oscillates is stopped within 50 ms.
 RECOVERY, RECOVERY_TIME = 5, 0.01  # attempts, and the time between them [s]

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # Powers of the factor of velocity P by which velocity I and position P are lowered beside it.
-BESIDE = (0.0, 0.5, 1.0)
+INTEGRAL, POSITION = (0.0, 0.5, 1.0), (0.0, 0.5, 1.0, 2.0, 4.0)
 # Twins know less of an axis that shakes than of others: what was found by search on them must be better by so much.
 WELL = 0.8
 
@@ -52,35 +52,28 @@ def cost_on_twins(run: AutoRun, axes: Sequence[int], gains: Integers) -> Floats:
 def calmer(run: AutoRun, k: int, factor: float) -> Integers:
     """Return the best gains of an axis, by its twins, whose velocity P is a factor of the present one or less.
 
-    An encoder's noise, and its counts at standstill, go into the current by velocity P; what the current's own
-    measurement adds goes by those of the current loop, which are the baseline rule's when the axis has been eased
-    before. The other gains of the outer loops are lowered with it as far as that is better; those of the rule are
-    looked at as well.
+    An encoder's noise, and its counts at standstill, go into the current by velocity P. The other gains of the outer
+    loops are lowered with it as far as that is better; those of the rule are looked at as well.
     """
     device, plant, own, rule = run.target.device, run.axes[k].plant, run.gains[k], run.reference[k]
     assert plant is not None, "an axis in the run has one"
-    torque_p, torque_i, velocity_p, velocity_i, position_p = cascade_columns(device)
-    present = own.copy()
-    if run.axes[k].eased and own[torque_p] > rule[torque_p]:
-        present[[torque_p, torque_i]] = rule[[torque_p, torque_i]]
+    *_, velocity_p, velocity_i, position_p = cascade_columns(device)
+    response = None if run.unseen[k] else run.response
     most = factor * own[velocity_p]
     rows = []
-    for base in (present, rule):
+    for base in (own, rule):
         share = min(1.0, most / base[velocity_p])
-        for integral in BESIDE:
-            for position in BESIDE:
+        for integral in INTEGRAL:
+            for position in POSITION:
                 row = base.astype(float)
                 row[[velocity_p, velocity_i, position_p]] *= share, share**integral, share**position
                 gains = tuple(map(int, np.maximum(np.rint(row), 1)))
-                together = integral == position == 1.0
-                rows.append(gains if together else sound_gains(device, plant, gains))
+                rows.append(gains if response is not None else sound_gains(device, plant, gains))
     candidates = np.array(rows, np.int64)
     cost = cost_on_twins(run, [k], candidates[None])[0]
-    response = run.response
-    if response is not None and not run.unseen[k]:
+    if response is not None:  # it knows more than the model
         near = np.array([sensitivity(run, response, row, k) > SENSITIVITY for row in candidates])
-        if not near.all():
-            cost = np.where(near, np.inf, cost)
+        cost = np.where(near & ~near.all(), np.inf, cost)
     of_own, of_rule = np.split(cost, 2)
     if of_own.min() < WELL * of_rule.min():
         return np.asarray(candidates[int(of_own.argmin())])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env.gains import write_gains
+from drive_env.gains import cascade_columns, write_gains
 from drive_env.safety.envelope import SafetyError
 from tuning.auto.calmer_gains import calmer
 from tuning.auto.load_step import NOISE, SWING, load_step
@@ -90,19 +90,18 @@ def _ease(run: AutoRun, k: int, swing: float, why: str) -> None:
         swing: Of its current over the rated one, RMS.
         why: What it did, in words.
     """
-    axis, rule, known = run.axes[k], run.reference[k], run.target.device.gains
+    axis, rule = run.axes[k], run.reference[k]
+    torque_p, *_ = cascade_columns(run.target.device)
     factor = float(np.clip(EASED_TO * RESTLESS / swing, EASED_LEAST, EASED))
     is_rule = np.array_equal(run.gains[k], rule)
-    if not is_rule and swing > LIMIT_CYCLE:
+    # What less velocity P has not calmed may be the current loop's doing.
+    has_fast_current = axis.eased and run.gains[k, torque_p] > rule[torque_p]
+    if not is_rule and (swing > LIMIT_CYCLE or has_fast_current):
         run.gains[k] = rule
         axis.notes.append(f"the gains of the baseline rule are kept: with faster ones {why}")
-    elif axis.eased < EASINGS - 1:
+    else:
         run.gains[k] = calmer(run, k, factor)
         axis.notes.append(f"velocity P lowered to {100.0 * factor:.0f} %, and gains that suit it taken: {why}")
-    else:
-        slowed = faster(known, run.gains[k], factor)
-        run.gains[k] = slowed
-        axis.notes.append(f"gains lowered to {100.0 * factor:.0f} %: {why}")
     run.spare[k] = 0  # about as fast as the best, which shook
     axis.eased += 1
 

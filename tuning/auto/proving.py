@@ -18,7 +18,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.trace import Trace
 from drive_env.gains import small_time_constants, write_gains
 from drive_env.safety.envelope import SafetyError
-from drive_env.trials.gain_trial import PHASES, Trial, Trials, measured_cost, softness
+from drive_env.trials.gain_trial import PHASE_TITLES, PHASES, Trial, Trials, measured_cost, softness
 from drive_env.trials.oscillation import OSCILLATION, shakes
 from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
 from drive_env.trials.score import TRIP, Terms, cost
@@ -464,7 +464,7 @@ class ProvingGround:
         reasons = []
         for axis in range(self.target.num_axes):
             if stopped[:, axis].any():
-                phase = PHASES[int(stopped[:, axis].argmax())]
+                phase = PHASE_TITLES[int(stopped[:, axis].argmax())]
                 reason = f"stopped in the {phase}: it oscillated or went into fault (cut off within 50 ms)"
                 if causes is not None and causes[axis] != UNTOLD:
                     reason += f"; the drive reported {causes[axis]}"

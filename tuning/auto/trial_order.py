@@ -26,7 +26,9 @@ class Rung(NamedTuple):
         """Return these gains in words."""
         if self.fallback is not None:
             return "the gains of a rule"
-        return f"the gains found, times {self.factor:.2f}" if self.other is None else OTHERS[self.other]
+        if self.other is not None:
+            return OTHERS[self.other]
+        return "the gains found" if self.factor == 1.0 else f"these lowered to {100.0 * self.factor:.0f} %"
 
 
 class Ladder:

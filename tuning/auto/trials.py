@@ -75,7 +75,7 @@ def prove(run: AutoRun) -> None:
         axis.proof, axis.verified = float(cost[k]), BY_TRIAL
         if ladder.failures:
             failed = ", ".join(rung.words for rung in ladder.failures)
-            axis.notes.append(f"failed trials: {failed}; the last: {last[k]}")
+            axis.notes.append(f"gains that failed in a trial before: {failed}; reason of the last: {last[k]}")
     run.gains = best
 
 

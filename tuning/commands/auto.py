@@ -130,7 +130,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
         if not axis.accepted and axis.identified is None and result.drive_seconds[k] == 0.0:  # refused at the outset
             lines.append(f"axis {k} was not tuned: {axis.reason}")
         elif not axis.accepted:
-            lines.append(f"axis {k} was rolled back: {axis.reason}")
+            lines.append(f"axis {k}: rejected, and its gains from before are restored: {axis.reason}")
         else:
             lines.append(f"axis {k}: {axis.verdict}; the gains were verified {axis.verified}")
             lines += [f"axis {k}: reservation: {reservation}" for reservation in axis.reservations]

@@ -156,7 +156,12 @@ def _print_result(result: Any, folder: Path) -> None:
         for flag, word in (("oscillates", "oscillate"), ("fault", "end in fault"), ("diverged", "diverge"))
     )
     lines = [f"{usable} of {len(result.order)} points are usable; {counts}."]
-    if not usable:
+    if not usable and result.columns["fault"].all():
+        lines.append(
+            "Every point ended in fault or at a limit switch, whatever its gains: for a load with little travel lower "
+            "velocity_rpm or duration, else load_torque (`drive-tune sweep --show-config`)."
+        )
+    elif not usable:
         lines.append("No point is usable: choose other ranges; heatmap.png and results.csv show all points.")
     lines += [f"{name} has no effect in this experiment." for name in result.without_effect()]
     if result.simulated > 0.0:

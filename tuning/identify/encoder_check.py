@@ -262,9 +262,9 @@ def _judge(field: float, away: float, back: float, expected: int) -> EncoderChec
     nearest = round(abs(ratio))
     if nearest < 1 or abs(abs(ratio) - nearest) + spread > _tolerance(nearest):
         reason = (
-            f"the field's electrical turns are {abs(ratio):.2f} (give or take {spread:.2f}) of those that the encoder "
-            "counts, which is not a whole number: check the encoder's counts per turn, or allow more travel "
-            "and current"
+            f"the field made {abs(ratio):.2f} electrical turns (give or take {spread:.2f}) per turn that the encoder "
+            "counted, which is not a whole number: check the encoder's counts per turn, or allow more travel and "
+            "current"
         )
         return EncoderCheck(refused("1", reason), direction, ratio)
     return EncoderCheck(Estimate(float(nearest), float(nearest), float(nearest), "1"), direction, ratio)

@@ -189,7 +189,7 @@ class ErrorControl:
             self._watched_id = self._heartbeats.node_id
             return
         raise NoWatchdogError(
-            f"node {self._node} has another master that lives (node-ID {living[0]}, 1016h), which may command it; end "
+            f"node {self._node} has another master, whose heartbeats still come (node-ID {living[0]}, 1016h); end "
             "that program first: two masters of one drive undo each other's stops"
         )
 

@@ -74,8 +74,8 @@ def check_mappable(description: Description, entries: Sequence[Entry], direction
         if not is_mappable(description, entry, direction):
             raise ObjectAccessError(
                 CANNOT_BE_MAPPED,
-                f"{entry.label} cannot be {direction.verb}: {description.name} has it in no {direction.name}; it has "
-                f"{mappable_names(description, direction)}; read and write reach the others",
+                f"{entry.label} cannot be {direction.verb}: no {direction.name} of {description.name} carries it; they "
+                f"carry {mappable_names(description, direction)}. Read or write it instead",
             )
 
 

@@ -36,7 +36,7 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
 
     def __init__(self, channel: str, bitrate: int | None = None, token: str | None = None) -> None:
         if bitrate is not None and bitrate not in _BIT_RATES:
-            raise OpenError(f"bit rate {bitrate} bit/s is none of slcan's: {', '.join(map(str, _BIT_RATES))}")
+            raise OpenError(f"bit rate {bitrate} bit/s is not one of slcan's: {', '.join(map(str, _BIT_RATES))}")
         self._socket = _connect(channel)
         if token is not None:
             _present(token, self._socket, channel)
@@ -122,7 +122,7 @@ def _connect(channel: str) -> socket.socket:
     host, _, port = channel.removeprefix("socket://").rpartition(":")
     if not host or not port.isdigit():
         raise OpenError(
-            f"{channel!r} is no address; write it as socket://127.0.0.1:PORT, as `drive-env serve` prints it"
+            f"{channel!r} is not an address; write it as socket://127.0.0.1:PORT, as `drive-env serve` prints it"
         )
     try:
         return socket.create_connection((host, int(port)), CONNECT_TIMEOUT)
@@ -149,7 +149,7 @@ def _present(token: str, connection: socket.socket, channel: str) -> None:
     except TimeoutError:
         connection.close()
         raise OpenError(
-            f"{channel} does not answer to the token within {CONNECT_TIMEOUT:g} s; if it is no hub of `drive-env "
+            f"{channel} does not answer to the token within {CONNECT_TIMEOUT:g} s; if it is not the hub of `drive-env "
             "serve`, unset DRIVE_ENV_TOKEN"
         ) from None
     except OSError:
