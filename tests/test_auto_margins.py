@@ -126,7 +126,7 @@ def test_a_loop_that_comes_too_near_to_instability_gets_half_its_gain(velocity, 
         half = [velocity if gains[2] > 300 else 2.0, position if gains[4] > 0.6 * full[4] * gains[2] / 400 else 2.0]
         return {loop: one._replace(ms=ms) for loop, ms in zip(("velocity", "position"), half, strict=True)}
 
-    monkeypatch.setattr(auto_margins, "_margins", found)
+    monkeypatch.setattr(auto_margins, "margins_with", found)
     axis = AxisRun(Gains(*full), Gains(*full))
     target = SimpleNamespace(linked=linked, device=find_device("tmcm1636"))
     run = SimpleNamespace(axes=[axis], gains=full[None].copy(), spare=np.zeros((1, 5), np.int64), target=target)

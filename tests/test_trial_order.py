@@ -34,7 +34,8 @@ NONE, RULE, SOFT, LAST = None, Rung(fallback=0), Rung(fallback=1), Rung(fallback
         ((BEST, WORSE, BEST), [F(1.0), B, F(1.15), NONE]),  # and no more than three trials
         ((FAIL,), [F(1.0), F(0.6)]),
         ((FAIL, BEST), [F(1.0), F(0.6), F(0.8)]),  # below what failed: half way up again
-        ((FAIL, BEST, BEST), [F(1.0), F(0.6), F(0.8), NONE]),
+        ((FAIL, BEST, BEST), [F(1.0), F(0.6), F(0.8), RULE]),  # and the rule's: the twins did not know the axis
+        ((FAIL, BEST, WORSE, FAIL), [F(1.0), F(0.6), F(0.8), RULE, NONE]),
         ((FAIL, FAIL), [F(1.0), F(0.6), RULE]),
         ((FAIL, FAIL, BEST), [F(1.0), F(0.6), RULE, NONE]),  # of a fallback that passes no neighbour is tried
         ((FAIL, FAIL, FAIL, FAIL, FAIL), [F(1.0), F(0.6), RULE, SOFT, LAST, NONE]),
@@ -77,7 +78,8 @@ def test_nothing_at_or_above_what_failed_is_tried_again():
         fails = ladder.rung.fallback is None and ladder.rung.factor > 0.7
         ladder.step(not fails, not fails, loud=False)
     factors = [rung.factor for rung in tried]
-    assert factors == pytest.approx([1.0, 0.6, 0.8])
+    assert factors == pytest.approx([1.0, 0.6, 0.8, 1.0])
+    assert tried[-1].fallback == 0
     assert ladder.passed
 
 

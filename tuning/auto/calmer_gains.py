@@ -53,16 +53,18 @@ def calmer(run: AutoRun, k: int, factor: float) -> Integers:
     """Return the best gains of an axis, by its twins, whose velocity P is a factor of the present one or less.
 
     An encoder's noise, and its counts at standstill, go into the current by velocity P. The other gains of the outer
-    loops are lowered with it as far as that is better; those of the rule are looked at as well.
+    loops are lowered with it as far as that is better; those of the rule are looked at as well, with as much more
+    velocity P as their current loop is slower.
     """
     device, plant, own, rule = run.target.device, run.axes[k].plant, run.gains[k], run.reference[k]
     assert plant is not None, "an axis in the run has one"
-    *_, velocity_p, velocity_i, position_p = cascade_columns(device)
+    torque_p, _, velocity_p, velocity_i, position_p = cascade_columns(device)
     response = None if run.unseen[k] else run.response
     most = factor * own[velocity_p]
     rows = []
     for base in (own, rule):
-        share = min(1.0, most / base[velocity_p])
+        slower = max(1.0, own[torque_p] / base[torque_p])  # a current loop passes on less of the noise
+        share = min(1.0, most * slower / base[velocity_p])
         for integral in INTEGRAL:
             for position in POSITION:
                 row = base.astype(float)

@@ -91,7 +91,7 @@ def _ease(run: AutoRun, k: int, swing: float, why: str) -> None:
         why: What it did, in words.
     """
     axis, rule = run.axes[k], run.reference[k]
-    torque_p, *_ = cascade_columns(run.target.device)
+    torque_p, _, velocity_p, *_ = cascade_columns(run.target.device)
     factor = float(np.clip(EASED_TO * RESTLESS / swing, EASED_LEAST, EASED))
     is_rule = np.array_equal(run.gains[k], rule)
     # What less velocity P has not calmed may be the current loop's doing.
@@ -100,8 +100,9 @@ def _ease(run: AutoRun, k: int, swing: float, why: str) -> None:
         run.gains[k] = rule
         axis.notes.append(f"the gains of the baseline rule are kept: with faster ones {why}")
     else:
-        run.gains[k] = calmer(run, k, factor)
-        axis.notes.append(f"velocity P lowered to {100.0 * factor:.0f} %, and gains that suit it taken: {why}")
+        before, run.gains[k] = run.gains[k, velocity_p], calmer(run, k, factor)
+        share = 100.0 * run.gains[k, velocity_p] / before
+        axis.notes.append(f"velocity P lowered to {share:.0f} %, the other gains as they suit it on the twins: {why}")
     run.spare[k] = 0  # about as fast as the best, which shook
     axis.eased += 1
 

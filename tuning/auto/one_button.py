@@ -37,7 +37,7 @@ Progress = Callable[[str, float], None]  # what is under way, and how much of it
 Files = Callable[["Result"], AbstractContextManager[object]]
 Find = Callable[[AutoRun, Progress], None]  # finds gains for the axes that go on, and has tried them on the drives
 
-BUDGET = 10.0  # s of drive time
+BUDGET = 12.0  # s of drive time
 
 
 def auto(

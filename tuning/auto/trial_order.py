@@ -36,7 +36,8 @@ class Ladder:
 
     Args:
         fallbacks: How many sets of gains there are to fall back on, the fastest first.
-        coupled: Other axes pull at this one, which no twin knows: the first of the fallbacks is tried in any case.
+        coupled: Other axes pull at this one, which no twin knows: the first of the fallbacks is tried in any case, as
+            it is where gains have failed.
 
     Attributes:
         rung: What is to be tried next; None when it is over.
@@ -67,6 +68,7 @@ class Ladder:
             self.rung = None if better or rung.other is None else Rung(UP)
         elif not passed:
             self.failures.append(rung)
+            self._owed |= rung.fallback is None  # the twins have not known this axis well enough
             self.rung = self._below(rung)
         else:
             self.passed = True

@@ -40,7 +40,7 @@ def auto(
 ) -> None:
     """Tune a drive: identify, search gains, try, verify and store them; an axis that fails a check is rolled back.
 
-    The motor turns, for about 10 s in all. The verdict is accepted, accepted with reservations, which are listed, or
+    The motor turns, for about 12 s in all. The verdict is accepted, accepted with reservations, which are listed, or
     rejected. Writes before.toml, with which `drive-tune undo` restores the state before, certificate.json and
     report.html. Exit code 1 if an axis was rejected; the reason is printed.
     """
