@@ -313,14 +313,14 @@ def test_a_lively_loop_is_calmed_and_the_calmed_gains_are_tried_again(quick, mon
     monkeypatch.setattr(proving_module, "RESTLESS", 1.0)  # or it would be slowed before
     monkeypatch.setattr(auto_margins, "LEAST_LINES", 1)
     monkeypatch.setattr(auto_margins, "SOFTER", (1.0, 0.5))
-    measured, full = auto_margins._margins, []
+    measured, full = auto_margins.margins_with, []
 
     def lively(run, response, gains, k):
         full.append(gains[2])
         found = measured(run, response, gains, k)
         return found | {"velocity": found["velocity"]._replace(ms=9.0 if gains[2] > 0.75 * full[0] else 2.0)}
 
-    monkeypatch.setattr(auto_margins, "_margins", lively)
+    monkeypatch.setattr(auto_margins, "margins_with", lively)
     with emulated(load="inertia", num_threads=1) as target:
         result = auto(target, tmp_path / "before.toml", experiments=standing_in)
     (axis,) = result.axes
