@@ -23,7 +23,7 @@ import agents.commands.cli
 import drive_env.commands.cli
 import tuning.commands.cli
 from drive_env.commands import compile_bar, compiling, progress
-from drive_env.commands.program import AGAIN, Quiet, Repeated, Verbose, say_as_much
+from drive_env.commands.program import AGAIN, Quiet, RepeatedLines, Verbose, say_as_much
 from drive_env.commands.progress import progress_on
 from mechanics import kernel_files
 
@@ -35,7 +35,7 @@ APPS = {
 
 
 def test_a_line_that_was_printed_a_moment_ago_is_left_out():
-    repeated = Repeated()
+    repeated = RepeatedLines()
 
     def passes(at, text):
         record = logging.LogRecord("drive_env", logging.WARNING, "", 0, text, (), None)

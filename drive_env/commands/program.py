@@ -15,7 +15,7 @@ PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
 AGAIN = 10.0  # s, after which a line that was printed is printed again
 
 
-class Repeated(logging.Filter):
+class RepeatedLines(logging.Filter):
     """Leaves out a line that was printed a moment ago: a bus that is gone fails every frame of a stop with the same."""
 
     def __init__(self) -> None:
@@ -58,8 +58,8 @@ def say_as_much(quiet: bool, verbose: bool) -> None:
     else:  # a program that is silent for half a minute seems to hang
         show_compiling()
     printer = logging.lastResort  # what prints warnings while no handler is set up
-    if printer is not None and not any(isinstance(one, Repeated) for one in printer.filters):
-        printer.addFilter(Repeated())
+    if printer is not None and not any(isinstance(one, RepeatedLines) for one in printer.filters):
+        printer.addFilter(RepeatedLines())
     if verbose:
         logging.basicConfig(format="%(message)s")
         for name in PACKAGES:
