@@ -22,8 +22,8 @@ Integers = NDArray[np.int64]
 
 # Powers of the factor of velocity P by which velocity I and position P are lowered beside it.
 INTEGRAL, POSITION = (0.0, 0.5, 1.0), (0.0, 0.5, 1.0, 1.5, 2.0, 4.0)
-# Twins know less of an axis that shakes than of others: what was found by search on them must be better by so much.
-WELL = 0.8
+# Twins know less of an axis that shakes than of others: what was found by search on them must be better by this.
+WELL = 0.95
 
 
 def cost_on_twins(run: AutoRun, axes: Sequence[int], gains: Integers) -> Floats:

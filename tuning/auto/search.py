@@ -61,11 +61,11 @@ def identify(run: AutoRun, experiments: Identify) -> None:
                 axis.plant = Plant.from_identification(target.device, target.motor, float(target.supply[k]), identified)
             except ValueError as error:
                 axis.reason = str(error)
-        axis.notes += [
-            f"{TITLES[name]} not identified: {estimate.reason}"
-            for name, estimate in identified.estimates.items()
-            if estimate.reason and name not in ("inertia",)
-        ]
+        unknown: dict[str, list[str]] = {}
+        for name, estimate in identified.estimates.items():
+            if estimate.reason and name not in ("inertia",):
+                unknown.setdefault(estimate.reason, []).append(TITLES[name])
+        axis.notes += [f"{', '.join(titles)} not identified: {reason}" for reason, titles in unknown.items()]
 
 
 def prepare(run: AutoRun) -> None:
