@@ -143,15 +143,16 @@ def test_stable_baselines_gets_the_lanes_own_arrays(kind):
 
 # --- the docstring ----------------------------------------------------------------------------------------------------
 def rows_of(text):
-    """Return the tables of a docstring, each as rows of index, name, unit, low and high."""
-    tables = []
+    """Return the tables of a docstring's spaces, each as rows of index, name, unit, low and high."""
+    tables, is_one = [], False
     for line in text.splitlines():
         cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
         if not line.strip().startswith("|"):
-            continue
-        if cells == ["index", "name", "unit", "low", "high"]:
+            is_one = False
+        elif cells == ["index", "name", "unit", "low", "high"]:
             tables.append([])
-        elif set(cells) != {"---"}:
+            is_one = True
+        elif is_one and set(cells) != {"---"}:
             assert len(cells) == 5, line
             tables[-1].append(cells)
     return tables

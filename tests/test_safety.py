@@ -180,7 +180,7 @@ def test_an_axis_that_is_enabled_outside_may_come_back(bus, drive):
         drive.motion = ramp(0x6064, -100)
         drives.advance(0.025)  # to 500
         drive.motion = ramp(0x6064, 100)
-        with pytest.raises(SafetyError, match="position is 300 beyond"):  # and not out again
+        with pytest.raises(SafetyError, match="position is 300 increments beyond"):  # and not out again
             drives.advance(0.1)
 
 
@@ -188,7 +188,7 @@ def test_an_axis_that_is_enabled_outside_may_not_go_on(bus, drive):
     drive.set(0x6064, 3000)
     with enabled(bus, Limits(position=(-1000, 1000))) as drives:
         drive.motion = ramp(0x6064, 100)
-        with pytest.raises(SafetyError, match="position is 2300 beyond"):
+        with pytest.raises(SafetyError, match="position is 2300 increments beyond"):
             drives.advance(0.1)
 
 
