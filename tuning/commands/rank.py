@@ -46,7 +46,7 @@ def rank(
         int | None, typer.Option(help="Most machines to use, taken from all loads in turn.", show_default="all")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-compare")
+        Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-rank")
     ] = None,
     trials: Annotated[
         int | None,
