@@ -18,7 +18,7 @@ from tuning.auto import moves as auto_moves
 from tuning.auto import one_button as auto_module
 from tuning.auto import proving as proving_module
 from tuning.auto import search as auto_search
-from tuning.auto.calmer_gains import calmer
+from tuning.auto.calmer_gains import _off_meanwhile, calmer
 from tuning.auto.certify import certificate
 from tuning.auto.load_step import NOISE, SWING, load_step
 from tuning.auto.moves import _ease, _keep_what_is_better
@@ -477,6 +477,20 @@ def test_calmer_gains_are_the_best_on_the_twins_with_less_velocity_p(better, ms,
         reference=np.array([RULE]), unseen=np.array([False]), response=object(),
     )  # fmt: skip
     assert calmer(run, 0, 0.5).tolist() == chosen
+
+
+@pytest.mark.parametrize(("time_waits", "done"), [(False, ["off", "twins", "on"]), (True, ["twins"])])
+def test_drives_whose_time_does_not_wait_are_off_while_twins_are_computed(time_waits, done, monkeypatch):
+    """That takes longer than an envelope lets a program be silent with an axis enabled."""
+    seen = []
+    monkeypatch.setattr(motion, "disable", lambda drives: seen.append("off"))
+    run = SimpleNamespace(
+        target=SimpleNamespace(drives=SimpleNamespace(time_waits=time_waits)), going=np.array([True]),
+        ground=SimpleNamespace(begin=lambda where: seen.append("on")),
+    )  # fmt: skip
+    with _off_meanwhile(run):
+        seen.append("twins")
+    assert seen == done
 
 
 # --- what is accepted stands still ------------------------------------------------------------------------------------

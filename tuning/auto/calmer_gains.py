@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env import motion
 from drive_env.dictionary.roles import Role
 from drive_env.gains import cascade_columns
 from tuning.auto.checks import sound_gains
@@ -45,8 +47,20 @@ def cost_on_twins(run: AutoRun, axes: Sequence[int], gains: Integers) -> Floats:
         assert plant is not None and identified is not None, "an axis in the run has both"
         known.append(known_of(plant, identified, float(reach[k])))
     scaler = np.asarray(run.target.drives.read(Role.POSITION_SCALE), float)[list(axes)]
-    with Twins(run.target.device, run.target.motor, known, scaler, gains.shape[1]) as twins:
+    with _off_meanwhile(run), Twins(run.target.device, run.target.motor, known, scaler, gains.shape[1]) as twins:
         return twins.score(gains)
+
+
+@contextmanager
+def _off_meanwhile(run: AutoRun) -> Iterator[None]:
+    """Have drives whose time does not wait off during a block: it is long, and an enabled axis wants to be watched."""
+    drives = run.target.drives
+    if drives.time_waits or run.ground is None:
+        yield
+        return
+    motion.disable(drives)
+    yield
+    run.ground.begin(run.going)
 
 
 def calmer(run: AutoRun, k: int, factor: float) -> Integers:
