@@ -38,7 +38,7 @@ def while_it_moves(monkeypatch):
     run = auto_trials.ProvingGround.run
 
     def interrupted(self, tried, where):
-        self.begin(where)
+        self._begin(where)
         motion.select_mode(self.target.drives, "pp", where)
         signal.raise_signal(signal.SIGINT)
         return run(self, tried, where)

@@ -18,7 +18,7 @@ from tuning.auto import moves as auto_moves
 from tuning.auto import one_button as auto_module
 from tuning.auto import proving as proving_module
 from tuning.auto import search as auto_search
-from tuning.auto.calmer_gains import _off_meanwhile, calmer
+from tuning.auto.calmer_gains import calmer
 from tuning.auto.certify import certificate
 from tuning.auto.load_step import NOISE, SWING, load_step
 from tuning.auto.moves import _ease, _keep_what_is_better
@@ -420,7 +420,7 @@ RULES = "the gains of the baseline rule are kept: with faster ones it shook"
 
 
 def lowered(percent):
-    return f"velocity P lowered to {percent} %, the other gains as they suit it on the twins: it shook"
+    return f"velocity P lowered to {percent} %, the other gains with it: it shook"
 
 
 @pytest.mark.parametrize(("had", "eased", "swing", "factor", "said"), [
@@ -473,24 +473,22 @@ def test_calmer_gains_are_the_best_on_the_twins_with_less_velocity_p(better, ms,
     monkeypatch.setattr("tuning.auto.calmer_gains.sensitivity", sensitivity)
     axis = AxisRun(Gains(*FOUND), Gains(*FOUND), plant=object())
     run = SimpleNamespace(
-        target=SimpleNamespace(device=find_device("tmcm1636")), axes=[axis], gains=np.array([FOUND]),
+        target=SimpleNamespace(device=find_device("tmcm1636"), drives=SimpleNamespace(time_waits=True)),
+        axes=[axis], gains=np.array([FOUND]),
         reference=np.array([RULE]), unseen=np.array([False]), response=object(),
     )  # fmt: skip
     assert calmer(run, 0, 0.5).tolist() == chosen
 
 
-@pytest.mark.parametrize(("time_waits", "done"), [(False, ["off", "twins", "on"]), (True, ["twins"])])
-def test_drives_whose_time_does_not_wait_are_off_while_twins_are_computed(time_waits, done, monkeypatch):
-    """That takes longer than an envelope lets a program be silent with an axis enabled."""
-    seen = []
-    monkeypatch.setattr(motion, "disable", lambda drives: seen.append("off"))
+def test_where_time_does_not_wait_no_twin_is_asked_while_an_axis_is_enabled(monkeypatch):
+    """That takes longer than an envelope lets a program be silent, and the voltage is not taken from what may turn."""
+    monkeypatch.setattr("tuning.auto.calmer_gains.cost_on_twins", lambda *given: pytest.fail("twins"))
     run = SimpleNamespace(
-        target=SimpleNamespace(drives=SimpleNamespace(time_waits=time_waits)), going=np.array([True]),
-        ground=SimpleNamespace(begin=lambda where: seen.append("on")),
+        target=SimpleNamespace(device=find_device("tmcm1636"), drives=SimpleNamespace(time_waits=False)),
+        axes=[AxisRun(Gains(*FOUND), Gains(*FOUND), plant=object())], gains=np.array([FOUND]),
+        reference=np.array([RULE]),
     )  # fmt: skip
-    with _off_meanwhile(run):
-        seen.append("twins")
-    assert seen == done
+    assert calmer(run, 0, 0.5).tolist() == [4000, 1000, 1000, 2400, 1000]
 
 
 # --- what is accepted stands still ------------------------------------------------------------------------------------

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motion
 from drive_env.dictionary.roles import Role
 from drive_env.gains import cascade_columns
 from tuning.auto.checks import sound_gains
 from tuning.auto.measured_margins import SENSITIVITY, sensitivity
+from tuning.auto.trials import faster
 from tuning.auto.twin import Twins, known_of
 
 if TYPE_CHECKING:
@@ -47,20 +46,8 @@ def cost_on_twins(run: AutoRun, axes: Sequence[int], gains: Integers) -> Floats:
         assert plant is not None and identified is not None, "an axis in the run has both"
         known.append(known_of(plant, identified, float(reach[k])))
     scaler = np.asarray(run.target.drives.read(Role.POSITION_SCALE), float)[list(axes)]
-    with _off_meanwhile(run), Twins(run.target.device, run.target.motor, known, scaler, gains.shape[1]) as twins:
+    with Twins(run.target.device, run.target.motor, known, scaler, gains.shape[1]) as twins:
         return twins.score(gains)
-
-
-@contextmanager
-def _off_meanwhile(run: AutoRun) -> Iterator[None]:
-    """Have drives whose time does not wait off during a block: it is long, and an enabled axis wants to be watched."""
-    drives = run.target.drives
-    if drives.time_waits or run.ground is None:
-        yield
-        return
-    motion.disable(drives)
-    yield
-    run.ground.begin(run.going)
 
 
 def calmer(run: AutoRun, k: int, factor: float) -> Integers:
@@ -69,9 +56,14 @@ def calmer(run: AutoRun, k: int, factor: float) -> Integers:
     An encoder's noise, and its counts at standstill, go into the current by velocity P. The other gains of the outer
     loops are lowered with it as far as that is better; those of the rule are looked at as well, with as much more
     velocity P as their current loop is slower.
+
+    Where time does not wait all of the outer gains are lowered alike: twins take longer than an enabled axis may be
+    left alone, and its voltage is not taken away, since it may still turn, or hold a weight.
     """
     device, plant, own, rule = run.target.device, run.axes[k].plant, run.gains[k], run.reference[k]
     assert plant is not None, "an axis in the run has one"
+    if not run.target.drives.time_waits:
+        return faster(device.gains, own, factor)
     torque_p, _, velocity_p, velocity_i, position_p = cascade_columns(device)
     response = None if run.unseen[k] else run.response
     most = factor * own[velocity_p]

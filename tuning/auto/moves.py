@@ -102,7 +102,7 @@ def _ease(run: AutoRun, k: int, swing: float, why: str) -> None:
     else:
         before, run.gains[k] = run.gains[k, velocity_p], calmer(run, k, factor)
         share = 100.0 * run.gains[k, velocity_p] / before
-        axis.notes.append(f"velocity P lowered to {share:.0f} %, the other gains as they suit it on the twins: {why}")
+        axis.notes.append(f"velocity P lowered to {share:.0f} %, the other gains with it: {why}")
     run.spare[k] = 0  # about as fast as the best, which shook
     axis.eased += 1
 

@@ -217,7 +217,7 @@ class ProvingGround:
         """
         drives, rated = self.target.drives, self.target.motor.rated_current
         where = self.target.together(where)
-        self.begin(where)
+        self._begin(where)
         self._hold_still(where)
         write_gains(drives, gains, where)
         write_profile(drives, self.move, where)
@@ -259,7 +259,7 @@ class ProvingGround:
             where: Axes, (num_axes,); those that pull at the same thing take part, too.
         """
         where = self.target.together(where)
-        self.begin(where)
+        self._begin(where)
         return self._noise(gains, where)
 
     def _noise(self, gains: Integers, where: Mask) -> Floats:
@@ -340,7 +340,7 @@ class ProvingGround:
         return np.asarray(np.abs(wrapped(positions - positions[-1])).max(axis=0) <= STEP_COUNTS * self._count)
 
     def _run(self, gains: Integers, where: Mask) -> Trial:
-        self.begin(where)
+        self._begin(where)
         self.moves[where] += len(PHASES)
         stop_causes(self.target.drives)  # of before
         tried = self._trials.run(gains, self.safe, self.move, self._origin, self._direction, where)
@@ -349,7 +349,7 @@ class ProvingGround:
         self._direction = np.where(where, -self._direction, self._direction)
         return tried
 
-    def begin(self, where: Mask) -> None:
+    def _begin(self, where: Mask) -> None:
         """Enable axes that are off, with stable gains, and bring those back that are not where they should be."""
         drives = self.target.drives
         down = self.target.together(where & self._trials.down())
