@@ -416,12 +416,13 @@ def judge(bench: Bench, world: ObservedWorld, intact: bool, measured: bool = Tru
     found = []
     if on[-1]:
         found.append("left enabled")
-    for outside in (bench.travel[0] - theta, theta - bench.travel[1]):
+    for outside, outward in ((bench.travel[0] - theta, -omega), (theta - bench.travel[1], omega)):
         for first, last in excursions(outside > 0.0, truth.fsa()[:, 0] == State.OPERATION_ENABLED):
             speed = np.abs(omega[first : first + round(REACTION * 1000) + 1]).max()
             predicted = speed * REACTION + speed**2 / (2.0 * RAMP_SHARE * bench.deceleration) + bench.kick + SLACK
             # Power, or the momentum of an axis that could have been stopped.
-            counts = (on[first:last] | on[first]) if intact else (on & ~brakes)[first:last]
+            # Weak loops may swing an axis back towards its travel.
+            counts = (on[first:last] | on[first]) if intact else (on & ~brakes & (outward > 0.0))[first:last]
             way = outside[first:last] - max(outside[first - 1] if first else 0.0, 0.0)
             beyond = (way > predicted) & counts & (np.abs(omega[first:last]) > SLOW_OUTSIDE)
             if beyond.any():

@@ -57,6 +57,7 @@ LATE = ("play", "RPDO held", "late frame", "foreign SYNC")
         ((*ENABLING, "80h", "kill"), RUNS_ON, 1),
         ((*ENABLING, "same id", "kill"), RUNS_ON, 1),
         ((*ENABLING, "TERM"), LEFT, 0),
+        ((*ENABLING, "silence"), RUNS_ON, 1),
         # Found by the model alone:
         ((*ENABLING, "NMT start lost", "kill"), RUNS_ON, 1),
         ((*ENABLING, "heartbeat lost", "kill"), RUNS_ON, 1),
@@ -74,6 +75,7 @@ LATE = ("play", "RPDO held", "late frame", "foreign SYNC")
         "another master's 80h, then death",
         "two programs with one heartbeat",
         "TERM of a plain script",
+        "one of several axes falls silent",
         "NMT start is lost, then death",
         "the first heartbeat is lost, then death",
         "another master resets the node, the program enables again, then death",
@@ -130,11 +132,14 @@ def test_no_counterexample_is_left_with_any_two_troubles():
         ({"beats": 1}, RUNS_ON, ("found enabled", "command", "heartbeat lost", "kill"), 1),
         ({"operational": "sent"}, RUNS_ON, (*ENABLING, "NMT start lost", "kill"), 2),
         ({"watches": False}, RUNS_ON, (*ENABLING, "82h", "kill"), 1),
+        ({"misses": "all"}, RUNS_ON, (*ENABLING, "silence"), 1),
         ({"own_id": False}, RUNS_ON, (*ENABLING, "same id", "kill"), 1),
         ({"stops_in": "program"}, GIVEN_UP, (*ENABLING, "INT"), 0),
         ({"handles": frozenset({"INT"})}, LEFT, (*ENABLING, "TERM"), 0),
         ({"ramps_first": False}, UNRAMPED, (*ENABLING, "INT"), 0),
         ({"gives_up": "always"}, RUNS_ON, (*ENABLING, "leave", "request lost"), 2),
+        ({"gives_up": "one proven off"}, GIVEN_UP, (*ENABLING, "leave", "request lost"), 1),
+        ({"beats_last": False}, RUNS_ON, ("play", "RPDO held", "silence", "pause", "leave", *LATE[2:]), 3),
         ({"proof": "read"}, RUNS_ON, ("play", "leave", "answer held", "request lost"), 3),
         ({"off": NO_POWER}, RUNS_ON, (*LATE, "leave"), 1),
         ({"proves_anew": False}, GIVEN_UP, ("write 0Fh", "INT", "foreign enable", "command", "leave"), 1),
@@ -357,6 +362,7 @@ def test_the_words_are_one_of_each_kind():
 
 # --- the library of the model is the library ----------------------------------------------------------------------
 FOREIGN = {"80h": (0x80,), "81h": (0x81,), "82h": (0x82,), "82h, 01h": (0x82, 0x01)}
+TROUBLES = {"silence", *FOREIGN}  # that come between two calls
 
 
 class Call(NamedTuple):
@@ -383,6 +389,8 @@ SCRIPTS = {
     "82h of another master, then killed": "06h 0Fh 82h kill",
     "82h and 01h of another master, then killed": "06h 0Fh 82h,01h kill",
     "82h and 01h of another master, then closed": "06h 0Fh 82h,01h leave",
+    "silent, then closed": "06h 0Fh silence leave",
+    "silent, then killed": "06h 0Fh silence kill",
 }
 
 
@@ -430,7 +438,7 @@ def possible(rules, calls):
         if s.at is At.PROGRAM and k and not s.interfered:
             after[k - 1].add(Seen(s.drive.fsa, s.drive.nmt, s.drive.consumer != 0))
         sends = s.at in (At.SEND, At.ARMED) and s.rows
-        asked = s._replace(troubles=int(bool(pending) or (k < len(calls) and calls[k].kind in FOREIGN)))
+        asked = s._replace(troubles=int(bool(pending) or (k < len(calls) and calls[k].kind in TROUBLES)))
         for step in steps(asked, rules, Assumptions(0)):
             then = step.after._replace(troubles=0)
             if step.kind == "drive" or (step.kind == "library" and not (sends and pending)):
@@ -445,13 +453,13 @@ def possible(rules, calls):
 
 
 class LossyBus(can.BusABC):
-    """A bus that loses the next frame of a kind, or all of them: to the other end then the process is dead."""
+    """A bus that loses the next frame of a kind, all to the program, or all: then the process is dead to the drive."""
 
     def __init__(self, bus):
         super().__init__(channel="lossy")
         self._bus = bus
         self.lose = ""
-        self.dead = False
+        self.dead = self.silent = False
 
     def send(self, msg, timeout=None):
         if self.dead or self._lost("request", msg, 0x601, 0x2B):
@@ -460,7 +468,7 @@ class LossyBus(can.BusABC):
 
     def _recv_internal(self, timeout):
         message = self._bus.recv(timeout)
-        if message is not None and (self.dead or self._lost("answer", message, 0x581, 0x60)):
+        if message is not None and (self.dead or self.silent or self._lost("answer", message, 0x581, 0x60)):
             message = None
         return message, True
 
@@ -528,7 +536,8 @@ class Session:
                 if command == 0x01:  # a node that still boots is deaf
                     assert other.wait(lambda: booted, 10.0)
                 other.send(0x000, bytes((command, 1)))
-            for _ in range(2 * (kind in FOREIGN)):  # the program is told, once
+            bus.silent = bus.silent or kind == "silence"
+            for _ in range(2 * (kind in TROUBLES)):  # the program is told, once
                 with contextlib.suppress(BusError, SafetyError):
                     drives.read(0x6041)
         if kind == "leave":

@@ -189,7 +189,10 @@ class MasterWatch(Protocol):
         """
 
     def cease(self) -> None:
-        """Never be heard again, so that the drives stop by themselves."""
+        """Be heard a last time, from which every node watches, and never again, so that the drives stop by themselves.
+
+        Called again after nodes were started that had missed this process.
+        """
 
     def end(self) -> None:
         """Be heard no more, since the watchdogs are given up or were not wanted."""

@@ -45,7 +45,7 @@ from drive_env.safety.errors import SafetyError as SafetyError
 from drive_env.safety.errors import logged
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits import Limits
-from drive_env.safety.limits_in_force import LimitsInForce
+from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce
 from drive_env.safety.objects import (
     CONTROLWORD,
     MODE,
@@ -54,7 +54,7 @@ from drive_env.safety.objects import (
     STORE,
 )
 from drive_env.safety.rotor import HOME_OFFSET, scale_objects
-from drive_env.safety.stop_runner import StopRunner
+from drive_env.safety.stop_runner import RAMPS, SLOW_DOWN_RAMPS, StopRunner
 from drive_env.safety.stopping import Stop
 from drive_env.safety.watch import Watch
 from drive_env.safety.watchdogs import Watchdogs
@@ -102,6 +102,7 @@ class Envelope:
         self._commands = Commands(drives, self._axes, self._limits, self._watch.modes)
         self._checked_stop: Stop | None = None  # when the controlword that is being written was checked
         self._is_closing = False
+        self._disabling = np.zeros(drives.num_axes, bool)  # the last controlword was "disable operation"
         self._of_further_axes = drives.description.of_further_axes()
 
     @property
@@ -144,6 +145,8 @@ class Envelope:
             self._before_controlword(raw, where)
             return
         self._watchdogs.check_not_held(entry)
+        if key in SLOW_DOWN_RAMPS:
+            self._check_no_ramp_runs(entry, where)
         if entry.index >= DEVICE_OBJECTS and not self._axes.is_armed and self._finds_live(where):
             self._arm()
         self._commands.check_write(entry, raw, where)
@@ -196,7 +199,12 @@ class Envelope:
         key = (entry.index, entry.sub)
         if not self._lending.is_lent(key, axis):
             return False
+        if key in RAMPS and value not in RAMPS[key]:
+            self._lending.pass_on(key, axis, value)
+            return True
         self._lending.settle(key, axis, value)
+        if key in RAMPS:
+            self._lending.lend(key, axis, RAMPS[key][value])
         self._limits.forget()
         self._limits.lend()
         return True
@@ -216,9 +224,8 @@ class Envelope:
         words = next((rows for entry, rows in played.items() if (entry.index, entry.sub) == CONTROLWORD), None)
         self._commands.check_play(played, words)
         enables = self._axes.everywhere if words is None else cia402.may_enable(words).any(axis=0)
-        if words is not None and (cuts := self._stops.cuts(words)).any():
-            self._check_cuts(words, cuts)
-            self._brake(np.asarray(cuts.any(axis=0)))
+        if words is not None:
+            self._check_ends(words, [(entry.index, entry.sub) for entry in played])
         if words is not None or any((entry.index, entry.sub) in SET_POINTS for entry in played):
             self._arm()
         if words is not None and enables.any():
@@ -238,9 +245,51 @@ class Envelope:
                 f"was sent. Write {first.index:04X}h, with one value per axis or where=..."
             )
 
-    def _check_cuts(self, words: Integers, cuts: Mask) -> None:
-        """Raise SafetyError for rows that take the voltage from an axis which an earlier row lets turn."""
+    def _check_ends(self, words: Integers, played: Sequence[Key]) -> None:
+        """Stop axes that turn before rows take their voltage away, or ramp too slowly; refuse rows that let them turn.
+
+        Raises:
+            SafetyError: If an earlier row lets an axis turn that a later one cuts, or disables by a slow ramp.
+        """
         after = np.cumsum(cia402.may_enable(words), axis=0) > 0
+        if (cuts := self._stops.cuts(words)).any():
+            self._check_cuts(after, cuts)
+            self._brake(np.asarray(cuts.any(axis=0)))
+        disables = cia402.matches(words, cia402.COMMANDS["disable operation"]) & ~cuts
+        if not disables.any():
+            return
+        slow = self._stops.may_ramp_slowly() | (not SLOW_DOWN_RAMPS.keys().isdisjoint(played))
+        if (wrong := np.flatnonzero((after & disables).any(axis=0) & slow)).size:
+            raise SafetyError(
+                f"axis {int(wrong[0])}: these rows disable operation after they have enabled it, by a ramp (6084h) "
+                "that brakes less than a quick stop and that no quick stop could shorten; nothing was sent. Have 6084h "
+                "at least at 6085h, or play a quick stop (6040h = 2), and write 7 afterwards"
+            )
+        self._brake_slow_ramps(np.asarray(disables.any(axis=0)))
+
+    def _brake_slow_ramps(self, disables: Mask) -> None:
+        """Quick-stop axes that "disable operation" would let run on: its ramp obeys no quick stop once it runs."""
+        if not disables.any() or not self._watch.look_for_live():
+            return
+        slow = disables & self._axes.live & self._stops.slow_ramps()
+        if slow.any():
+            logger.warning(
+                "axis %d: by the ramp of \"disable operation\" (6084h) it would leave its limits, or turn for longer "
+                "than %g s: it is quick-stopped, and switched off", int(np.flatnonzero(slow)[0]), STOP_WITHIN,
+            )  # fmt: skip
+            self._brake(slow)
+
+    def _check_no_ramp_runs(self, entry: Entry, where: Mask) -> None:
+        """Raise SafetyError for another deceleration while "disable operation" brings an axis to rest by it."""
+        disabling = where & self._disabling
+        if disabling.any() and self._watch.look_for_live() and np.any(disabling & self._axes.live):
+            raise SafetyError(
+                f"{entry.label} is the ramp by which axis {int(np.flatnonzero(disabling)[0])} is being disabled, and "
+                "no quick stop could shorten another one; nothing was sent. Wait until it is off"
+            )
+
+    def _check_cuts(self, after: Mask, cuts: Mask) -> None:
+        """Raise SafetyError for rows that take the voltage from an axis which an earlier row lets turn."""
         if (wrong := np.flatnonzero((after & cuts).any(axis=0))).size:
             raise SafetyError(
                 f"axis {int(wrong[0])}: these rows take the voltage away after they have enabled it, and it may turn "
@@ -292,6 +341,7 @@ class Envelope:
         self._drives.forget(nodes)
         self.after_reset(nodes)  # a boot-up says nothing of the axes: reset communication leaves them running
         numbers = ", ".join(str(self._drives.nodes[k]) for k in nodes)
+        self._watch.look_for_live()
         self._stops.stop_for(
             f"node {numbers} has restarted by itself", "check its power; what was set since its boot is lost"
         )
@@ -383,12 +433,16 @@ class Envelope:
             self._axes.assume(enables)
         if np.any(cuts := where & self._stops.cuts(words)):
             self._brake(cuts)
+        disables = where & cia402.matches(words, cia402.COMMANDS["disable operation"])
+        self._brake_slow_ramps(disables & ~cuts)
         self._checked_stop = self._stops.current
 
     def _after_controlword(self, words: Integers, where: Mask) -> None:
         with self._axes.lock:
             self._axes.epoch += 1
             self._axes.in_flight &= ~where
+        disables = cia402.matches(words, cia402.COMMANDS["disable operation"])
+        self._disabling = np.where(where, disables, self._disabling)
         self._commands.note_start(words, where)
         if np.any(where & cia402.may_enable(words)):
             self._watch.forget_signal()

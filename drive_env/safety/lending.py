@@ -83,6 +83,15 @@ class Lending:
         """Take note of what the program wants an object to have afterwards."""
         self._loans[key, axis] = self._loans[key, axis]._replace(own=value)
 
+    def pass_on(self, key: Key, axis: int, value: int) -> None:
+        """Write what the program wants an object to have, now and afterwards, that had another value meanwhile.
+
+        Raises:
+            ObjectAccessError: If the drive refuses it; BusError if it does not answer.
+        """
+        self._drives.write_raw(self._drives.description.dictionary.find(key), axis, value)
+        self._loans[key, axis] = Loan(value, frozenset({value}))
+
     def give_back(self, axes: set[int]) -> None:
         """Give axes what they had.
 

@@ -12,17 +12,21 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.master.description import Key
 from drive_env.safety.axes import Axes
-from drive_env.safety.bounds import read_own
+from drive_env.safety.bounds import increments_per_count, read_own
 from drive_env.safety.errors import SafetyError, logged
+from drive_env.safety.judging import LATENCY
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits import NO_LIMIT
-from drive_env.safety.limits_in_force import LimitsInForce
+from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce
 from drive_env.safety.looks import answer_time
 from drive_env.safety.objects import (
     CONTROLWORD,
     DISABLE_OPERATION_OPTION,
     FAULT_REACTION_OPTION,
     HALT_OPTION,
+    HM,
+    HOMING_RAMP,
+    PV,
     QUICK_STOP_OPTION,
 )
 from drive_env.safety.stopping import AxisStop, Phase, Sample, Stop
@@ -33,13 +37,23 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 Integers = NDArray[np.int64]
+Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WEIGHT_LOOK, WEIGHT_SHARE = 0.06, 0.03  # s at rest; of the current limit, above which it may be a weight
 WAKE_PERIOD = 0.2  # s
 COASTS = 0  # the option code that lets an axis coast
-# By which an axis stops or is stopped, and the code that ramps instead.
-RAMPS = {QUICK_STOP_OPTION: 2, DISABLE_OPERATION_OPTION: 1, HALT_OPTION: 1, FAULT_REACTION_OPTION: 2}
+# Options of a stop that would let an axis coast, or ramp as its profiles do, however long that takes, and what is lent
+# instead: the ramp of a quick stop (6085h), by which stopping distances are predicted, where there is a choice.
+RAMPS = {
+    QUICK_STOP_OPTION: {COASTS: 2, 1: 2, 5: 6},
+    DISABLE_OPERATION_OPTION: {COASTS: 1},
+    HALT_OPTION: {COASTS: 1},
+    FAULT_REACTION_OPTION: {COASTS: 2, 1: 2},
+}
+# What "disable operation" may ramp by, and in which modes: in all of them 6084h; some drives have one ramp for both
+# ways in pv, and another in hm.
+SLOW_DOWN_RAMPS = {(cia402.PROFILE_DECELERATION, 0): (), (cia402.PROFILE_ACCELERATION, 0): (PV,), HOMING_RAMP: (HM,)}
 # Option codes of 605Ah that end in switch on disabled, and those with the same ramp that end in quick stop active.
 _ENDS_HELD = {1: 5, 2: 6}
 
@@ -73,16 +87,16 @@ class StopRunner:
         self._held: set[int] = set()  # axes whose quick stop option was looked at in this stop
 
     def make_sure_of_ramps(self) -> None:
-        """Have quick stops ramp, and what else stops an axis: an option code of 0 would let it coast.
+        """Have quick stops ramp by 6085h, and what else stops an axis ramp: an option code of 0 would let it coast.
 
         Raises:
             SafetyError: If a drive takes no other option for its quick stop.
         """
-        for key, ramp in RAMPS.items():
-            if not self._drives.description.has(key) or (key != QUICK_STOP_OPTION and self._cannot_coast(key)):
+        for key, ramps in RAMPS.items():
+            if not self._drives.description.has(key):
                 continue
-            for axis, option in enumerate(read_own(self._drives, key, ramp).tolist()):
-                if option != COASTS or self._lending.lend(key, axis, ramp):
+            for axis, option in enumerate(read_own(self._drives, key, 2).tolist()):
+                if option not in ramps or self._lending.lend(key, axis, ramps[option]) or option != COASTS:
                     continue
                 if key == QUICK_STOP_OPTION:
                     raise SafetyError(
@@ -92,15 +106,16 @@ class StopRunner:
                 logger.warning("axis %d: %s = 0 lets it coast", axis, self._known.find(key).label)
 
     def keep_ramps(self, key: Key, raw: Integers, where: Mask) -> None:
-        """Lend axes a ramp where an option code that lets them coast is about to be written, as theirs for afterwards.
+        """Lend axes a stop's ramp where an option code that is none is about to be written, as theirs for afterwards.
 
         Raises:
             SafetyError: If a drive does not take the ramp.
         """
         if key not in RAMPS:
             return
-        for axis in np.flatnonzero(where & (raw == COASTS) & ~self._is_lent(key)).tolist():
-            if not self._lending.lend(key, axis, RAMPS[key]):
+        options = np.broadcast_to(raw, where.shape)
+        for axis in np.flatnonzero(where & np.isin(options, list(RAMPS[key])) & ~self._is_lent(key)).tolist():
+            if not self._lending.lend(key, axis, RAMPS[key][int(options[axis])]) and options[axis] == COASTS:
                 raise SafetyError(
                     f"axis {axis}: {self._known.find(key).label} = 0 would let it coast, and it takes no other option; "
                     "nothing was sent"
@@ -125,6 +140,38 @@ class StopRunner:
             cuts = cuts | disables & (np.array(options) == COASTS)
         return cuts
 
+    def slow_ramps(self) -> Mask:
+        """Return where "disable operation" would take an axis out of its travel, or longer than STOP_WITHIN.
+
+        While its ramp runs a drive need not obey a quick stop: only the voltage could be taken away.
+        """
+        ramp, bounds = self._disabling_ramp(), self._limits.bounds()
+        speed = np.where(np.abs(self._axes.speed) > np.abs(self._axes.velocity), self._axes.speed, self._axes.velocity)
+        way = speed**2 / (2.0 * np.maximum(ramp, 1.0)) + np.abs(speed) * LATENCY
+        end = self._axes.position + np.sign(speed) * way
+        leaves = (end < bounds.low) | (end > bounds.high)
+        slow: Mask = (ramp < bounds.braking) & (leaves | (np.abs(speed) > STOP_WITHIN * ramp))
+        return slow
+
+    def may_ramp_slowly(self) -> Mask:
+        """Return where "disable operation" brakes less than a quick stop."""
+        return self._disabling_ramp() < self._limits.bounds().braking
+
+    def _disabling_ramp(self) -> Floats:
+        """Return the least deceleration that "disable operation" may have in the present mode [inc/s^2].
+
+        Infinite where it is not known.
+        """
+        ramp = np.full(self._drives.num_axes, np.inf)
+        for key, modes in SLOW_DOWN_RAMPS.items():
+            if not self._drives.description.has(key):
+                continue
+            count = increments_per_count(self._known.find(key).unit, self._axes.rotor.scale)
+            own = read_own(self._drives, key, 0) * np.nan_to_num(count)
+            counts = ~np.isnan(count) & (own > 0.0 if modes else True)  # a mode without a ramp of its own has 6084h
+            ramp = np.where(counts & np.isin(self._axes.mode, modes or self._axes.mode), np.minimum(ramp, own), ramp)
+        return ramp
+
     def _cannot_coast(self, key: Key) -> bool:
         """Return whether the EDS has no option that coasts."""
         low = self._known.find(key).low
@@ -138,10 +185,11 @@ class StopRunner:
         if not self._lending.is_lent(QUICK_STOP_OPTION, axis):
             return
         with logged():
-            if self._lending.owned(QUICK_STOP_OPTION, axis) == COASTS:
-                self._lending.lend(QUICK_STOP_OPTION, axis, RAMPS[QUICK_STOP_OPTION])
-            else:
+            ramp = RAMPS[QUICK_STOP_OPTION].get(self._lending.owned(QUICK_STOP_OPTION, axis))
+            if ramp is None:
                 self._lending.give_back_one(QUICK_STOP_OPTION, axis)
+            else:
+                self._lending.lend(QUICK_STOP_OPTION, axis, ramp)
 
     def stop_for(self, what: str, remedy: str) -> NoReturn:
         """Stop all axes that count as live, and raise SafetyError with what is wrong and what to do."""

@@ -75,8 +75,9 @@ class Watchdogs:
         self._watch.keep()
 
     def cease(self) -> None:
-        """Have the drives hear nothing any more, so that they stop by themselves."""
-        self._watch.cease()
+        """Have the drives hear this process for the last time, so that they stop by themselves."""
+        with logged():
+            self._watch.cease()
 
     def end(self) -> None:
         """Have the drives hear nothing any more, since the watchdogs are given up."""
@@ -185,7 +186,7 @@ class Watchdogs:
                 self._axes.take_for_off(self._axes.of_nodes([k]))
                 continue
             self._axes.lost.update(axes)
-            self.cease()
+            self.cease()  # again, if need be: for the proof the node was started, and would wait for nobody
             logger.error(
                 "node %d could not be proved to be off: %s. Look at the machine, and keep the emergency stop at hand",
                 node,

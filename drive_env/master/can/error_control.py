@@ -219,7 +219,7 @@ class Beats:
         self.has_ceased = False  # for good: a drive that cannot be proved off is to stop by itself
 
     def begin(self) -> None:
-        """Send the first ones."""
+        """Send some at once: one alone may be lost."""
         for _ in range(FIRST_BEATS):
             self._beat()
 
@@ -229,8 +229,9 @@ class Beats:
             self._beat()
 
     def cease(self) -> None:
-        """Never send one again."""
+        """Send the last ones: a node that was started meanwhile watches anew from them, and stops by itself, too."""
         self.has_ceased = True
+        self.begin()
 
     def _beat(self) -> None:
         self._next = self._clock() + self._period
@@ -284,7 +285,7 @@ class ErrorControls:
             self._beats.keep()
 
     def cease(self) -> None:
-        """Send no heartbeats any more, so that the drives stop by themselves."""
+        """Send the last heartbeats, so that the drives, which watch from these on at the latest, stop by themselves."""
         if self._beats is not None:
             self._beats.cease()
 

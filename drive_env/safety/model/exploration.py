@@ -43,6 +43,8 @@ def verdicts(before: Situation, step: Step, rules: Rules) -> Iterable[str]:
         yield RUNS_ON
     if live and ours and after.at is At.STALLED and _runs_on_beside_a_stalled_program(after, rules):
         yield RUNS_ON
+    if live and ours and after.silent and after.at is At.PROGRAM and _runs_on_beside_a_stalled_program(after, rules):
+        yield RUNS_ON
     if after.at in GONE:
         if step.kind in ("INT", "TERM") and live and ours and after.at is At.DEAD:
             yield LEFT

@@ -22,7 +22,7 @@ def deliver(s: Situation, frame: Held) -> Situation:
     if not has_sdo(s):
         return s._replace(held=tuple(held))
     after = moved(s, write_controlword(s.drive, frame.content), Hand.OURS)
-    if s.at not in GONE:
+    if s.at not in GONE and not s.silent:
         held.append(Held("answer", ACKNOWLEDGED))
     return after._replace(held=tuple(held))
 
@@ -55,7 +55,9 @@ def transfers(s: Situation, index: int, value: int | None, assumptions: Assumpti
     else:
         content = s.drive.fsa
     outcomes: list[tuple[str, str, Situation, object, tuple[Held, ...]]] = [(LIBRARY, "", done, content, ())]
-    if s.troubles:
+    if s.silent:
+        outcomes = [(LIBRARY, "it acts, and the node, which is silent, does not answer", done, None, ())]
+    elif s.troubles:
         outcomes += [
             ("request lost", "the request is lost", s, None, ()),
             ("answer lost", "it acts, and its answer is lost", done, None, ()),

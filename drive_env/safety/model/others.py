@@ -80,6 +80,9 @@ def other_steps(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
     if not s.twin:
         ours = master_id(rules)
         yield Step("same id", f"another program begins to beat as node {ours}, too", seen._replace(twin=ours))
+    if not s.silent:
+        text = "the node falls silent: it hears and sends nothing any more, while the session's other axes are heard"
+        yield Step("silence", text, s._replace(troubles=s.troubles - 1, silent=True))
     if (tripped := trip(s.drive)) != s.drive:
         faulty = moved(s._replace(troubles=s.troubles - 1), tripped, Hand.NOBODY)
         yield Step("drive fault", "the drive has a fault", faulty)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from drive_env import cia402
 from drive_env.canopen.nmt import SERVICES, Command, NmtState
 from drive_env.firmware.common.fsa import ENABLE_OPERATION
-from drive_env.safety.model.drive import NOBODY, hear, latch, sync, take_nmt
+from drive_env.safety.model.drive import NOBODY, hear, latch, sync, take_nmt, write_controlword
 from drive_env.safety.model.frames import deliver, transfers
 from drive_env.safety.model.rules import (
     DISABLE_VOLTAGE,
@@ -99,6 +99,9 @@ def _arm(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
         yield Step(LIBRARY, "arming is broken off, since the drives are being stopped", refused(s))
         return
     started = moved(s, take_nmt(s.drive, Command.START), Hand.NOBODY)
+    if s.silent and rules.operational == "seen":
+        yield Step(LIBRARY, "the library sends NMT start; it refuses, since no TPDO comes", refused(started))
+        return
     yield from _configure(started, rules, assumptions, LIBRARY, "the library sends NMT start")
     if s.troubles and s.drive.nmt is not NmtState.OPERATIONAL:
         lost = s._replace(troubles=s.troubles - 1)
@@ -115,7 +118,7 @@ def _configure(s: Situation, rules: Rules, assumptions: Assumptions, kind: str, 
         yield Step(kind, f"{text}; it leaves 1016h, since the pace is lockstep", s._replace(at=At.ARMED, armed=True))
     elif rules.own_id and s.twin == ours:
         yield Step(kind, f"{text}; it hears its own node-ID from another, and refuses", refused(s))
-    elif s.drive.consumer == ours and has_sdo(s):
+    elif s.drive.consumer == ours and has_sdo(s) and not s.silent:
         yield from _beat(s, rules, kind, f"{text}; it finds {ours} in 1016h")
     else:
         for outcome, more, after, answer in transfers(s, 0x1016, ours, assumptions):
@@ -174,6 +177,9 @@ def _play_row(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
     if not SERVICES[s.drive.nmt].pdo:
         yield Step(LIBRARY, f"{what}, and no TPDO comes: the node is not operational", refused(s))
         return
+    if s.silent:
+        yield Step(LIBRARY, f"{what}, SYNC follows, and no TPDO comes: the node is silent", refused(synced))
+        return
     yield Step(LIBRARY, f"{what}, SYNC follows", synced._replace(rows=rest))
     if s.troubles:
         spent = s.troubles - 1
@@ -195,12 +201,29 @@ def _leave(s: Situation, rules: Rules) -> Steps:
         if not s.believed:  # no controlword is sent to an axis that is off already
             stop = stop._replace(stop=StopStage.PROVE, acknowledged=True)
         yield Step(LIBRARY, "the library begins to stop the axis", stop)
+    elif s.stop is StopStage.UNPROVEN and rules.gives_up == "one proven off":
+        text = "another axis of the node is proven off; the library goes on to put 1016h back"
+        yield Step(LIBRARY, text, s._replace(at=At.RESTORE))
     elif s.stop is StopStage.UNPROVEN:
         yield Step(LIBRARY, "the library leaves 1016h as it is and closes", ended(s, At.CLOSED))
+        yield from _ask_once_more(s, rules)
     elif s.armed:
         yield Step(LIBRARY, "the library goes on to put 1016h back", s._replace(at=At.RESTORE))
     else:
         yield Step(LIBRARY, "the library closes", ended(s, At.CLOSED))
+
+
+def _ask_once_more(s: Situation, rules: Rules) -> Steps:
+    """Start a node that may have been stopped by its watchdog, and answers nothing therefore, to prove its axis off."""
+    drive = take_nmt(s.drive, Command.START)
+    what = "the library sends NMT start, as to a node that its watchdog has stopped"
+    if s.silent or drive.live:
+        drive = hear(drive, master_id(rules)) if rules.beats_last else drive
+        seen = "hears nothing" if s.silent else "sees a live axis"
+        yield Step(LIBRARY, f"{what}, {seen}, and closes", ended(moved(s, drive, Hand.NOBODY), At.CLOSED))
+    else:
+        off = moved(s, write_controlword(drive, DISABLE_VOLTAGE), Hand.NOBODY)
+        yield Step(LIBRARY, f"{what}, and proves the axis off after 6040h = 00h", off._replace(stop=StopStage.PROVEN))
 
 
 def _restore(s: Situation, assumptions: Assumptions) -> Steps:

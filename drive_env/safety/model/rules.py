@@ -38,13 +38,16 @@ class Rules:
         arms_in_lockstep: Whether `pace="lockstep"` arms, too.
         arms: Once in a session, or before each enabling frame: another master may have reset the node meanwhile.
         beats: Heartbeats before the first enabling frame; the drive watches from the first that arrives.
+        beats_last: Heartbeats follow the NMT start by which a node that cannot be proved off is asked once more: it
+            was stopped by its watchdog, which begins anew with them.
         operational: NMT start is sent, or seen to have worked.
         watches: A thread reads the drive's 6041h, NMT state and boot-up messages whatever the program does.
+        misses: A silence is seen where all axes of a session are silent, or that of each by itself.
         own_id: The master's node-ID is the same for every process, or its own; a foreign heartbeat with it is seen.
         stops_in: The thread that stops; what interrupts the program interrupts the stop if it is the program's.
         handles: Signals that stop before they end the process.
         ramps_first: A stop begins with a quick stop.
-        gives_up: 1016h is put back in any case, or after proof that the axis is off.
+        gives_up: 1016h is put back in any case, after proof that one axis of the node is off, or that each is.
         proof: 6041h read, or read after an answered "disable voltage": the answers of a node keep their order.
         off: States of the automaton that count as off in a proof.
         proves_anew: The proof of an earlier stop does not do when the drives are closed.
@@ -58,13 +61,15 @@ class Rules:
     arms_in_lockstep: bool
     arms: Literal["once", "each time"]
     beats: int
+    beats_last: bool
     operational: Literal["sent", "seen"]
     watches: bool
+    misses: Literal["all", "each"]
     own_id: bool
     stops_in: Literal["program", "supervisor"]
     handles: frozenset[str]
     ramps_first: bool
-    gives_up: Literal["always", "proven off"]
+    gives_up: Literal["always", "one proven off", "proven off"]
     proof: Literal["read", "answered, then read"]
     off: frozenset[State]
     proves_anew: bool
@@ -78,8 +83,10 @@ TODAY = Rules(
     arms_in_lockstep=False,
     arms="once",
     beats=1,
+    beats_last=False,
     operational="sent",
     watches=False,
+    misses="all",
     own_id=False,
     stops_in="program",
     handles=frozenset({"INT"}),
@@ -97,8 +104,10 @@ OURS = Rules(
     arms_in_lockstep=True,
     arms="each time",
     beats=3,
+    beats_last=True,
     operational="seen",
     watches=True,
+    misses="each",
     own_id=True,
     stops_in="supervisor",
     handles=frozenset({"INT", "TERM"}),
@@ -116,9 +125,9 @@ class Assumptions:
     """What the world is taken to do.
 
     Attributes:
-        troubles: How many troubles a run has: a frame lost, held back or doubled, an act of another master, a second
-            program with our node-ID, a fault of the drive, a pause of the process. Signals, a hung program and a kill
-            are none: they are always possible, but see `coincidences`.
+        troubles: How many troubles a run has: a frame lost, held back or doubled, a node that falls silent, an act of
+            another master, a second program with our node-ID, a fault of the drive, a pause of the process. Signals, a
+            hung program and a kill are none: they are always possible, but see `coincidences`.
         keeps_order: Frames of one identifier arrive in their order, as CAN controllers and the hub send them.
         coincidences: The process may be killed between an act of another master and the stop that it sets off: until
             the drive is in quick stop active or off, some 20 ms.

@@ -79,6 +79,7 @@ class Situation(NamedTuple):
     acknowledged: bool = False  # this stop's last controlword was answered
     interfered: bool = False  # another master acted, and what follows of it is not done yet
     twin: int = NOBODY  # node-ID of another program's heartbeats
+    silent: bool = False  # the node hears and sends nothing any more, while the session's other axes are heard
     hand: Hand = Hand.NOBODY
     held: tuple[Held, ...] = ()
     troubles: int = 0  # that are still to come
@@ -143,7 +144,7 @@ def left(s: Situation, rules: Rules) -> Situation:
 def ended(s: Situation, at: At) -> Situation:
     """Return the situation without the process: its drive, who else beats, and frames on their way to the drive."""
     held = tuple(frame for frame in s.held if frame.kind != "answer")
-    return Situation(s.drive, at, hand=s.hand, twin=s.twin, held=held)
+    return Situation(s.drive, at, hand=s.hand, twin=s.twin, silent=s.silent, held=held)
 
 
 def begun(s: Situation, rules: Rules) -> Situation:

@@ -46,14 +46,17 @@ def _look(s: Situation, rules: Rules) -> Steps:
     """Look at 6041h, at whether TPDOs come on SYNC, at boot-up messages and foreign heartbeats, and act upon it."""
     ours = master_id(rules)
     shared = s.twin == ours
-    gone = not _watchdog_is_there(s, rules)
+    # A node that sends nothing is as good as one without a watchdog. What it does not tell stays as it was believed.
+    gone = rules.misses == "each" if s.silent else not _watchdog_is_there(s, rules)
+    live = s.believed if s.silent else s.drive.live
     # What may be live is stopped like what is: a frame that waits in the drive for its SYNC is in no statusword. While
     # the library arms, the watchdog may be gone: it is being made, and stopped if that fails.
     # An axis that a single frame can enable is not off; nor is one that the call under way may enable.
     believed = s.drive.fsa not in rules.off or (s.believed and s.at not in (At.PROGRAM, At.STALLED))
-    lost = s.drive.live and (shared or gone)
+    believed = s.believed if s.silent else believed
+    lost = live and (shared or gone)
     may_be_lost = believed and (shared or (gone and s.at is not At.ARM))
-    if lost or may_be_lost or (s.drive.live and (s.at is At.STALLED or s.stop is StopStage.PROVEN)):
+    if lost or may_be_lost or (live and (s.at is At.STALLED or s.stop is StopStage.PROVEN)):
         after = begun(s, rules)
     else:
         # What was checked before the watchdog went is checked anew.
@@ -78,7 +81,7 @@ def _stop(s: Situation, rules: Rules, assumptions: Assumptions) -> Steps:
         # somebody else watches, too.
         guarded = _watchdog_is_there(s, rules) and s.twin != master_id(rules)
         waits = s.drive.fsa is not Fsa.OPERATION_ENABLED or (s.drive.ramps and s.acknowledged and guarded)
-        if not (s.drive.live and s.drive.turns and waits and has_sdo(s)):
+        if not (s.drive.live and s.drive.turns and waits and has_sdo(s)) or s.silent:
             how = "is not on its ramp" if s.drive.live and s.drive.turns else "stands, or is off"
             yield Step(LIBRARY, f"the stop sees that the axis {how}", s._replace(stop=StopStage.CUT))
     elif s.stop is StopStage.CUT:
