@@ -101,9 +101,9 @@ class MemoryNode:
                 axis.trip()
 
     def after_cycle(self):
-        for axis in self._axes:
+        for k, axis in enumerate(self._axes):
             for queued in axis.take_emergencies():
-                row = self.device.emergencies[self.device.firmware.causes[queued.row].name]
+                row = self.device.emergencies[self.device.firmware.causes[queued.row].name].of_axis(k)
                 self.emergencies.append((row.code, queued.error_register, tuple(row.extra)))
 
     def restart(self):

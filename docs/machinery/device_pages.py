@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tables import table, unit
 
-from drive_env.devices import Device, device_names, find_device
+from drive_env.devices import AXIS, Device, device_names, find_device
 from drive_env.dictionary.entries import Entry
 
 FOLDER = "reference/devices"
@@ -100,13 +100,17 @@ def roles(device: Device) -> str:
 def emergencies(device: Device) -> str:
     """Return the emergency messages."""
     rows = [
-        (f"{one.code:04X}h", " ".join(f"{byte:02X}" for byte in one.extra), name.replace("_", " "))
+        (f"{one.code:04X}h", " ".join(map(_byte, one.extra)), name.replace("_", " "))
         for name, one in sorted(device.emergencies.items(), key=lambda item: (item[1].code, item[1].extra))
     ]
     return (
         "## Emergencies\n\nCode, the five additional bytes (hexadecimal), and what it means. What causes each of them "
         "on purpose is in [Faults](../../faults.md).\n\n" + table(("code", "bytes", "meaning"), rows)
     )
+
+
+def _byte(byte: int) -> str:
+    return "axis" if byte == AXIS else f"{byte:02X}"
 
 
 def objects(device: Device) -> str:

@@ -113,7 +113,8 @@ class ModuleObjects:
 
         def checked(raw: int) -> None:
             check_limits(entry, raw)
-            allowed = self._device.allowed_values.get(key)
+            # A device's data name the PDOs of the first axis; those of the others take the same values.
+            allowed = self._device.allowed_values.get((self._device.locate(entry.index)[1], entry.sub))
             if allowed is not None:
                 check_allowed(entry, np.array([raw]), allowed)
             if check is not None:

@@ -127,6 +127,7 @@ class Node:
         device = self._device
         self._sdo = SdoServer(self.dictionary.port, device.canopen.sdo_timeout)
         self._emergency = EmergencyProducer(self._transmit)
+        self._told_last = 0  # axis of the last emergency
         self._conditions: dict[Hashable, ErrorCondition] = {}
         self._heartbeat = HeartbeatProducer()
         self._guarding = NodeGuarding()
@@ -221,7 +222,8 @@ class Node:
                 self._tell_of(axis, emergency, now)
         if self._emergency.told and not self._error_register():
             # CiA 301: whoever was told of an error is told when there is none any more, however it ended.
-            self._emergency.push(self._device.emergencies[self._device.firmware.causes[FAULT_RESET].name], 0)
+            reset = self._device.emergencies[self._device.firmware.causes[FAULT_RESET].name]
+            self._emergency.push(reset.of_axis(self._told_last), 0)
         self._flush(now)
         if nmt.SERVICES[self.state].pdo:
             for pdo in self._event_tpdos:
@@ -470,7 +472,8 @@ class Node:
             return
         if condition.lasts:
             self._conditions[key] = condition
-        emergency = self._device.emergencies[name]
+        emergency = self._device.emergencies[name].of_axis(0)
+        self._told_last = 0
         self._emergency.push(emergency, self._error_register() | condition.error_register)
         self._history.add(emergency.code)
         self._flush(now)
@@ -481,9 +484,10 @@ class Node:
         if queued.row == FAULT_RESET:
             self._conditions.clear()
         register = queued.error_register | self._error_register(without=axis)
-        emergency = self._device.emergencies[cause.name]
+        self._told_last = self._axes.index(axis)
+        emergency = self._device.emergencies[cause.name].of_axis(self._told_last)
         self._emergency.push(emergency, register)
-        self._history.add(emergency.code, self._axes.index(axis))
+        self._history.add(emergency.code, self._told_last)
         if cause.reaction in (CUT, STOP) and queued.row != FAULT_RESET:
             self._flush(now)
             self._react(APPLICATION_ERROR)

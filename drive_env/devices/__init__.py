@@ -46,11 +46,24 @@ class StageParameter(NamedTuple):
     source: str
 
 
+AXIS = -1  # in the place of an additional byte that tells the axis
+
+
 class EmergencyCode(NamedTuple):
-    """Emergency code and the five additional bytes."""
+    """Emergency code and the five additional bytes; `AXIS` where a byte tells the number of the node's axis."""
 
     code: int
     extra: tuple[int, ...]
+
+    def of_axis(self, axis: int) -> EmergencyCode:
+        """Return it with the bytes that an axis of the node sends; one that tells no axis as it is."""
+        return EmergencyCode(self.code, tuple(axis if byte == AXIS else byte for byte in self.extra))
+
+    def axis_told(self, extra: tuple[int, ...], num_axes: int) -> int | None:
+        """Return the axis that received bytes tell, 0 where they tell none; None if they are another emergency's."""
+        told = {sent for byte, sent in zip(self.extra, extra, strict=True) if byte == AXIS} or {0}
+        axis = min(told)
+        return axis if axis < num_axes and self.of_axis(axis).extra == extra else None
 
 
 class AxisOffset(NamedTuple):
@@ -171,6 +184,13 @@ class Device(NamedTuple):
             if 0 <= axis < self.num_axes and offset.first + above <= offset.last:
                 return axis, offset.first + above
         return 0, index
+
+    def is_shared(self, index: int) -> bool:
+        """Return whether the axes of a node have an object in common; a drive with one axis shares nothing."""
+        ranges = self.axis_offsets
+        return bool(ranges) and not any(
+            one.first <= index - axis * one.step <= one.last for one in ranges for axis in range(self.num_axes)
+        )
 
     def preset(self, motor: Motor) -> dict[str, int]:
         """Return the commissioning preset of a motor: object name -> raw value, in the order of writing.
@@ -315,7 +335,7 @@ def _device(
         allowed_values=allowed_values(data),
         unsupported=frozenset(parse_key(text) for text in data["unsupported"]["objects"]),
         refuses_same_mode=data["quirks"]["refuses_same_mode"],
-        emergencies={n: EmergencyCode(e["code"], tuple(e["bytes"])) for n, e in data["emergencies"].items()},
+        emergencies={name: _emergency(row) for name, row in data["emergencies"].items()},
         stage={n: StageParameter(**row) for n, row in data["stage"].items()},
         presets=folder / "presets",
         axis_offsets=tuple(AxisOffset(**row) for row in data["axis_offsets"]),
@@ -343,6 +363,14 @@ def allowed_values(data: Mapping[str, Any]) -> dict[tuple[int, int], tuple[int, 
     if data["quirks"]["strict_transmission_types"]:
         rows |= data["strict_transmission_types"]
     return {parse_key(text): tuple(value for item in items for value in _values(item)) for text, items in rows.items()}
+
+
+def _emergency(row: Mapping[str, Any]) -> EmergencyCode:
+    """Return the row of an emergency: five bytes, of which "axis" is the number of the axis."""
+    found = tuple(AXIS if byte == "axis" else byte for byte in row["bytes"])
+    if len(found) != 5 or any(not isinstance(byte, int) or not AXIS <= byte <= 255 for byte in found):
+        raise ValueError(f'bytes = {row["bytes"]} of an emergency are five of 0 to 255, or "axis" in place of one')
+    return EmergencyCode(row["code"], found)
 
 
 def _values(item: int | str) -> Sequence[int]:

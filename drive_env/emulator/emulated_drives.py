@@ -288,7 +288,7 @@ class EmulatedDrives:
             for k in range(int(counts[axis])):
                 queued = int(get_lanes(self._records, "emergency", self.num_axes, k)[axis])
                 cause = self._firmware.causes[(queued & 0xFF) - 1]
-                emergency = self.device.emergencies[cause.name]
+                emergency = self.device.emergencies[cause.name].of_axis(int(axis) % self.device.num_axes)
                 messages.append(EmergencyMessage(int(axis), emergency.code, queued >> 8, emergency.extra, cause.name))
         set_lanes(self._records, "emergency_count", np.zeros(self.num_axes, np.int32))
         return messages

@@ -192,16 +192,16 @@ class BusDrives:
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis.
 
-        A node with several axes does not say which one sent an emergency: its first one stands for it.
+        Of a node with several axes that does not tell which one sent an emergency, the first one stands for it.
         """
         self._enter()
         if self._pace.time_waits:
             self._catch_up()
         messages = []
         for node, code, register, extra in self._link.take_emergencies():
-            axis = self.nodes.index(node) * self._description.num_axes
-            name = self._description.emergency_name(code, extra)
-            messages.append(EmergencyMessage(axis, code, register, extra, name))
+            name, axis = self._description.emergency(code, extra)
+            first = self.nodes.index(node) * self._description.num_axes
+            messages.append(EmergencyMessage(first + axis, code, register, extra, name))
         return sorted(messages, key=lambda message: message.axis)
 
     def reset_node(self, where: Mask | None = None) -> None:

@@ -151,16 +151,20 @@ class Description:
         """Return the bytes that an integer object has."""
         return max(1, len(self._types[entry.index, entry.sub]) // 8)
 
-    def emergency_name(self, code: int, extra: tuple[int, ...]) -> str:
-        """Return the name of an emergency by the device's table, by CiA 301's, or as its code."""
+    def emergency(self, code: int, extra: tuple[int, ...]) -> tuple[str, int]:
+        """Return the name of an emergency and the axis of its node that sent it.
+
+        The name is that of the device's table, of CiA 301's, or the code; the axis is 0 where nothing tells it.
+        """
         rows = {} if self.device is None else self.device.emergencies
         for name, row in rows.items():
-            if (row.code, tuple(row.extra)) == (code, extra):
-                return name
+            axis = row.axis_told(extra, self.num_axes) if row.code == code else None
+            if axis is not None:
+                return name, axis
         same_code = [name for name, row in rows.items() if row.code == code]
         if len(same_code) == 1:
-            return same_code[0]
-        return EMERGENCY_NAMES.get(code, f"emergency_{code:04X}h")
+            return same_code[0], 0
+        return EMERGENCY_NAMES.get(code, f"emergency_{code:04X}h"), 0
 
     def role(self, role: Role) -> Key | None:
         """Return the object that plays a part, None where this drive has none that does."""

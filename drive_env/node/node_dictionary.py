@@ -69,6 +69,8 @@ class NodeDictionary:
             return None
         if 0x1000 <= entry.index <= 0x1FFF:
             return "communication"
+        if self._device.is_shared(entry.index):
+            return "module"
         axis, base = self._device.locate(entry.index)
         return "profile" if base in cia402.PROFILE_AREAS else f"motor {axis}"
 

@@ -1,0 +1,129 @@
+"""A module of six axes on one node: its objects, PDOs, emergencies and store, by the rules of multi-axis modules."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from canopen_wire import Wire
+from several_axes import AXES, build, six_axes
+
+from drive_env import EmulatedDrives
+from drive_env.devices import find_device
+from drive_env.dictionary.aborts import VALUE_RANGE
+from drive_env.master.description import describe
+
+
+@pytest.fixture(scope="module")
+def module(tmp_path_factory):
+    return six_axes(tmp_path_factory.mktemp("module") / "six")
+
+
+@pytest.fixture
+def drives(module):
+    with EmulatedDrives(module.name, load="inertia", num_machines=AXES, num_threads=1) as made:
+        yield made
+
+
+@pytest.fixture
+def wire(drives):
+    return Wire(drives)
+
+
+@pytest.mark.parametrize(
+    ("index", "axis", "base"),
+    [(0x2005, 0, 0x2005), (0x2A05, 5, 0x2005), (0x21FF, 0, 0x21FF), (0x2200, 1, 0x2000), (0x2BFF, 5, 0x21FF),
+     (0x3002, 0, 0x3002), (0x8841, 5, 0x6041), (0x1541, 5, 0x1401), (0x1B42, 5, 0x1A02), (0x1017, 0, 0x1017)],
+)  # fmt: skip
+def test_the_axis_of_an_index(module, index, axis, base):
+    assert module.locate(index) == (axis, base)
+    assert module.is_shared(index) == (index in (0x3002, 0x1017))
+
+
+def test_a_drive_of_one_axis_shares_nothing():
+    assert not find_device("tmcm1636").is_shared(0x2704)
+
+
+# --- values -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("index", [0x1800 + 0x40 * axis + k for axis in range(AXES) for k in range(4)])
+def test_the_types_of_a_pdo_are_those_of_the_same_pdo_of_the_first_axis(wire, index):
+    assert wire.download(index, 2, 245, 1) == VALUE_RANGE, "CiA 301, table 69: reserved"
+    assert wire.download(index, 2, 240, 1) == 0
+
+
+# --- emergencies ------------------------------------------------------------------------------------------------------
+def too_hot(drives, axis):
+    """Warm the stage of one axis beyond what it bears, and cool the others."""
+    drives.machine.set_temperatures(25.0, np.where(np.arange(AXES) == axis, 101.0, 25.0))
+
+
+def test_an_emergency_tells_its_axis_and_so_does_its_end(wire):
+    for word in (6, 7, 15):
+        assert wire.download(0x6040, 0, word, 2) == wire.download(0x7840, 0, word, 2) == 0
+    wire.wait(1)
+    assert wire.value(0x6041) & 0x6F == wire.value(0x7841) & 0x6F == 0x27
+    too_hot(wire.drives, 3)
+    wire.play("""
+        wait 1 ms
+        tx 085  10 43 09 02 03 00 00 00   # overtemperature of axis 3
+        tx 085  10 43 09 01 03 00 00 00   # and the warning, which holds too
+    """)
+    assert wire.value(0x7841) & 0x4F == 0x08
+    assert wire.value(0x6041) & 0x6F == 0x27, "the others go on"
+    too_hot(wire.drives, None)
+    wire.play("""
+        rx 605  2B 40 78 00 80 00 00 00
+        tx 585  60 40 78 00 00 00 00 00
+        wait 1 ms
+        tx 085  00 00 00 00 03 00 00 00   # its error reset
+    """)
+
+
+def test_an_emergency_of_the_enable_input_tells_none(wire):
+    """It is the module's: 255 in the place of the axis."""
+    for word in (6, 7, 15):
+        assert wire.download(0x8840, 0, word, 2) == 0
+    wire.drives.machine.enable_input = False
+    wire.play("""
+        wait 1 ms
+        tx 085  41 54 81 00 FF 00 00 00
+    """)
+    wire.drives.machine.enable_input = True
+
+
+@pytest.mark.parametrize(
+    ("extra", "name", "axis"),
+    [
+        ((2, 5, 0, 0, 0), "overtemperature", 5),
+        ((1, 0, 0, 0, 0), "overtemperature_warning", 0),
+        ((2, 6, 0, 0, 0), "emergency_4310h", 0),  # the node has no seventh
+        ((3, 1, 0, 0, 0), "emergency_4310h", 0),
+    ],
+)
+def test_bytes_that_were_received(module, extra, name, axis):
+    assert describe(module.name, None).emergency(0x4310, extra) == (name, axis)
+
+
+def test_bytes_that_are_none_are_told(tmp_path):
+    folder = build(tmp_path / "own")
+    path = folder / "device.toml"
+    path.write_text(path.read_text(encoding="utf-8").replace('[2, "axis", 0', '[2, "axes", 0', 1), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"device.toml: bytes = \[2, 'axes', 0, 0, 0\] .* \"axis\" in place of one"):
+        find_device(str(folder))
+
+
+# --- store ------------------------------------------------------------------------------------------------------------
+def test_each_axis_is_stored_alone_and_the_module_too(drives, tmp_path):
+    wire = Wire(drives, store=tmp_path / "store.json")
+    for axis in range(AXES):
+        assert wire.download(0x2003 + 0x200 * axis, 0, 1000 + axis, 4) == 0
+    assert wire.download(0x1010, 6, 0x65766173, 4) == 0  # axis 2
+    stored = json.loads((tmp_path / "store.json").read_text(encoding="utf-8"))["sections"]
+    assert list(stored) == ["motor 2"] and stored["motor 2"]["2403:0"] == 1002
+    assert not any(index[:4] < "2400" or index[:4] > "25FF" for index in stored["motor 2"])
+    wire.receive(0, "81 05")
+    factory = wire.value(0x2003)
+    assert [wire.value(0x2003 + 0x200 * axis) for axis in range(AXES)] == [factory] * 2 + [1002] + [factory] * 3
+    assert wire.download(0x1010, 10, 0x65766173, 4) == 0  # what belongs to no axis
+    assert set(json.loads((tmp_path / "store.json").read_text(encoding="utf-8"))["sections"]) == {"motor 2", "module"}
