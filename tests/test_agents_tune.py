@@ -244,6 +244,35 @@ def test_what_shakes_on_with_the_incumbent_is_calmed(monkeypatch):
     assert audit.violations[KINDS.index("oscillated")].tolist() == [0]  # never for 100 ms
 
 
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_trial_that_a_fault_ends_names_the_emergency(tmp_path, monkeypatch, number):
+    """The rule's trial as well as one of the agent's."""
+    run, seen = Trials.run, []
+    with emulated("tmcm1636", "inertia", "qbl4208") as target:
+
+        def failing(self, *arguments):
+            seen.append(None)
+            if len(seen) == number + 1:
+                target.drives.machine.fault("enable_lost", duration=0.02)
+            return run(self, *arguments)
+
+        with monkeypatch.context() as during:
+            during.setattr(Trials, "run", failing)
+            done = run_agent(target, Reckless(), tmp_path / "before.toml", name="reckless")
+    assert [trial.faults[0] for trial in done.trials[:2]] == [("shutdown_switch",) * (k == number) for k in range(2)]
+
+    def shown(*_, show, **__):
+        for trial in done.trials[:2]:
+            show(trial)
+        return done
+
+    monkeypatch.setattr("agents.tuner.tuning_run.run", shown)
+    _, out, _ = command("--load", "inertia", "--out", tmp_path / "run")
+    rows = [line for line in out.splitlines() if "it oscillated or went into fault" in line]
+    (named,) = (row for row in rows if "; the drive reported shutdown switch" in row)
+    assert named.split()[0] == ("1" if number else "rule")
+
+
 def test_a_wrong_wiring_ends_the_run_before_any_trial_with_code_1_and_the_reason(tmp_path, monkeypatch):
     reversed_ = (0x2080, 1)
     with emulated("tmcm1636", "inertia", "qbl4208") as target:

@@ -343,6 +343,7 @@ def test_too_few_coherent_lines_are_said_and_what_was_verified_instead(quick, mo
     (note,) = [note for note in axis.reservations if note.startswith("margins not measured: only 0 frequencies")]
     assert "verified by a move, its reversal" in note
     assert "frequency response" not in axis.verified
+    assert any(text.startswith("the identified model gives no bound of the margins") for text in axis.reservations)
     (_, shown) = paper.axes[0].frequency_responses
     assert shown.coherence.max() <= 0.1
     assert all(np.isnan(value) for value in shown.margins.values())

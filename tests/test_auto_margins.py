@@ -99,7 +99,6 @@ def test_without_a_model_that_fits_nothing_is_said(measured):
     ((np.nan, 12.0), (30.0, 9.0), False),  # a bound, and said
     ((40.0, np.nan), (30.0, 9.0), False),
     ((np.nan, 12.0), (9.0, 9.0), True),  # too near to rely on
-    ((np.nan, 12.0), (np.nan, np.nan), True),  # nobody knows
     ((40.0, np.nan), (30.0, np.inf), None),  # no phase of -180 degrees anywhere
 ])  # fmt: skip
 def test_a_margin_that_was_not_seen_is_a_bound_or_a_reservation(seen, bound, reserved):

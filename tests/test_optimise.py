@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from dataclasses import replace
 
@@ -83,6 +84,28 @@ def test_a_slower_axis_costs_more_even_where_j_has_come_to_its_end(rigid):
     costs = [bench.run(gains).cost for gains in (slow, slower)]
     assert np.all(costs[0] > math.log(30.0))
     assert np.all(costs[1] > costs[0])
+
+
+def fails_in_its_second_trial(monkeypatch, drives):
+    """Take the enabling input from the first machine of emulated drives in whatever is tried second."""
+    run, seen = Trials.run, []
+
+    def failing(self, *arguments):
+        seen.append(None)
+        if len(seen) == 2:
+            drives.machine.fault("enable_lost", duration=0.02, where=np.arange(drives.num_axes) == 0)
+        return run(self, *arguments)
+
+    monkeypatch.setattr(Trials, "run", failing)
+
+
+def test_a_trial_that_a_fault_ends_names_the_emergency(rigid, monkeypatch):
+    bench = TrialBench(rigid)
+    bench.identify()
+    fails_in_its_second_trial(monkeypatch, rigid.drives)
+    told = [bench.run(bench.rule) for _ in range(3)]
+    assert [one.causes.tolist() for one in told] == [[""] * 4, ["shutdown switch (5441h)", "", "", ""], [""] * 4]
+    assert [one.aborted.tolist() for one in told] == [[False] * 4, [True, False, False, False], [False] * 4]
 
 
 @pytest.mark.parametrize("gains", [np.zeros(5, int), WILD], ids=["factory fresh", "wild"])
@@ -477,6 +500,19 @@ def node(tmp_path, monkeypatch):
     with Server(world, hub):
         yield machine, ("optimise", *bus, "--travel", "-5:5", "--yes", "--trials", 4, "--out", "obus")
     world.close()
+
+
+def test_the_emergency_that_ended_a_trial_is_printed_and_in_the_table(node, tmp_path, monkeypatch):
+    machine, arguments = node
+    fails_in_its_second_trial(monkeypatch, machine)
+    done = CliRunner().invoke(app, [str(argument) for argument in (*arguments, "--sampler", "random")])
+    assert done.exit_code == 0, done.output
+    assert done.stdout.count("was stopped: the drive reported") == 1
+    assert "trial 1 was stopped: the drive reported shutdown switch (5441h)" in done.stdout
+    with (tmp_path / "obus" / "trials.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["cause"] for row in rows] == ["", "shutdown switch (5441h)", "", ""]
+    assert rows[1]["stopped"] == "True"
 
 
 def is_interrupted(monkeypatch):

@@ -228,7 +228,9 @@ def _run(target: Target, policy: Any, folder: Path, agent: str, store: bool, jso
         if trial.number == 0:
             mark = "the baseline rule's gains, where the agent starts"
         if trial.aborted[0]:
-            mark = f"stopped: it oscillated or went into fault{f'; {mark}' if trial.number == 0 else ''}"
+            told = ", ".join(name.replace("_", " ") for name in trial.faults[0])
+            rule = f"; {mark}" if trial.number == 0 else ""
+            mark = f"stopped: it oscillated or went into fault{told and f'; the drive reported {told}'}{rule}"
         figures = "".join(f" {value:>{width}}" for value, width in zip(trial.gains[0, outer], widths, strict=True))
         print_lines([f"{trial.number or 'rule':>5}{figures} {trial.measured[0]:>8.3f}  {mark}".rstrip()])
 

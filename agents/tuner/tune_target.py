@@ -158,8 +158,8 @@ def _make_trials(
     """
     observation, info = env.reset(seed=0)
     policy.reset()
-    no_faults = ((),) * env.num_envs
-    shown = [TrialShown(0, _flat(info["gains"]), info["measured"], info["aborted"], ~info["aborted"], no_faults)]
+    shown = [TrialShown(0, _flat(info["gains"]), info["measured"], info["aborted"], ~info["aborted"],
+                        tuple(info["faults"]))]  # fmt: skip
     show(shown[-1])
     for number in range(1, env.config.trials + 1):
         action = policy.act(observation)

@@ -161,9 +161,9 @@ class GainTuning(VectorEnvironment):
 
     `info`: "reward_terms" ("tuning", "abort"); "gains", the incumbent's, (environments, axes, count) raw integers in
     the order of the device's set; "measured", its J by measured terms, and "robust_cost"; "trial_robust_cost", that of
-    this step's trial; "trial_gains" and "trial_measured" too; "aborted", whether it was stopped, of the rule's trial at
-    the begin as well; "faults", names of the trial's emergencies, tuples; "parameters", the true machine. Given drives
-    have no robust cost.
+    this step's trial; "trial_gains" and "trial_measured" too; "aborted", whether it was stopped, and "faults",
+    names of the trial's emergencies, tuples, of the rule's trial at the begin as well; "parameters", the true machine.
+    Given drives have no robust cost.
 
     Args:
         num_envs: Number of environments.
@@ -300,7 +300,9 @@ class GainTuning(VectorEnvironment):
         self._rule = np.where(axes[:, None], rule, self._rule)
         self._best = np.where(axes[:, None], self._rule, self._best)
         self._best_is_stable = np.where(axes, False, self._best_is_stable)
+        drives.emergencies()  # of before
         tried = self._try(self._rule, mask)
+        faults = self._faults()
         self._following = np.where(axes, tried.following, self._following)
         measured = self._measure(self._rule, tried)
         self._take(mask, self._rule, tried, measured)
@@ -313,6 +315,7 @@ class GainTuning(VectorEnvironment):
         drives.emergencies()
         info = self._told()
         info["aborted"] = mask & self._stopped(tried)
+        info["faults"] = faults
         return self._observe(), info
 
     def _step_environments(self, action: Any) -> Stepped:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuning.auto.load_step import NOISE, SWING
 from tuning.certificate.certificate import (
@@ -26,6 +27,11 @@ if TYPE_CHECKING:
     from tuning.auto.result import AxisRun, Result
     from tuning.target import Target
 
+Floats = NDArray[np.float64]
+
+# Of a loop whose margins are not known: its lines are shown as what they are.
+UNKNOWN = Margins(*(np.nan,) * len(Margins._fields))
+MODEL_LOW, MODEL_HIGH, MODEL_POINTS = 2.0, 1000.0, 200  # frequencies of a loop that is a model's alone [Hz]
 SETTLED = 0.01  # of the move: the band of settling
 # Counted from the end of the profile.
 SETTLING = "settling time after the set-point's arrival, to within 1 % of the move [s]"
@@ -108,48 +114,56 @@ def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
 
 
 def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple[FrequencyResponse, ...]:
-    """Return both outer loops: measured with the new gains, and computed with the gains before."""
+    """Return both outer loops: measured with the new gains, or by the model, and computed with the gains before."""
     response = result.response
     if response is None or not np.isfinite(response.open_loop[:, axis]).any():
-        return ()
-    # Too few lines are coherent for margins: then they are shown as what they are.
-    nothing = Margins(*(np.nan,) * len(Margins._fields))
-    loops, device = response.loops(run.after, axis, plant=run.plant, refined=False), target.device
+        return _modelled(target, run)
+    loops = response.loops(run.after, axis, plant=run.plant, refined=False)
     changed = not np.array_equal(response.gains[axis], run.after)
     sources = {
         "velocity": "multisine, 1 kHz samples"
         + (", with other gains, converted to the new gains by the linear model" if changed else ""),
         "position": "computed from the measured velocity loop and position P",
     }
-    known = device.gains
-    closed = run.plant is not None and not known.opens(run.before, "current", "velocity")
     shown = []
     for name, L in (("velocity", loops.velocity), ("position", loops.position)):
-        if name == "position" and name not in run.margins:
+        if name == "position" and name not in run.margins and name not in run.at_least:
             continue  # too few coherent lines, or one of linked axes
-        if closed and not known.opens(run.before, name) and not run.is_kept:
-            assert run.plant is not None, "it was identified"
-            before = OPEN_LOOPS[name](device, run.plant, run.before, response.f)
-            shown.append(
-                frequency_response(
-                    f"{name} loop",
-                    response.f,
-                    before,
-                    margins(response.f, before),
-                    tuned=False,
-                    source="linear model of the identified axis, with the gains before",
-                )
-            )
-        shown.append(
+        shown += [
+            *_before(target, run, name, response.f),
             frequency_response(
                 f"{name} loop",
                 response.f,
                 L,
-                run.margins.get(name, nothing),
+                run.margins.get(name, UNKNOWN),
                 at_least=run.at_least.get(name),
                 tuned=True,
                 coherence=response.coherence[:, axis],
                 source=sources[name],
-            )
-        )
+            ),
+        ]
     return tuple(shown)
+
+
+def _modelled(target: Target, run: AxisRun) -> tuple[FrequencyResponse, ...]:
+    """Return both outer loops by the linear model where nothing was measured; their margins are bounds."""
+    f, shown = np.geomspace(MODEL_LOW, MODEL_HIGH, MODEL_POINTS), []
+    for name, least in run.at_least.items():
+        assert run.plant is not None, "what has a bound has a model"
+        L = OPEN_LOOPS[name](target.device, run.plant, run.after, f)
+        source = "linear model of the identified axis, not measured; margins are bounds within its 95 % intervals"
+        shown += [
+            *_before(target, run, name, f),
+            frequency_response(f"{name} loop", f, L, UNKNOWN, at_least=least, tuned=True, source=source),
+        ]
+    return tuple(shown)
+
+
+def _before(target: Target, run: AxisRun, name: str, f: Floats) -> list[FrequencyResponse]:
+    """Return a loop with the gains before, by the linear model; nothing where these are kept or leave a loop open."""
+    known, plant = target.device.gains, run.plant
+    if plant is None or run.is_kept or known.opens(run.before, "current", "velocity", name):
+        return []
+    L = OPEN_LOOPS[name](target.device, plant, run.before, f)
+    source = "linear model of the identified axis, with the gains before"
+    return [frequency_response(f"{name} loop", f, L, margins(f, L), tuned=False, source=source)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ from tuning.auto.moves import show
 from tuning.auto.run import MOVE_TIME, TRIAL_TIME
 from tuning.auto.trials import BY_TRIAL, faster, watch_following
 from tuning.response.measured_loop import merged
+from tuning.response.model_bounds import at_least_by_model, why_unbounded
 
 if TYPE_CHECKING:
     from tuning.auto.result import AxisRun
@@ -157,17 +158,27 @@ def _calm(run: AutoRun, k: int, response: MeasuredLoop) -> bool:
 
 def judge(run: AutoRun) -> None:
     """Write down the margins of the final gains: as measured, or their lower bound."""
-    response = run.response
-    if response is None:
-        return
-    for k in map(int, np.flatnonzero(run.going & ~run.unseen)):
-        axis = run.axes[k]
-        gains = run.gains[k]
+    response, loops = run.response, judged_loops(run)
+    for k in map(int, np.flatnonzero(run.going)):
+        axis, gains = run.axes[k], run.gains[k]
+        if response is None or run.unseen[k]:
+            axis.at_least, bounds = _by_model(run, k, loops)
+            axis.reservations.append(bounds)
+            continue
         found = margins_with(run, response, gains, k)
-        axis.margins = {loop: found[loop] for loop in judged_loops(run)}
-        axis.at_least = {loop: response.at_least(loop, gains, k) for loop in judged_loops(run)}
-        for loop in judged_loops(run):
-            _tell(axis, loop, axis.margins[loop], axis.at_least[loop])
+        axis.margins = {loop: found[loop] for loop in loops}
+        axis.at_least = {loop: response.at_least(loop, gains, k) for loop in loops}
+        blank = [loop for loop in loops if _is_blank(axis.margins[loop], axis.at_least[loop])]
+        for loop in loops:
+            if loop not in blank:
+                _tell(axis, loop, axis.margins[loop], axis.at_least[loop])
+        if blank:
+            least, bounds = _by_model(run, k, blank)
+            axis.at_least |= least
+            axis.reservations.append(
+                f"not all margins of the {' and the '.join(blank)} loop were measured: too few frequencies are "
+                f"coherent, and the response fits no model; {bounds}"
+            )
         axis.notes += [note for note in response.notes[k] if note not in axis.notes]
         if run.target.linked:
             axis.reservations.append(ALONE)
@@ -180,20 +191,42 @@ def judge(run: AutoRun) -> None:
         )
 
 
+def _is_blank(found: Margins, least: AtLeast) -> bool:
+    """Return whether a margin was not measured, and the response has no bound for it."""
+    pairs = ((found.phase_deg, least.phase_deg), (found.gain_db, least.gain_db))
+    return any(math.isnan(bound) and not math.isfinite(value) for value, bound in pairs)
+
+
+def _by_model(run: AutoRun, k: int, loops: Sequence[str]) -> tuple[dict[str, AtLeast], str]:
+    """Return what margins of loops are at least by the model of the identified axis, and that in words."""
+    plant, identified = run.axes[k].plant, run.axes[k].identified
+    why = "the axis was not identified" if identified is None else why_unbounded(identified)
+    if run.target.linked:
+        why = "the model is of this axis alone, and all axes of its machine share what it moves"
+    if why or plant is None or identified is None:
+        return {}, f"the identified model gives no bound of the margins: {why}"
+    every = at_least_by_model(run.target.device, plant, identified, run.gains[k])
+    return {loop: every[loop] for loop in loops}, (
+        "margins by the identified model, anywhere within its 95 % intervals: "
+        + ", ".join(f"{loop} loop {_in_words(every[loop])}" for loop in loops)
+        + "; this is a bound from the model, not a measurement"
+    )
+
+
+def _in_words(least: AtLeast) -> str:
+    if math.isnan(least.phase_deg):
+        return "no bound, since it may be unstable there"
+    gain = f" and {least.gain_db:.1f} dB" if math.isfinite(least.gain_db) else ""
+    return f"at least {least.phase_deg:.0f} degrees{gain}"
+
+
 def _tell(axis: AxisRun, loop: str, found: Margins, least: AtLeast) -> None:
-    """Add reservations for margins that were not measured, with their lower bound."""
+    """Add notes, or reservations if they are small, of the lower bounds of margins that were not measured."""
     for name, value, bound, unit in (
         ("phase", found.phase_deg, least.phase_deg, "degrees"),
         ("gain", found.gain_db, least.gain_db, "dB"),
     ):
-        if math.isfinite(value):
-            continue
-        if math.isnan(bound):
-            axis.reservations.append(
-                f"the {loop} loop's {name} margin was not measured: too few frequencies are coherent, and the "
-                "response fits no model"
-            )
-        elif not math.isinf(bound):
+        if not math.isfinite(value) and math.isfinite(bound):
             (axis.reservations if bound < CLOSE[name] else axis.notes).append(
                 f"the {loop} loop's {name} margin was not measured; it is at least {bound:.0f} {unit} by the model "
                 "fitted to the response, with its 95 % intervals"

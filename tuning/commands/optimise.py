@@ -342,6 +342,10 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
         print_table(columns, rows, title + ", with the Pareto front of the trials" * several)
     stopped = sum(row.aborted for row in found.rows)
     lines = [f"{len(found.rows)} trials, {stopped} of them stopped, in {found.drive_seconds:.1f} s of drive time."]
+    for row in found.rows:
+        if row.cause:
+            which = f"search {row.search}, trial" if len(searches) > 1 else "trial"
+            lines.append(f"{which} {row.number} was stopped: the drive reported {row.cause}")
     lines += sorted({note for note in found.notes if note})
     if before is None and len(searches) > 1 and np.isfinite(found.cost).any():
         lines.append(f"search {int(np.nanargmin(found.cost))} found the best gains")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from tuning.identify.wiring import Settings
+    from tuning.response.plant_fit import PlantFit
 
 Progress = Callable[[str, float], None]  # the present step, and the share done, 0...1
 
@@ -74,12 +75,14 @@ class Identification:
             none.
         wiring: The settings that encoder and halls need, by object, and those of the drive. With wrong ones the motor
             runs away or locks.
+        fit: The linear model fitted to the frequency response, None where none was measured or it is another axis's.
     """
 
     estimates: Mapping[str, Estimate]
     drive_time: float
     told: Mapping[str, Estimate] | None = None
     wiring: Settings = field(default_factory=dict)
+    fit: PlantFit | None = None
 
     def value(self, name: str) -> float:
         """Return a value, nan where it was not identified."""

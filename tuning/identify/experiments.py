@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,9 @@ from tuning.oscillation_watch import OscillationError, OscillationWatch, shaken,
 from tuning.response.frequency_response import Signal, measure
 from tuning.stop_causes import stop_causes
 from tuning.target import Target, timed
+
+if TYPE_CHECKING:
+    from tuning.response.plant_fit import PlantFit
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -75,6 +79,7 @@ class Experiments:
             {name: refused(UNITS[name], "not asked for") for name in NAMES} for _ in range(target.num_axes)
         ]
         self._wiring: list[Settings] = [{} for _ in range(target.num_axes)]
+        self._fits: list[PlantFit | None] = [None] * target.num_axes
 
     def run(self) -> list[Identification]:
         """Do them all."""
@@ -90,8 +95,9 @@ class Experiments:
                         self.turn(replace(working, where=good))
                 self.calm(working)
         self.progress("done", 1.0)
-        return [Identification(found, clock.seconds if chosen else 0.0, wiring=wiring)
-                for found, chosen, wiring in zip(self.found, self.where, self._wiring, strict=True)]  # fmt: skip
+        every = zip(self.found, self.where, self._wiring, self._fits, strict=True)
+        return [Identification(found, clock.seconds if chosen else 0.0, wiring=wiring, fit=fit)
+                for found, chosen, wiring, fit in every]  # fmt: skip
 
     def begin(self, what: str, share: float, names: tuple[str, ...]) -> None:
         """Tell what is under way and the share done; what it and all after it are to say has these names."""
@@ -276,6 +282,7 @@ class Experiments:
                 self.refuse(int(k), RESPONSE, "; ".join(response.notes[k]) or "the response was not measured")
                 continue
             self.found[k] |= {name: fit.estimates[name] for name in RESPONSE}
+            self._fits[k] = fit
             if fit.misfit > WORST_MISFIT:
                 for name in RESPONSE:
                     self.found[k][name] = refused(UNITS[name], (

@@ -155,6 +155,7 @@ class _Brief(Experiments):
             moved = self.found[k]["inertia"]
             self.found[k] |= _guessed(fit)
             self._told[k] |= _told(fit, float(response.f[-1]))
+            self._fits[k] = fit
             if target.linked:
                 self.found[k]["inertia"] = moved
                 self._told[k]["inertia"] = refused(UNITS["inertia"], OF_ALL)

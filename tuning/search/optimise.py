@@ -78,6 +78,7 @@ class TrialRow(NamedTuple):
     objectives: In the order of `OBJECTIVES`.
     aborted: Stopped, since it oscillated or went into fault. fragile: Not kept, since with these gains the axis did not
         stop oscillating after a disturbance.
+    cause: Emergencies of the drives in a trial that was stopped; "" if there were none.
     """
 
     search: int
@@ -87,6 +88,7 @@ class TrialRow(NamedTuple):
     objectives: tuple[float, ...]
     aborted: bool
     fragile: bool = False
+    cause: str = ""
 
     @property
     def accepted(self) -> bool:
@@ -271,6 +273,7 @@ class _Search:
                 float(tried.cost[machine]),
                 tuple(map(float, tried.objectives[machine])),
                 bool(tried.aborted[machine]),
+                cause=str(tried.causes[machine]) if tried.aborted[machine] else "",
             )
             self._take(k, own, row)
             pulled = PULLED * float(np.abs(point - own).max()) + SHUNNED * (self._settings.safe and row.aborted)
@@ -409,6 +412,7 @@ def _row(search: int, fact: Mapping[str, Any]) -> TrialRow:
         float(fact["cost"]),
         tuple(fact["objectives"]),
         bool(fact["aborted"]),
+        cause=str(fact.get("cause", "")),
     )
 
 

@@ -141,6 +141,7 @@ def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: No
         "objectives": np.array([row.objectives for row in rows], float).reshape(len(rows), -1),
         "aborted": np.array([row.aborted for row in rows], bool),
         "fragile": np.array([row.fragile for row in rows], bool),
+        "cause": np.array([row.cause for row in rows], np.str_),
         "drive_seconds": np.array(found.drive_seconds),
         "moves": found.moves,
         "aborts": found.aborts,
@@ -151,9 +152,19 @@ def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: No
 
 def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
     rows = tuple(
-        TrialRow(search, int(number), gains, float(cost), tuple(objectives.tolist()), bool(aborted), bool(fragile))
-        for number, gains, cost, objectives, aborted, fragile in zip(
-            *(arrays[name] for name in ("number", "tried", "costs", "objectives", "aborted", "fragile")), strict=True
+        TrialRow(
+            search,
+            int(number),
+            gains,
+            float(cost),
+            tuple(objectives.tolist()),
+            bool(aborted),
+            bool(fragile),
+            str(cause),
+        )
+        for number, gains, cost, objectives, aborted, fragile, cause in zip(
+            *(arrays[name] for name in ("number", "tried", "costs", "objectives", "aborted", "fragile", "cause")),
+            strict=True,
         )
     )
     return Optimised(

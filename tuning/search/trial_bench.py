@@ -31,6 +31,7 @@ from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, plan_mo
 from drive_env.trials.score import TRIP, cost
 from tuning.auto.fallback_gains import FallbackGains
 from tuning.oscillation_watch import SOFTER, OscillationError, OscillationWatch
+from tuning.stop_causes import told_causes
 from tuning.target import Target
 
 Floats = NDArray[np.float64]
@@ -66,12 +67,14 @@ class Tried(NamedTuple):
         among them; RMS increment of the current over the rated one [%].
     aborted: Stopped in any phase, (num_machines,).
     fragile: Shook on with the incumbent's gains after it had been stopped, (num_machines,): those are none to keep.
+    causes: Emergencies of the machine's drives meanwhile, texts, (num_machines,); "" where there were none.
     """
 
     cost: Floats
     objectives: Floats
     aborted: Mask
     fragile: Mask
+    causes: NDArray[np.str_]
 
 
 class TrialBench:
@@ -170,6 +173,7 @@ class TrialBench:
         self._start_trial()
         self._return(axes)
         self._fallback.begin()
+        told_causes(target.drives)  # of before
         try:
             tried = self._trials.run(gains, self.incumbent, self.move, self._origin, self._direction, axes)
         except SafetyError as error:  # the envelope has stopped all drives
@@ -186,13 +190,21 @@ class TrialBench:
         self.aborts[axes & stopped] += 1
         objectives = self._objectives(tried)
         shape = (self.num_machines, target.axes_per_machine)
+        causes = self._causes()
         fragile = axes & self._fallback.calmed
         return Tried(
             self._cost(gains, tried).reshape(shape).max(axis=1),
             objectives.reshape(*shape, -1).max(axis=1),
             np.any(stopped.reshape(shape), axis=1),
             np.any(fragile.reshape(shape), axis=1),
+            causes,
         )
+
+    def _causes(self) -> NDArray[np.str_]:
+        """Return the emergencies since they were read last, of each machine; what several axes told stands once."""
+        lanes, told = self.target.axes_per_machine, told_causes(self.target.drives)
+        machines = (told[k : k + lanes] for k in range(0, len(told), lanes))
+        return np.array([", ".join(dict.fromkeys(filter(None, axes))) for axes in machines], np.str_)
 
     def _stopped(self, axes: Mask, error: SafetyError) -> Tried:
         """Return what there is to say of a trial that the envelope ended: everything that took part is stopped."""
@@ -211,6 +223,7 @@ class TrialBench:
             np.tile(worst, (shape[0], 1)),
             machines,
             np.zeros(shape[0], bool),
+            self._causes(),
         )
 
     def _cost(self, gains: Integers, tried: Trial) -> Floats:

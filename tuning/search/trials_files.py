@@ -57,12 +57,12 @@ def save(
     writer = csv.writer(table)
     names, gains_there_are = (COST, *OBJECTIVES), find_device(machine["device"]).gains.names
     writer.writerow(
-        ["search", "trial", "axis", *gains_there_are, *(TITLES[name] for name in names), "stopped", "fragile"]
+        ["search", "trial", "axis", *gains_there_are, *(TITLES[name] for name in names), "stopped", "fragile", "cause"]
     )
     for row in found.rows:
         values = [f"{value:.6g}" for value in figures(row, names, found.t_0)]
         for axis, gains in enumerate(row.gains.tolist()):
-            writer.writerow([row.search, row.number, axis, *gains, *values, row.aborted, row.fragile])
+            writer.writerow([row.search, row.number, axis, *gains, *values, row.aborted, row.fragile, row.cause])
     write_whole(folder / "trials.csv", table.getvalue())
     lines = _lines({name: getattr(settings, name) for name in _SEARCH})
     if settings.journal is not None:
