@@ -231,8 +231,8 @@ def quick(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["compute", "prove", "show", "measure", "look_back"])
 def test_whatever_ends_it_the_gains_before_are_back(quick, monkeypatch, tmp_path, stage):
-    def interrupted(run):
-        write_gains(run.target.drives, np.full((1, 5), 77))
+    def interrupted(bench, *handed):
+        write_gains(bench.target.drives, np.full((1, 5), 77))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(auto_module, stage, interrupted)
@@ -315,9 +315,9 @@ def test_a_lively_loop_is_calmed_and_the_calmed_gains_are_tried_again(quick, mon
     monkeypatch.setattr(auto_margins, "SOFTER", (1.0, 0.5))
     measured, full = auto_margins.margins_with, []
 
-    def lively(run, response, gains, k):
+    def lively(basis, response, gains, k):
         full.append(gains[2])
-        found = measured(run, response, gains, k)
+        found = measured(basis, response, gains, k)
         return found | {"velocity": found["velocity"]._replace(ms=9.0 if gains[2] > 0.75 * full[0] else 2.0)}
 
     monkeypatch.setattr(auto_margins, "margins_with", lively)

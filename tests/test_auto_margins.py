@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from auto_stages import basis, recorded
 
 from drive_env import cia402, motion
 from drive_env.devices import find_device
-from drive_env.gains import Gains, write_gains
+from drive_env.gains import write_gains
 from tuning.auto import loop_margins as auto_margins
-from tuning.auto.result import AxisRun
-from tuning.auto.run import AutoRun
+from tuning.auto.bench import AutoBench, Journal
 from tuning.identify.true_plant import true_plant
 from tuning.response import frequency_response
 from tuning.response.linear_model import OPEN_LOOPS
@@ -39,12 +39,12 @@ def test_the_response_is_measured_within_what_is_left_of_the_travel(moved, left,
     monkeypatch.setattr(frequency_response, "measure", measure)
     travel = (-0.3 * TURN, 0.3 * TURN)
     with emulated(load="inertia", travel=travel, num_threads=1) as target, timed(target) as (watched, clock):
-        run = AutoRun(watched, 0, clock, 60.0)
+        bench = AutoBench(watched, 0, clock, 60.0)
         motion.enable(target.drives, mode="pp")
         motion.move_to(target.drives, target.drives.read(cia402.POSITION_ACTUAL) + round(moved * 65536))
-        run.gains = np.array([[4000, 1500, 500, 300, 100]])
-        run.ground = SimpleNamespace(move=SimpleNamespace(distance=np.array([16384])))
-        auto_margins.measure(run)
+        gains = np.array([[4000, 1500, 500, 300, 100]])
+        bench.ground = SimpleNamespace(move=SimpleNamespace(distance=np.array([16384])))
+        auto_margins.measure(bench, basis(gains), recorded(gains))
     assert asked == [pytest.approx(left, abs=5e-3)]
 
 
@@ -102,11 +102,10 @@ def test_without_a_model_that_fits_nothing_is_said(measured):
     ((40.0, np.nan), (30.0, np.inf), None),  # no phase of -180 degrees anywhere
 ])  # fmt: skip
 def test_a_margin_that_was_not_seen_is_a_bound_or_a_reservation(seen, bound, reserved):
-    axis = AxisRun(Gains(1, 1, 1, 1, 1), Gains(1, 1, 1, 1, 1))
+    journal = Journal()
     found = Margins(seen[0], seen[1], 30.0, 60.0, 1.5)
-    auto_margins._tell(axis, "velocity", found, AtLeast(*bound))
-    assert (len(axis.notes), len(axis.reservations)) == (int(reserved is False), int(reserved is True))
-    assert axis.verdict == ("accepted with reservations" if reserved else "accepted")
+    auto_margins.tell_bounds(journal, "velocity", found, AtLeast(*bound))
+    assert (len(journal.notes), len(journal.reservations)) == (int(reserved is False), int(reserved is True))
 
 
 @pytest.mark.parametrize("linked", [False, True])
@@ -120,17 +119,19 @@ def test_a_loop_that_comes_too_near_to_instability_gets_half_its_gain(velocity, 
     monkeypatch.setattr(auto_margins, "SOFTER", (1.0, 0.5))
     full = np.array([4000, 1500, 400, 300, 200])
 
-    def found(run, response, gains, k):
+    def found(basis, response, gains, k):
         one = Margins(40.0, 10.0, 30.0, 60.0, 1.0)
         half = [velocity if gains[2] > 300 else 2.0, position if gains[4] > 0.6 * full[4] * gains[2] / 400 else 2.0]
         return {loop: one._replace(ms=ms) for loop, ms in zip(("velocity", "position"), half, strict=True)}
 
     monkeypatch.setattr(auto_margins, "margins_with", found)
-    axis = AxisRun(Gains(*full), Gains(*full))
     target = SimpleNamespace(linked=linked, device=find_device("tmcm1636"))
-    run = SimpleNamespace(axes=[axis], gains=full[None].copy(), spare=np.zeros((1, 5), np.int64), target=target)
+    bench = SimpleNamespace(target=target, journals=[Journal()])
     response = SimpleNamespace(f=np.arange(80.0), refined=lambda k: (None, None, np.ones(80, bool)))
     if linked:  # nothing is known of its position loop
         factors = (factors[0], factors[0])
-    assert auto_margins._calm(run, 0, response) == (factors != (1.0, 1.0))
-    np.testing.assert_array_equal(run.gains[0], full * [1, 1, factors[0], 1, factors[1]])
+    start = recorded(full[None], spare=9)
+    calmed = auto_margins.calm(bench, basis(full[None]), start, 0, response)
+    np.testing.assert_array_equal(calmed.gains[0], full * [1, 1, factors[0], 1, factors[1]])
+    is_calmed = factors != (1.0, 1.0)
+    assert (calmed is not start, not calmed.spare.any(), bool(bench.journals[0].notes)) == (is_calmed,) * 3

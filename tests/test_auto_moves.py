@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from auto_stages import basis, recorded
 from test_auto import gains, standing_in
 
 from drive_env import cia402, motion
@@ -18,14 +19,13 @@ from tuning.auto import moves as auto_moves
 from tuning.auto import one_button as auto_module
 from tuning.auto import proving as proving_module
 from tuning.auto import search as auto_search
+from tuning.auto.bench import Journal
 from tuning.auto.calmer_gains import calmer
 from tuning.auto.certify import certificate
 from tuning.auto.load_step import NOISE, SWING, load_step
-from tuning.auto.moves import _ease, _keep_what_is_better
+from tuning.auto.moves import ease, keep_what_is_better
 from tuning.auto.one_button import auto, tell_of_lateness
 from tuning.auto.proving import RESTLESS, ProvingGround, Shown, without_noise
-from tuning.auto.result import AxisRun
-from tuning.auto.run import AutoRun
 from tuning.auto.search import calm_gains
 from tuning.auto.trials import faster
 from tuning.auto.twin import Optimum
@@ -149,16 +149,15 @@ def test_a_machine_of_several_axes_is_as_good_as_its_worst():
         return Shown(np.zeros(1), row, row, row, np.ones(4, bool), ("",) * 4, cost, np.zeros(4), np.zeros(4))
 
     gains_now, gains_before = np.full((4, 5), 7), np.full((4, 5), 3)
-    axes = [AxisRun(Gains(*gains_before[k]), Gains(*gains_before[k])) for k in range(4)]
-    run = SimpleNamespace(
-        target=SimpleNamespace(axes_per_machine=2), axes=axes, gains=gains_now, before=gains_before,
-        shown=moved(now), earlier=moved(before),
-    )  # fmt: skip
-    _keep_what_is_better(run, np.ones(4, bool))
-    assert [axis.is_kept for axis in axes] == [True, True, False, False]
-    assert run.gains[:, 0].tolist() == [3, 3, 7, 7]
-    assert run.shown.actual[0].tolist() == [3.0, 4.0, 9.0, 2.0]
-    assert run.earlier.where.tolist() == [False, False, True, True]
+    bench = SimpleNamespace(target=SimpleNamespace(axes_per_machine=2), journals=[Journal() for _ in range(4)])
+    start = recorded(gains_now, shown=moved(now), earlier=moved(before))
+    found = keep_what_is_better(bench, basis(gains_now, before=gains_before), start, np.ones(4, bool))
+    assert found.kept.tolist() == [bool(journal.notes) for journal in bench.journals] == [True, True, False, False]
+    assert found.gains[:, 0].tolist() == [3, 3, 7, 7]
+    assert found.proof[:2].tolist() == [4.0, 4.0] and np.isnan(found.proof[2:]).all()
+    assert found.shown.actual[0].tolist() == [3.0, 4.0, 9.0, 2.0]
+    assert found.earlier.where.tolist() == [False, False, True, True]
+    assert not start.kept.any() and start.earlier.where.all() and np.all(start.gains == 7)
 
 
 # --- several axes -----------------------------------------------------------------------------------------------------
@@ -405,14 +404,13 @@ def test_gains_that_shake_at_rest_are_eased_until_they_do_not(monkeypatch, tmp_p
 @pytest.mark.parametrize(("late", "told"), [(0, False), (7, True)])
 def test_syncs_that_were_late_are_told(late, told):
     """A busy computer tears holes into set-points and samples: whoever reads a certificate of such a run must know."""
-    axis = AxisRun(Gains(1, 1, 1, 1, 1), Gains(1, 1, 1, 1, 1))
     drives = SimpleNamespace(time_waits=False, bus=SimpleNamespace(total_timing=Timing(9000, late, 0.0031)))
-    run = SimpleNamespace(target=SimpleNamespace(drives=drives, num_axes=1), axes=[axis], note=None)
-    run.reserve = lambda where, text: AutoRun.reserve(run, where, text)
-    tell_of_lateness(run)
+    reservations = []
+    tell_of_lateness(SimpleNamespace(
+        target=SimpleNamespace(drives=drives, num_axes=1), reserve=lambda where, text: reservations.append(text)
+    ))  # fmt: skip
     wanted = "7 of 9000 SYNCs were more than a cycle late, the worst by 3.1 ms: this computer is too busy"
-    assert [reservation.startswith(wanted) for reservation in axis.reservations] == [True] * told
-    assert axis.verdict == ("accepted with reservations" if told else "accepted")
+    assert [reservation.startswith(wanted) for reservation in reservations] == [True] * told
 
 
 RULE, FOUND, FAST_CURRENT = [4000, 1500, 700, 1800, 700], [4000, 1000, 2000, 4800, 2000], [9000, 1000, 900, 2000, 900]
@@ -436,21 +434,19 @@ def lowered(percent):
 def test_who_shakes_at_rest_takes_calmer_gains(had, eased, swing, factor, said, monkeypatch):
     asked = []
 
-    def calm(run, k, factor):
+    def calm(bench, basis, recorded, k, factor):
         asked.append(factor)
         return (np.array(had) * [1, 1, factor, 1, 1]).astype(int)
 
     monkeypatch.setattr("tuning.auto.moves.calmer", calm)
-    axis = AxisRun(Gains(*FOUND), Gains(*FOUND), eased=eased)
-    run = SimpleNamespace(
-        target=SimpleNamespace(device=find_device("tmcm1636")), axes=[axis], gains=np.array([had]),
-        spare=np.full((1, 5), 9), reference=np.array([RULE]),
-    )  # fmt: skip
-    _ease(run, 0, swing, "it shook")
+    bench = SimpleNamespace(target=SimpleNamespace(device=find_device("tmcm1636")), journals=[Journal()])
+    start = recorded([had], spare=9, eased=np.array([eased]))
+    found = ease(bench, basis([RULE]), start, 0, swing, "it shook")
     assert asked == ([] if factor is None else [pytest.approx(factor)])
-    assert run.gains[0].tolist() == (RULE if factor is None else [*had[:2], int(factor * had[2]), *had[3:]])
-    assert (axis.notes, axis.eased) == ([said], eased + 1)
-    assert not run.spare.any()
+    assert found.gains[0].tolist() == (RULE if factor is None else [*had[:2], int(factor * had[2]), *had[3:]])
+    assert (bench.journals[0].notes, found.eased.tolist()) == ([said], [eased + 1])
+    assert not found.spare.any()
+    assert start.spare.all() and start.gains[0].tolist() == had and start.eased.tolist() == [eased]
 
 
 @pytest.mark.parametrize(("better", "ms", "chosen"), [
@@ -460,35 +456,35 @@ def test_who_shakes_at_rest_takes_calmer_gains(had, eased, swing, factor, said, 
     ("own", {4800: 5.0}, [4000, 1000, 1000, 3394, 2000]),  # what the measured loop refuses is not taken
 ])  # fmt: skip
 def test_calmer_gains_are_the_best_on_the_twins_with_less_velocity_p(better, ms, chosen, monkeypatch):
-    def cost(run, axes, sets):
+    def cost(bench, basis, axes, sets):
         """The less is lowered the better."""
         per_gain = -1e-6 * sets[..., 2:].sum(axis=-1)
         is_rule = sets[..., 1] == RULE[1]
         return per_gain + np.where(is_rule, 2.0, {"own": 1.0, "rule": 3.0, "nearly": 1.95}[better])
 
-    def sensitivity(run, response, gains, k):
+    def sensitivity(target, basis, response, gains, k):
         return ms.get(int(gains[3]), 2.0)
 
     monkeypatch.setattr("tuning.auto.calmer_gains.cost_on_twins", cost)
     monkeypatch.setattr("tuning.auto.calmer_gains.sensitivity", sensitivity)
-    axis = AxisRun(Gains(*FOUND), Gains(*FOUND), plant=object())
-    run = SimpleNamespace(
-        target=SimpleNamespace(device=find_device("tmcm1636"), drives=SimpleNamespace(time_waits=True)),
-        axes=[axis], gains=np.array([FOUND]),
-        reference=np.array([RULE]), unseen=np.array([False]), response=object(),
-    )  # fmt: skip
-    assert calmer(run, 0, 0.5).tolist() == chosen
+    seen = recorded([FOUND], response=object())
+    assert calmer(bench_of(time_waits=True), identified_basis(), seen, 0, 0.5).tolist() == chosen
+
+
+def bench_of(time_waits):
+    drives = SimpleNamespace(time_waits=time_waits)
+    return SimpleNamespace(target=SimpleNamespace(device=find_device("tmcm1636"), drives=drives))
+
+
+def identified_basis():
+    return basis([RULE], plant=object(), found=object())
 
 
 def test_where_time_does_not_wait_no_twin_is_asked_while_an_axis_is_enabled(monkeypatch):
     """That takes longer than an envelope lets a program be silent, and the voltage is not taken from what may turn."""
     monkeypatch.setattr("tuning.auto.calmer_gains.cost_on_twins", lambda *given: pytest.fail("twins"))
-    run = SimpleNamespace(
-        target=SimpleNamespace(device=find_device("tmcm1636"), drives=SimpleNamespace(time_waits=False)),
-        axes=[AxisRun(Gains(*FOUND), Gains(*FOUND), plant=object())], gains=np.array([FOUND]),
-        reference=np.array([RULE]),
-    )  # fmt: skip
-    assert calmer(run, 0, 0.5).tolist() == [4000, 1000, 1000, 2400, 1000]
+    found = calmer(bench_of(time_waits=False), identified_basis(), recorded([FOUND]), 0, 0.5)
+    assert found.tolist() == [4000, 1000, 1000, 2400, 1000]
 
 
 # --- what is accepted stands still ------------------------------------------------------------------------------------
@@ -506,7 +502,9 @@ def swing_of(drives):
 
 def test_gains_that_swing_on_after_a_load_step_are_calmed_until_they_stand(monkeypatch, tmp_path):
     finds(monkeypatch, np.array(SWINGING))
-    monkeypatch.setattr(auto_module, "choose", lambda run: None)  # the twins have no gear that is loose
+    monkeypatch.setattr(
+        auto_module, "choose", lambda bench, basis, recorded: recorded
+    )  # the twins have no gear that is loose
     with emulated(load="geared_joint", num_threads=1) as target:
         result = auto(target, tmp_path / "before.toml", experiments=standing_in)
         (axis,) = result.axes

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from auto_stages import skip_stages
 from test_every_change_leaves_a_file import node, status_is
 from test_serve import environment
 from typer.testing import CliRunner
@@ -23,7 +24,7 @@ from drive_env.commands.cli import app as drive_env
 from drive_env.devices import find_device
 from drive_env.whole_file import files_to_be, write_whole
 from tuning.auto import one_button as auto_module
-from tuning.auto.run import AutoRun
+from tuning.auto.stages import TriedGains
 from tuning.commands.cli import app as drive_tune
 from tuning.search import trials_files
 from tuning.snapshot import load_snapshot
@@ -48,16 +49,9 @@ def gains(machine):
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Have auto find gains at once."""
-
-    def found(run):
-        run.gains = NEW.copy()
-
-    monkeypatch.setattr(auto_module, "identify", lambda run, experiments: None)
-    for name in ("compute", "prove", "show", "measure", "look_back"):
-        monkeypatch.setattr(auto_module, name, lambda run: None)
-    monkeypatch.setattr(auto_module, "prepare", found)
-    monkeypatch.setattr(tuning_run, "_try", lambda run, policy, show: found(run))
+    """Have auto, and a trained tuner, find gains at once."""
+    skip_stages(monkeypatch.setattr, NEW)
+    monkeypatch.setattr(tuning_run, "make_trials", lambda bench, basis, policy, show: TriedGains.only(NEW.copy()))
 
 
 def tune(program, bus, out):
@@ -72,14 +66,14 @@ def tune(program, bus, out):
 def test_a_tuning_whose_file_finds_no_room_is_rolled_back_and_says_so(tmp_path, monkeypatch, program, file):
     """before.toml is written twice: before anything is changed, and before the drive is to keep the gains."""
     out = tmp_path / "run"
-    result = AutoRun.result
+    collect = auto_module.collect
 
-    def disk_is_full(self, *arguments):
+    def disk_is_full(*arguments):
         assert (out / "before.toml").is_file()
         full(out / file)
-        return result(self, *arguments)
+        return collect(*arguments)
 
-    monkeypatch.setattr(AutoRun, "result", disk_is_full)
+    monkeypatch.setattr(auto_module, "collect", disk_is_full)
     with node() as (machine, bus):
         before = gains(machine)
         done = tune(program, bus, out)
@@ -140,16 +134,15 @@ def test_with_room_it_keeps_them(tmp_path):
     assert names == ["before.toml", "certificate.json", "report.html"]
 
 
-KILLED = """
-import os, signal
+KILLED = f"""
+import os, signal, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
 import numpy as np
+from auto_stages import skip_stages
 from drive_env.programs import drive_tune
 from tuning.auto import one_button as auto
-from tuning.auto.run import AutoRun
-auto.identify = lambda run, experiments: None
-auto.compute = auto.prove = auto.show = auto.measure = auto.look_back = lambda run: None
-auto.prepare = lambda run: setattr(run, "gains", np.array([[1000, 900, 800, 700, 600]]))
-AutoRun.result = lambda *arguments: os.kill(os.getpid(), signal.SIGKILL)
+skip_stages(setattr, np.array({NEW.tolist()}))
+auto.collect = lambda *arguments: os.kill(os.getpid(), signal.SIGKILL)
 drive_tune()
 """
 
@@ -267,15 +260,15 @@ def tiny_disk(place, kilobytes):
 @pytest.mark.skipif(sys.platform != "linux", reason="tmpfs")
 @pytest.mark.usefixtures("quick")
 def test_a_real_disk_that_holds_the_way_back_and_no_report(tmp_path, monkeypatch):
-    result = AutoRun.result
+    collect = auto_module.collect
 
-    def fill(self, *arguments):
+    def fill(*arguments):
         with pytest.raises(OSError, match=SAID), (tmp_path / "disk" / "others").open("wb", buffering=0) as others:
             while True:
                 others.write(bytes(4096))
-        return result(self, *arguments)
+        return collect(*arguments)
 
-    monkeypatch.setattr(AutoRun, "result", fill)
+    monkeypatch.setattr(auto_module, "collect", fill)
     with tiny_disk(tmp_path / "disk", 64) as disk, node() as (machine, bus):
         before = gains(machine)
         done = tune(drive_tune, bus, disk / "run")

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from agents.tuner.tune_target import TrialShown, best_unstopped, tune_target
 
 if TYPE_CHECKING:
+    from tuning.auto.bench import AutoBench
     from tuning.auto.result import Result
-    from tuning.auto.run import AutoRun
+    from tuning.auto.stages import Basis, TriedGains
     from tuning.certificate.certificate import Certificate
     from tuning.target import Target
 
@@ -68,9 +69,9 @@ def run(
         trials.append(trial)
         show(trial)
 
-    def find(run: AutoRun, _: Any) -> None:
+    def find(bench: AutoBench, basis: Basis, _: Any) -> TriedGains:
         say("trials")
-        _try(run, policy, tried)
+        return make_trials(bench, basis, policy, tried)
 
     def told(what: str, share: float) -> None:
         if share < 1.0:
@@ -86,47 +87,48 @@ def run(
     return TunerRun(result, certificates[0], tuple(trials))
 
 
-def _try(run: AutoRun, policy: Any, show: Callable[[TrialShown], None]) -> None:
-    """Make the policy's trials; keep its answer, the second best gains, and where moves start."""
+def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[TrialShown], None]) -> TriedGains:
+    """Make the policy's trials; return its answer and the second best gains, and set where moves start."""
     from dataclasses import replace
 
     from drive_env.safety.envelope import SafetyError, swinging_allowed
-    from tuning.auto.proving import ProvingGround
-    from tuning.auto.trials import BY_TRIAL, watch_following
+    from tuning.auto.stages import TriedGains
+    from tuning.auto.trials import BY_TRIAL, proving_ground, watch_following
 
-    target, going = run.target, run.going
+    target, going = bench.target, bench.going
     if not going.all():
-        run.stop(going, "another axis was rejected, and an agent tunes all of them or none")
-        return
-    low, high = run.room()
+        bench.stop(going, "another axis was rejected, and an agent tunes all of them or none")
+        return TriedGains.only(basis.before)
+    low, high = bench.room()
     try:
         # The trials stop by themselves what oscillates, within 50 ms, and go on.
-        with run.spending(going), swinging_allowed(target.drives):
-            tuned = tune_target(replace(target, low=low, high=high), policy, show=show, calm=run.fallbacks[-1])
+        with bench.spending(going), swinging_allowed(target.drives):
+            tuned = tune_target(replace(target, low=low, high=high), policy, show=show, calm=basis.fallbacks[-1])
     except SafetyError as error:
-        run.stop(going, f"the envelope stopped the trials: {error}")
-        return
-    lanes = target.axes_per_machine
-    run.gains = tuned.gains
-    run.ground = ground = ProvingGround(
-        target, [axis.plant for axis in run.axes], run.room(), run.fallbacks[-1], run.reference
-    )
+        bench.stop(going, f"the envelope stopped the trials: {error}")
+        return TriedGains.only(basis.before)
+    lanes, tried = target.axes_per_machine, TriedGains.only(tuned.gains)
+    ground = proving_ground(bench, basis)
     ground.aborts += np.repeat(np.sum([trial.aborted for trial in tuned.trials], axis=0), lanes)
     ground.moves += tuned.moves
-    watch_following(run, going)
+    watch_following(bench, going)
+    spare, proof, verified = tried.spare, tried.proof, list(tried.verified)
     for machine in range(target.num_axes // lanes):
         own = slice(machine * lanes, (machine + 1) * lanes)
         answer = tuned.trials[int(tuned.answers[machine])]
         if answer.aborted[machine]:
-            run.stop(np.arange(target.num_axes) // lanes == machine, "every trial was stopped, the baseline rule's too")
+            bench.stop(
+                np.arange(target.num_axes) // lanes == machine, "every trial was stopped, the baseline rule's too"
+            )
             continue
         others = [trial for trial in tuned.trials if not np.array_equal(trial.gains[own], tuned.gains[own])]
         second = best_unstopped(others, machine)
         if second is not None:
-            run.spare[own] = second.gains[own]
-        for axis in run.axes[own]:
-            axis.proof, axis.verified = float(answer.measured[machine]), BY_TRIAL
-            if tuned.overruled[machine]:
-                axis.notes.append(
+            spare[own] = second.gains[own]
+        proof[own], verified[own] = float(answer.measured[machine]), [BY_TRIAL] * lanes
+        if tuned.overruled[machine]:
+            for journal in bench.journals[own]:
+                journal.note(
                     "the agent's own choice was stopped in its trial; the best trial that was not stopped is kept"
                 )
+    return replace(tried, spare=spare, proof=proof, verified=tuple(verified))

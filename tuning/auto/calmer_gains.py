@@ -13,10 +13,11 @@ from drive_env.gains import cascade_columns
 from tuning.auto.checks import sound_gains
 from tuning.auto.measured_margins import SENSITIVITY, sensitivity
 from tuning.auto.trials import faster
-from tuning.auto.twin import Twins, known_of
+from tuning.auto.twin import Twins
 
 if TYPE_CHECKING:
-    from tuning.auto.run import AutoRun
+    from tuning.auto.bench import AutoBench
+    from tuning.auto.stages import Basis, RecordedGains
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -27,30 +28,25 @@ INTEGRAL, POSITION = (0.0, 0.5, 1.0), (0.0, 0.5, 1.0, 1.5, 2.0, 4.0)
 WELL = 0.95
 
 
-def cost_on_twins(run: AutoRun, axes: Sequence[int], gains: Integers) -> Floats:
+def cost_on_twins(bench: AutoBench, basis: Basis, axes: Sequence[int], gains: Integers) -> Floats:
     """Return the robust cost of gains on the digital twins of axes.
 
     Args:
-        run: The run.
+        bench: The drives.
+        basis: What was identified.
         axes: Which; they are identified.
         gains: Raw integers, (axes, sets, count).
 
     Returns:
         Shape (axes, sets).
     """
-    low, high = run.room()
-    reach = np.where(high >= -low, high, low)
-    known = []
-    for k in axes:
-        plant, identified = run.axes[k].plant, run.axes[k].identified
-        assert plant is not None and identified is not None, "an axis in the run has both"
-        known.append(known_of(plant, identified, float(reach[k])))
-    scaler = np.asarray(run.target.drives.read(Role.POSITION_SCALE), float)[list(axes)]
-    with Twins(run.target.device, run.target.motor, known, scaler, gains.shape[1]) as twins:
+    target, known = bench.target, basis.identified.twins(axes, bench.reach())
+    scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[list(axes)]
+    with Twins(target.device, target.motor, known, scaler, gains.shape[1]) as twins:
         return twins.score(gains)
 
 
-def calmer(run: AutoRun, k: int, factor: float) -> Integers:
+def calmer(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, factor: float) -> Integers:
     """Return the best gains of an axis, by its twins, whose velocity P is a factor of the present one or less.
 
     An encoder's noise, and its counts at standstill, go into the current by velocity P. The other gains of the outer
@@ -60,12 +56,12 @@ def calmer(run: AutoRun, k: int, factor: float) -> Integers:
     Where time does not wait all of the outer gains are lowered alike: twins take longer than an enabled axis may be
     left alone, and its voltage is not taken away, since it may still turn, or hold a weight.
     """
-    device, plant, own, rule = run.target.device, run.axes[k].plant, run.gains[k], run.reference[k]
-    assert plant is not None, "an axis in the run has one"
-    if not run.target.drives.time_waits:
+    target, device, (plant, _) = bench.target, bench.target.device, basis.identified.known(k)
+    own, rule = recorded.gains[k], basis.reference[k]
+    if not target.drives.time_waits:
         return faster(device.gains, own, factor)
     torque_p, _, velocity_p, velocity_i, position_p = cascade_columns(device)
-    response = None if run.unseen[k] else run.response
+    response = None if recorded.unseen[k] else recorded.response
     most = factor * own[velocity_p]
     rows = []
     for base in (own, rule):
@@ -78,9 +74,9 @@ def calmer(run: AutoRun, k: int, factor: float) -> Integers:
                 gains = tuple(map(int, np.maximum(np.rint(row), 1)))
                 rows.append(gains if response is not None else sound_gains(device, plant, gains))
     candidates = np.array(rows, np.int64)
-    cost = cost_on_twins(run, [k], candidates[None])[0]
+    cost = cost_on_twins(bench, basis, [k], candidates[None])[0]
     if response is not None:  # it knows more than the model
-        near = np.array([sensitivity(run, response, row, k) > SENSITIVITY for row in candidates])
+        near = np.array([sensitivity(target, basis, response, row, k) > SENSITIVITY for row in candidates])
         cost = np.where(near & ~near.all(), np.inf, cost)
     of_own, of_rule = np.split(cost, 2)
     if of_own.min() < WELL * of_rule.min():

@@ -24,7 +24,7 @@ from tuning.runs.provenance import versions
 
 if TYPE_CHECKING:
     from tuning.auto.proving import Shown
-    from tuning.auto.result import AxisRun, Result
+    from tuning.auto.result import AxisResult, Result
     from tuning.target import Target
 
 Floats = NDArray[np.float64]
@@ -46,7 +46,7 @@ def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") 
         seed: That of the run.
         tuner: Name of the tuner that found the gains.
     """
-    axes = tuple(_axis(target, result, axis, run) for axis, run in enumerate(result.axes))
+    axes = tuple(_axis(target, result, axis, outcome) for axis, outcome in enumerate(result.axes))
     return Certificate(
         tuner=tuner,
         device=target.device.name,
@@ -60,29 +60,29 @@ def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") 
     )
 
 
-def _axis(target: Target, result: Result, axis: int, run: AxisRun) -> AxisCertificate:
+def _axis(target: Target, result: Result, axis: int, outcome: AxisResult) -> AxisCertificate:
     supply = float(target.supply[axis])
     loaded = [result.loaded[axis]] if axis in result.loaded else []
     return AxisCertificate(
         axis=axis,
-        accepted=run.accepted,
-        reservations=tuple(run.reservations),
-        reason=run.reason or f"{_opening(run)}; the gains were verified {run.verified}",
-        identified={} if run.identified is None else identified(run.identified),
-        before=tuple(run.before),
-        after=tuple(run.after),
-        before_si=si_gains(target.device, supply, run.before),
-        after_si=si_gains(target.device, supply, run.after),
-        steps=(*_steps(result, axis), *loaded) if run.accepted else (),
-        frequency_responses=_responses(target, result, axis, run) if run.accepted else (),
-        notes=tuple(run.notes),
+        accepted=outcome.accepted,
+        reservations=outcome.reservations,
+        reason=outcome.reason or f"{_opening(outcome)}; the gains were verified {outcome.verified}",
+        identified={} if outcome.identified is None else identified(outcome.identified),
+        before=outcome.before,
+        after=outcome.after,
+        before_si=si_gains(target.device, supply, outcome.before),
+        after_si=si_gains(target.device, supply, outcome.after),
+        steps=(*_steps(result, axis), *loaded) if outcome.accepted else (),
+        frequency_responses=_responses(target, result, axis, outcome) if outcome.accepted else (),
+        notes=outcome.notes,
         hardware_seconds=float(result.drive_seconds[axis]),
         aborts=int(result.aborts[axis]),
     )
 
 
-def _opening(run: AxisRun) -> str:
-    return "all checks passed" if not run.reservations else "all checks that could be made passed"
+def _opening(outcome: AxisResult) -> str:
+    return "all checks passed" if not outcome.reservations else "all checks that could be made passed"
 
 
 def _steps(result: Result, axis: int) -> tuple[StepResponse, ...]:
@@ -113,13 +113,13 @@ def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
     return StepResponse("move", tuned, "rad", shown.t, demand, actual, way * shown.current[:, axis], figures)
 
 
-def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple[FrequencyResponse, ...]:
+def _responses(target: Target, result: Result, axis: int, outcome: AxisResult) -> tuple[FrequencyResponse, ...]:
     """Return both outer loops: measured with the new gains, or by the model, and computed with the gains before."""
     response = result.response
     if response is None or not np.isfinite(response.open_loop[:, axis]).any():
-        return _modelled(target, run)
-    loops = response.loops(run.after, axis, plant=run.plant, refined=False)
-    changed = not np.array_equal(response.gains[axis], run.after)
+        return _modelled(target, outcome)
+    loops = response.loops(outcome.after, axis, plant=outcome.plant, refined=False)
+    changed = not np.array_equal(response.gains[axis], outcome.after)
     sources = {
         "velocity": "multisine, 1 kHz samples"
         + (", with other gains, converted to the new gains by the linear model" if changed else ""),
@@ -127,16 +127,16 @@ def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple
     }
     shown = []
     for name, L in (("velocity", loops.velocity), ("position", loops.position)):
-        if name == "position" and name not in run.margins and name not in run.at_least:
+        if name == "position" and name not in outcome.margins and name not in outcome.at_least:
             continue  # too few coherent lines, or one of linked axes
         shown += [
-            *_before(target, run, name, response.f),
+            *_before(target, outcome, name, response.f),
             frequency_response(
                 f"{name} loop",
                 response.f,
                 L,
-                run.margins.get(name, UNKNOWN),
-                at_least=run.at_least.get(name),
+                outcome.margins.get(name, UNKNOWN),
+                at_least=outcome.at_least.get(name),
                 tuned=True,
                 coherence=response.coherence[:, axis],
                 source=sources[name],
@@ -145,25 +145,25 @@ def _responses(target: Target, result: Result, axis: int, run: AxisRun) -> tuple
     return tuple(shown)
 
 
-def _modelled(target: Target, run: AxisRun) -> tuple[FrequencyResponse, ...]:
+def _modelled(target: Target, outcome: AxisResult) -> tuple[FrequencyResponse, ...]:
     """Return both outer loops by the linear model where nothing was measured; their margins are bounds."""
     f, shown = np.geomspace(MODEL_LOW, MODEL_HIGH, MODEL_POINTS), []
-    for name, least in run.at_least.items():
-        assert run.plant is not None, "what has a bound has a model"
-        L = OPEN_LOOPS[name](target.device, run.plant, run.after, f)
+    for name, least in outcome.at_least.items():
+        assert outcome.plant is not None, "what has a bound has a model"
+        L = OPEN_LOOPS[name](target.device, outcome.plant, outcome.after, f)
         source = "linear model of the identified axis, not measured; margins are bounds within its 95 % intervals"
         shown += [
-            *_before(target, run, name, f),
+            *_before(target, outcome, name, f),
             frequency_response(f"{name} loop", f, L, UNKNOWN, at_least=least, tuned=True, source=source),
         ]
     return tuple(shown)
 
 
-def _before(target: Target, run: AxisRun, name: str, f: Floats) -> list[FrequencyResponse]:
+def _before(target: Target, outcome: AxisResult, name: str, f: Floats) -> list[FrequencyResponse]:
     """Return a loop with the gains before, by the linear model; nothing where these are kept or leave a loop open."""
-    known, plant = target.device.gains, run.plant
-    if plant is None or run.is_kept or known.opens(run.before, "current", "velocity", name):
+    known, plant = target.device.gains, outcome.plant
+    if plant is None or outcome.is_kept or known.opens(outcome.before, "current", "velocity", name):
         return []
-    L = OPEN_LOOPS[name](target.device, plant, run.before, f)
+    L = OPEN_LOOPS[name](target.device, plant, outcome.before, f)
     source = "linear model of the identified axis, with the gains before"
     return [frequency_response(f"{name} loop", f, L, margins(f, L), tuned=False, source=source)]

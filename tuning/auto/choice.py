@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.safety.envelope import SafetyError
+from tuning.auto.bench import MOVE_TIME
 from tuning.auto.calmer_gains import cost_on_twins
 from tuning.auto.measured_margins import SENSITIVITY, sensitivity
 from tuning.auto.moves import show
-from tuning.auto.run import MOVE_TIME
 
 if TYPE_CHECKING:
-    from tuning.auto.run import AutoRun
+    from tuning.auto.bench import AutoBench
+    from tuning.auto.stages import Basis, RecordedGains
 
 Mask = NDArray[np.bool_]
 
@@ -22,66 +23,66 @@ BAD = 8.0  # measured cost J of a move, above which another is made with the rul
 CLEARLY = 0.98  # of the robust cost on the twins: what is less than that is worth another move
 
 
-def choose(run: AutoRun) -> None:
+def choose(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
     """Take the rule's gains where they are better on the twins and the measured loop is stable enough with them.
 
     The gains found are better on the twins before they are slowed; afterwards they need not be.
     """
-    _try_rule_where_bad(run)
-    better = _rule_is_better(run)
-    if not better.any():
-        return
+    recorded = _try_rule_where_bad(bench, basis, recorded)
+    better = _rule_is_better(bench, basis, recorded)
     for k in map(int, np.flatnonzero(better)):
-        run.gains[k], run.spare[k] = run.reference[k], 0
-        run.axes[k].notes.append(
+        recorded = recorded.with_gains(k, basis.reference[k])
+        bench.journals[k].note(
             "the gains of the baseline rule are kept: on the digital twins, the gains found by "
             "search are worse once slowed"
         )
-    show(run, better)
+    return show(bench, basis, recorded, better) if better.any() else recorded
 
 
-def _try_rule_where_bad(run: AutoRun) -> None:
+def _try_rule_where_bad(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
     """Record a move with the rule's gains on axes that moved badly, and keep what moved better."""
-    if run.shown is None or run.ground is None:
-        return
-    where = run.going & run.shown.where & (run.shown.cost > BAD) & (run.gains != run.reference).any(axis=1)
-    where = run.whole_machines(where & run.affordable(MOVE_TIME))
+    shown = recorded.shown
+    if shown is None or bench.ground is None:
+        return recorded
+    where = bench.going & shown.where & (shown.cost > BAD) & (recorded.gains != basis.reference).any(axis=1)
+    where = bench.whole_machines(where & bench.affordable(MOVE_TIME))
     if not where.any():
-        return
+        return recorded
     try:
-        with run.spending(where):
-            with_rule = run.ground.show(run.reference, where)
+        with bench.spending(where):
+            with_rule = bench.ground.show(basis.reference, where)
     except SafetyError as error:
-        run.note(where, f"the envelope stopped the move with the baseline rule's gains: {error}")
-        return
-    faulted = np.isin(np.arange(run.target.num_axes), list(run.faults()))
+        bench.note(where, f"the envelope stopped the move with the baseline rule's gains: {error}")
+        return recorded
+    faulted = np.isin(np.arange(bench.target.num_axes), list(bench.faults()))
     if faulted.any():
-        with run.spending(run.target.together(faulted)):
-            run.ground.recover(faulted)
-        run.drop_faults("moving with the baseline rule's gains, and the fault cannot be reset")
+        with bench.spending(bench.target.together(faulted)):
+            bench.ground.recover(faulted)
+        bench.drop_faults("moving with the baseline rule's gains, and the fault cannot be reset")
     passed = np.array([not reason for reason in with_rule.reason])
-    better = run.whole_machines(where & passed & ~with_rule.restless & (with_rule.cost < run.shown.cost))
+    better = bench.whole_machines(where & passed & ~with_rule.restless & (with_rule.cost < shown.cost))
     for k in map(int, np.flatnonzero(better)):
-        run.gains[k], run.spare[k] = run.reference[k], 0
-        run.axes[k].notes.append(
+        recorded = recorded.with_gains(k, basis.reference[k])
+        bench.journals[k].note(
             f"the gains of the baseline rule are kept: the measured cost J of a move was {with_rule.cost[k]:.2f} with "
-            f"them and {run.shown.cost[k]:.2f} with the gains found by search"
+            f"them and {shown.cost[k]:.2f} with the gains found by search"
         )
-    run.shown = run.shown.replaced(with_rule._replace(where=better))
+    return recorded.with_move(with_rule._replace(where=better))
 
 
-def _rule_is_better(run: AutoRun) -> Mask:
+def _rule_is_better(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Mask:
     """Return the axes for which the rule's gains are better than the present ones, (num_axes,)."""
-    target, response = run.target, run.response
+    target, response = bench.target, recorded.response
     better = np.zeros(target.num_axes, bool)
-    found_on_twins = np.array([np.isfinite(axis.twin) for axis in run.axes])
-    differs = (run.gains != run.reference).any(axis=1)
-    open_ = run.going & ~run.unseen & found_on_twins & differs & run.affordable(MOVE_TIME + run.look_back_time)
-    chosen = np.flatnonzero(open_)
+    differs = (recorded.gains != basis.reference).any(axis=1)
+    affordable = bench.affordable(MOVE_TIME + basis.look_back_time(bench))
+    chosen = np.flatnonzero(bench.going & ~recorded.unseen & np.isfinite(recorded.cost) & differs & affordable)
     if response is None or not chosen.size:
         return better
     axes = chosen.tolist()
-    cost = cost_on_twins(run, axes, np.stack([run.gains[chosen], run.reference[chosen]], axis=1))
-    for k, (own, rule) in zip(axes, cost, strict=True):
-        better[k] = rule < CLEARLY * own and sensitivity(run, response, run.reference[k], k) <= SENSITIVITY
+    both = np.stack([recorded.gains[chosen], basis.reference[chosen]], axis=1)
+    for k, (own, rule) in zip(axes, cost_on_twins(bench, basis, axes, both), strict=True):
+        better[k] = rule < CLEARLY * own and (
+            sensitivity(target, basis, response, basis.reference[k], k) <= SENSITIVITY
+        )
     return better

@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.gains import check_linear_model
+from tuning.auto.bench import AutoBench
 from tuning.auto.choice import choose
 from tuning.auto.loop_margins import judge, measure
 from tuning.auto.moves import look_back, show, stand
-from tuning.auto.run import AutoRun
+from tuning.auto.result import collect
 from tuning.auto.search import compute, identify, prepare
 from tuning.auto.settings import begin, commission, write
+from tuning.auto.stages import Basis, RecordedGains, TriedGains
 from tuning.auto.trials import prove
 from tuning.identify.quick_identification import identify_briefly
 from tuning.outcome import Outcome
@@ -35,7 +37,9 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
 Files = Callable[["Result"], AbstractContextManager[object]]
-Find = Callable[[AutoRun, Progress], None]  # finds gains for the axes that go on, and has tried them on the drives
+Find = Callable[
+    [AutoBench, Basis, Progress], TriedGains
+]  # finds gains for the axes that go on, and tries them on the drives
 
 BUDGET = 12.0  # s of drive time
 
@@ -74,12 +78,12 @@ def auto(
     )  # fmt: skip
 
 
-def on_twins(run: AutoRun, say: Progress) -> None:
+def on_twins(bench: AutoBench, basis: Basis, say: Progress) -> TriedGains:
     """Search gains on digital twins, and try the best few on the drives."""
     say("searching gains on digital twins", 0.3)
-    compute(run)
+    candidates = compute(bench, basis)
     say("trying gains on the drives", 0.7)
-    prove(run)
+    return prove(bench, basis, candidates)
 
 
 def prove_found(
@@ -99,8 +103,8 @@ def prove_found(
     Args:
         target: The drives, as `auto` takes them.
         file: File for the state before.
-        find: Finds gains: it sets the run's gains and proving ground. If it raises, the run ends and everything is
-            rolled back.
+        find: Finds gains, and tries them on the proving ground that it gives the bench. If it raises, the run ends and
+            everything is rolled back.
         seed: Of the run.
         keep: Whether drives on a bus store the new gains, so that they survive a power cycle.
         progress: Called with the present step, and the share done.
@@ -114,29 +118,26 @@ def prove_found(
     check_linear_model(target.device)
     say = progress or (lambda what, share: None)
     with Transaction(target, file) as transaction, timed(target) as (watched, clock):
-        run = AutoRun(watched, seed, clock, budget)
+        bench = AutoBench(watched, seed, clock, budget)
         say("checking the drives", 0.0)
-        begin(run)
+        begin(bench)
         say("identifying", 0.05)
-        identify(run, experiments)
-        commission(run)
-        prepare(run)
-        if run.going.any():
-            find(run, say)
+        identified = identify(bench, experiments)
+        fresh = commission(bench, identified)
+        basis = prepare(bench, identified)
+        tried = find(bench, basis, say) if bench.going.any() else TriedGains.only(bench.before)
         say("recording a move", 0.8)
-        show(run)
+        recorded = show(bench, basis, RecordedGains.of(tried))
         say("measuring the frequency response", 0.85)
-        measure(run)
-        choose(run)
+        recorded = choose(bench, basis, measure(bench, basis, recorded))
         say("comparing with the gains before", 0.93)
-        look_back(run)
-        stand(run, target)
-        judge(run)
-        tell_of_lateness(run)
+        recorded = stand(bench, basis, look_back(bench, basis, recorded), target)
+        verdict = judge(bench, basis, recorded)
+        tell_of_lateness(bench)
         say("writing", 0.96)
-        accepted = write(run, transaction)
+        accepted = write(bench, fresh, recorded.gains, transaction)
         kept = keep and bool(accepted.any()) and bool(target.bus)
-        result = run.result(transaction.path, kept)
+        result = collect(bench, basis, recorded, verdict, transaction.path, kept)
         # What cannot be written down is not left in the drives, and nothing is written of what they did not keep.
         with files(result):
             if kept:
@@ -146,16 +147,16 @@ def prove_found(
     return result
 
 
-def tell_of_lateness(run: AutoRun) -> None:
+def tell_of_lateness(bench: AutoBench) -> None:
     """Add a reservation if SYNCs of a bus in real time were late, which distorts moves and responses."""
-    drives = run.target.drives
+    drives = bench.target.drives
     if drives.time_waits or drives.bus is None:
         return
     timing = drives.bus.total_timing
     worst = 1e3 * timing.worst
     if timing.late:
-        run.reserve(
-            np.ones(run.target.num_axes, bool),
+        bench.reserve(
+            np.ones(bench.target.num_axes, bool),
             f"{timing.late} of {timing.cycles} SYNCs were more than a cycle late, the worst by {worst:.1f} ms: "
             "this computer is too busy, which distorts moves and frequency responses; end other programs, or put "
             "`chrt -f 10` before the command (Linux)",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 from tuning.certificate.certificate import verdict
 
 if TYPE_CHECKING:
+    from tuning.auto.bench import AutoBench
     from tuning.auto.proving import Shown
+    from tuning.auto.stages import Basis, RecordedGains, Verdict
     from tuning.certificate.certificate import StepResponse
     from tuning.identify.estimate import Identification
     from tuning.response.linear_model import Plant
@@ -24,20 +27,20 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
-@dataclass
-class AxisRun:
-    """The state of one axis so far.
+@dataclass(frozen=True)
+class AxisResult:
+    """What became of one axis.
 
     Attributes:
-        reason: Why it stopped; "" while it goes on.
+        before, after: Raw gains, in the order of the device's gain set.
+        reason: Why it was rejected; "" where all checks passed, with reservations or without.
         reservations: Checks that could not be made or are near a limit; with any of them the certificate is not a plain
             accept.
         notes: Further remarks.
-        before, after: Raw gains, in the order of the device's gain set.
-        identified: The identification, None before it.
+        identified: The identification, None where there was none.
         plant: The axis model made of it, None where that was not possible.
-        twin: Robust cost on the twin of the gains that were found.
-        proof: J by measured terms of the gains that were taken; nan before.
+        twin: Robust cost on the twin of the gains that were found; nan where none were.
+        proof: J by measured terms of the gains that were taken; nan where none passed a trial.
         verified: How the gains were verified, in words; "" where they were not.
         margins: Of the outer loops as measured, "velocity" and "position"; nothing where nothing was.
         at_least: Lower bounds of margins that were not measured, likewise.
@@ -48,15 +51,15 @@ class AxisRun:
     before: tuple[int, ...]
     after: tuple[int, ...]
     reason: str = ""
-    reservations: list[str] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    reservations: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     identified: Identification | None = None
     plant: Plant | None = None
     twin: float = np.nan
     proof: float = np.nan
     verified: str = ""
-    margins: dict[str, Margins] = field(default_factory=dict)
-    at_least: dict[str, AtLeast] = field(default_factory=dict)
+    margins: Mapping[str, Margins] = field(default_factory=dict)
+    at_least: Mapping[str, AtLeast] = field(default_factory=dict)
     eased: int = 0
     is_kept: bool = False
 
@@ -80,7 +83,7 @@ class Result(NamedTuple):
     file: The snapshot that brings everything back. kept: Whether drives on a bus stored the gains.
     """
 
-    axes: tuple[AxisRun, ...]
+    axes: tuple[AxisResult, ...]
     drive_seconds: Floats
     moves: Integers
     aborts: Integers
@@ -88,7 +91,7 @@ class Result(NamedTuple):
     shown: Shown | None
     earlier: Shown | None
     response: MeasuredLoop | None
-    loaded: dict[int, StepResponse]
+    loaded: Mapping[int, StepResponse]
     file: Path
     kept: bool
 
@@ -96,3 +99,26 @@ class Result(NamedTuple):
     def accepted(self) -> Mask:
         """Which axes have gains that passed, new ones or those before, shape (num_axes,)."""
         return np.array([axis.accepted for axis in self.axes])
+
+
+def collect(
+    bench: AutoBench, basis: Basis, recorded: RecordedGains, verdict: Verdict, file: Path, kept: bool
+) -> Result:
+    """Return the result of a run: of the axes that were accepted with their gains."""
+    identified, axes = basis.identified, []
+    for k, journal in enumerate(bench.journals):
+        gains = bench.before[k] if journal.reason else recorded.gains[k]
+        axes.append(
+            AxisResult(
+                tuple(map(int, bench.before[k])), tuple(map(int, gains)), journal.reason, tuple(journal.reservations),
+                tuple(journal.notes), identified.found[k], identified.plants[k], float(recorded.cost[k]),
+                float(recorded.proof[k]), verdict.verified[k], verdict.margins[k], verdict.at_least[k],
+                int(recorded.eased[k]), bool(recorded.kept[k]),
+            )
+        )  # fmt: skip
+    ground, zero = bench.ground, np.zeros(bench.target.num_axes, np.int64)
+    counts = (zero, zero, zero) if ground is None else (ground.moves, ground.aborts, ground.violations)
+    return Result(
+        tuple(axes), bench.spent, *counts, recorded.shown, recorded.earlier, recorded.response, recorded.loaded, file,
+        kept,
+    )  # fmt: skip

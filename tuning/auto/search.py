@@ -13,8 +13,9 @@ from drive_env.gains import bandwidth_gains, rule_gains
 from drive_env.master.errors import BusError
 from drive_env.safety.envelope import SafetyError, swinging_allowed
 from tuning.auto.checks import sound_gains, unsafe_gains, wrong_wiring
-from tuning.auto.trial_order import BOLD, SLIPPERY
-from tuning.auto.twin import WORLDS, Known, Optimum, Twins, known_of, search
+from tuning.auto.stages import Basis, Candidates, IdentifiedAxes
+from tuning.auto.trial_order import BOLD, OTHERS, SLIPPERY
+from tuning.auto.twin import WORLDS, Known, Optimum, Twins, search
 from tuning.identify.estimate import TITLES
 from tuning.identify.working_state import cautious_bandwidth
 from tuning.response.linear_model import Plant
@@ -22,7 +23,7 @@ from tuning.rules.rules_by_name import RULES, propose
 from tuning.target import Target
 
 if TYPE_CHECKING:
-    from tuning.auto.run import AutoRun
+    from tuning.auto.bench import AutoBench
     from tuning.identify.estimate import Identification
 
 Floats = NDArray[np.float64]
@@ -39,89 +40,87 @@ SOFT = "margin_60"  # the rule that is tried when nothing faster passes: 60 degr
 CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4
 
 
-def identify(run: AutoRun, experiments: Identify) -> None:
-    """Check the wiring and identify."""
-    target = run.target
-    if not run.going.any():
-        return
+def identify(bench: AutoBench, experiments: Identify) -> IdentifiedAxes:
+    """Check the wiring and identify; take out axes that cannot be tuned."""
+    target, going = bench.target, bench.going
+    found: list[Identification | None] = [None] * target.num_axes
+    plants: list[Plant | None] = [None] * target.num_axes
+    if not going.any():
+        return IdentifiedAxes(tuple(found), tuple(plants))
     try:
-        with run.spending(run.going), swinging_allowed(target.drives):
-            found = experiments(target, run.going)
+        with bench.spending(going), swinging_allowed(target.drives):
+            every = experiments(target, going)
     except (SafetyError, RuntimeError, TimeoutError) as error:
         if isinstance(error, BusError):
             raise
-        run.stop(run.going, f"identification was stopped: {error}")
-        return
-    for k in map(int, np.flatnonzero(run.going)):
-        axis, identified = run.axes[k], found[k]
-        axis.identified = identified
-        axis.reason = wrong_wiring(target, identified)
-        if not axis.reason:
+        bench.stop(bench.going, f"identification was stopped: {error}")
+        return IdentifiedAxes(tuple(found), tuple(plants))
+    for k in map(int, np.flatnonzero(going)):
+        journal, found[k] = bench.journals[k], every[k]
+        journal.stop(wrong_wiring(target, every[k]))
+        if not journal.reason:
             try:
-                axis.plant = Plant.from_identification(target.device, target.motor, float(target.supply[k]), identified)
+                plants[k] = Plant.from_identification(target.device, target.motor, float(target.supply[k]), every[k])
             except ValueError as error:
-                axis.reason = str(error)
+                journal.stop(str(error))
         unknown: dict[str, list[str]] = {}
-        for name, estimate in identified.estimates.items():
+        for name, estimate in every[k].estimates.items():
             if estimate.reason and name not in ("inertia",):
                 unknown.setdefault(estimate.reason, []).append(TITLES[name])
-        axis.notes += [f"{', '.join(titles)} not identified: {reason}" for reason, titles in unknown.items()]
+        for reason, titles in unknown.items():
+            journal.note(f"{', '.join(titles)} not identified: {reason}")
+    return IdentifiedAxes(tuple(found), tuple(plants))
 
 
-def prepare(run: AutoRun) -> None:
-    """Set the reference gains, the fallback gains, and whether the gains before are safe."""
-    target = run.target
-    for axis in map(int, np.flatnonzero(run.going)):
-        plant, before = run.axes[axis].plant, run.axes[axis].before
-        assert plant is not None, "an axis in the run has one"
-        fitted = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)[0]
-        run.unsafe[axis] = unsafe_gains(target.device, plant, before)
+def prepare(bench: AutoBench, identified: IdentifiedAxes) -> Basis:
+    """Return the reference gains, the fallback gains, and whether the gains before are safe."""
+    target = bench.target
+    reference = np.ones_like(bench.before)
+    fallbacks, unsafe = np.tile(reference, (3, 1, 1)), ["not checked"] * target.num_axes
+    for axis in map(int, np.flatnonzero(bench.going)):
+        (plant, _), before = identified.known(axis), bench.before[axis]
+        reference[axis] = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)[0]
+        unsafe[axis] = unsafe_gains(target.device, plant, before)
         # What the drive had may be better than what is only soft.
-        soft = propose(SOFT, target.device, target.motor, plant).gains if run.unsafe[axis] else before
-        run.fallbacks[:, axis] = fitted, soft, calm_gains(target, plant)
-        run.reference[axis] = fitted
+        soft = propose(SOFT, target.device, target.motor, plant).gains if unsafe[axis] else before
+        fallbacks[:, axis] = reference[axis], soft, calm_gains(target, plant)
+    return Basis(identified, bench.before, reference, fallbacks, tuple(unsafe))
 
 
-def compute(run: AutoRun) -> None:
+def compute(bench: AutoBench, basis: Basis) -> Candidates:
     """Search gains on twins, from what the rules propose."""
-    target = run.target
-    chosen = np.flatnonzero(run.going)
-    if not chosen.size:
-        return
-    room = run.room()
-    reach = np.where(room[1] >= -room[0], room[1], room[0])
-    known, starts = [], []
+    target, chosen = bench.target, np.flatnonzero(bench.going).tolist()
+    known = basis.identified.twins(chosen, bench.reach())
+    starts = []
     for axis in chosen:
-        plant, identified = run.axes[axis].plant, run.axes[axis].identified
-        assert plant is not None and identified is not None, "an axis in the run has both"
-        known.append(known_of(plant, identified, float(reach[axis])))
+        plant, _ = basis.identified.known(axis)
         proposals = (propose(name, target.device, target.motor, plant) for name in RULES)
-        starts.append(np.array([run.reference[axis], *(proposal.gains for proposal in proposals)], np.int64))
+        starts.append(np.array([basis.reference[axis], *(proposal.gains for proposal in proposals)], np.int64))
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[chosen]
-    found = _search_apart(run, known, np.array(starts), scaler)
-    run.gains[chosen] = found.gains[:, 0]
+    found = _search_apart(bench, known, np.array(starts), scaler)
+    gains, cost = np.ones_like(bench.before), np.full(target.num_axes, np.nan)
+    others = np.tile(gains, (len(OTHERS), 1, 1))
+    gains[chosen], cost[chosen] = found.gains[:, 0], found.cost[:, 0]
     # What the drive itself then tells apart: what is best on other twins.
     for number, worlds in {BOLD: WORLDS[:1], SLIPPERY: SLIPPERY_WORLDS}.items():
         with Twins(target.device, target.motor, known, scaler, SETS, worlds=worlds) as twins:
-            other = search(twins, found.gains, run.rng, generations=OTHER_GENERATIONS, width=OTHER_WIDTH)
-        run.others[number, chosen] = other.gains[:, 0]
+            other = search(twins, found.gains, bench.rng, generations=OTHER_GENERATIONS, width=OTHER_WIDTH)
+        others[number, chosen] = other.gains[:, 0]
     for axis in chosen:
-        plant = run.axes[axis].plant
-        assert plant is not None, "an axis in the run has one"
-        for rows in (run.gains, *run.others):
+        plant, _ = basis.identified.known(axis)
+        for rows in (gains, *others):
             rows[axis] = sound_gains(target.device, plant, tuple(map(int, rows[axis])))
-    for axis, cost in zip(chosen, found.cost[:, 0], strict=True):
-        run.axes[axis].twin = float(cost)
+    return Candidates(gains, others, cost)
 
 
-def _search_apart(run: AutoRun, known: Sequence[Known], starts: Integers, scaler: Floats) -> Optimum:
+def _search_apart(bench: AutoBench, known: Sequence[Known], starts: Integers, scaler: Floats) -> Optimum:
     """Run several searches at the same time, and return the best of each axis.
 
     On an elastic axis the robust cost has several local minima, and a search stays in the first that it reaches.
     """
-    target, n = run.target, len(known)
+    target, n = bench.target, len(known)
     with Twins(target.device, target.motor, [*known] * SEARCHES, np.tile(scaler, SEARCHES), SETS) as twins:
-        found = search(twins, np.tile(starts, (SEARCHES, 1, 1)), run.rng, generations=GENERATIONS)
+        found = search(twins, np.tile(starts, (SEARCHES, 1, 1)), bench.rng, generations=GENERATIONS)
     best = found.cost[:, 0].reshape(SEARCHES, n).argmin(axis=0) * n + np.arange(n)
     return Optimum(found.gains[best], found.cost[best], found.start[best])
 

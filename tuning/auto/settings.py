@@ -17,20 +17,22 @@ from tuning.identify.working_state import BOTH_ENDS
 from tuning.snapshot import Transaction, restore
 
 if TYPE_CHECKING:
-    from tuning.auto.run import AutoRun
+    from tuning.auto.bench import AutoBench
+    from tuning.auto.stages import IdentifiedAxes
     from tuning.target import Target
 
+Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 LEAST_WAY = 0.2  # rad between the ends of the travel: finding the poles alone turns a rotor so far
 
 
-def begin(run: AutoRun) -> None:
+def begin(bench: AutoBench) -> None:
     """Reject axes with too short a travel, and disable enabled ones: identification begins at rest."""
-    drives, way = run.target.drives, run.target.high - run.target.low
+    drives, way = bench.target.drives, bench.target.high - bench.target.low
     for axis in np.flatnonzero(way < LEAST_WAY):
         turns, least = (0.5 * x / np.pi for x in (way[axis], LEAST_WAY))
-        run.axes[axis].reason = (
+        bench.journals[axis].stop(
             f"the travel is too short: {way[axis]:.2g} rad ({turns:.2g} turns), and {LEAST_WAY:g} rad ({least:.2g} "
             "turns) are needed; allow more with --travel"
         )
@@ -39,32 +41,33 @@ def begin(run: AutoRun) -> None:
         motion.disable(drives, where=on)
 
 
-def commission(run: AutoRun) -> None:
-    """Write the motor's parameters to a factory-fresh drive, and the wiring settings to any drive.
+def commission(bench: AutoBench, identified: IdentifiedAxes) -> Mask:
+    """Write the motor's parameters to factory-fresh drives, and the wiring settings to any; return which were fresh.
 
     Identification did so, too, but left drives as they were.
     """
-    target = run.target
-    run.fresh = run.going & (target.drives.read(Role.MOTOR_TYPE) == 0)
-    _wire(run)
-    if not run.fresh.any():
-        return
+    target = bench.target
+    fresh: Mask = bench.going & (target.drives.read(Role.MOTOR_TYPE) == 0)
+    _wire(bench, identified, fresh)
+    if not fresh.any():
+        return fresh
     for name, value in zip(_keys(target, names := _commissioning(target)), names.values(), strict=True):
         if name not in findings(target.device):
-            target.drives.write(name, value, where=run.fresh)
+            target.drives.write(name, value, where=fresh)
     # No axis is at both ends: switches that say so are not there.
-    unwired = run.fresh & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
+    unwired = fresh & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
     target.drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
     index, _ = target.device.roles[Role.LIMIT_SWITCHES]
-    run.note(
+    bench.note(
         unwired, f"both limit switches were active at once, so they are not connected: they are ignored ({index:04X}h)"
     )
-    run.note(run.fresh, f"factory-fresh drive: commissioned for {target.motor.name} first")
+    bench.note(fresh, f"factory-fresh drive: commissioned for {target.motor.name} first")
+    return fresh
 
 
-def _wire(run: AutoRun) -> None:
+def _wire(bench: AutoBench, identified: IdentifiedAxes, fresh: Mask) -> None:
     """Write the wiring settings: as identified, or else the known ones of a factory-fresh drive's motor."""
-    target = run.target
+    target = bench.target
     preset = _commissioning(target)
     known = {
         key: value
@@ -72,43 +75,49 @@ def _wire(run: AutoRun) -> None:
         if key in findings(target.device)
     }
     wanted: list[dict[Key, int]] = []
-    for k, axis in enumerate(run.axes):
-        seen = {} if axis.identified is None else axis.identified.wiring
-        needed = known | {key: one.needs for key, one in seen.items()} if run.fresh[k] else changes(seen)
-        wanted.append(needed if run.going[k] else {})
-        if run.going[k] and not run.fresh[k]:
-            axis.notes += corrected(target.device, seen)
-    run.wire(wanted)
+    for k, found in enumerate(identified.found):
+        seen = {} if found is None else found.wiring
+        needed = known | {key: one.needs for key, one in seen.items()} if fresh[k] else changes(seen)
+        wanted.append(needed if bench.going[k] else {})
+        if bench.going[k] and not fresh[k]:
+            for text in corrected(target.device, seen):
+                bench.journals[k].note(text)
+    bench.wire(wanted)
 
 
-def write(run: AutoRun, transaction: Transaction) -> Mask:
-    """Leave the accepted axes with their gains and restore everything else; return which they are, (num_axes,)."""
-    going = run.going
-    run.stop(~going, "another axis of its machine was rejected")
+def write(bench: AutoBench, fresh: Mask, gains: Integers, transaction: Transaction) -> Mask:
+    """Leave the accepted axes with gains and restore everything else; return which they are, (num_axes,).
+
+    Args:
+        bench: The drives.
+        fresh: Those that came fresh from the factory, and keep what they were commissioned with, (num_axes,).
+        gains: Raw, (num_axes, count).
+        transaction: With the state before.
+    """
+    going = bench.going
+    bench.stop(~going, "another axis of its machine was rejected")
     if not going.any():
         return going
-    drives = run.target.drives
-    write_gains(drives, run.gains, going)
+    drives = bench.target.drives
+    write_gains(drives, gains, going)
     motion.disable(drives, where=going)
     # 0, no mode, is what a drive has before its first; it cannot be written.
-    other = going & (run.modes != 0) & (drives.read(cia402.MODE) != run.modes)
+    other = going & (bench.modes != 0) & (drives.read(cia402.MODE) != bench.modes)
     if other.any():
-        drives.write(cia402.MODE, run.modes, where=other)
-    kept = dict(zip(run.target.device.gains.keys, run.gains.T, strict=True))
+        drives.write(cia402.MODE, bench.modes, where=other)
+    kept = dict(zip(bench.target.device.gains.keys, gains.T, strict=True))
     axes = []
     for k, values in enumerate(transaction.before.axes):
         wanted = dict(values)
-        if run.fresh[k]:
+        if fresh[k]:
             commissioned = [
-                *_keys(run.target, _commissioning(run.target)),
-                run.target.device.roles[Role.LIMIT_SWITCHES],
+                *_keys(bench.target, _commissioning(bench.target)),
+                bench.target.device.roles[Role.LIMIT_SWITCHES],
             ]
             wanted |= {key: int(drives.read(key)[k]) for key in commissioned if key in values}
-        wanted |= {key: int(drives.read(key)[k]) for key in findings(run.target.device) if key in values}
+        wanted |= {key: int(drives.read(key)[k]) for key in findings(bench.target.device) if key in values}
         axes.append(wanted | {key: int(column[k]) for key, column in kept.items()})
     restore(drives, replace(transaction.before, axes=tuple(axes)), going, whole=False)
-    for axis in np.flatnonzero(going):
-        run.axes[axis].after = tuple(map(int, run.gains[axis]))
     return going
 
 

@@ -22,7 +22,7 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from tuning.auto.result import AxisRun, Result
+    from tuning.auto.result import AxisResult, Result
     from tuning.target import Target
 
 
@@ -145,7 +145,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool) -> None:
     print_lines(lines)
 
 
-def _margins(axis: AxisRun, loop: str) -> str:
+def _margins(axis: AxisResult, loop: str) -> str:
     """Return phase and gain margin of a loop; a lower bound where one was not measured."""
     found, least = axis.margins.get(loop), axis.at_least.get(loop)
     texts = []

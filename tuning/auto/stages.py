@@ -1,0 +1,169 @@
+"""What the stages of auto hand on to each other; it is never changed, the next stage makes its own of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.auto.bench import LOOK_BACK_TIME
+from tuning.auto.twin import Known, known_of
+
+if TYPE_CHECKING:
+    from tuning.auto.bench import AutoBench
+    from tuning.auto.proving import Shown
+    from tuning.certificate.certificate import StepResponse
+    from tuning.identify.estimate import Identification
+    from tuning.response.linear_model import Plant
+    from tuning.response.margins import Margins
+    from tuning.response.measured_loop import AtLeast, MeasuredLoop
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class IdentifiedAxes:
+    """What was identified of each axis.
+
+    Attributes:
+        found: The identification, None where there was none.
+        plants: The axis model made of it, None where that was not possible.
+    """
+
+    found: tuple[Identification | None, ...]
+    plants: tuple[Plant | None, ...]
+
+    def known(self, axis: int) -> tuple[Plant, Identification]:
+        """Return model and identification of an axis that goes on."""
+        plant, found = self.plants[axis], self.found[axis]
+        assert plant is not None and found is not None, "an axis in the run has both"
+        return plant, found
+
+    def twins(self, axes: Iterable[int], reach: Floats) -> list[Known]:
+        """Return the data of the digital twins of axes; `reach` is how far rotors may turn [rad], (num_axes,)."""
+        return [known_of(*self.known(axis), float(reach[axis])) for axis in axes]
+
+
+@dataclass(frozen=True)
+class Basis:
+    """What the search for gains starts from, and what is fallen back on.
+
+    Attributes:
+        identified: The axes.
+        before: Raw gains of the drives before the run, (num_axes, count).
+        reference: Those of the baseline rule, likewise.
+        fallbacks: What is tried when the twin's gains fail, (3, num_axes, count): the baseline rule's; those before, or
+            the soft rule's; and those that are slow enough for any load, with which what is stopped goes on.
+        unsafe: Why an axis must not be moved with the gains before, "" where it may.
+    """
+
+    identified: IdentifiedAxes
+    before: Integers
+    reference: Integers
+    fallbacks: Integers
+    unsafe: tuple[str, ...]
+
+    def look_back_time(self, bench: AutoBench) -> Floats:
+        """Return the time that a move with the gains before takes [s], 0 where none is made, (num_axes,)."""
+        safe = bench.whole_machines(np.array([not why for why in self.unsafe]))
+        return np.where(safe, LOOK_BACK_TIME, 0.0)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What the search on digital twins found.
+
+    Attributes:
+        gains: The best on all twins, raw, (num_axes, count).
+        others: The best for the axis exactly as identified, and for less friction, (2, num_axes, count).
+        cost: Robust cost of the best on all twins, (num_axes,); nan where nothing was searched.
+    """
+
+    gains: Integers
+    others: Integers
+    cost: Floats
+
+
+@dataclass(frozen=True)
+class TriedGains:
+    """What trials on the drives left of the gains that were found.
+
+    Attributes:
+        gains: The best, raw, (num_axes, count).
+        spare: The second best that passed a trial, likewise; zeros where none did.
+        proof: J by measured terms of the best, (num_axes,); nan where there is none.
+        verified: How they were verified, in words; "" where they were not.
+        cost: Robust cost on digital twins of what was found on these, (num_axes,); nan where nothing was.
+    """
+
+    gains: Integers
+    spare: Integers
+    proof: Floats
+    verified: tuple[str, ...]
+    cost: Floats
+
+    @staticmethod
+    def only(gains: Integers) -> TriedGains:
+        """Return gains of which nothing is known, (num_axes, count)."""
+        n = len(gains)
+        return TriedGains(gains, np.zeros_like(gains), np.full(n, np.nan), ("",) * n, np.full(n, np.nan))
+
+    def with_gains(self, axis: int, gains: Integers) -> Self:
+        """Return this with other gains of an axis, shape (count,), beside which nothing is second best."""
+        here = (np.arange(len(self.gains)) == axis)[:, None]
+        return replace(self, gains=np.where(here, gains, self.gains), spare=np.where(here, 0, self.spare))
+
+
+@dataclass(frozen=True)
+class RecordedGains(TriedGains):
+    """What moves and frequency responses showed of the gains, which were lowered where they had to be.
+
+    Attributes:
+        shown: A recorded move with the gains, None if none was made.
+        eased: How often the gains of an axis were lowered because it shook at rest, (num_axes,).
+        response: The velocity loop's, None if none was measured.
+        unseen: Axes without a usable frequency response, (num_axes,).
+        earlier: A recorded move with the gains before, None if none was made.
+        kept: Axes that keep the gains before, which were better, (num_axes,).
+        loaded: Response to a load step, of emulated machines, by axis.
+    """
+
+    shown: Shown | None
+    eased: Integers
+    response: MeasuredLoop | None
+    unseen: Mask
+    earlier: Shown | None = None
+    kept: Mask = field(default_factory=lambda: np.zeros(0, bool))
+    loaded: Mapping[int, StepResponse] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, tried: TriedGains) -> RecordedGains:
+        """Return gains that were tried, and nothing recorded yet."""
+        known = {one.name: getattr(tried, one.name) for one in fields(TriedGains)}
+        n = len(tried.gains)
+        none = np.zeros(n, bool)
+        return cls(**known, shown=None, eased=np.zeros(n, np.int64), response=None, unseen=none, kept=none)
+
+    def with_move(self, shown: Shown) -> RecordedGains:
+        """Return this with a later move of some axes in place of theirs."""
+        return replace(self, shown=shown if self.shown is None else self.shown.replaced(shown))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the final gains are worth, by axis.
+
+    Attributes:
+        margins: Of the outer loops as measured, "velocity" and "position"; nothing where nothing was.
+        at_least: Lower bounds of margins that were not measured, likewise.
+        verified: How the gains were verified, in words; "" where they were not.
+    """
+
+    margins: tuple[Mapping[str, Margins], ...]
+    at_least: tuple[Mapping[str, AtLeast], ...]
+    verified: tuple[str, ...]
