@@ -416,10 +416,15 @@ def test_a_watchdog_of_another_program_stays_while_its_axis_is_enabled(run, shar
 
 
 def test_jog_holds_its_current_and_a_drive_that_cannot_follow_ends_it(run, shared):
-    """The limit is lent to the drive: it is not passed, and the drive faults or the command gives up waiting."""
-    code, _, error = run("jog", "3000 rpm", "--for", "0.5", "--max-current", "40 mA")
+    """The limit is lent to the drive: 40 mA do not turn the rotor.
+
+    Who notices it first is chance on a busy computer: the envelope, if samples come in time that show the current swing;
+    the drive; the command while it waits, or at the end of the way.
+    """
+    code, out, error = run("jog", "3000 rpm", "--for", "0.5", "--max-current", "40 mA")
     assert code == REFUSED, error
-    assert "is in fault while waiting" in error or "emergency" in error or "quick-stopped" in error
+    assert re.search(r"in fault|emergency|quick-stopped|hardly moved|did not reach", error), error
+    assert abs(float(re.search(r"moved by -?\d+ inc \((\S+) rev\)", out)[1])) < 0.25  # of 25 revolutions
     assert "Limits(" not in error
     assert shared[1][0].read(0x6041)[0] & 0x6F != 0x27
     assert shared[1][0].read(0x2003)[0] == 7000  # its own again
