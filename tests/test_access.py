@@ -293,7 +293,7 @@ LIVE = {
 
 
 def test_a_drive_as_the_factory_leaves_it_reads_the_manuals_defaults_but_for_what_it_measures():
-    with EmulatedDrives(load="inertia", motor=None, num_threads=1, ideal=True) as factory:
+    with EmulatedDrives(load="inertia", commissioned=False, num_threads=1, ideal=True) as factory:
         found = {(e.index, e.sub): factory.read((e.index, e.sub))[0] for e in ENTRIES if e.bits is not None}
     assert {key: raw for key, raw in found.items() if raw != DICTIONARY.find(key).default} == LIVE
 
@@ -498,7 +498,7 @@ def test_a_restart_restores_stored_values(drives, restart):
 
 
 def test_factory_values_are_those_of_the_eds():
-    with EmulatedDrives(load="inertia", motor=None, num_threads=1) as drives:
+    with EmulatedDrives(load="inertia", commissioned=False, num_threads=1) as drives:
         for entry in ENTRIES:
             if entry.access == "rw" and entry.bits:
                 assert int(drives.read((entry.index, entry.sub))[0]) == entry.default, entry.label

@@ -330,6 +330,11 @@ def test_a_gap_is_found_and_told():
     two = Evaluation("p", "ServoDrive/Tracking-v0", {}, "bus", [1, 2, 3], {SCORE: [1.5, 2.5, 3.5]}, {}, {})
     [row] = gap.compare(one, two)
     assert not row.paired and row.difference.mean == 0.5 and row.difference.low < 0.0 < row.difference.high
+    two.side = "emulator"  # which draws the same machines for the same seeds
+    assert gap.compare(one, two)[0].paired
+    two.configuration = {"load": "inertia"}
+    assert not gap.compare(one, two)[0].paired
+    two.side, two.configuration = "bus", {}
     one.side = "emulator as on a bus"
     [row] = gap.compare(one, two)
     assert row.paired and row.difference[:3] == (0.5, 0.5, 0.5)
@@ -358,6 +363,8 @@ def test_the_command_on_both_sides_and_the_gap(tmp_path, served):
     assert int(emulated.read(0x6041)[0]) & 0x4F == 0x40
     found = run("evaluate", path, "--episodes", 1, "--against", tmp_path / "one" / "report.json", "--json")
     assert json.loads(found.output)["gap"][0].startswith("gap of RMS following error")
+    found = run("evaluate", path, "--episodes", 2, "--against", tmp_path / "one" / "report.json", "--json")
+    assert "difference +0 (95 % of +0 to +0, +0.0%; paired by seed)" in json.loads(found.output)["gap"][0]
 
 
 def test_a_profile_velocity_beyond_the_tasks_limit_is_lowered_and_put_back(tmp_path, served, caplog):

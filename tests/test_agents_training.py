@@ -118,6 +118,13 @@ def test_a_curriculum_goes_on_where_a_run_was_cut(tmp_path, monkeypatch):
     assert stages == expected[-len(stages) :] and min(stages) > 0.4
 
 
+def test_a_training_counts_to_the_end_of_its_last_rollout(tmp_path):
+    """PPO learns from whole rollouts, here of 8 steps in 4 environments: "32 of 10 steps" would be no progress."""
+    told = []
+    train(tiny(timesteps=10), tmp_path, report=told.append)
+    assert (told[-1].timesteps, told[-1].total) == (32, 32)
+
+
 def test_what_is_left_of_a_run(tmp_path):
     told = []
     bundle = train(tiny(), tmp_path, report=told.append)

@@ -269,7 +269,7 @@ def test_gains_that_fail_every_trial_are_rolled_back_with_the_last_reason(quick,
 
 @pytest.mark.slow
 def test_a_drive_fresh_from_the_factory_is_commissioned_first(tmp_path):
-    drives = EmulatedDrives(load="inertia", motor=None, num_threads=1)
+    drives = EmulatedDrives(load="inertia", commissioned=False, num_threads=1)
     motor, device = find_motor("qbl4208"), find_device("tmcm1636")
     free = np.array([np.inf])
     target = Target(drives, device, motor, np.array([24.0]), -free, free, motor.rated_speed, motor.rated_current)

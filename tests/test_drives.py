@@ -20,7 +20,7 @@ def test_drives_come_up_commissioned_in_switch_on_disabled(axis):
 
 
 def test_factory_state_has_the_manuals_defaults():
-    drives = EmulatedDrives(load="inertia", motor=None)
+    drives = EmulatedDrives(load="inertia", commissioned=False)
     assert drives.read("Maximum Current")[0] == 0
     assert drives.read("Motor Type")[0] == 0
     assert drives.read("Profile velocity")[0] == 0

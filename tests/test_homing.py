@@ -373,7 +373,7 @@ def test_without_a_method_or_a_speed_it_ends_at_once_and_nothing_moves(belt, mis
 
 
 def test_method_and_speeds_are_0_from_factory():
-    factory = EmulatedDrives(load="belt", motor=None)
+    factory = EmulatedDrives(load="belt", commissioned=False)
     assert [int(factory.read(name)[0]) for name in (0x6098, (0x6099, 1), (0x6099, 2), 0x609A, 0x607C)] == [0] * 5
 
 

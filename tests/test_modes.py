@@ -506,7 +506,7 @@ def test_2080h_wrong_encoder_direction_does_not_follow(drives):
 
 # --- not commissioned -------------------------------------------------------------------------------------------------
 def test_factory_state_enables_but_nothing_moves():
-    with EmulatedDrives(load="inertia", motor=None, num_threads=1) as drives:
+    with EmulatedDrives(load="inertia", commissioned=False, num_threads=1) as drives:
         assert drives.read(0x2003).tolist() == [0]
         assert drives.read(0x2050).tolist() == [0]
         drives.write(0x2005, 3)

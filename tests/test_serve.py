@@ -1,8 +1,10 @@
 """`drive-env serve` as a user meets it: what it prints, how it ends, what it says to mistakes; the TOML of a bus."""
 
+import errno
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import tomllib
@@ -20,7 +22,9 @@ from drive_env.bus.hub import Hub
 from drive_env.canopen.frames import Frame
 from drive_env.commands.serve import serve
 from drive_env.master.can.port import open_bus
+from drive_env.master.can_drives import CanDrives
 from drive_env.master.errors import OpenError
+from drive_env.motors import MOTORS
 
 ROOT = Path(__file__).parent.parent
 EXAMPLE = ROOT / "examples" / "bus.toml"
@@ -139,6 +143,38 @@ def test_the_example_bus_is_served(tmp_path):
     assert "in lockstep: each SYNC is 1 ms" in done.stdout
 
 
+def test_nobody_reaches_the_port_while_kernels_are_compiled(tmp_path, monkeypatch):
+    """A master would take drives that do not answer yet for drives that are not there."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+    heard = []
+
+    def compile_for_long(bus):
+        with socket.socket() as client:
+            heard.append(client.connect_ex(("127.0.0.1", port)))
+
+    monkeypatch.setattr("drive_env.commands.serve._warm_up", compile_for_long)
+    app = typer.Typer()
+    app.command()(serve)
+    done = CliRunner().invoke(app, ["--port", str(port), "--duration", "0.1"])
+    assert (done.exit_code, heard) == (0, [errno.ECONNREFUSED])
+    assert f"socket://127.0.0.1:{port}" in done.stdout
+
+
+def test_drives_with_factory_values_turn_the_motor_that_was_named(tmp_path):
+    arguments = ("--motor", "ec_i_40", "--factory", "--lockstep")
+    with (
+        served(*arguments, cwd=tmp_path) as (_, channel),
+        CanDrives("tmcm1636", channel=channel, interface="slcan", pace="lockstep", safety=False) as drives,
+    ):
+        assert [int(drives.read(name)[0]) for name in ("Maximum Current", "Motor Type", (0x2042, 1))] == [0, 0, 0]
+    world = build_world(Bus(machines=(Machine(motor="ec_i_40", commissioned=False),)), lockstep=True)
+    assert world.drives[0].motor is MOTORS["ec_i_40"]
+    assert world.drives[0].read("Maximum Current").tolist() == [0]
+    world.close()
+
+
 def test_any_interface_serves(tmp_path):
     done = run_serve("--interface", "virtual", "--channel", "test", "--duration", "0.1", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
@@ -149,6 +185,9 @@ def test_any_interface_serves(tmp_path):
     (["tmcm1637"], "drive-env: no device is named 'tmcm1637'; there are tmcm1636"),
     (["--load", "abc"], "drive-env: no load is named 'abc'; there are "),
     (["--motor", "abc"], "drive-env: no motor is named 'abc'; there are"),
+    (["--motor", "none"], "drive-env: motor none: every machine has a motor; name it, and for a drive with factory "
+                          "values add --factory"),
+    (["--config", "two.toml", "--factory"], "drive-env: two.toml has 2 machines, so --factory is ambiguous"),
     (["--node", "0"], "drive-env: node 0 is out of range; identifiers are 1 to 127"),
     (["--node", "1", "--node", "2"], "2 node identifiers were given"),
     (["--port", "70000"], "drive-env: --port 70000 must be 0 to 65535"),
@@ -224,7 +263,8 @@ def test_a_bus_is_read_as_it_is_written(tmp_path):
         [[machines]]
         device = "tmcm1636"
         load = "inertia"
-        motor = "none"
+        motor = "ec_i_40"
+        commissioned = false
         nodes = [10]
         ideal = true
         parameters = { "load.inertia" = 1e-4 }
@@ -232,7 +272,7 @@ def test_a_bus_is_read_as_it_is_written(tmp_path):
         drop = 0.01
         only = [0x581]
     """))  # fmt: skip
-    machine = Machine("tmcm1636", "inertia", "none", (10,), True, {"load.inertia": 1e-4})
+    machine = Machine("tmcm1636", "inertia", "ec_i_40", (10,), False, True, {"load.inertia": 1e-4})
     assert bus == Bus(500_000, 7, str(tmp_path / "saved"), (machine,), Faults(drop=0.01, only=(0x581,)))
 
 
@@ -271,7 +311,7 @@ def test_machines_that_cannot_be_say_why(machines, message):
 
 
 def test_a_world_is_built_as_the_bus_says():
-    bus = Bus(500_000, 3, None, (Machine(load="inertia"), Machine(load="belt", motor="none", nodes=(9,))))
+    bus = Bus(500_000, 3, None, (Machine(load="inertia"), Machine(load="belt", commissioned=False, nodes=(9,))))
     world = build_world(bus, lockstep=False)
     assert list(world.nodes) == [1, 9]
     assert [drives.load.name for drives in world.drives] == ["inertia", "belt"]

@@ -7,6 +7,7 @@ from scripted_drive import ScriptedBus, ScriptedDrive
 from typer.testing import CliRunner
 
 from drive_env.commands.cli import app
+from drive_env.master.can.error_control import is_of_a_watchdog
 
 DONE, REFUSED, USER_ERROR = 0, 1, 2
 OFF, ENABLED, QUICK_STOP, FAULT_REACTION, FAULT = 0x0240, 0x0637, 0x0607, 0x060F, 0x0608
@@ -126,6 +127,54 @@ def test_any_other_write_to_a_live_axis_asks_first_and_says_why(drive, name, val
     assert error.endswith(f" = {value}? There is no terminal to ask; confirm with --yes\n")
     assert put(name, value, "--yes")[0] == DONE
     assert drive.get(*key) == value
+
+
+@pytest.mark.parametrize("status", [ENABLED, QUICK_STOP, FAULT_REACTION])
+@pytest.mark.parametrize("name", ["1016:1", "100C", "100D", "1029:1"])
+@pytest.mark.parametrize("options", [(), ("--yes",), ("--raw", "--yes"), ("--dry-run",)], ids=str)
+def test_what_stops_a_live_axis_when_its_master_dies_is_not_changed(drive, name, status, options):
+    """Invariant 1: never removed or changed unless the statusword, read back, proves that the axis is off."""
+    key = int(name[:4], 16), int(name[5:] or 0)
+    drive.values.update({key: (1, {"1016": 4, "100C": 2}.get(name[:4], 1))})
+    drive.set(0x6041, status)
+    code, out, error = put(name, 0, *options)
+    assert (code, out) == (REFUSED, ""), error
+    assert "is part of what stops it when its master dies" in error and "drive-env set 6040 2" in error
+    assert not [one for one in requests(drive) if one.startswith("w")]
+    drive.set(0x6041, OFF)
+    assert (put(name, 0)[0], drive.get(*key)) == (DONE, 0)
+
+
+def test_neither_is_6007h_of_any_axis(drive, tmp_path):
+    """CiA 402's abort connection option, which the TMCM-1636 lacks: nothing, or the quick stop."""
+    from drive_env.devices import find_device
+
+    text = find_device("tmcm1636").eds.read_text(encoding="cp1252").replace("=0x6040\n", "=0x6040\n900=0x6007\n")
+    section = text[text.index("[6040]") : text.index("[", text.index("[6040]") + 1)]
+    (tmp_path / "other.eds").write_text(text + "\n" + section.replace("6040", "6007"), "cp1252")
+    drive.values[0x6007, 0] = (3, 2)
+    drive.set(0x6041, ENABLED)
+    code, _, error = put("6007", 0, "--yes", "--eds", tmp_path / "other.eds")
+    assert (code, "6007h:00" in error, drive.get(0x6007)) == (REFUSED, True, 3), error
+    assert is_of_a_watchdog(0x6807) and not is_of_a_watchdog(0x6807 + 1)
+
+
+def test_a_watchdog_stays_where_its_statusword_cannot_be_read(drive):
+    drive.silent.add((0x6041, 0))
+    assert put("1016:1", 0, "--yes", "--timeout", 0.05)[0] == REFUSED
+    assert "w1016" not in requests(drive)
+
+
+@pytest.mark.parametrize(("kept", "code"), [(1 << 30, DONE), (1 << 31, REFUSED)])
+def test_a_bit_of_a_pdos_identifier_that_the_drive_keeps_is_said(drive, monkeypatch, kept, code):
+    plain = drive.set
+    monkeypatch.setattr(drive, "set", lambda index, value, sub=0: plain(index, value | kept, sub))
+    plain(0x6041, OFF)
+    plain(0x1800, 0x181, sub=1)
+    ended, _, error = put("1800:01", "0x181")
+    assert ended == code
+    expected = "the drive keeps bit 30 set, which is its to decide" if code == DONE else "reads back another value"
+    assert expected in error
 
 
 def test_a_user_who_says_no_has_changed_nothing(drive, monkeypatch):

@@ -56,8 +56,12 @@ def test_a_factory_fresh_drive_has_no_gains():
     with emulated(factory_fresh=True) as target:
         assert target.drives.read((0x2042, 1)) == [0]
         assert target.motor.name == EmulatedDrives.DEFAULT_MOTOR
-    with pytest.raises(ValueError, match="factory-fresh drives turn a qbl4208, not a ec_i_40"):
-        emulated(motor="ec_i_40", factory_fresh=True)
+
+
+def test_a_factory_fresh_drive_turns_the_motor_that_was_named():
+    with emulated(motor="ec_i_40", factory_fresh=True) as target:
+        assert target.motor.name == target.drives.motor.name == "ec_i_40"
+        assert target.drives.read("Maximum Current").tolist() == [0]
 
 
 @pytest.mark.parametrize(("change", "message"), [

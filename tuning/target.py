@@ -147,7 +147,7 @@ def emulated(
     Args:
         device: Name of the device.
         load: A load's name, the path of an MJCF, or a `mechanics.Load`.
-        motor: Name of the motor; the drives come up commissioned for it.
+        motor: Name of the motor.
         num_machines: Machines, each with its drives.
         seed: Seed of everything random.
         supply: Supply voltage [V]; the motor's by default. The machines have it, and the tuner knows it.
@@ -155,7 +155,7 @@ def emulated(
             machine; the load's own by default.
         speed: Limit of what excites [rad/s]; the motor's rated speed by default.
         current: Limit of what excites [A]; the motor's rated current by default.
-        factory_fresh: Leave the drives as they come out of the box, all gains 0; of the emulator's default motor only.
+        factory_fresh: Leave the drives as they come out of the box, all gains 0, instead of commissioned for the motor.
         options: What `EmulatedDrives` takes besides, such as `randomise` and `parameters`.
 
     Raises:
@@ -165,14 +165,11 @@ def emulated(
     from mechanics.shaft import one, way
     from tuning.identify.linked_axes import are_linked
 
-    if factory_fresh and motor != EmulatedDrives.DEFAULT_MOTOR:
-        raise ValueError(
-            f"factory-fresh drives turn a {EmulatedDrives.DEFAULT_MOTOR}, not a {motor}; choose one of the two"
-        )
     drives = EmulatedDrives(
         device,
         load=load,
-        motor=None if factory_fresh else motor,
+        motor=motor,
+        commissioned=not factory_fresh,
         num_machines=num_machines,
         seed=seed,
         supply=supply,

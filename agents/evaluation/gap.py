@@ -13,6 +13,8 @@ from tuning.bootstrap import bootstrap_interval
 
 Floats = NDArray[np.float64]
 
+EMULATOR = "emulator"  # as a side: machines that are drawn for each episode
+
 
 class Gap(NamedTuple):
     """A figure on two sides.
@@ -40,8 +42,7 @@ def compare(first: Evaluation, second: Evaluation) -> list[Gap]:
     """
     if first.environment != second.environment:
         raise ValueError(f"{first.environment} and {second.environment} cannot be compared: they are different tasks")
-    # Emulated machines are drawn anew for every episode and a bus has its own: their episodes are no pairs.
-    paired = first.seeds == second.seeds and "emulator" not in (first.side, second.side)
+    paired = first.seeds == second.seeds and _met_the_same(first, second)
     found = []
     for name in first.values:
         if name not in second.values:
@@ -51,6 +52,16 @@ def compare(first: Evaluation, second: Evaluation) -> list[Gap]:
         medians = _medians(one, two, paired)
         found.append(Gap(name, first.interval(name), second.interval(name), difference, paired, medians))
     return found
+
+
+def _met_the_same(first: Evaluation, second: Evaluation) -> bool:
+    """Return whether episodes of one seed have the same machine on both sides.
+
+    Emulated machines are drawn by the seed, from the configuration, and a bus has its own.
+    """
+    if EMULATOR not in (first.side, second.side):
+        return True
+    return first.side == second.side and first.configuration == second.configuration
 
 
 def text(gaps: list[Gap], first: str, second: str) -> list[str]:

@@ -46,6 +46,7 @@ class Segments(BaseCallback):  # type: ignore[misc]
         super().__init__()
         self._run, self._folder, self._lanes, self._normaliser = run, folder, lanes, normaliser
         self._report, self._resumed = report, resumed
+        self._total = run.total
         self._length = segment_length(run, lanes)
         self._row_length = max(1, run.total // ROWS)
         self._segment = 0
@@ -55,6 +56,8 @@ class Segments(BaseCallback):  # type: ignore[misc]
         self._row_steps, self._row_seconds = 0, 0.0
 
     def _on_training_start(self) -> None:
+        rollout = getattr(self.model, "n_steps", 1) * self._lanes.num_envs
+        self._total = self.num_timesteps + -(-(self._run.total - self.num_timesteps) // rollout) * rollout
         self._segment = self.num_timesteps // self._length
         self._next_row = self.num_timesteps + self._row_length
         self._table = TrainingTable(self._folder / TABLE, keep=self.num_timesteps if self._resumed else 0)
@@ -121,7 +124,7 @@ class Segments(BaseCallback):  # type: ignore[misc]
         lanes = self._lanes
         progress = Progress(
             self.num_timesteps,
-            self._run.total,
+            self._total,
             lanes.episodes,
             lanes.episode_means(),
             lanes.take_terms(),

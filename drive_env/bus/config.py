@@ -13,7 +13,7 @@ from drive_env.bus.wire import BIT_RATE, Wire
 from drive_env.bus.world import World
 from mechanics.untrusted import read_toml
 
-FACTORY = "none"  # as a motor: the drive is not commissioned
+NO_MOTOR = "none"  # no machine is without one
 
 
 class BusConfigError(ValueError):
@@ -24,14 +24,16 @@ class BusConfigError(ValueError):
 class Machine:
     """One emulated machine: device, load, motor and the identifiers of its nodes.
 
-    `motor` "none" leaves the drives with their factory values. `parameters` are true machine parameters [SI] that
-    replace defaults, as those of EmulatedDrives; `ideal` takes a stage, encoder and bearings without faults.
+    Drives that are not `commissioned` for their motor have their factory values. `parameters` are true machine
+    parameters [SI] that replace defaults, as those of EmulatedDrives; `ideal` takes a stage, encoder and bearings
+    without faults.
     """
 
     device: str = "tmcm1636"
     load: str = "two_mass"
     motor: str = "qbl4208"
     nodes: tuple[int, ...] = (1,)
+    commissioned: bool = True
     ideal: bool = False
     parameters: Mapping[str, float] = field(default_factory=dict)
 
@@ -91,10 +93,14 @@ def build_world(bus: Bus, *, lockstep: bool, own_wire: bool = True) -> World:
         world = World(lockstep=lockstep, wire=wire)
         store = None if bus.store is None else _folder(Path(bus.store))
         for k, row in enumerate(bus.machines):
-            motor = None if row.motor == FACTORY else row.motor
+            if row.motor == NO_MOTOR:
+                raise ValueError(
+                    "motor none: every machine has a motor; name it, and for a drive with factory values add --factory "
+                    "(in a file: commissioned = false)"
+                )
             drives = EmulatedDrives(
-                row.device, row.load, motor, seed=bus.seed, first_machine=k, ideal=row.ideal,
-                parameters=row.parameters, num_threads=1,
+                row.device, row.load, row.motor, commissioned=row.commissioned, seed=bus.seed, first_machine=k,
+                ideal=row.ideal, parameters=row.parameters, num_threads=1,
             )  # fmt: skip
             world.add(drives, row.nodes, store)
     except (ValueError, OSError) as error:

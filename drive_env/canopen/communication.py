@@ -124,7 +124,7 @@ class ModuleObjects:
 
     def _fixed(self, entry: Entry) -> int:
         """Return the bits that are set whatever is written: bit 30 of a PDO's COB-ID, where the factory's has it."""
-        return self.factory_value(entry) & frames.NO_REMOTE if _is_pdo_id(entry) else 0
+        return self.factory_value(entry) & frames.NO_REMOTE if is_pdo_id(entry) else 0
 
     def factory_value(self, entry: Entry) -> int:
         """Return the factory's number of an object, with node 1's COB-IDs."""
@@ -149,7 +149,8 @@ class ModuleObjects:
 Rule = Callable[[ModuleObjects, Entry, int], None]
 
 
-def _is_pdo_id(entry: Entry) -> bool:
+def is_pdo_id(entry: Entry) -> bool:
+    """Return whether an object is the COB-ID of a PDO."""
     return entry.sub == 1 and (entry.index in RPDO or entry.index in TPDO)
 
 

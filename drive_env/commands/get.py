@@ -89,9 +89,11 @@ def set_object(
 
     Put -- before a negative value: drive-env set 60FF -- -1000. If an axis is enabled it asks first. A controlword that
     enables is refused, since nothing would monitor the motor; one that stops (0, 2, 6, 7) is always sent, after a quick
-    stop to rest where it takes the voltage away (0, 6).
+    stop to rest where it takes the voltage away (0, 6). What an enabled axis stops by when its master dies (1016h,
+    100Ch, 100Dh, 1029h, 6007h) is not changed.
     """
     from drive_env.master import quantities
+    from drive_env.master.can.error_control import is_of_a_watchdog
     from drive_env.master.parameters import command
 
     options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "safety": False}
@@ -111,6 +113,8 @@ def set_object(
             ]
         if is_controlword:
             _refuse_to_enable(entry, wanted[0])
+        if is_of_a_watchdog(entry.index):
+            _keep_watchdog(drives, entry)
         if dry_run:
             _tell_plan(drives, entry, wanted, increments, value, raw=raw, json=json)
             return
@@ -129,6 +133,7 @@ def set_object(
         else:
             for axis, _, now, scale in rows:
                 print(f"{axis_name(drives, axis)}  {entry.label} = {_text(now, entry, scale, raw)}")
+        wanted = _without_remote_frames(entry, wanted, list(found))
         differs = readable and any(a != b for a, b in zip(found, wanted, strict=True))
         # Stores and the like take a signature and read something else.
         if differs and not command(entry.index, drives.description.hints).endswith("a service"):
@@ -187,12 +192,45 @@ def _bring_to_rest(drives: BusDrives, controlword: Entry) -> None:
             print(f"drive-env: {axis}: its voltage was switched off while it turned: {outcome.cut}", file=sys.stderr)
 
 
+def _without_remote_frames(entry: Entry, wanted: list[Any], found: list[Any]) -> list[Any]:
+    """Return the values that were wanted with bit 30 where a drive keeps it, and say so on stderr.
+
+    CiA 301 has it in the COB-ID of a PDO: no remote frames for it. A drive that answers none may keep it set.
+    """
+    from drive_env.canopen.communication import is_pdo_id
+    from drive_env.canopen.frames import NO_REMOTE
+
+    if not is_pdo_id(entry) or found == wanted or found != [one | NO_REMOTE for one in wanted]:
+        return wanted
+    print(
+        f"drive-env: note: {entry.label}: the drive keeps bit 30 set, which is its to decide: no remote frames for "
+        "this PDO (CiA 301)",
+        file=sys.stderr,
+    )
+    return found
+
+
+def _live(drives: BusDrives) -> str:
+    """Return which axes are enabled by their statuswords, read now; "" for none."""
+    status = [int(word) for word in drives.read(cia402.STATUSWORD)]
+    return ", ".join(
+        f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if cia402.is_live(word)
+    )
+
+
+def _keep_watchdog(drives: BusDrives, entry: Entry) -> None:
+    """Raise RuntimeError where an axis is enabled that stops by this object when its master dies."""
+    if who := _live(drives):
+        raise RuntimeError(
+            f"{who} is enabled by its statusword, and {entry.label} is part of what stops it when its master dies, "
+            "whoever set it: it was not changed, and --yes does not change that. Switch the axis off first, in the "
+            "program that enabled it or with drive-env set 6040 2"
+        )
+
+
 def _ask_where_live(drives: BusDrives, what: str, yes: bool) -> None:
     """Have the user agree to a write where a drive may turn its motor; `ask` raises otherwise."""
-    status = [int(word) for word in drives.read(cia402.STATUSWORD)]
-    live = [f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if cia402.is_live(word)]
-    if live:
-        who = ", ".join(live)
+    if who := _live(drives):
         ask(f"{who} is enabled by its statusword, and reacts at once (to stop it, set 6040 to 2). Write {what}?", yes)
 
 

@@ -7,6 +7,7 @@ import os
 import secrets
 import signal
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -19,11 +20,13 @@ from drive_env.commands.options import REFUSED, USER_ERROR, fail
 if TYPE_CHECKING:
     from drive_env.bus.config import Bus
     from drive_env.bus.server import Server
+    from drive_env.bus.transport import Transport
     from drive_env.faults.control import Control
 
 PORT = 29636  # no service is registered there, and no system gives it to others
 LOOPBACK = "127.0.0.1"
 AUTO = "auto"  # as --token
+NAMES = {"nodes": "--node", "device": "a device", "commissioned": "--factory"}  # of what is not named as its option
 NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then hears nobody
 TOKEN_BYTES = 12  # of chance: 16 characters
 # SDO of any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1 synchronous.
@@ -38,10 +41,11 @@ def serve(
     load: Annotated[str | None, typer.Option(help="Load on the motor; two_mass by default.")] = None,
     motor: Annotated[
         str | None,
-        typer.Option(
-            help="Motor, a name or a TOML file; qbl4208 by default. none: that, with factory values, not commissioned."
-        ),
+        typer.Option(help="Motor, a name or a TOML file; qbl4208 by default."),
     ] = None,
+    factory: Annotated[
+        bool, typer.Option("--factory", help="Drives with factory values, not commissioned for their motor.")
+    ] = False,
     node: Annotated[
         list[int] | None,
         typer.Option("--node", "-n", help="Node identifier, 1 by default; once per axis of the machine."),
@@ -88,7 +92,11 @@ def serve(
     previous = [(number, signal.signal(number, _ender(server))) for number in (signal.SIGINT, signal.SIGTERM)]
     logging.basicConfig(format="drive-env: %(message)s", level=logging.WARNING)
     try:
-        bus = _bus(device, load, motor, node, config, bitrate, store, seed)
+        machine: dict[str, Any] = {
+            "device": device, "load": load, "motor": motor, "nodes": tuple(node) if node else None,
+            "commissioned": False if factory else None,
+        }  # fmt: skip
+        bus = _bus(machine, config, bitrate, store, seed)
         if duration is not None and not duration > 0.0:
             _fail(f"--duration {duration:g} s must be above 0 s")
         if token == AUTO:
@@ -114,20 +122,10 @@ def serve(
             signal.signal(number, handler)
 
 
-def _bus(
-    device: str | None,
-    load: str | None,
-    motor: str | None,
-    node: list[int] | None,
-    config: Path | None,
-    bitrate: int | None,
-    store: Path | None,
-    seed: int | None,
-) -> Bus:
-    """Return the bus that the arguments ask for."""
+def _bus(one: Mapping[str, Any], config: Path | None, bitrate: int | None, store: Path | None, seed: int | None) -> Bus:
+    """Return the bus that the arguments ask for; `one` are those of its one machine, None for what is not given."""
     from drive_env.bus.config import Bus, BusConfigError, Machine, load_bus
 
-    one: dict[str, Any] = {"device": device, "load": load, "motor": motor, "nodes": tuple(node) if node else None}
     one = {key: value for key, value in one.items() if value is not None}
     every: dict[str, Any] = {"bit_rate": bitrate, "store": str(store) if store else None, "seed": seed}
     every = {key: value for key, value in every.items() if value is not None}
@@ -136,7 +134,8 @@ def _bus(
             return replace(Bus(machines=(Machine(**one),)), **every)
         bus = load_bus(config)
         if one and len(bus.machines) > 1:
-            flag = {"nodes": "--node", "device": "a device"}.get(next(iter(one)), f"--{next(iter(one))}")
+            name = next(iter(one))
+            flag = NAMES.get(name, f"--{name}")
             _fail(f"{config} has {len(bus.machines)} machines, so {flag} is ambiguous; change the file")
         return replace(bus, machines=tuple(replace(row, **one) for row in bus.machines), **every)
     except BusConfigError as error:
@@ -152,11 +151,10 @@ def _server(
     interface: str | None,
     channel: str | None,
 ) -> Server:
-    """Return the server of a bus, its transport open."""
+    """Return the server of a bus, its kernels compiled, its transport open."""
     from drive_env.bus.config import BusConfigError, build_world
     from drive_env.bus.hub import Hub
     from drive_env.bus.server import Server
-    from drive_env.bus.transport import Transport
 
     if interface is None and channel is not None:
         _fail(f"--channel {channel} needs --interface, e.g. --interface socketcan")
@@ -170,19 +168,23 @@ def _server(
         world = build_world(bus, lockstep=not real_time, own_wire=interface is None)
     except BusConfigError as error:
         _fail(str(error))
-    transport: Transport
-    if interface is None:
+
+    def open_transport() -> Transport:
+        if interface is not None:
+            return _can_port(interface, channel, bus.bit_rate)
         try:
-            transport = Hub(port, listen, bus.bit_rate, token=token)
+            return Hub(port, listen, bus.bit_rate, token=token)
         except (OSError, UnicodeError) as error:
             reason = getattr(error, "strerror", None) or error
             _fail(f"cannot listen on {listen}:{port}: {reason}; choose another --port (0: a free one) or --listen")
         except ValueError as error:
             _fail(f"{error}; give --token auto, --token TEXT of 8 characters or more, or --listen {LOOPBACK}")
-    else:
-        transport = _can_port(interface, channel, bus.bit_rate)
+
+    # Open for a moment, so that a mistake is told before a minute of compiling; then only when drives answer: a master
+    # that reaches a port behind which kernels are compiled takes the drives for silent, and its frames would pile up.
+    open_transport().close()
     _warm_up(bus)
-    return Server(world, transport)
+    return Server(world, open_transport())
 
 
 def _faults(server: Server, orders: list[str], port: int | None) -> list[Control]:
@@ -213,7 +215,7 @@ def _faults(server: Server, orders: list[str], port: int | None) -> list[Control
     return [control]
 
 
-def _can_port(interface: str, channel: str | None, bit_rate: int) -> Any:
+def _can_port(interface: str, channel: str | None, bit_rate: int) -> Transport:
     import can
 
     from drive_env.bus.can_port import CanPort
@@ -248,7 +250,9 @@ def _announce(
     from drive_env.bus.hub import Hub
 
     nodes = ", ".join(
-        f"node {', '.join(map(str, row.nodes))} ({row.device}, {row.motor}, {row.load})" for row in bus.machines
+        f"node {', '.join(map(str, row.nodes))} ({row.device}, {row.motor}, {row.load}"
+        f"{'' if row.commissioned else '; factory values, not commissioned'})"
+        for row in bus.machines
     )
     pace = "in real time" if real_time else "in lockstep: each SYNC is 1 ms"
     print(f"drive-env: {nodes}, {bus.bit_rate / 1e3:g} kbit/s, {pace}; stop with Ctrl-C")

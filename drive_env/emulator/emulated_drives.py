@@ -69,15 +69,16 @@ def check_number_of_machines(number: int) -> None:
 class EmulatedDrives:
     """Emulated drives that turn emulated machines.
 
-    The drives come up commissioned for their motor and in switch on disabled; with `motor=None` they have their
-    factory values and the machine the device's default motor, and nothing moves until commissioned.
+    The drives come up commissioned for their motor and in switch on disabled; with `commissioned=False` they have their
+    factory values, and nothing moves until they are commissioned.
 
     Args:
         device: Name of the device.
         load: A load's name, the path of your own MJCF, or a `mechanics.Load`.
-        motor: Name of the motor, the path of your own motor's TOML, a `Motor`, or None for factory values.
+        motor: Name of the motor, the path of your own motor's TOML, or a `Motor`.
         num_machines: Machines, each with its drives.
         seed: Seed of everything random. Machine k of a seed is the same machine in every set.
+        commissioned: Give the drives their motor's preset; otherwise they have their factory values.
         first_machine: Number of the first machine.
         identical: Make every machine the one numbered `first_machine`, its noise included: for comparing gains.
         randomise: Parameters to draw per machine: True for all, or names or groups ("load", "motor.R_s"). How a motor
@@ -106,10 +107,11 @@ class EmulatedDrives:
         self,
         device: str = "tmcm1636",
         load: str | Path | Load = "two_mass",
-        motor: str | Path | Motor | None = DEFAULT_MOTOR,
+        motor: str | Path | Motor = DEFAULT_MOTOR,
         num_machines: int = 1,
         seed: int = 0,
         *,
+        commissioned: bool = True,
         first_machine: int = 0,
         identical: bool = False,
         randomise: bool | Collection[str] = False,
@@ -123,7 +125,7 @@ class EmulatedDrives:
     ) -> None:
         check_number_of_machines(num_machines)
         self.device: Device = find_device(device)
-        self.motor = find_motor(motor or self.DEFAULT_MOTOR)
+        self.motor = find_motor(motor)
         self.load = find_load(load)
         self.num_machines = num_machines
         self.num_axes = num_machines * self.load.num_axes
@@ -135,7 +137,7 @@ class EmulatedDrives:
         numbers = (
             [first_machine] * num_machines if identical else list(range(first_machine, first_machine + num_machines))
         )
-        self._draw(seed, numbers, randomise, ideal, parameters or {}, wired_as_known=motor is not None)
+        self._draw(seed, numbers, randomise, ideal, parameters or {}, wired_as_known=commissioned)
         self._groups = self._build_groups(physics_steps, integrator, friction)
         self._turn = np.zeros(1, np.int64)
         self._fleet = cycle.Fleet(np.array([group.machinery.address for group in self._groups], np.int64), self._turn)
@@ -144,7 +146,7 @@ class EmulatedDrives:
         self._begin()
         self.machine = Machines(self)
         self.inside = Inside(self)
-        self._commission(np.array(numbers), is_commissioned=motor is not None)
+        self._commission(np.array(numbers), is_commissioned=commissioned)
 
     def _apply_what_was_drawn(self, supply: float) -> None:
         """Give the records what machines, motor and supply [V] are."""

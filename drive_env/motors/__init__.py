@@ -156,7 +156,7 @@ def find_motor(motor: str | Path | Motor) -> Motor:
     """
     if isinstance(motor, Motor):
         return motor
-    if isinstance(motor, Path) or motor.endswith(".toml"):
+    if isinstance(motor, Path) or str(motor).endswith(".toml"):
         return load_motor(Path(motor))
     if motor not in MOTORS:
         raise ValueError(

@@ -85,8 +85,8 @@ def open_pool(workers: int | None = None, cluster: str | None = None, again: str
         again: What to do when work is lost, for messages.
 
     Raises:
-        ValueError: For both, or fewer than one worker.
-        PoolError: If the cluster cannot be reached, or `distributed` is not installed.
+        ValueError: For both, fewer than one worker, or a cluster while `distributed` is not installed.
+        PoolError: If the cluster cannot be reached.
     """
     if workers is not None and cluster is not None:
         raise ValueError("--workers and --cluster exclude each other; choose one")
@@ -276,7 +276,7 @@ def _cluster(address: str, again: str) -> Iterator[Pool]:
     try:
         from distributed import Client
     except ImportError:
-        raise PoolError('--cluster needs dask.distributed; pip install "drive-env[cluster]"') from None
+        raise ValueError('--cluster needs dask.distributed; pip install "drive-env[cluster]"') from None
     address, certificates = parse_cluster(address)
     try:
         client = Client(address, security=certificates or None, timeout=CONNECT_TIMEOUT, set_as_default=False)

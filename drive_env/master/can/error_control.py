@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
+from drive_env import cia402
 from drive_env.canopen.frames import ERROR_CONTROL
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.can.port import Port
@@ -72,6 +73,12 @@ class Heartbeats:
 
     def _hear(self, node: int, data: bytes) -> None:
         self._heard[node] = time.monotonic()
+
+
+def is_of_a_watchdog(index: int) -> bool:
+    """Return whether a drive's watch over its master depends on an object, by CiA 301 and, with 6007h, CiA 402."""
+    alone = index in (_CONSUMERS, *(key[0] for key in (_GUARD_TIME, _LIFE_FACTOR, _ERROR_BEHAVIOUR)))
+    return alone or cia402.of_first_axis(index) == cia402.ABORT_CONNECTION_OPTION
 
 
 class ErrorControl:
