@@ -15,6 +15,7 @@ from drive_env import EmulatedDrives, SafetyError, motion
 from drive_env.bus.can_port import CanPort
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
+from drive_env.devices import find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.master.errors import refused
 from mechanics.loads import LOADS
@@ -55,7 +56,7 @@ def test_travel_is_the_loads_own_and_never_wider(load, ends):
 def test_a_factory_fresh_drive_has_no_gains():
     with emulated(factory_fresh=True) as target:
         assert target.drives.read((0x2042, 1)) == [0]
-        assert target.motor.name == EmulatedDrives.DEFAULT_MOTOR
+        assert target.motor.name == find_device("tmcm1636").default_motor
 
 
 def test_a_factory_fresh_drive_turns_the_motor_that_was_named():
