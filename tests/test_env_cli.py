@@ -418,8 +418,8 @@ def test_a_watchdog_of_another_program_stays_while_its_axis_is_enabled(run, shar
 def test_jog_holds_its_current_and_a_drive_that_cannot_follow_ends_it(run, shared):
     """The limit is lent to the drive: 40 mA do not turn the rotor.
 
-    Who notices it first is chance on a busy computer: the envelope, if samples come in time that show the current
-    swing; the drive; the command while it waits, or at the end of the way.
+    Who notices it first is chance on a busy computer: the envelope, if samples come in time that show how the current
+    swings; the drive; the command while it waits, or at the end of the way.
     """
     code, out, error = run("jog", "3000 rpm", "--for", "0.5", "--max-current", "40 mA")
     assert code == REFUSED, error

@@ -149,8 +149,9 @@ def test_helps_are_whole_at_80_columns(name, monkeypatch):
     for command in (None, *group.commands):
         result = CliRunner().invoke(APPS[name], ["--help"] if command is None else [command, "--help"], prog_name=name)
         described = group if command is None else group.commands[command]
-        texts = [described.help.replace("\b", " "), *(getattr(one, "help", None) or "" for one in described.params)]
-        texts += [option for one in described.params for option in (*one.opts, *one.secondary_opts) if "-" in option]
+        shown = [one for one in described.params if not getattr(one, "hidden", False)]
+        texts = [described.help.replace("\b", " "), *(getattr(one, "help", None) or "" for one in shown)]
+        texts += [option for one in shown for option in (*one.opts, *one.secondary_opts) if "-" in option]
         if command is None:
             texts += [one.get_short_help_str(limit=1000) for one in group.commands.values()]
         assert max(map(len, result.stdout.splitlines())) <= WIDTH, command

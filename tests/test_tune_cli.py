@@ -163,6 +163,11 @@ def test_show_config_prints_the_experiment_with_its_comments_and_reads_back(tmp_
 @pytest.mark.parametrize(("arguments", "message"), [
     (["swep"], "No such command"),
     (["sweep", "--grid", "3"], "No such option"),
+    (["identify", "--eds", "vendor.eds"], "an EDS says neither which objects are gains nor in what units"),
+    (["auto", "--eds", "vendor.eds", "--node", "1", "--travel", "free"], "give --device FOLDER"),
+    (["response", "--eds", "vendor.eds"], "give --device FOLDER"),
+    (["optimise", "--eds", "vendor.eds"], "give --device FOLDER"),
+    (["rules", "--eds", "vendor.eds"], "give --device FOLDER"),
     (["sweep", "--seed", "x"], "--seed"),
     (["sweep", "extra"], "unexpected extra argument"),
     (["sweep", "--config", "none.toml"], "drive-tune: cannot read the experiment none.toml: No such file"),

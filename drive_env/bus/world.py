@@ -109,7 +109,7 @@ class World:
 
             def make(send: Callable[[Frame], None], k: int = k, path: Path | None = path) -> Node:
                 bit_rate = round(self.wire.bit_rate)
-                real = not self.lockstep
+                real = not self.lockstep  # docs/decisions/bus.md has why nothing takes time in lockstep
                 node = Node(
                     node_ids[k], drives, k * per_node, send=send, store=path, bit_rate=bit_rate, takes_time=real
                 )

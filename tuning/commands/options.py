@@ -45,6 +45,7 @@ MotorName = Annotated[
 LoadName = Annotated[
     str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF file.")
 ]
+ForeignEds = Annotated[Path | None, typer.Option("--eds", hidden=True)]  # as drive-env has it; refused with the remedy
 Seed = Annotated[int, typer.Option("--seed", help="Seed of all random numbers, 0 or more.")]
 Out = Annotated[Path | None, typer.Option("--out", help="Folder for the results, new or empty.")]
 Bus = Annotated[
@@ -105,6 +106,7 @@ class DriveOptions:
 
     bus: Bus = False
     device: DeviceName = "tmcm1636"
+    eds: ForeignEds = None
     motor: MotorName = "qbl4208"
     load: LoadName = "two_mass"
     seed: Seed = 0
@@ -119,8 +121,14 @@ class DriveOptions:
     yes: Yes = False
 
     def check(self) -> None:
-        """Raise ValueError for a number that cannot be."""
+        """Raise ValueError for a number that cannot be, or a drive of which too little is known."""
         check_seed(self.seed)
+        if self.eds is not None:
+            raise ValueError(
+                f"--eds {self.eds}: an EDS says neither which objects are gains nor in what units a drive counts, and "
+                "both are needed to tune it; make it a device, a folder with this EDS and some tables, and give "
+                "--device FOLDER (the page on file formats, section Device, has the list)"
+            )
 
     def machine(self) -> dict[str, Any]:
         """Return what `tuning.target.emulated` takes of these options; raises as `open_target` does."""
@@ -131,6 +139,7 @@ class DriveOptions:
 
     def open(self) -> Target:
         """Return the drives, once the user lets a motor of a bus turn; raises as `open_target` does."""
+        self.check()  # before anybody is asked
         if self.bus and self.travel is not None:
             ask_to_turn(self.nodes, self.yes)
         return open_target(self)
