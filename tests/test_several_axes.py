@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from canopen_wire import Wire
 from several_axes import AXES, build, six_axes
+from test_parity import WorldBus
 
-from drive_env import EmulatedDrives
+from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import VALUE_RANGE
+from drive_env.master.can.port import Port
+from drive_env.master.can.sdo import SdoClient
 from drive_env.master.description import describe
+from drive_env.master.errors import BusError
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +98,27 @@ def test_an_emergency_of_the_enable_input_tells_none(wire):
     wire.drives.machine.enable_input = True
 
 
+def test_a_master_finds_the_axis_of_an_emergency(module):
+    machine = {"load": "inertia", "num_machines": 2 * AXES, "num_threads": 1}
+    hot = np.where(np.arange(2 * AXES) == AXES + 4, 101.0, 25.0)
+    found = []
+    with EmulatedDrives(module.name, **machine) as inside:
+        motion.enable(inside, mode="pv")
+        inside.machine.set_temperatures(25.0, hot)
+        inside.advance(0.002)
+        found.append(inside.emergencies())
+    with (
+        served(module, (1, 20)) as (world, bus),
+        CanDrives(module.name, bus=bus, nodes=(1, 20), pace="lockstep") as drives,
+    ):
+        motion.enable(drives, mode="pv")
+        world.nodes[1].drives.machine.set_temperatures(25.0, hot)
+        drives.advance(0.002)
+        found.append(drives.emergencies())
+    assert found[0] == found[1]
+    assert tuple(found[0][0]) == (AXES + 4, 0x4310, 0x09, (2, 4, 0, 0, 0), "overtemperature")
+
+
 @pytest.mark.parametrize(
     ("extra", "name", "axis"),
     [
@@ -111,6 +138,100 @@ def test_bytes_that_are_none_are_told(tmp_path):
     path.write_text(path.read_text(encoding="utf-8").replace('[2, "axis", 0', '[2, "axes", 0', 1), encoding="utf-8")
     with pytest.raises(ValueError, match=r"device.toml: bytes = \[2, 'axes', 0, 0, 0\] .* \"axis\" in place of one"):
         find_device(str(folder))
+
+
+# --- process data -----------------------------------------------------------------------------------------------------
+PLAYED, SAMPLED = (0x607A,), (0x6041, 0x6064, 0x606C)
+
+
+@contextmanager
+def served(module, nodes=(1,), more=()):
+    """Nodes of the module on a bus in lockstep, and single drives at `more`."""
+    world = World(lockstep=True)
+    emulated = EmulatedDrives(module.name, load="inertia", num_machines=AXES * len(nodes), num_threads=1, seed=4)
+    world.add(emulated, list(nodes))
+    if more:
+        world.add(EmulatedDrives(load="inertia", num_machines=len(more), num_threads=1), list(more))
+    bus = WorldBus(world)
+    try:
+        yield world, bus
+    finally:
+        bus.shutdown()
+        world.close()
+
+
+def cyclic_move(drives):
+    """Return what a move of all axes, each its own way, shows in csp."""
+    motion.enable(drives, mode="csp")
+    way = np.linspace(0.0, 1.0, 40)[:, None] * 3000.0 * np.arange(1, drives.num_axes + 1)
+    trace = drives.record(SAMPLED, 0.04, play={0x607A: np.rint(way).astype(np.int64)})
+    motion.disable(drives)
+    return np.stack([trace[name] for name in SAMPLED])
+
+
+def test_cyclic_targets_of_two_modules_are_what_they_are_in_process(module):
+    with EmulatedDrives(module.name, load="inertia", num_machines=2 * AXES, num_threads=1, seed=4) as inside:
+        expected = cyclic_move(inside)
+    with (
+        served(module, (1, 20)) as (_, bus),
+        CanDrives(module.name, bus=bus, nodes=(1, 20), pace="lockstep") as drives,
+    ):
+        found = cyclic_move(drives)
+    np.testing.assert_array_equal(found, expected)
+    assert np.abs(expected[1, -1]).min() > 0
+
+
+def cob_ids(bus, node=1):
+    """Return the COB-IDs of a node's PDOs, as a second client reads them."""
+    port = Port(bus, owned=False)
+    client = SdoClient(port, node)
+    read = {
+        index: int.from_bytes(client.read(index, 1, "", 0.5), "little")
+        for first in (0x1400, 0x1800)
+        for index in range(first, first + 0x40 * AXES)
+        if index & 0x3F < 4
+    }
+    port.subscribe(0x580 + node, None)
+    return read
+
+
+def test_pdos_of_further_axes_borrow_identifiers_and_give_them_back(module):
+    with served(module) as (_, bus):
+        before = cob_ids(bus)
+        assert {before[0x1440 + 0x40 * k] for k in range(AXES - 1)} == {0xC0000000}
+        with CanDrives(module.name, bus=bus, pace="lockstep") as drives:
+            cyclic_move(drives)
+            during = cob_ids(bus)
+            # One received PDO an axis; the statusword and the position in one PDO, the speed in the next.
+            assert [during[0x1400 + 0x40 * axis] & 0x7FF for axis in range(AXES)] == [0x201 + k for k in range(AXES)]
+            assert [during[0x1800 + 0x40 * axis] & 0x7FF for axis in range(AXES)] == [0x181 + k for k in range(AXES)]
+            assert not any(during[0x1440 + 0x40 * k] >> 31 for k in range(AXES - 1))
+        assert cob_ids(bus) == before
+
+
+@pytest.mark.parametrize(
+    ("nodes", "more", "says"),
+    [
+        ((1,), (4,), r"node 1 has 6 axes, .* nodes 2 to 6, and node 4 is there: give the nodes other IDs"),
+        ((1, 3), (), r"node 1 has 6 axes, .* nodes 2 to 6, and node 3 is there"),
+        ((125,), (), r"node 125 has 6 axes, .* nodes 126 to 130: the highest node-ID is 127; give the nodes other IDs"),
+    ],
+)
+def test_identifiers_that_somebody_has_are_not_borrowed(module, nodes, more, says):
+    with (
+        served(module, nodes, more) as (_, bus),
+        CanDrives(module.name, bus=bus, nodes=nodes, pace="lockstep", safety=False) as drives,
+        pytest.raises(BusError, match=says),
+    ):
+        drives.record(SAMPLED, 0.01)
+
+
+def test_a_dry_run_shows_whom_it_would_ask(module):
+    lines = []
+    with CanDrives(module.name, dry_run=lines.append, safety=False) as drives:
+        drives.record(SAMPLED, 0.002)
+    asked = [line[:3] for line in lines if line[4:].split("]")[1].split()[:3] == ["40", "00", "10"]]
+    assert [f"60{node}" for node in range(2, 7)] == [who for who in asked if who != "601"]
 
 
 # --- store ------------------------------------------------------------------------------------------------------------

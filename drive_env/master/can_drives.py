@@ -24,7 +24,8 @@ class CanDrives(BusDrives):
 
     Axes are those of the first node, then those of the second, and so on. Nodes are started (NMT) when PDOs or a
     safeguard need it; PDO mapping and error control are put back as they were by `close`. `record` samples in
-    synchronous TPDOs and plays in synchronous RPDOs.
+    synchronous TPDOs and plays in synchronous RPDOs, or in others if a drive has none. PDOs of further axes that have
+    no identifier borrow those of the node-IDs above (`borrowed_identifiers.py`).
 
     Args:
         device: Name of a known device; ignored with `eds`.

@@ -9,6 +9,7 @@ from functools import cached_property
 from drive_env.canopen.frames import SYNC
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.master.can.borrowed_identifiers import BorrowedIdentifiers
 from drive_env.master.can.dry_run import DryPort, DrySdoClient
 from drive_env.master.can.error_control import ErrorControls
 from drive_env.master.can.network import PRE_OPERATIONAL, START, Network
@@ -52,7 +53,8 @@ class CanLink:
             clients = [SdoClient(port, node, lambda: self._alive()) for node in self.nodes]
             self._network.on_boot = lambda node: clients[self.nodes.index(node)].forget()
             self._clients += clients
-        pdos = [PdoConfiguration(*one, description) for one in zip(self.nodes, self._clients, strict=True)]
+        borrowed = BorrowedIdentifiers(port, self.nodes, description.num_axes)
+        pdos = [PdoConfiguration(*one, description, borrowed) for one in zip(self.nodes, self._clients, strict=True)]
         self.process = PdoProcessData(port, description, pdos, self.is_dry)
 
     @cached_property

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from drive_env.canopen.frames import EXTENDED, IDENTIFIER, INVALID, RPDO, TPDO
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.master.can.borrowed_identifiers import BorrowedIdentifiers
 from drive_env.master.can.mapping import PDO_BITS, Slots, pack
 from drive_env.master.description import Description
 from drive_env.master.errors import BusError, RefusedError
@@ -124,12 +125,14 @@ class PdoConfiguration:
         node: Node-ID.
         sdo: The node's SDO client.
         description: What device it is.
+        borrowed: Where PDOs of further axes have their identifiers from that have none.
     """
 
-    def __init__(self, node: int, sdo: ObjectClient, description: Description) -> None:
+    def __init__(self, node: int, sdo: ObjectClient, description: Description, borrowed: BorrowedIdentifiers) -> None:
         self._node = node
         self._sdo = sdo
         self._description = description
+        self._borrowed = borrowed
         self._before: dict[tuple[str, int], _Before] = {}
         self._silenced: dict[int, int] = {}  # TPDO -> its COB-ID as it was found
         self._quiet: set[int] = set()  # TPDOs that do not go with SYNC as they are
@@ -200,9 +203,7 @@ class PdoConfiguration:
         self._before[direction.name, number] = before
         if direction is OUT_OF_DRIVE:
             self._silenced.pop(number, None)
-        can_id = before.cob_id & IDENTIFIER
-        if can_id == 0 and number < len(direction.identifiers):
-            can_id = direction.identifiers[number] + self._node
+        can_id = before.cob_id & IDENTIFIER or self._usual_identifier(direction, number, axis)
         if can_id == 0 or before.cob_id & EXTENDED:
             raise BusError(
                 f"{label} has no 11-bit identifier ({before.cob_id:08X}h in "
@@ -222,6 +223,16 @@ class PdoConfiguration:
         kinds = dict.fromkeys((own, *SYNCHRONOUS)) if direction is INTO_DRIVE else (SYNC_EVERY,)
         self._write_all(direction, number, cob_id, (*kinds,), mapping, len(mapping), self._sdo.write)
         return RemotePdo(label, can_id, start, tuple(members))
+
+    def _usual_identifier(self, direction: Direction, number: int, axis: int) -> int:
+        """Return the identifier of a PDO that has none: the node's, or a borrowed one; 0 of a fifth PDO of an axis."""
+        usual = direction.identifiers
+        if number < len(usual):
+            return usual[number] + self._node
+        place = slots(self._description, direction, axis).numbers.index(number)
+        if axis == 0 or place >= len(usual):
+            return 0
+        return usual[place] + self._borrowed.node_of(self._node, axis)
 
     def _look(self, direction: Direction, number: int) -> _Before:
         communication, mapping = direction.communication + number, direction.mapping + number
@@ -266,7 +277,7 @@ class PdoConfiguration:
         put = partial(self._put, write=write)
         communication = direction.communication + number
         put(communication, 1, cob_id | INVALID, 4)
-        for place, kind in enumerate(kinds, 1):
+        for place, kind in enumerate(() if self._is_fixed(direction, number) else kinds, 1):
             try:
                 put(communication, 2, kind, 1)
                 break
@@ -278,6 +289,12 @@ class PdoConfiguration:
             put(direction.mapping + number, sub, value, 4)
         put(direction.mapping + number, 0, count, 1)
         put(communication, 1, cob_id, 4)
+
+    def _is_fixed(self, direction: Direction, number: int) -> bool:
+        """Return whether nobody can write when an RPDO takes effect: then it does as it comes, just before SYNC."""
+        kind = (direction.communication + number, 2)
+        known = self._description
+        return direction is INTO_DRIVE and known.has(kind) and known.dictionary.find(kind).access in ("ro", "const")
 
     def _put(
         self, index: int, sub: int, value: int, size: int, write: Callable[[int, int, bytes, str, float], None]
