@@ -13,6 +13,8 @@ class Role(Enum):
     """A part that an object plays; the value is what a message calls it."""
 
     POSITION_SCALE = "scale of positions (increments of a revolution)"
+    FULL_STEPS = "full steps of a revolution"
+    MICROSTEPS = "microsteps of a full step, as a power of two"
     CURRENT_LIMIT = "current limit"
     OPEN_LOOP_CURRENT = "open-loop current"
     MOTOR_TYPE = "motor type"

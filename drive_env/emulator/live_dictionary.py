@@ -19,9 +19,10 @@ from drive_env.dictionary.aborts import CANNOT_BE_STORED, WRONG_STATE, ObjectAcc
 from drive_env.dictionary.access import check_allowed, check_in_range, check_readable, check_writable, checked_values
 from drive_env.dictionary.codec import Code, code_of, decode, encode
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
+from drive_env.dictionary.position_scale import position_scale
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
-from drive_env.emulator.prepared_record import SCALES, PreparedObject, PreparedRecord
+from drive_env.emulator.prepared_record import SCALE_FIELD, SCALES, PreparedObject, PreparedRecord
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.firmware import cycle
 from drive_env.firmware.common.modes import MODES
@@ -50,7 +51,8 @@ class LiveDictionary:
     def __init__(self, device: Device, records: NDArray[np.void], num_axes: int, preset: Mapping[str, int]) -> None:
         self.device = device
         self.entries: ObjectDictionary = device.new_dictionary()
-        self.scale_key = device.roles.get(Role.POSITION_SCALE)  # whose write gives positions another scale
+        self._scale = position_scale(device.roles)
+        self.scale_keys = () if self._scale is None else self._scale.keys  # whose write gives positions another scale
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
         self._layout = device.firmware.layout
         self._parameters = frozenset(field.name for field in self._layout.parameters)
@@ -63,6 +65,8 @@ class LiveDictionary:
 
     def read(self, name: ObjectName) -> Integers:
         """Return an object of every axis, int64 of shape (num_axes,); a text as an array of str."""
+        if name is Role.POSITION_SCALE and len(self.scale_keys) > 1:  # no object has it: several make it
+            return np.rint(self._context().position_scaler).astype(np.int64)
         entry = self.entries.find(name)
         check_readable(entry)
         return self._read(entry)
@@ -188,7 +192,7 @@ class LiveDictionary:
         for k, (name, given) in enumerate(play.items()):
             entry = self.entries.find(name)
             check_writable(entry)
-            if not self._is_bound(entry) or (entry.index, entry.sub) == self.scale_key:
+            if not self._is_bound(entry) or (entry.index, entry.sub) in self.scale_keys:
                 raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} cannot be played; write it before")
             raw = np.asarray(given)
             if raw.shape not in ((cycles,), (cycles, self.num_axes)):
@@ -235,8 +239,10 @@ class LiveDictionary:
         """
         length = max(map(len, self._stored.values()))
         context = self._context()
-        if self.scale_key is not None:
-            context = context._replace(position_scaler=self._stored[self.scale_key].astype(float))
+        scaler = None
+        if self._scale is not None:
+            scaler = self._scale.increments([self._stored[key].astype(float) for key in self.scale_keys])
+            context = context._replace(position_scaler=scaler)
         bound = [
             key
             for key in self._stored
@@ -245,6 +251,9 @@ class LiveDictionary:
         ]
         values = [self._from_od(self.codes[key], self._stored[key], context) for key in bound]
         fields = [(self.codes[key].field, self.codes[key].part) for key in bound]
+        if scaler is not None and (SCALE_FIELD, 0) not in fields:
+            values.append(scaler)
+            fields.append((SCALE_FIELD, 0))
         return RecordSnapshot(
             self._layout, self._records, fields, np.array([np.broadcast_to(value, (length,)) for value in values])
         )
@@ -255,7 +264,7 @@ class LiveDictionary:
     def _context(self) -> units.Context:
         device = self.device
         return units.Context(
-            position_scaler=get_lanes(self._records, "position_scaler", self.num_axes).astype(float),
+            position_scaler=get_lanes(self._records, SCALE_FIELD, self.num_axes).astype(float),
             current_lsb=device.current_full_scale / 32768.0,
         )
 
@@ -293,6 +302,9 @@ class LiveDictionary:
 
     def _write(self, entry: Entry, raw: Integers, where: Mask) -> None:
         key = (entry.index, entry.sub)
+        if key in self.scale_keys:
+            self._rescale(entry, raw, where)
+            return
         if not self._is_bound(entry):
             self._set_value(entry, raw, where)
             return
@@ -302,13 +314,12 @@ class LiveDictionary:
             set_lanes(self._records, "set_point_fresh", np.ones(self.num_axes, np.int32), where)
         elif event >= 0:
             self.device.firmware.write_events(self._records, event, raw, where)
-        elif key == self.scale_key:
-            self._rescale(entry, raw, where)
         else:
             self._set_field(entry, raw, where)
 
     def _rescale(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Change 2058h: what is stored in increments keeps its integers, and so changes its SI value."""
+        """Change the scale of positions: what is stored in increments keeps its integers, whose SI value changes."""
+        assert self._scale is not None, "an object of the scale was written"
         kept = [
             (other, self._read(other))
             for other in self.entries
@@ -316,7 +327,13 @@ class LiveDictionary:
             and other.access not in ("ro", "const")
             and self.codes[other.index, other.sub].follows_scale
         ]
-        self._set_field(entry, raw, where)
+        if self._is_bound(entry):
+            self._set_field(entry, raw, where)
+        else:
+            self._set_value(entry, raw, where)
+        made = self._scale.increments([self._read(self.entries.find(key)).astype(float) for key in self.scale_keys])
+        set_lanes(self._records, SCALE_FIELD, made, where)
+        self._scale_changes += 1
         for other, value in kept:
             self._set_field(other, value, where)
 

@@ -30,7 +30,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # Fields that factors depend on: played, they would change between two rows.
-SCALES = frozenset({"position_scaler"})
+SCALE_FIELD = "position_scaler"  # increments of a revolution
+SCALES = frozenset({SCALE_FIELD})
 
 
 class PreparedObject(NamedTuple):

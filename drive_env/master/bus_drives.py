@@ -21,6 +21,8 @@ from drive_env.devices import device_of, find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_readable, check_writable, checked_values
 from drive_env.dictionary.entries import Entry, ObjectName
+from drive_env.dictionary.position_scale import position_scale
+from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.trace import Trace
@@ -96,7 +98,12 @@ class BusDrives:
             ObjectAccessError: If there is no such object or it cannot be read; NoAnswerError if a node is silent.
         """
         self._enter()
-        values: Integers = self.read_entry(self._description.dictionary.find(name))
+        known = self._description.dictionary
+        scale = position_scale(known.roles) if name is Role.POSITION_SCALE else None
+        if scale is not None and len(scale.keys) > 1:  # no object has it: several make it
+            made = scale.increments([self.read_entry(known.find(key)).astype(float) for key in scale.keys])
+            return np.asarray(np.rint(made), np.int64)
+        values: Integers = self.read_entry(known.find(name))
         return values
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.entries import Entry
+from drive_env.dictionary.position_scale import position_scale
 from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
@@ -69,10 +70,11 @@ def increments_per_revolution(drives: BusDrives) -> list[float | None]:
         drives: On a bus.
     """
     known = drives.description
-    for name in (Role.POSITION_SCALE, (cia402.ENCODER_RESOLUTION, 1)):  # its own, or encoder increments of CiA 402
-        if known.has(name):
-            return [float(value) or None for value in drives.read(name)]
-    return [None] * drives.num_axes
+    encoder = (cia402.ENCODER_RESOLUTION, 1)
+    own = position_scale(known.dictionary.roles) is not None
+    if not own and not known.has(encoder):
+        return [None] * drives.num_axes
+    return [float(value) or None for value in drives.read(Role.POSITION_SCALE if own else encoder)]
 
 
 def parse(text: str, entry: Entry, increments: float | None) -> int:

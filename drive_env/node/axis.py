@@ -117,7 +117,8 @@ class Axis:
         code = self._objects.codes.get((entry.index, entry.sub))
         check = self._checker(entry)
         if code is None:
-            return ObjectPort(entry, self._unbound_reader(entry), check, self._unbound_writer(entry))
+            write = self._scale_writer(entry) or self._unbound_writer(entry)
+            return ObjectPort(entry, self._unbound_reader(entry), check, write)
         return ObjectPort(entry, self._reader(code), check, self._writer(entry, code), code.event)
 
     def _checker(self, entry: Entry) -> Callable[[int], None]:
@@ -175,8 +176,8 @@ class Axis:
 
     def _writer(self, entry: Entry, code: Code) -> Callable[[int], None]:
         memory, place = self._place(code.field, code.part)
-        if (entry.index, entry.sub) == self._objects.scale_key:
-            return lambda raw: self._objects.write_checked(entry, raw, self.number)
+        if (rescale := self._scale_writer(entry)) is not None:
+            return rescale
         if code.event in ("controlword", "mode"):
             kind = cycle.CONTROLWORD if code.event == "controlword" else cycle.MODE
             return lambda raw: self._write_event(kind, raw)
@@ -192,6 +193,12 @@ class Axis:
                 self._integers[self._fresh] = 1
 
         return write
+
+    def _scale_writer(self, entry: Entry) -> Callable[[int], None] | None:
+        """Return how an object of the scale of positions is written, since much follows it; None of another one."""
+        if (entry.index, entry.sub) not in self._objects.scale_keys:
+            return None
+        return lambda raw: self._objects.write_checked(entry, raw, self.number)
 
     def _write_event(self, kind: int, raw: int) -> None:
         self._word[self._lane] = raw

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.dictionary.roles import Role
+from drive_env.dictionary.position_scale import PositionScale, position_scale
 from drive_env.master.description import Description, Key
 from drive_env.master.errors import RefusedError
 
@@ -60,11 +60,17 @@ class RotorAngle:
         return result
 
 
+def _own_scale(description: Description) -> PositionScale | None:
+    """Return the objects of the drive's own that say it, None of a drive that has CiA 402's."""
+    own = position_scale(description.dictionary.roles)
+    return own if own is not None and all(description.has(key) for key in own.keys) else None
+
+
 def scale_objects(description: Description) -> tuple[Key, ...]:
     """Return the objects that say how many increments a revolution has."""
-    own = description.role(Role.POSITION_SCALE)
-    if own is not None and description.has(own):
-        return (own,)
+    own = _own_scale(description)
+    if own is not None:
+        return own.keys
     if all(description.has((index, sub)) for index in (cia402.GEAR_RATIO, cia402.FEED_CONSTANT) for sub in (1, 2)):
         return ((cia402.GEAR_RATIO, 1), (cia402.GEAR_RATIO, 2), (cia402.FEED_CONSTANT, 1), (cia402.FEED_CONSTANT, 2))
     return tuple(
@@ -80,7 +86,12 @@ def read_scale(drives: BusDrives) -> Floats:
         values = [drives.read_entry(known.find(key)).astype(float) for key in keys]
     except RefusedError:  # the EDS has what the drive has not
         values = []
-    if len(values) == 4:  # feed per revolution of the driving shaft, and revolutions of the motor for one of the shaft
+    own = _own_scale(drives.description)
+    if own is not None and values:
+        scale = own.increments(values)
+    elif (
+        len(values) == 4
+    ):  # feed per revolution of the driving shaft, and revolutions of the motor for one of the shaft
         motor, shaft, feed, shafts = values
         scale = feed / np.where(shafts > 0, shafts, np.nan) * shaft / np.where(motor > 0, motor, np.nan)
     elif len(values) == 2:

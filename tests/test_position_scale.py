@@ -1,0 +1,131 @@
+"""A scale of positions that two objects make: full steps of a turn, and microsteps of a full step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from canopen_wire import Wire
+from several_axes import build
+from test_parity import WorldBus
+
+from drive_env import CanDrives, EmulatedDrives, Limits, ObjectAccessError, motion
+from drive_env.bus.world import World
+from drive_env.devices import find_device
+from drive_env.dictionary.position_scale import position_scale
+from drive_env.dictionary.roles import Role
+from drive_env.safety.errors import SafetyError
+from drive_env.safety.rotor import scale_objects
+
+AXES = 6
+FULL_STEPS, MICROSTEPS = 0x2100, 0x20FF
+ROW = """
+[{index:04X}]
+ParameterName={name}{axis}
+ObjectType=0x7
+DataType={kind}
+AccessType=rw
+DefaultValue={default}
+HighLimit={high}
+LowLimit=0
+PDOMapping=0
+"""
+
+
+@pytest.fixture(scope="module")
+def module(tmp_path_factory):
+    """A module of six axes whose positions are microsteps; 2058h is gone."""
+    folder = build(tmp_path_factory.mktemp("microsteps") / "own")
+    eds = folder / "six.eds"
+    rows = [
+        ROW.format(index=index + 0x200 * axis, name=name, axis=f" axis {axis}" * (axis > 0), kind=kind, default=default,
+                   high=high)
+        for axis in range(AXES)
+        for index, name, kind, default, high in (
+            (MICROSTEPS, "Microstep resolution", "0x0005", 8, 8),
+            (FULL_STEPS, "Full steps", "0x0006", 200, 65535),
+        )
+    ]  # fmt: skip
+    eds.write_text(eds.read_text(encoding="utf-8") + "".join(rows), encoding="utf-8")
+    bindings, roles = folder / "bindings.toml", folder / "roles.toml"
+    lines = bindings.read_text(encoding="utf-8").splitlines()
+    bindings.write_text("\n".join(line for line in lines if "position_scaler" not in line), encoding="utf-8")
+    text = roles.read_text(encoding="utf-8").replace(
+        'position_scale = "2058:0"', f'full_steps = "{FULL_STEPS:04X}:0"\nmicrosteps = "{MICROSTEPS:04X}:0"'
+    )
+    roles.write_text(text, encoding="utf-8")
+    return find_device(str(folder))
+
+
+@pytest.fixture
+def drives(module):
+    with EmulatedDrives(module.name, load="inertia", num_machines=AXES, num_threads=1) as made:
+        yield made
+
+
+def test_the_rule():
+    assert position_scale({}) is None
+    assert position_scale({Role.FULL_STEPS: (1, 0)}) is None
+    rule = position_scale({Role.FULL_STEPS: (1, 0), Role.MICROSTEPS: (2, 0)})
+    assert rule.keys == ((1, 0), (2, 0))
+    np.testing.assert_array_equal(rule.increments([np.array([200.0, 400.0]), np.array([8.0, 0.0])]), [51200.0, 400.0])
+
+
+def test_positions_are_microsteps_from_power_on(drives):
+    assert drives.read(Role.POSITION_SCALE).tolist() == [51200] * AXES
+    motion.enable(drives, mode="pp")
+    motion.start_move(drives, 5120)
+    drives.advance(0.5)
+    np.testing.assert_allclose(drives.inside.records["theta_meas"].reshape(-1)[:AXES], 0.2 * np.pi, atol=2e-3)
+
+
+def test_a_coarser_resolution_keeps_what_is_stored_and_rescales_what_is_measured(drives):
+    drives.write(0x6081, 51200)
+    before = drives.inside.records["max_velocity"].reshape(-1)[:AXES].copy()
+    motion.enable(drives, mode="pp")
+    motion.start_move(drives, 5120)
+    drives.advance(0.5)
+    motion.disable(drives)
+    at = drives.read(0x6064)
+    drives.write(MICROSTEPS, 4, where=np.arange(AXES) == 2)
+    assert drives.read(Role.POSITION_SCALE).tolist() == [51200, 51200, 3200, 51200, 51200, 51200]
+    assert drives.read(0x6081).tolist() == [51200] * AXES
+    after = drives.inside.records["max_velocity"].reshape(-1)[:AXES]
+    np.testing.assert_allclose(after / before, [1, 1, 16, 1, 1, 1])
+    assert abs(drives.read(0x6064)[2] - at[2] / 16) <= 1
+    drives.write(FULL_STEPS, 400, where=np.arange(AXES) == 2)
+    assert drives.read(Role.POSITION_SCALE)[2] == 6400
+
+
+def test_the_same_over_a_bus_and_after_a_reset(drives):
+    wire = Wire(drives)
+    assert wire.download(MICROSTEPS + 0x200, 0, 3, 1) == 0  # axis 1
+    assert drives.read(Role.POSITION_SCALE).tolist() == [51200, 1600, 51200, 51200, 51200, 51200]
+    assert wire.download(0x1010, 5, 0x65766173, 4) == 0
+    assert wire.download(MICROSTEPS + 0x400, 0, 0, 1) == 0  # axis 2, not stored
+    wire.receive(0, "81 05")
+    assert drives.read(Role.POSITION_SCALE).tolist() == [51200, 1600, 51200, 51200, 51200, 51200]
+
+
+def test_neither_object_is_played(drives):
+    with pytest.raises(ObjectAccessError, match="cannot be played"):
+        drives.record([0x6064], 0.002, play={MICROSTEPS: np.array([4, 4])})
+
+
+def test_a_master_reads_it_and_its_limits_stay_with_the_rotor(module):
+    world = World(lockstep=True)
+    world.add(EmulatedDrives(module.name, load="inertia", num_machines=AXES, num_threads=1), [1])
+    bus = WorldBus(world)
+    limits = Limits(position=(-51200, 51200))
+    with CanDrives(module.name, bus=bus, pace="lockstep", safety=limits) as drives:
+        assert scale_objects(drives.description) == ((FULL_STEPS, 0), (MICROSTEPS, 0))
+        assert drives.read(Role.POSITION_SCALE).tolist() == [51200] * AXES
+        drives.write(MICROSTEPS, 4)
+        assert drives.read(Role.POSITION_SCALE).tolist() == [3200] * AXES
+        motion.enable(drives, mode="csp")
+        with pytest.raises(SafetyError, match="changes the scale of positions, and the axis is enabled"):
+            drives.write(MICROSTEPS, 5)
+        with pytest.raises(SafetyError, match="would lead to 3201, beyond the limits -3200 to 3200"):
+            drives.write(0x607A, 3201)
+        motion.disable(drives)
+    bus.shutdown()
+    world.close()
