@@ -54,6 +54,8 @@ def write_eds(path):
             if name in after:
                 continue
             row = dict(before[section])
+            if index == 0x2005:
+                row["ParameterName"] = "Switch parameters"  # nobody knows it by its name
             if axis:
                 row["ParameterName"] += f" axis {axis}"
             kind = index & 0xFE00

@@ -168,9 +168,12 @@ class EmulatedDrives:
 
     def _commission(self, numbers: Integers, *, is_commissioned: bool) -> None:
         """Give the drives their dictionaries, with the motor's preset if they are commissioned, and start them."""
-        preset = {}
+        preset: dict[ObjectName, int] = {}
         if is_commissioned:
-            preset = {"Limit switches": 0 if self.load.has_switches else 3, **self.device.preset(self.motor)}
+            if Role.LIMIT_SWITCHES in self.device.roles:
+                preset[Role.LIMIT_SWITCHES] = 0 if self.load.has_switches else 3
+            for name, raw in self.device.preset(self.motor).items():
+                preset[name] = raw
         self._objects = LiveDictionary(self.device, self._records, self.num_axes, preset)
         serial = self.device.canopen.objects.get("serial_number")
         if serial is not None:

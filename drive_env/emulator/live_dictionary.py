@@ -48,7 +48,9 @@ class LiveDictionary:
             records have them from the first restart on.
     """
 
-    def __init__(self, device: Device, records: NDArray[np.void], num_axes: int, preset: Mapping[str, int]) -> None:
+    def __init__(
+        self, device: Device, records: NDArray[np.void], num_axes: int, preset: Mapping[ObjectName, int]
+    ) -> None:
         self.device = device
         self.entries: ObjectDictionary = device.new_dictionary()
         self._scale = position_scale(device.roles)
@@ -209,7 +211,7 @@ class LiveDictionary:
         return values, channels(self._layout, fields, kinds) if fields else NOTHING
 
     # --- inside ---------------------------------------------------------------------------------------------------
-    def _commission(self, preset: Mapping[str, int]) -> dict[tuple[int, int], Integers]:
+    def _commission(self, preset: Mapping[ObjectName, int]) -> dict[tuple[int, int], Integers]:
         """Return the raw values that a restart restores, factory values and then the preset; one of all axes each."""
         stored: dict[tuple[int, int], Integers] = {}
         for entry in self.entries:
