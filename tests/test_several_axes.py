@@ -12,7 +12,7 @@ from canopen_wire import Wire
 from several_axes import AXES, build, six_axes
 from test_parity import WorldBus
 
-from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import VALUE_RANGE
@@ -257,6 +257,25 @@ def test_a_drive_that_tells_no_current_is_stopped_like_any_other(tmp_path):
         emulated = world.nodes[1].drives
         assert (emulated.read(0x6041) & 0x6F != 0x27).all()
         assert (np.abs(emulated.read(0x606C)) < 5_000).all()
+
+
+# --- what the axes have in common -------------------------------------------------------------------------------------
+def test_inputs_and_outputs_of_the_module(wire):
+    wire.drives.machine.digital_inputs = 0b1010
+    assert wire.value(0x3002) == 0b1010 << 16
+    assert wire.drives.machine.digital_inputs.tolist() == [0b1010] * AXES
+    assert wire.value(0x60FD) == wire.value(0x8860 + 0x9D) == 0x0F, "those of the axes are others"
+    for sub, bits in ((2, 0b0110), (1, 0b0011)):
+        assert wire.download(0x3003, sub, bits << 16, 4) == 0
+    assert wire.drives.machine.outputs[0] == 0b0010
+    for wrong in (256, -1, 0.5):
+        with pytest.raises(ValueError, match="0 to 255, a bit for each"):
+            wire.drives.machine.digital_inputs = wrong
+    with (
+        EmulatedDrives(num_threads=1) as other,
+        pytest.raises(ObjectAccessError, match="no digital inputs that belong"),
+    ):
+        other.machine.digital_inputs = 1
 
 
 # --- store ------------------------------------------------------------------------------------------------------------
