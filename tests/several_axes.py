@@ -54,6 +54,8 @@ def write_eds(path):
             if name in after:
                 continue
             row = dict(before[section])
+            if index == 0x2702:
+                row["HighLimit"] = "0xFFFFFFFF"
             if index == 0x2005:
                 row["ParameterName"] = "Switch parameters"  # nobody knows it by its name
             if axis:
@@ -115,12 +117,13 @@ def build(folder):
         f'"{moved(f"{row.index:04X}:{row.sub}")}" = {{ field = "{row.field}", unit = "{row.unit}", part = {row.part}, '
         f'event = "{row.event}" }}'
         for row in BINDINGS
+        if row.index != 0x2702  # 3002h has the inputs of the module, which belong to no axis
     ]
     (folder / "bindings.toml").write_text("\n".join(rows) + "\n", encoding="utf-8")
     roles = (BASE / "roles.toml").read_text(encoding="utf-8")
     for index in range(0x2702, 0x270F):
         roles = roles.replace(f'"{index:04X}:', f'"{index + MODULE:04X}:')
-    (folder / "roles.toml").write_text(roles, encoding="utf-8")
+    (folder / "roles.toml").write_text(roles + 'digital_inputs = "3002:0"\n', encoding="utf-8")
     shutil.copy(BASE / "gains.toml", folder / "gains.toml")
     shutil.copytree(BASE / "presets", folder / "presets", dirs_exist_ok=True)
     return folder

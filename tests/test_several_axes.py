@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import contextmanager
 
 import numpy as np
@@ -11,7 +12,7 @@ from canopen_wire import Wire
 from several_axes import AXES, build, six_axes
 from test_parity import WorldBus
 
-from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import VALUE_RANGE
@@ -232,6 +233,49 @@ def test_a_dry_run_shows_whom_it_would_ask(module):
         drives.record(SAMPLED, 0.002)
     asked = [line[:3] for line in lines if line[4:].split("]")[1].split()[:3] == ["40", "00", "10"]]
     assert [f"60{node}" for node in range(2, 7)] == [who for who in asked if who != "601"]
+
+
+def test_a_drive_that_tells_no_current_is_stopped_like_any_other(tmp_path):
+    """Steppers have no 6077h: what looks at the drives while they stop goes without it."""
+    folder = build(tmp_path / "silent")
+    eds, bindings = folder / "six.eds", folder / "bindings.toml"
+    sections = re.split(r"(?m)^(?=\[)", eds.read_text(encoding="utf-8"))
+    torque = tuple(f"[{index + 0x800 * axis:04X}]" for axis in range(AXES) for index in (0x6071, 0x6077, 0x60B2))
+    eds.write_text("".join(one for one in sections if not one.startswith(torque)), encoding="utf-8")
+    rows = bindings.read_text(encoding="utf-8").splitlines()
+    rows = [row for row in rows if not row.startswith(('"6071', '"6077', '"60B2'))]
+    bindings.write_text("\n".join(rows), encoding="utf-8")
+    module = find_device(str(folder))
+    with served(module) as (world, bus):
+        drives = CanDrives(module.name, bus=bus, pace="lockstep")
+        with pytest.raises(KeyError), drives:
+            motion.enable(drives, mode="pv")
+            drives.write(0x60FF, 200_000)
+            drives.advance(0.2)
+            assert (np.abs(drives.read(0x606C)) > 100_000).all()
+            raise KeyError("a mistake in the program")
+        emulated = world.nodes[1].drives
+        assert (emulated.read(0x6041) & 0x6F != 0x27).all()
+        assert (np.abs(emulated.read(0x606C)) < 5_000).all()
+
+
+# --- what the axes have in common -------------------------------------------------------------------------------------
+def test_inputs_and_outputs_of_the_module(wire):
+    wire.drives.machine.digital_inputs = 0b1010
+    assert wire.value(0x3002) == 0b1010 << 16
+    assert wire.drives.machine.digital_inputs.tolist() == [0b1010] * AXES
+    assert wire.value(0x60FD) == wire.value(0x8860 + 0x9D) == 0x0F, "those of the axes are others"
+    for sub, bits in ((2, 0b0110), (1, 0b0011)):
+        assert wire.download(0x3003, sub, bits << 16, 4) == 0
+    assert wire.drives.machine.outputs[0] == 0b0010
+    for wrong in (256, -1, 0.5):
+        with pytest.raises(ValueError, match="0 to 255, a bit for each"):
+            wire.drives.machine.digital_inputs = wrong
+    with (
+        EmulatedDrives(num_threads=1) as other,
+        pytest.raises(ObjectAccessError, match="no digital inputs that belong"),
+    ):
+        other.machine.digital_inputs = 1
 
 
 # --- store ------------------------------------------------------------------------------------------------------------

@@ -37,6 +37,7 @@ class Role(Enum):
     FLUX_ERROR_SUM = "error sum of the flux current"
     BRAKE_CHOPPER = "brake chopper"
     BRAKE_CHOPPER_VOLTAGE = "voltage of the brake chopper"
+    DIGITAL_INPUTS = "digital inputs that belong to no axis"
     OUTPUTS = "digital outputs"
     OUTPUTS_MASK = "mask of the digital outputs"
     ANALOG_INPUTS = "analog inputs"

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+INPUTS_SHIFT = 16  # general inputs and outputs are bits 16 to 23 of their objects
 _BRAKES = ("open", "closed", "with_stage")  # numbers of firmware/cycle.py
 
 
@@ -204,7 +205,22 @@ class Machines:
     def outputs(self) -> NDArray[np.int64]:
         """Digital outputs, bit 0 is GPO0: those that their mask lets through, shape (num_axes,)."""
         read = self._drives.read
-        return (read(Role.OUTPUTS) & read(Role.OUTPUTS_MASK)) >> 16 & 0xF
+        return (read(Role.OUTPUTS) & read(Role.OUTPUTS_MASK)) >> INPUTS_SHIFT & 0xF
+
+    @property
+    def digital_inputs(self) -> NDArray[np.int64]:
+        """Levels of the inputs that belong to no axis, bit 0 is IN0, shape (num_axes,); set them likewise, 0 to 255.
+
+        A node with several axes shows those of its first one.
+        """
+        return self._drives.read(Role.DIGITAL_INPUTS) >> INPUTS_SHIFT
+
+    @digital_inputs.setter
+    def digital_inputs(self, value: ArrayLike) -> None:
+        values = np.broadcast_to(np.asarray(value), (self._drives.num_axes,))
+        if values.dtype.kind not in "iu" or np.any((values < 0) | (values > 0xFF)):
+            raise ValueError(f"digital inputs are whole numbers of 0 to 255, a bit for each, not {value!r}")
+        self._drives._objects.impose(Role.DIGITAL_INPUTS, values.astype(np.int64) << INPUTS_SHIFT)
 
     @property
     def analog_inputs(self) -> NDArray[np.int64]:

@@ -272,8 +272,8 @@ class Watch:
         except BusError as error:
             logger.error("%s", error)
             self._axes.clock += SILENT_CYCLE
-        entries = [self._known.find(key) for key in (STATUSWORD, POSITION, CURRENT)]
-        self.looks.ask([entry for entry in entries if self._drives.description.has((entry.index, entry.sub))])
+        there = [key for key in (STATUSWORD, POSITION, CURRENT) if self._drives.description.has(key)]
+        self.looks.ask([self._known.find(key) for key in there])
         self._axes.clock += self._drives.description.cycle
         with self._axes.lock:
             if self._stops.current is not None:
