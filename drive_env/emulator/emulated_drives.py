@@ -27,8 +27,8 @@ from drive_env.emulator.inertia_check import warn_of_misfits
 from drive_env.emulator.inside import Inside
 from drive_env.emulator.live_dictionary import NOTHING, LiveDictionary
 from drive_env.emulator.machine import Machines, checked_supply
+from drive_env.emulator.machine_kinds import MACHINE_KINDS
 from drive_env.emulator.parameters import (
-    apply_to_records,
     check_known,
     check_parameter,
     draw_parameters,
@@ -128,7 +128,7 @@ class EmulatedDrives:
         self.num_machines = num_machines
         self.num_axes = num_machines * self.load.num_axes
         volts = checked_supply(self.motor.voltage if supply is None else supply, 1)
-        self._firmware = self.device.firmware
+        self._firmware, self._kind = self.device.firmware, MACHINE_KINDS[self.device.firmware_name]
         self._records = self._firmware.layout.new_records(self.num_axes)
         self._threads = max(1, num_threads if num_threads is not None else usable_cores())
         self._executor: ThreadPoolExecutor | None = None
@@ -152,7 +152,7 @@ class EmulatedDrives:
         for name, values in self._parameters.items():
             everywhere = np.ones(self.num_axes, bool)
             per_axis = np.repeat(values, self.load.num_axes)
-            apply_to_records(self._records, self.device, self.motor, name, per_axis, everywhere)
+            self._apply_to_records(name, per_axis, everywhere)
         self._refresh_inertia()
         set_lanes(self._records, "brake_torque", np.full(self.num_axes, BRAKE_TORQUE * self.motor.rated_torque))
 
@@ -322,7 +322,7 @@ class EmulatedDrives:
         axes = (1, self.load.num_axes)
         single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6)
         defaults = {p.name: float(single.get(p.name)[0]) for p in self.load.parameters}
-        table = parameter_table(self.device, self.motor, self.load, defaults)
+        table = parameter_table(self._kind, self.device, self.motor, self.load, defaults)
         self._parameters, noise = draw_parameters(table, seed, numbers, randomise, ideal, wired_as_known=wired_as_known)
         seeds = np.repeat(noise, self.load.num_axes) + np.tile(np.arange(axes[1]), self.num_machines)
         self._noise_seeds = np.mod(seeds, 2.0**32 - 1.0) + 1.0  # xorshift stays at 0 for ever
@@ -355,20 +355,12 @@ class EmulatedDrives:
         return groups
 
     def _set_constants(self, supply: float) -> None:
-        records, device, motor = self._records, self.device, self.motor
-        records["duty_limit"] = device.duty_limit
-        records["overcurrent"] = device.overcurrent
+        records, device = self._records, self.device
         records["undervoltage"] = device.undervoltage
         records["overvoltage"] = device.overvoltage
         records["standstill"] = device.standstill
         records["warning_temperature"] = device.warning_temperature
         records["error_temperature"] = device.error_temperature
-        records["nominal_current"] = device.nominal_current
-        records["overload_time"] = device.overload_time
-        records["is_dc"] = motor.kind == "dc"
-        records["phase_factor"] = 1.0 if motor.kind == "dc" else 1.5
-        records["flux_temperature"] = motor.flux_temperature
-        records["n_p"] = motor.n_p
         for switch in self.load.switches:
             kind = SWITCHES.index(switch.kind)
             axes = np.tile(np.arange(self.load.num_axes) == switch.axis, self.num_machines)
@@ -376,9 +368,21 @@ class EmulatedDrives:
             set_lanes(records, "switch_high", np.full(self.num_axes, switch.high), axes, kind)
             wired = get_lanes(records, "wired", self.num_axes).astype(np.int32)
             set_lanes(records, "wired", wired | (1 << kind), axes)
-        records["cogging_order"] = motor.cogging_order
         records["supply_voltage"] = supply
-        set_lanes(records, "random", self._noise_seeds)
+        self._kind.set_constants(records, device, self.motor)
+        self._set_noise(np.ones(self.num_axes, bool))
+
+    def _set_noise(self, axes: Mask) -> None:
+        """Let the noise of axes begin anew, where their firmware has any."""
+        if self._kind.noise:
+            set_lanes(self._records, self._kind.noise, self._noise_seeds, axes)
+
+    def _apply_to_records(self, name: str, values: Floats, axes: Mask) -> bool:
+        """Write a motor or stage parameter into the records; return False for one that is the mechanics'."""
+        if name not in self._kind.known:
+            return False
+        self._kind.apply(self._records, self.device, self.motor, name, values, axes)
+        return True
 
     def _armature(self) -> Floats:
         return np.repeat(self._parameters["motor.inertia"][:, None], self.load.num_axes, 1)
@@ -393,7 +397,7 @@ class EmulatedDrives:
         """Bring a true parameter into records and mechanics; a refused one changes nothing."""
         axes_per_machine = self.load.num_axes
         axes = np.repeat(machines, axes_per_machine)
-        if apply_to_records(self._records, self.device, self.motor, name, np.repeat(values, axes_per_machine), axes):
+        if self._apply_to_records(name, np.repeat(values, axes_per_machine), axes):
             return
         before, self._parameters[name] = self._parameters[name], values
         try:
@@ -412,9 +416,7 @@ class EmulatedDrives:
         mechanical = [
             name
             for name, value in values.items()
-            if not apply_to_records(
-                self._records, self.device, self.motor, name, np.repeat(value, axes_per_machine), axes
-            )
+            if not self._apply_to_records(name, np.repeat(value, axes_per_machine), axes)
         ]
         if not mechanical:
             return

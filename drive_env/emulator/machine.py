@@ -348,7 +348,7 @@ class Machines:
             initial = np.array([[field.initial] for field, _ in parts])
             self._rest = RecordSnapshot(layout, drives._records, [(field.name, part) for field, part in parts], initial)
         self._rest.restore(axes)
-        set_lanes(drives._records, "random", drives._noise_seeds, axes)
+        drives._set_noise(axes)
         for live, nominal in (("R_s", "R_nominal"), ("psi_m", "psi_nominal")):
             set_lanes(drives._records, live, get_lanes(drives._records, nominal, drives.num_axes), axes)
         drives._reported[mask] = False

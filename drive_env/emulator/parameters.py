@@ -8,11 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drive_env import motors
 from drive_env.devices import Device
 from drive_env.emulator.machine_numbers import machine_numbers
+from drive_env.firmware.common.encoder import encoder_count
 from drive_env.firmware.record import get_lanes, set_lanes
-from drive_env.firmware.servo.sensors import encoder_count
 from drive_env.motors import Motor
 from mechanics.load import Load
 from mechanics.near_names import did_you_mean
@@ -39,82 +38,43 @@ class MachineParameter(NamedTuple):
     ideal: float
 
 
-# Parameters that are a field of the record as they stand: name -> (field, part).
-_FIELDS = {
-    "motor.R_s": ("R_nominal", 0),
-    "motor.L_d": ("L_d", 0),
-    "motor.L_q": ("L_q", 0),
-    "motor.psi_m": ("psi_nominal", 0),
-    "motor.thermal_resistance": ("thermal_resistance", 0),
-    "motor.thermal_time": ("thermal_time", 0),
-    "motor.ambient": ("ambient", 0),
-    "motor.hall_polarity": ("hall_true_polarity", 0),
-    "motor.hall_direction": ("hall_true_direction", 0),
-    "motor.hall_offset": ("hall_true_offset", 0),
-    "motor.hall_broken": ("hall_broken", 0),
-    "motor.encoder_broken": ("encoder_broken", 0),
-    "motor.open_a": ("open_a", 0),
-    "motor.open_b": ("open_b", 0),
-    "motor.cogging_torque": ("cogging_torque", 0),
-    "motor.cogging_phase": ("cogging_phase", 0),
-    "motor.encoder_line_error": ("encoder_line_error", 0),
-    "motor.encoder_line_phase": ("encoder_line_phase", 0),
-    "motor.commutation_offset": ("commutation_offset", 0),
-    "stage.dead_time_current": ("dead_time_current", 0),
-    "stage.adc_noise": ("adc_noise", 0),
-    "stage.adc_offset_a": ("adc_offset_error", 0),
-    "stage.adc_offset_b": ("adc_offset_error", 1),
-    "stage.supply_resistance": ("supply_resistance", 0),
-    "stage.dc_capacitance": ("dc_capacitance", 0),
-    "stage.chopper_resistance": ("chopper_resistance", 0),
-    "stage.idle_current": ("idle_current", 0),
-    "stage.supply_sinks": ("supply_sinks", 0),
-    "stage.on_resistance": ("on_resistance", 0),
-    "stage.thermal_resistance": ("stage_thermal_resistance", 0),
-    "stage.thermal_time": ("stage_thermal_time", 0),
-    "stage.short_conductance": ("short_conductance", 0),
-}
+class MachineKind(NamedTuple):
+    """What the machines of a firmware are made of, beside what all have; a row of `machine_kinds.py`.
 
+    Attributes:
+        motor_parameters: (motor) -> parameters of the motor, in the order in which they are drawn.
+        wiring_parameters: (motor) -> those of its cables, drawn after all others.
+        known: Names of all parameters that `apply` brings into the records.
+        set_constants: (records, device, motor): writes the fields that no parameter is.
+        apply: (records, device, motor, name, values, axes): brings a parameter's values, one per axis, into records.
+        noise: Field that is the state of the axes' noise generator; "" without one.
+    """
 
-_AT_TEMPERATURE = {"motor.R_s": "R_s", "motor.psi_m": "psi_m"}
+    motor_parameters: Callable[[Motor], list[MachineParameter]]
+    wiring_parameters: Callable[[Motor], list[MachineParameter]]
+    known: frozenset[str]
+    set_constants: Callable[[Records, Device, Motor], None]
+    apply: Callable[[Records, Device, Motor, str, Floats, Mask], None]
+    noise: str
 
 
 def parameter_table(
-    device: Device, motor: Motor, load: Load, load_defaults: Mapping[str, float]
+    kind: MachineKind, device: Device, motor: Motor, load: Load, load_defaults: Mapping[str, float]
 ) -> dict[str, MachineParameter]:
-    """Return every parameter of a machine by name: `motor.`, `stage.` and `load.` with a dot."""
-    rows: list[MachineParameter] = []
-    for name in ("R_s", "L_d", "L_q", "psi_m", "inertia", "cogging_torque", "coulomb", "viscous"):
-        value = getattr(motor, name)
-        low, high = motors.RANGES[name]
-        faultless = 0.0 if name in ("cogging_torque", "coulomb", "viscous") else value
-        rows.append(MachineParameter(f"motor.{name}", _MOTOR_UNITS[name], value, low * value, high * value, faultless))
-    for name in ("encoder_line_error", "commutation_offset"):
-        value = getattr(motor, name)
-        low, high = motors.RANGES[name]
-        rows.append(MachineParameter(f"motor.{name}", "rad", value, low * value, high * value, 0.0))
-    for name in ("cogging_phase", "encoder_line_phase"):
-        rows.append(MachineParameter(f"motor.{name}", "rad", 0.0, 0.0, 2.0 * np.pi, 0.0))
-    for name, unit, value in (
-        ("thermal_time", "s", motor.thermal_time),
-        ("ambient", "degC", 25.0),
-        ("hall_offset", "rad", 0.0),
-        # Broken cables: 1 is broken. Never drawn: a world with faults is made on purpose.
-        ("hall_broken", "1", 0.0),
-        ("encoder_broken", "1", 0.0),
-        ("open_a", "1", 0.0),
-        ("open_b", "1", 0.0),
-    ):
-        rows.append(MachineParameter(f"motor.{name}", unit, value, value, value, value))
-    # An ideal winding does not warm.
-    heat = motor.thermal_resistance
-    rows.append(MachineParameter("motor.thermal_resistance", "K/W", heat, 0.7 * heat, 1.4 * heat, 0.0))
-    rows.append(MachineParameter("stage.short_conductance", "S", 0.0, 0.0, 0.0, 0.0))
-    rows.append(MachineParameter("motor.encoder_interpolation", "1", 1.0, 1.0, 1.0, 4096.0))
-    rows += [
-        MachineParameter(f"stage.{name}", row.unit, row.default, row.low, row.high, row.ideal)
-        for name, row in device.stage.items()
-    ]
+    """Return every parameter of a machine by name: `motor.`, `stage.` and `load.` with a dot.
+
+    Raises:
+        ValueError: If the device names a parameter of its stage that its firmware does not know.
+    """
+    rows = kind.motor_parameters(motor)
+    for name, row in device.stage.items():
+        if f"stage.{name}" not in kind.known:
+            known = sorted(one.removeprefix("stage.") for one in kind.known if one.startswith("stage."))
+            raise ValueError(
+                f"{device.name}: [stage.{name}] is no parameter of firmware {device.firmware_name!r}; there are "
+                f"{', '.join(known)}{did_you_mean(name, known)}"
+            )
+        rows.append(MachineParameter(f"stage.{name}", row.unit, row.default, row.low, row.high, row.ideal))
     for parameter in load.parameters:
         value = load_defaults[parameter.name]
         rows.append(
@@ -123,16 +83,8 @@ def parameter_table(
             )
         )
     # Last, so that all others are drawn as they were without them.
-    for name in WIRING:
-        wired = float(getattr(motor, name.removeprefix("motor.")))
-        rows.append(MachineParameter(name, "1", wired, 0.0, 1.0, wired))
+    rows += kind.wiring_parameters(motor)
     return {row.name: row for row in rows}
-
-
-_MOTOR_UNITS = {
-    "R_s": "ohm", "L_d": "H", "L_q": "H", "psi_m": "V*s", "inertia": "kg*m^2", "cogging_torque": "N*m",
-    "coulomb": "N*m", "viscous": "N*m*s/rad",
-}  # fmt: skip
 
 
 def draw_parameters(
@@ -241,34 +193,6 @@ def velocity_filter(cutoff: Floats, rate: float) -> tuple[Floats, Floats, Floats
     return K * K * norm, 2.0 * (K * K - 1.0) * norm, (1.0 - 2.0 * VELOCITY_FILTER_DAMPING * K + K * K) * norm
 
 
-def apply_to_records(records: Records, device: Device, motor: Motor, name: str, values: Floats, axes: Mask) -> bool:
-    """Write a motor or stage parameter into the records; return False for one that is the mechanics'."""
-    if name == "motor.commutation_offset":
-        # A drive that runs is aligned: the error of its angle changes with the offset.
-        change = values - get_lanes(records, "commutation_offset", len(values)).astype(float)
-        set_lanes(records, "angle_zero", get_lanes(records, "angle_zero", len(values)).astype(float) + change, axes)
-    if name in _FIELDS:
-        field, part = _FIELDS[name]
-        set_lanes(records, field, values, axes, part)
-        if name in _AT_TEMPERATURE:
-            # The thermal model sets the live value once a millisecond; until then it is the one at 25 degC.
-            set_lanes(records, _AT_TEMPERATURE[name], values, axes)
-        return True
-    special: dict[str, Callable[[], None]] = {
-        "motor.encoder_direction": lambda: change_encoder(records, "encoder_true_direction", values, axes),
-        "motor.encoder_interpolation": lambda: _set_encoder(records, motor, values, axes),
-        "stage.dead_time": lambda: set_lanes(records, "dead_time_duty", values * device.current_rate, axes),
-        "stage.adc_gain_error_a": lambda: set_lanes(records, "adc_gain", 1.0 + values, axes, 0),
-        "stage.adc_gain_error_b": lambda: set_lanes(records, "adc_gain", 1.0 + values, axes, 1),
-        "stage.adc_bits": lambda: _set_adc(records, device, values, axes),
-        "stage.velocity_filter": lambda: _set_filter(records, device, values, axes),
-    }
-    if name not in special:
-        return False
-    special[name]()
-    return True
-
-
 def change_encoder(records: Records, field: str, values: Floats, axes: Mask) -> None:
     """Let encoders count otherwise from here on, by a field of the record: what they have counted they keep."""
 
@@ -288,17 +212,14 @@ def change_encoder(records: Records, field: str, values: Floats, axes: Mask) -> 
         set_lanes(records, name, lanes(name) + moved, axes)
 
 
-def _set_encoder(records: Records, motor: Motor, interpolation: Floats, axes: Mask) -> None:
+def set_encoder_counts(records: Records, motor: Motor, interpolation: Floats, axes: Mask) -> None:
+    """Give encoders the motor's counts a turn, each interpolated by a factor."""
     set_lanes(records, "encoder_interpolation", interpolation, axes)
     set_lanes(records, "encoder_counts", motor.encoder_counts * interpolation, axes)
 
 
-def _set_adc(records: Records, device: Device, bits: Floats, axes: Mask) -> None:
-    set_lanes(records, "adc_step", 2.0 * device.current_full_scale / 2.0**bits, axes)
-    set_lanes(records, "adc_step_lsb", 65536.0 / 2.0**bits, axes)
-
-
-def _set_filter(records: Records, device: Device, cutoff: Floats, axes: Mask) -> None:
+def set_velocity_filter(records: Records, device: Device, cutoff: Floats, axes: Mask) -> None:
+    """Give the filter of the measured velocity a corner frequency [Hz]; ValueError for one that the rate forbids."""
     limit = 0.45 * device.velocity_rate
     if np.any(cutoff[axes] > limit) or np.any(cutoff[axes] <= 0.0):
         worst = cutoff[axes][np.argmax(np.abs(cutoff[axes] - 0.5 * limit))]

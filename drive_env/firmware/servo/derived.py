@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from drive_env.firmware.common.arithmetic import TWO_PI
+from drive_env.firmware.common.dc_link import derive_link
 from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined
-
-SMALLEST_RESISTANCE = 1e-15  # ohm; a supply without resistance is one that holds its voltage
 
 
 @inlined
@@ -26,11 +25,4 @@ def derive(drive, dt):
         drive.ampere_per_lsb[lane] = drive.adc_step[lane] / drive.adc_step_lsb[lane]
         drive.dead_time_slope[lane] = 1.0 / drive.dead_time_current[lane]
         drive.chopper_conductance[lane] = 1.0 / drive.chopper_resistance[lane]
-        drive.tick_mobility[lane] = dt / drive.J_rotor[lane]
-        step = dt / drive.dc_capacitance[lane]
-        feed = step / (drive.supply_resistance[lane] + SMALLEST_RESISTANCE)
-        drive.link_step[lane] = step
-        drive.link_feed[lane] = feed
-        short = step * drive.short_conductance[lane]
-        drive.link_decay[lane] = 1.0 / (1.0 + short)
-        drive.link_share[lane] = 1.0 / (1.0 + feed + short)
+    derive_link(drive, dt)

@@ -12,12 +12,11 @@ matrices change with speed only and are refreshed once per window. A DC motor is
 from __future__ import annotations
 
 from drive_env.firmware.common.arithmetic import clip, cosine_series, exponential, sine_series
+from drive_env.firmware.common.dc_link import link_voltage
 from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined
 
 SQRT3 = 3.0**0.5
-ENDLESS = 1e300  # V
-SMALLEST_VOLTAGE = 1e-3  # V; an empty DC link divides nothing
 
 
 @inlined
@@ -247,7 +246,8 @@ def convert_energy(drive, dt, progress):
         )
         drive.tau_m[lane] = tau
         # Power from the DC link: the held voltage, as the rotor frame sees it in the middle of the tick, times the mean
-        # current. The source feeds through a diode: braking charges the link, and only the chopper takes it away.
+        # current. What braking charges the link
+        # with the chopper alone takes away.
         half_s = drive.half_turn_sin[lane]
         half_c = drive.half_turn_cos[lane]
         mid_d = half_c * drive.u_d[lane] + half_s * drive.u_q[lane]
@@ -260,13 +260,14 @@ def convert_energy(drive, dt, progress):
         chopper = drive.chopper_enable[lane] if u_dc > limit else chopper
         drive.chopper[lane] = chopper
         drained = drive.idle_current[lane] + power / u_dc + u_dc * chopper * drive.chopper_conductance[lane]
-        # A short circuit is implicit: it may empty the link within a tick.
-        left = u_dc - drive.link_step[lane] * drained
-        blocked = left * drive.link_decay[lane]
-        fed = (left + drive.link_feed[lane] * drive.supply_voltage[lane]) * drive.link_share[lane]
-        floor = drive.supply_voltage[lane] if drive.supply_sinks[lane] < 0.5 else ENDLESS
-        link = fed if blocked < floor else blocked
-        drive.u_dc[lane] = link if link > SMALLEST_VOLTAGE else SMALLEST_VOLTAGE
+        drive.u_dc[lane] = link_voltage(
+            u_dc - drive.link_step[lane] * drained,
+            drive.link_decay[lane],
+            drive.link_feed[lane],
+            drive.link_share[lane],
+            drive.supply_voltage[lane],
+            drive.supply_sinks[lane],
+        )
         reaction = drive.tau_reaction[lane] + progress * (drive.tau_reaction[lane] - drive.tau_reaction_before[lane])
         omega = drive.omega_m[lane]
         new_omega = omega + drive.tick_mobility[lane] * (tau + drive.tau_cogging[lane] - reaction)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
+from drive_env.firmware.common.encoder import BYTES_MEAN, BYTES_SCALE, U32, encoder_count
 from drive_env.firmware.record import LANES
 from mechanics.compiled import inlined, stage
 
@@ -12,34 +13,6 @@ SQRT3 = 3.0**0.5
 PI = 3.141592653589793
 HALL_STANDSTILL = 0.05  # s without an edge after which the halls tell no speed
 HALL_UNKNOWN = 1.0  # s between edges, for "not known": beyond standstill
-U32 = np.uint32  # without it every operation of the generator widens to 64 bits
-# Sum of four random bytes: mean 510, variance 4 (256^2 - 1) / 12.
-_BYTES_MEAN = 510.0
-_BYTES_SCALE = 1.0 / (4.0 * 65535.0 / 12.0) ** 0.5
-
-
-@inlined
-def shake_encoders(drive):
-    """Draw the noise of the encoders for one window: writes encoder_shake [rad]; it has a generator of its own."""
-    for lane in range(LANES):
-        x = U32(drive.encoder_random[lane])
-        x = U32(x ^ U32(x << U32(13)))
-        x = U32(x ^ U32(x >> U32(17)))
-        x = U32(x ^ U32(x << U32(5)))
-        drive.encoder_random[lane] = x
-        pairs = U32(U32(x & U32(0x00FF00FF)) + U32(U32(x >> U32(8)) & U32(0x00FF00FF)))
-        total = np.int32(U32(U32(pairs & U32(0xFFFF)) + U32(pairs >> U32(16))))
-        drive.encoder_shake[lane] = drive.encoder_noise[lane] * (np.float64(total) - _BYTES_MEAN) * _BYTES_SCALE
-
-
-@inlined
-def encoder_count(edges, backwards):
-    """Return what the counter shows after so many edges, whole or not: counted backwards below 0 where that is 1.
-
-    Edge 0 lies between 0 and -1, however it is wired: the drive's own direction, 2080h:01, gives the same angle again.
-    """
-    count = np.floor(edges)
-    return count + backwards * (-1.0 - 2.0 * count)
 
 
 @inlined
@@ -163,8 +136,8 @@ def measure_currents(drive):
         pairs_b = U32(U32(y & U32(0x00FF00FF)) + U32(U32(y >> U32(8)) & U32(0x00FF00FF)))
         sum_a = np.int32(U32(U32(pairs_a & U32(0xFFFF)) + U32(pairs_a >> U32(16))))
         sum_b = np.int32(U32(U32(pairs_b & U32(0xFFFF)) + U32(pairs_b >> U32(16))))
-        noise_a = (np.float64(sum_a) - _BYTES_MEAN) * _BYTES_SCALE
-        noise_b = (np.float64(sum_b) - _BYTES_MEAN) * _BYTES_SCALE
+        noise_a = (np.float64(sum_a) - BYTES_MEAN) * BYTES_SCALE
+        noise_b = (np.float64(sum_b) - BYTES_MEAN) * BYTES_SCALE
         noise = drive.adc_noise[lane]
         inverse_step = drive.adc_steps_per_ampere[lane]
         steps_a = np.floor(

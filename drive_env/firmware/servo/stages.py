@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
+from drive_env.firmware.common.encoder import encoder_count, shake_encoders
 from drive_env.firmware.cycle import FirmwareStages, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo import alignment, causes, fields, thermal
@@ -12,12 +13,10 @@ from drive_env.firmware.servo.derived import derive
 from drive_env.firmware.servo.loops import current_loop, motion_loops
 from drive_env.firmware.servo.power_stage import convert_energy, open_phases, power_stage, refresh_winding
 from drive_env.firmware.servo.sensors import (
-    encoder_count,
     measure_angle,
     measure_currents,
     measure_halls,
     measure_motion,
-    shake_encoders,
     tell_counts,
 )
 from drive_env.firmware.servo.status_flags import tell_status

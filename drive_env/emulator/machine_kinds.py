@@ -1,0 +1,9 @@
+"""Which kind of machine the drives of each firmware turn."""
+
+from __future__ import annotations
+
+from drive_env.emulator.parameters import MachineKind
+from drive_env.emulator.servo_machine import SERVO
+
+# By the name of the firmware's folder.
+MACHINE_KINDS: dict[str, MachineKind] = {"servo": SERVO}

@@ -1,0 +1,66 @@
+"""The DC link between supply and bridge: its fields, the constants of a tick, and its voltage after one."""
+
+from __future__ import annotations
+
+from drive_env.firmware.record import LANES, Field
+from mechanics.compiled import inlined
+
+SMALLEST_RESISTANCE = 1e-15  # ohm; a supply without resistance is one that holds its voltage
+SMALLEST_VOLTAGE = 1e-3  # V; an empty DC link divides nothing
+ENDLESS = 1e300  # V
+
+PARAMETERS = (
+    Field("dc_capacitance", "f8", "F", "of the DC link", 1e-3),
+    Field("idle_current", "f8", "A", "that logic, gate drivers and bleeder take from the DC link"),
+    Field("supply_sinks", "f8", "", "1: a supply that takes power back; 0: fed through a diode"),
+    Field("supply_resistance", "f8", "ohm", "resistance of supply and cables"),
+    Field("short_conductance", "f8", "S", "short circuit across the DC link, in the stage"),
+)
+
+STATE = (
+    Field("tick_mobility", "f8", "1/(kg*m^2*Hz)", "speed gained per torque in a tick"),
+    Field("link_step", "f8", "V/A", "voltage lost per ampere in a tick"),
+    Field("link_feed", "f8", "1", "charging constant of the supply in a tick"),
+    Field("link_decay", "f8", "1", "what a short circuit leaves of the voltage after a tick"),
+    Field("link_share", "f8", "1", "1 / (1 + link_feed), less with a short circuit"),
+    Field("bridge_power", "f8", "W", "power that the bridge takes from the DC link"),
+)
+
+
+@inlined
+def derive_link(drive, dt):
+    """Compute the constants of DC link and rotor for ticks of dt [s]: a division costs a tick as much as ten products.
+
+    Writes tick_mobility, link_step, link_feed, link_decay, link_share.
+    """
+    for lane in range(LANES):
+        drive.tick_mobility[lane] = dt / drive.J_rotor[lane]
+        step = dt / drive.dc_capacitance[lane]
+        feed = step / (drive.supply_resistance[lane] + SMALLEST_RESISTANCE)
+        drive.link_step[lane] = step
+        drive.link_feed[lane] = feed
+        short = step * drive.short_conductance[lane]
+        drive.link_decay[lane] = 1.0 / (1.0 + short)
+        drive.link_share[lane] = 1.0 / (1.0 + feed + short)
+
+
+@inlined
+def link_voltage(left, decay, feed, share, supply, sinks):
+    """Return the voltage of the link after a tick [V].
+
+    The source feeds through a diode, so braking charges the link, unless it is one that sinks current, too. A short
+    circuit is implicit: it may empty the link within a tick.
+
+    Args:
+        left: Voltage that the drained current leaves [V].
+        decay: link_decay of the record.
+        feed: link_feed.
+        share: link_share.
+        supply: Open-circuit voltage of the supply [V].
+        sinks: 1: it takes power back.
+    """
+    blocked = left * decay
+    fed = (left + feed * supply) * share
+    floor = supply if sinks < 0.5 else ENDLESS
+    link = fed if blocked < floor else blocked
+    return link if link > SMALLEST_VOLTAGE else SMALLEST_VOLTAGE

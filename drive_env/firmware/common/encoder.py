@@ -1,0 +1,64 @@
+"""The incremental encoder, as every kind of drive counts it: its fields, its noise, and what the counter shows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drive_env.firmware.record import LANES, Field
+from mechanics.compiled import inlined
+
+U32 = np.uint32  # without it every operation of the generator widens to 64 bits
+# Sum of four random bytes: mean 510, variance 4 (256^2 - 1) / 12.
+BYTES_MEAN = 510.0
+BYTES_SCALE = 1.0 / (4.0 * 65535.0 / 12.0) ** 0.5
+
+PARAMETERS = (
+    Field("encoder_direction", "f8", "", "1: the drive takes its counts backwards"),
+    Field("encoder_steps", "f8", "1/rev", "counts a turn: the drive's belief", 8192.0),
+    Field("velocity_filter_b", "f8", "1", "first numerator coefficient of the velocity filter; the others 2b, b"),
+    Field("velocity_filter_a", "f8", "1", "denominator coefficients of the velocity filter", depth=2),
+    Field("encoder_true_direction", "f8", "", "1: channels A and B are exchanged, the encoder counts backwards"),
+    Field("encoder_broken", "f8", "", "1: the encoder's cable is broken, it does not count"),
+    Field("encoder_counts", "f8", "1/rev", "counts per turn, interpolation included", 4096.0),
+    Field("encoder_interpolation", "f8", "1", "counts per encoder step: above 1 an interpolated analog encoder", 1.0),
+    Field("encoder_line_error", "f8", "rad", "once-per-turn error of the encoder disc, mechanical angle"),
+    Field("encoder_line_phase", "f8", "rad", "phase of that error"),
+    Field("encoder_gain", "f8", "1", "counts per true count: below 1 some are lost, 0 stuck", 1.0),
+    Field("encoder_noise", "f8", "rad", "rms noise of the encoder's angle"),
+)
+
+STATE = (
+    Field("block_has_noisy_encoder", "i4", "", "lane 0: 1 if a lane of this block has a noisy encoder"),
+    Field("count", "f8", "", "encoder count"),
+    Field("count_zero", "f8", "", "encoder count at power-on"),
+    Field("encoder_error", "f8", "rad", "disc error at the present angle, and noise"),
+    Field("encoder_shake", "f8", "rad", "noise of the encoder in this window"),
+    Field("encoder_random", "f8", "", "state of that noise's generator, an unsigned 32-bit integer", 1.0),
+    Field("velocity_filter_z", "f8", "rad/s", "state of the velocity filter", depth=2),
+    Field("turns_per_count", "f8", "rev", "1 / encoder_steps, signed by the encoder's direction"),
+    Field("counts_per_rad", "f8", "1/rad", "encoder_counts / 2 pi"),
+)
+
+
+@inlined
+def shake_encoders(drive):
+    """Draw the noise of the encoders for one window: writes encoder_shake [rad]; it has a generator of its own."""
+    for lane in range(LANES):
+        x = U32(drive.encoder_random[lane])
+        x = U32(x ^ U32(x << U32(13)))
+        x = U32(x ^ U32(x >> U32(17)))
+        x = U32(x ^ U32(x << U32(5)))
+        drive.encoder_random[lane] = x
+        pairs = U32(U32(x & U32(0x00FF00FF)) + U32(U32(x >> U32(8)) & U32(0x00FF00FF)))
+        total = np.int32(U32(U32(pairs & U32(0xFFFF)) + U32(pairs >> U32(16))))
+        drive.encoder_shake[lane] = drive.encoder_noise[lane] * (np.float64(total) - BYTES_MEAN) * BYTES_SCALE
+
+
+@inlined
+def encoder_count(edges, backwards):
+    """Return what the counter shows after so many edges, whole or not: counted backwards below 0 where that is 1.
+
+    Edge 0 lies between 0 and -1, however it is wired: the drive's own direction, 2080h:01, gives the same angle again.
+    """
+    count = np.floor(edges)
+    return count + backwards * (-1.0 - 2.0 * count)
