@@ -20,7 +20,7 @@ from drive_env.firmware.cycle import mechanics_window
 from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.firmware.servo.thermal import warm
-from drive_env.motors import MOTORS
+from drive_env.motors import MOTORS, motors_of
 from mechanics.compiled import OPTIONS
 
 start_window, supervise, tick = FIRMWARE.start_window, FIRMWARE.supervise, FIRMWARE.tick
@@ -271,7 +271,7 @@ def test_a_blocked_axis_warms_and_its_torque_per_ampere_falls():
     assert warm_duty / duty == pytest.approx(1.0 + COPPER * (winding - 25.0), rel=0.05)
 
 
-@pytest.mark.parametrize("name", sorted(MOTORS))
+@pytest.mark.parametrize("name", sorted(motors_of(["pmsm", "dc"])))
 def test_rated_current_warms_the_winding_by_80_k_in_the_end(name):
     """In the end: resistance and so the loss have grown with the temperature by then."""
     motor = MOTORS[name]

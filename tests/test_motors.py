@@ -12,9 +12,10 @@ from drive_env.devices import find_device
 from drive_env.devices.tmcm1636.commissioning import preset as rule
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.gains import gains_from_bandwidths
-from drive_env.motors import MOTORS, find_motor
+from drive_env.motors import find_motor
 
 DEVICE = find_device("tmcm1636")
+MOTORS = DEVICE.motors  # steppers: test_stepper_motors.py
 NAMES = sorted(MOTORS)
 INC = 65536.0 / (2.0 * math.pi)  # increments per rad
 TICK = 1.0 / 25_000.0  # s

@@ -92,7 +92,7 @@ def test_a_wrong_number_is_told_with_the_remedy(change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kind": "stepper"}, "kind is 'stepper'; it is 'pmsm'"),
+        ({"kind": "linear"}, r"kind is 'linear'; it is one of 'pmsm' \(brushless\)"),
         ({"sources": {}}, "there is no source 'sheet'; describe it under"),
         ({"numbers": {"voltage_v": 48.0}}, r"voltage_v = 48.0: write the number and where it comes from"),
         ({"poles": 8}, "'poles' is not a key of a motor"),

@@ -25,7 +25,7 @@ from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
 from drive_env.drives.speeds import per_increment
 from drive_env.firmware.record import set_lanes
 from drive_env.master.errors import BusError
-from drive_env.motors import MOTORS, find_motor
+from drive_env.motors import find_motor
 from drive_env.safety.errors import SafetyError
 from drive_env.safety.limits import Limits
 from tuning.move_counter import POSITIONS, SPEEDS, MoveCounter
@@ -164,7 +164,7 @@ def test_data_of_a_variant_replace_values_and_not_tables():
     assert merged(base, {"a": 5, "table": {"c": [7]}}) == {"a": 5, "table": {"b": 2, "c": [7]}, "other": {"d": 3}}
 
 
-@pytest.mark.parametrize("motor", MOTORS)
+@pytest.mark.parametrize("motor", BASE.motors)
 def test_a_preset_is_the_devices_in_other_units(motor):
     base, own = BASE.preset(find_motor(motor)), VARIANT.preset(find_motor(motor))
     assert list(own) == list(base)

@@ -20,6 +20,9 @@ constant is the torque per ampere of peak i_q. What a data sheet gives otherwise
 is converted when the file is read; the tables below show the numbers as the files have them, each with its source.
 
 {table}
+Of a stepper the rated torque is the holding torque, the rated current the peak of a phase, and the rated speed the one
+up to which its supply carries that current. Servo drives do not turn steppers, nor stepper drives other motors.
+
 With `randomise=True` each machine's motor differs from its row, by these factors:
 
 {ranges}
@@ -42,7 +45,7 @@ def summary(motor: Motor) -> tuple[object, ...]:
     """Return the row of a motor."""
     return (
         f"[`{motor.name}`](#{motor.name})",
-        {"pmsm": "brushless", "dc": "brushed DC"}[motor.kind],
+        {"pmsm": "brushless", "dc": "brushed DC", "stepper": "stepper"}[motor.kind],
         motor.voltage,
         motor.rated_torque,
         f"{motor.rated_current:.3g}",
@@ -51,7 +54,7 @@ def summary(motor: Motor) -> tuple[object, ...]:
         f"{motor.R_s:.3g}",
         f"{1e3 * motor.L_q:.3g}",
         f"{motor.inertia:.3g}",
-        motor.n_p if motor.kind == "pmsm" else None,
+        None if motor.kind == "dc" else motor.n_p,
         motor.encoder_counts,
     )
 

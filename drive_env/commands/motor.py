@@ -38,7 +38,7 @@ def new_motor(
         Path | None,
         typer.Argument(help="New TOML file to write; only --list needs none.", show_default=False),
     ] = None,
-    kind: Annotated[str | None, typer.Option("--kind", help="pmsm (brushless) or dc (brushed).")] = None,
+    kind: Annotated[str | None, typer.Option("--kind", help="pmsm (brushless), dc (brushed) or stepper.")] = None,
     title: Annotated[str, typer.Option("--title", help="Name of the motor.")] = "",
     numbers: Annotated[
         list[str] | None,
@@ -66,7 +66,7 @@ def new_motor(
             raise ValueError(f"{file} must end with .toml, which distinguishes it from a motor's name")
         given = _given(numbers or [])
         if kind is None:
-            kind = _asked("kind of motor, pmsm (brushless) or dc (brushed)", "pmsm")
+            kind = _asked("kind of motor, pmsm (brushless), dc (brushed) or stepper", "pmsm")
         missing = _missing(kind, given)
         if missing and not _is_answered():
             hint = f"; {ESTIMATES[missing[0][0]]}" if missing[0][0] in ESTIMATES else ""
@@ -93,13 +93,15 @@ def _list_numbers() -> None:
     phases = (*motors.RESISTANCE, *motors.INDUCTANCE, *motors.TORQUE_CONSTANT, *motors.RATED_CURRENT, "pole_pairs")
     brushless = tuple(name for name in phases if name not in brushed)
     needed = motors.NEEDED
+    of_stepper = tuple(name for name in (*motors.STEPPER_NEEDED, *motors.RATED_CURRENT, *motors.STEPPER_MAY))
     groups = {
-        "every motor, all of them:": needed,
+        "every motor with or without brushes, all of them:": needed,
         "a brushless motor (pmsm), pole_pairs and one each of resistance, inductance, and torque constant, back-EMF or "
         "rated current:": brushless,
         "a brushed motor (dc), all of them:": brushed,
+        "a two-phase stepper, all of the first six and one rated current; the others may be left out:": of_stepper,
         "what may be left out; then values of motors of its class are taken:": tuple(
-            name for name in motors.NUMBERS if name not in (*needed, *brushless, *brushed)
+            name for name in motors.NUMBERS if name not in (*needed, *brushless, *brushed, *motors.OF_STEPPER)
         ),
     }
     for title, names in groups.items():
@@ -137,8 +139,11 @@ def _missing(kind: str, given: Mapping[str, float]) -> list[tuple[str, ...]]:
     """Return what is still to be asked for: of each quantity the forms in which it can be given."""
     from drive_env import motors
 
+    if kind == "stepper":
+        wanted: list[tuple[str, ...]] = [*((name,) for name in motors.STEPPER_NEEDED), motors.RATED_CURRENT]
+        return [choice for choice in wanted if not any(name in given for name in choice)]
     if kind == "dc":
-        wanted: list[tuple[str, ...]] = [(name,) for name in motors.OF_DC]
+        wanted = [(name,) for name in motors.OF_DC]
     else:
         forms = (motors.RESISTANCE, motors.INDUCTANCE, motors.TORQUE_CONSTANT)
         wanted = [tuple(name for name in form if name not in motors.OF_DC) for form in forms]
@@ -196,12 +201,15 @@ def _tell(file: Path, row: Motor) -> None:
     from drive_env.devices import device_names, find_device
 
     no_load = row.voltage / math.sqrt(3.0) / (row.n_p * row.psi_m) if row.kind != "dc" else row.voltage / row.psi_m
+    rpm = 30.0 / math.pi
     print(f"{file}: {row.title}")
     print(f"  a phase: {row.R_s:.4g} ohm, {1e3 * row.L_q:.4g} mH; rated current {row.rated_current:.3g} A peak")
-    print(
-        f"  torque constant {row.torque_constant:.4g} N*m/A of peak i_q; {no_load * 30 / math.pi:.0f} rpm without load"
-    )
-    print(f"  rated power {row.rated_torque * row.rated_speed:.3g} W")
+    if row.kind == "stepper":
+        print(f"  holding torque {row.rated_torque:.4g} N*m, detent torque {row.cogging_torque:.3g} N*m")
+        print(f"  {row.voltage:g} V carry the rated current up to {row.rated_speed * rpm:.0f} rpm")
+    else:
+        print(f"  torque constant {row.torque_constant:.4g} N*m/A of peak i_q; {no_load * rpm:.0f} rpm without load")
+        print(f"  rated power {row.rated_torque * row.rated_speed:.3g} W")
     for name in device_names():
         try:
             find_device(name).preset(row)

@@ -191,11 +191,11 @@ def commission(
     """
     with errors_as_exit_codes():
         from drive_env.devices import find_device
-        from drive_env.motors import MOTORS, find_motor
+        from drive_env.motors import find_motor
 
         known = find_device(device)
         if motor == "?":
-            print("\n".join(MOTORS))
+            print("\n".join(known.motors))
             return
         preset = known.preset(find_motor(motor))
         dictionary = known.new_dictionary()

@@ -25,8 +25,8 @@ from drive_env.devices.variants import (
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from drive_env.dictionary.roles import Role
-from drive_env.firmware import checked_firmware, find_firmware
-from drive_env.motors import MOTORS, Motor
+from drive_env.firmware import checked_firmware, default_motor, find_firmware, motor_kinds
+from drive_env.motors import KINDS, MOTORS, Motor, motors_of
 from mechanics.near_names import did_you_mean
 
 if TYPE_CHECKING:
@@ -173,6 +173,25 @@ class Device(NamedTuple):
         """What runs in the drive; it is composed at the first look, and compiled at its first use."""
         return find_firmware(self.firmware_name)
 
+    @property
+    def motors(self) -> dict[str, Motor]:
+        """The motors of the catalogue that it can turn, by name."""
+        return motors_of(motor_kinds(self.firmware_name))
+
+    @property
+    def default_motor(self) -> str:
+        """The motor that its machines have where nothing is said."""
+        return default_motor(self.firmware_name)
+
+    def check_motor(self, motor: Motor) -> None:
+        """Raise ValueError, with the motors that it turns, for one that is of another kind than these."""
+        kinds = motor_kinds(self.firmware_name)
+        if motor.kind not in kinds:
+            raise ValueError(
+                f"{self.name} turns {' and '.join(KINDS[kind] for kind in kinds)} motors; {motor.name} is a "
+                f"{KINDS[motor.kind]} motor: take {', '.join(self.motors)}, or a device that turns it"
+            )
+
     def new_dictionary(self, node_id: int = 1) -> ObjectDictionary:
         """Return the object dictionary of a node of this device."""
         return ObjectDictionary(self.eds, node_id, self.roles)
@@ -200,6 +219,7 @@ class Device(NamedTuple):
         Raises:
             ValueError: For a motor that the drive cannot turn, or for which a device of one's own has no preset.
         """
+        self.check_motor(motor)
         path = self.presets / f"{motor.name}.toml"
         written_for = find_device(self.variant_of or self.name)
         preset: dict[str, int]

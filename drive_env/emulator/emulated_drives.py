@@ -92,7 +92,7 @@ class EmulatedDrives:
         friction: How the load's friction is modelled: "none", "coulomb_viscous", "stribeck" or "lugre".
 
     Raises:
-        ValueError: For an unknown name, or a machine that cannot be.
+        ValueError: For an unknown name, a motor that the device does not turn, or a machine that cannot be.
     """
 
     DEFAULT_MOTOR = "qbl4208"
@@ -123,7 +123,8 @@ class EmulatedDrives:
     ) -> None:
         check_number_of_machines(num_machines)
         self.device: Device = find_device(device)
-        self.motor = find_motor(motor or self.DEFAULT_MOTOR)
+        self.motor = find_motor(motor or self.device.default_motor)
+        self.device.check_motor(self.motor)
         self.load = find_load(load)
         self.num_machines = num_machines
         self.num_axes = num_machines * self.load.num_axes

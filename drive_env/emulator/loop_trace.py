@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# Signal -> unit; fields of the drive's record (firmware/record.py), as they are at a window's start.
+# Signal -> unit; fields of the drive's record (firmware/record.py), as they are at a window's start. A drive has
+# those that its firmware has.
 SIGNALS = {
     "position_demand": "rad",
     "theta_meas": "rad",
@@ -67,9 +68,11 @@ def trace_loops(
     if drives.machine is None:
         raise ValueError("drives on a bus show their loops once per communication cycle only; use record()")
     emulated = drives.machine.drives  # whatever looks at them does not see this time pass
+    fields = emulated.device.firmware.layout.dtype.names or ()
+    known = [name for name in SIGNALS if name in fields]
     for name in signals:
-        if name not in SIGNALS:
-            raise ValueError(f"no signal is named {name!r}; there are {', '.join(SIGNALS)}")
+        if name not in known:
+            raise ValueError(f"no signal is named {name!r}; there are {', '.join(known)}")
     cycles = emulated._cycles(duration)
     values, played = emulated._objects.plan_play(play or {}, cycles)
     sampled = channels(emulated.device.firmware.layout, [(name, 0) for name in signals])

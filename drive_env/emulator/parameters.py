@@ -132,8 +132,8 @@ def draw_parameters(
 # positive.
 _SIGNED = ("offset", "error", "phase", "ambient")
 _MAY_VANISH = (
-    "cogging_torque", "coulomb", "viscous", "broken", "open_a", "open_b", "short_conductance", "noise", "dead_time",
-    "resistance", "supply_sinks",
+    "cogging_torque", "detent_torque", "saturation", "coulomb", "viscous", "broken", "open_a", "open_b",
+    "short_conductance", "noise", "dead_time", "resistance", "supply_sinks",
 )  # fmt: skip
 
 

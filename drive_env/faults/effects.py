@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +61,8 @@ ENCODER_GAIN = Quantity("record", "encoder_gain")
 ENCODER_DIRECTION = Quantity("record", "encoder_true_direction")
 ENCODER_NOISE = Quantity("record", "encoder_noise")
 
-# Temperatures act on R_s and psi_m each millisecond, so what is changed is their value at 25 degC.
+# Of a row's fields a drive has those that its firmware has (`of_drives`). Temperatures act on R_s and psi_m each
+# millisecond, so what is changed is their value at 25 degC.
 CHANGES: dict[str, tuple[Change, ...]] = {
     "encoder_lost_counts": (Change(ENCODER_GAIN, lambda sound, given, rated: sound * (1.0 - given["share"])),),
     "encoder_stuck": (Change(ENCODER_GAIN, _vanished),),
@@ -71,7 +72,7 @@ CHANGES: dict[str, tuple[Change, ...]] = {
     "current_offset": (_record("adc_offset_error", lambda sound, given, rated: sound + given["current"]),),
     "open_phase": tuple(_record(f"open_{letter}", _phase(number)) for number, letter in enumerate("abc")),
     "demagnetised": (_record("psi_nominal", lambda sound, given, rated: sound * (1.0 - given["share"])),),
-    "winding_short": tuple(_record(name, _left) for name in ("R_nominal", "L_d", "L_q")),
+    "winding_short": tuple(_record(name, _left) for name in ("R_nominal", "L_d", "L_q", "L_s")),
     "stage_short": (_record("short_conductance", lambda sound, given, rated: sound + given["conductance"]),),
     "supply_dip": (_record("supply_voltage", lambda sound, given, rated: np.minimum(sound, given["voltage"])),),
     "supply_surge": (_record("supply_voltage", lambda sound, given, rated: np.maximum(sound, given["voltage"])),),
@@ -83,6 +84,24 @@ CHANGES: dict[str, tuple[Change, ...]] = {
 }
 # A moment, not a state: what MachineFaults does at once.
 MOMENTS = ("encoder_jump", "node_reset")
+
+
+def of_drives(name: str, changes: tuple[Change, ...], fields: Collection[str], device: str) -> tuple[Change, ...]:
+    """Return those of a fault's changes that drives can have.
+
+    Args:
+        name: The fault.
+        changes: All of it.
+        fields: Fields of the drives' records.
+        device: What the drives are, for the message.
+
+    Raises:
+        ValueError: If it changes nothing that these drives or their motors have.
+    """
+    found = tuple(one for one in changes if one.quantity.kind != "record" or one.quantity.name in fields)
+    if not found:
+        raise ValueError(f"fault {name}: a {device} and its motor have nothing that this fault changes")
+    return found
 
 
 def changes_of(name: str, load_parameters: tuple[str, ...], load: str, num_axes: int) -> tuple[Change, ...]:

@@ -22,6 +22,7 @@ from drive_env.faults.effects import (
     Change,
     Quantity,
     changes_of,
+    of_drives,
 )
 from drive_env.faults.schedule import ENABLED, NEVER, NO_CONDITION, Condition, Order, cycles_of
 from drive_env.faults.table import FaultRow, checked_parameters, find_fault
@@ -118,6 +119,9 @@ class MachineFaults:
         drives, axis = self._drives, order.axis
         row, changes = self.check(order)
         given = checked_parameters(row, order.parameters)
+        if row.name == "open_phase" and given["phase"] >= len(changes):
+            phase = f"{given['phase']:g}"
+            raise ValueError(f"fault open_phase: phase={phase} must be 0 to {len(changes) - 1} of this motor")
         delay, length = cycles_of(order, row, drives.inside.cycles)
         condition = Condition.parse(order.when)
         axes = np.repeat(machines, self._axes_per_machine)
@@ -222,7 +226,9 @@ class MachineFaults:
     def _changes(self, name: str) -> tuple[Change, ...]:
         load = self._drives.load
         names = tuple(parameter.name for parameter in load.parameters)
-        return changes_of(name, names, str(load.name), self._axes_per_machine)
+        changes = changes_of(name, names, str(load.name), self._axes_per_machine)
+        device = self._drives.device
+        return of_drives(name, changes, device.firmware.layout.dtype.names or (), device.name)
 
     def _rehearse(self, changes: tuple[Change, ...], given: Mapping[str, float], axes: Mask) -> None:
         """Refuse a change of the load that cannot be stepped now rather than in the middle of a run."""

@@ -28,6 +28,18 @@ def checked_firmware(name: str) -> str:
     return name
 
 
+def motor_kinds(name: str) -> tuple[str, ...]:
+    """Return the kinds of motor that the stages of a firmware turn; nothing is composed for it."""
+    kinds: tuple[str, ...] = importlib.import_module(f"drive_env.firmware.{checked_firmware(name)}").MOTOR_KINDS
+    return kinds
+
+
+def default_motor(name: str) -> str:
+    """Return the motor of the catalogue that a firmware's drives have where nothing is said."""
+    motor: str = importlib.import_module(f"drive_env.firmware.{checked_firmware(name)}").DEFAULT_MOTOR
+    return motor
+
+
 @cache
 def find_firmware(name: str) -> Firmware:
     """Return the firmware of a list of stages; it is composed at the first call, compiled at its first use."""

@@ -3,13 +3,18 @@
 SI; phase values, amplitude-invariant dq, currents as peak i_q. A file may say what a data sheet has (between two
 terminals, per rpm, RMS), and is converted here. Catalogues of block commutation give k_t so that psi_m = k_t / (sqrt(3)
 n_p), with which the no-load speed is theirs; the torque constant of peak i_q is then 1.5 n_p psi_m = 0.866 k_t.
+
+A stepper is a hybrid motor of two phases: its holding torque is that of both phases at their rated RMS current, which
+is a current vector of sqrt(2) times that, and falls behind the proportional as a current saturates the iron:
+torque = n_p psi_m i / sqrt(1 + saturation i^2).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,8 +28,27 @@ class MotorError(ValueError):
     """A file that describes no motor; the message names the number and the remedy."""
 
 
+class PullOut(NamedTuple):
+    """The torque that a stepper gives at rated current before it falls out of step, over its speed.
+
+    Attributes:
+        supply: Of the chopper [V].
+        speed: Increasing [rad/s], (n,).
+        torque: At the shaft [N m], (n,).
+    """
+
+    supply: float
+    speed: tuple[float, ...]
+    torque: tuple[float, ...]
+
+
 class Motor(NamedTuple):
-    """A motor with its encoder: `kind` "pmsm", or "dc" with R_s, L and psi_m those of its one winding and n_p = 1."""
+    """A motor with its encoder.
+
+    `kind` is "pmsm", "dc" with R_s, L and psi_m those of its one winding and n_p = 1, or "stepper", whose rated torque
+    is its holding torque, its cogging the detent torque, and its rated speed the one up to which the supply carries the
+    rated current.
+    """
 
     name: str
     title: str
@@ -53,10 +77,12 @@ class Motor(NamedTuple):
     encoder_direction: int = 0
     hall_polarity: int = 0
     hall_direction: int = 0
+    saturation: float = 0.0  # 1/A^2, of a stepper
+    pull_out: PullOut | None = None  # of a stepper, where it is known
 
     @property
     def torque_constant(self) -> float:
-        """Torque per ampere of peak i_q, of a DC motor per ampere [N*m/A]."""
+        """Torque per ampere of peak i_q, of a DC motor per ampere, of a stepper at small current [N*m/A]."""
         return self._phase_factor * self.n_p * self.psi_m
 
     @property
@@ -67,7 +93,7 @@ class Motor(NamedTuple):
 
     @property
     def _phase_factor(self) -> float:
-        return 1.0 if self.kind == "dc" else 1.5
+        return 1.5 if self.kind == "pmsm" else 1.0  # two phases, or one, add up as they are
 
 
 COPPER = 0.00393  # 1/K, relative change of a winding's resistance
@@ -80,11 +106,13 @@ RANGES = {
     "R_s": (0.85, 1.4),
     "L_d": (0.85, 1.15),
     "L_q": (0.85, 1.15),
+    "L_s": (0.8, 1.2),
     "psi_m": (0.88, 1.05),
     "inertia": (0.9, 1.1),
     "cogging_torque": (0.0, 2.0),
     "coulomb": (0.3, 2.5),
     "viscous": (0.3, 3.0),
+    "detent_torque": (0.5, 1.5),
     "encoder_line_error": (-2.0, 2.0),
     "commutation_offset": (-3.0, 3.0),
 }
@@ -108,6 +136,7 @@ TORQUE_CONSTANT = (
     "back_emf_line_rms_v_per_krpm", "torque_constant",
 )  # fmt: skip
 RATED_CURRENT = ("rated_current_peak_a", "rated_current_rms_a")
+KINDS = {"pmsm": "brushless", "dc": "brushed", "stepper": "two-phase hybrid stepper"}
 OF_DC = ("resistance_ohm", "inductance_h", "torque_constant")  # a brushed motor's, which has no phases
 NUMBERS: dict[str, Number] = {
     "resistance_phase_ohm": Number("ohm", "winding resistance of one phase", 0.0),
@@ -136,13 +165,33 @@ NUMBERS: dict[str, Number] = {
     "viscous_nm_s": Number("N*m*s/rad", "viscous friction of the bearings", 0.0, math.inf, True),
     "encoder_line_error_rad": Number("rad", "error of the encoder, once a turn", -0.1, 0.1, True),
     "commutation_offset_rad": Number("rad", "electrical angle that alignment leaves", -1.0, 1.0, True),
+    "full_steps": Number("", "full steps a turn of a stepper", 4, 4000, True),
+    "holding_torque_nm": Number("N*m", "torque of a stepper with both phases at their rated current", 0.0),
+    "detent_torque_nm": Number("N*m", "torque of a stepper without current", 0.0, math.inf, True),
+    "torque_saturation": Number("1", "share of torque that saturation takes at the rated current", 0.0, 0.5, True),
     "thermal_time_s": Number("s", "thermal time constant of winding and housing", 0.0),
     "encoder_direction": Number("", "1 where the encoder counts backwards", 0, 1, True),
     "hall_polarity": Number("", "1 where the halls' levels are inverted", 0, 1, True),
     "hall_direction": Number("", "1 where the halls come in reverse order", 0, 1, True),
 }
-WHOLE = ("pole_pairs", "encoder_counts", "cogging_order", "encoder_direction", "hall_polarity", "hall_direction")
+WHOLE = (
+    "pole_pairs", "encoder_counts", "cogging_order", "encoder_direction", "hall_polarity", "hall_direction",
+    "full_steps",
+)  # fmt: skip
 NEEDED = ("inertia_kg_m2", "rated_torque_nm", "rated_speed_rpm", "voltage_v", "encoder_counts")
+# A stepper's: what its file must have besides one form of the rated current, and what it may have.
+STEPPER_NEEDED = (
+    "resistance_phase_ohm", "inductance_phase_h", "full_steps", "holding_torque_nm", "inertia_kg_m2", "voltage_v",
+)  # fmt: skip
+STEPPER_MAY = (
+    "detent_torque_nm", "torque_saturation", "coulomb_nm", "viscous_nm_s", "encoder_counts", "encoder_line_error_rad",
+    "encoder_direction", "thermal_time_s",
+)  # fmt: skip
+OF_STEPPER = ("full_steps", "holding_torque_nm", "detent_torque_nm", "torque_saturation")  # no other motor has them
+# What a stepper's data sheet seldom has. Their common table has 125 % of the torque at 125 % of the current, and at
+# 150 % at most that. The drag is mostly that of eddy currents, a damping ratio of 0.045 of the rotor's swing in the
+# holding torque: that is what the QSH4218-47-28-040's torque at 1200 rpm, which its data sheet tells, leaves.
+DETENT_SHARE, SATURATION_SHARE, STEPPER_COULOMB_SHARE, STEPPER_DAMPING = 0.05, 0.05, 0.02, 0.045
 # What a data sheet seldom has: class values, of a rotor that is like the catalogue's.
 COGGING_SHARE, COULOMB_SHARE, VISCOUS_SHARE = 0.01, 0.015, 0.005  # of the rated torque, at the rated speed
 ENCODER_LINE_ERROR, COMMUTATION_OFFSET = 2e-4, 0.02
@@ -186,19 +235,26 @@ def load_motor(path: Path) -> Motor:
 
 def motor_of(name: str, data: Mapping[str, Any]) -> Motor:
     """Return the motor of a file's tables."""
-    unknown = sorted(set(data) - {"title", "kind", "sources", "numbers"})
+    unknown = sorted(set(data) - {"title", "kind", "sources", "numbers", "pull_out"})
     if unknown:
-        raise MotorError(f"{unknown[0]!r} is not a key of a motor; there are title, kind, sources, numbers")
+        raise MotorError(f"{unknown[0]!r} is not a key of a motor; there are title, kind, sources, numbers, pull_out")
     kind = data.get("kind", "pmsm")
-    if kind not in ("pmsm", "dc"):
-        raise MotorError(f"kind is {kind!r}; it is 'pmsm' (brushless) or 'dc' (brushed)")
+    if kind not in KINDS:
+        meant = ", ".join(f"{name!r} ({what})" for name, what in KINDS.items())
+        raise MotorError(f"kind is {kind!r}; it is one of {meant}")
     texts, rows = data.get("sources", {}), data.get("numbers", {})
     if not isinstance(texts, Mapping) or not isinstance(rows, Mapping):
         raise MotorError("sources and numbers are tables: [sources], [numbers]")
     values, sources = {}, {}
     for key, row in rows.items():
         values[key], sources[key] = _checked(key, row, texts)
-    return _built(name, str(data.get("title", name)), kind, values, sources)
+    title = str(data.get("title", name))
+    if kind == "stepper":
+        curve = _pull_out(data["pull_out"], texts) if "pull_out" in data else None
+        return _stepper(name, title, values, sources, curve)
+    if "pull_out" in data:
+        raise MotorError(f"pull_out: only a stepper falls out of step; kind is {kind!r}")
+    return _built(name, title, kind, values, sources)
 
 
 def _checked(key: str, row: Any, texts: Mapping[str, Any]) -> tuple[float, str]:
@@ -235,6 +291,7 @@ def _built(name: str, title: str, kind: str, values: Mapping[str, float], source
         wrong = [key for key in (*RESISTANCE, *INDUCTANCE, *TORQUE_CONSTANT) if key in values and key not in OF_DC]
     else:
         wrong = [key for key in OF_DC if key in values]
+    _refuse(OF_STEPPER, values, "only a stepper has it")
     if wrong:
         other = "a brushed motor has no phases" if kind == "dc" else "of a brushless motor say between what"
         raise MotorError(f"{wrong[0]}: {other}; there are {', '.join(k for k in NUMBERS if k[:5] == wrong[0][:5])}")
@@ -281,6 +338,93 @@ def _built(name: str, title: str, kind: str, values: Mapping[str, float], source
     )
 
 
+def _stepper(
+    name: str, title: str, values: Mapping[str, float], sources: Mapping[str, str], curve: PullOut | None
+) -> Motor:
+    """Return the stepper of checked numbers; its class values are those of data sheets that have them."""
+    for key in STEPPER_NEEDED:
+        _one_of((key,), values)
+    _refuse(
+        [key for key in NUMBERS if key not in (*STEPPER_NEEDED, *STEPPER_MAY, *RATED_CURRENT)], values,
+        f"not of a stepper, which has {', '.join((*STEPPER_NEEDED, *RATED_CURRENT, *STEPPER_MAY))}",
+    )  # fmt: skip
+    if not any(key in values for key in RATED_CURRENT):
+        raise MotorError(f"{' or '.join(RATED_CURRENT)} is missing")
+    steps, torque, inertia = int(values["full_steps"]), values["holding_torque_nm"], values["inertia_kg_m2"]
+    if steps % 4:
+        raise MotorError(f"full_steps = {steps} must be a multiple of 4: four of them are a period of the current")
+    n_p = steps // 4
+    current = _rated_current(values, torque, None, "stepper")
+    kept = 1.0 - values.get("torque_saturation", SATURATION_SHARE)
+    R, L, psi_m = values["resistance_phase_ohm"], values["inductance_phase_h"], torque / (n_p * current * kept)
+    return Motor(
+        name=name,
+        title=title,
+        R_s=R,
+        L_d=L,
+        L_q=L,
+        psi_m=psi_m,
+        n_p=n_p,
+        inertia=inertia,
+        rated_torque=torque,
+        rated_current=current,
+        rated_speed=_corner(R, L, kept * psi_m, current, values["voltage_v"]) / n_p,
+        voltage=values["voltage_v"],
+        encoder_counts=int(values.get("encoder_counts", 0)),
+        cogging_torque=values.get("detent_torque_nm", DETENT_SHARE * torque),
+        cogging_order=steps,
+        coulomb=values.get("coulomb_nm", STEPPER_COULOMB_SHARE * torque),
+        viscous=values.get("viscous_nm_s", 2.0 * STEPPER_DAMPING * math.sqrt(n_p * torque * inertia)),
+        encoder_line_error=values.get("encoder_line_error_rad", ENCODER_LINE_ERROR),
+        commutation_offset=0.0,
+        sources=tuple(sources.items()),
+        kind="stepper",
+        thermal_time=values.get("thermal_time_s", 600.0),
+        encoder_direction=int(values.get("encoder_direction", 0)),
+        saturation=(1.0 / (kept * kept) - 1.0) / current**2,
+        pull_out=curve,
+    )
+
+
+def _corner(R: float, L: float, psi_m: float, current: float, supply: float) -> float:
+    """Return the electrical speed [rad/s] up to which a supply carries a current vector across the magnets' flux.
+
+    There (R i + w psi)^2 + (w L i)^2 = u^2.
+    """
+    if R * current >= supply:
+        raise MotorError(
+            f"voltage_v = {supply:g} V does not even drive {current:g} A through {R:g} ohm; a chopper needs several "
+            "times as much"
+        )
+    a, b = (L * current) ** 2 + psi_m**2, R * current * psi_m
+    return (math.sqrt(b * b + a * (supply**2 - (R * current) ** 2)) - b) / a
+
+
+def _pull_out(row: Any, texts: Mapping[str, Any]) -> PullOut:
+    """Return a file's pull-out curve, checked."""
+    keys = {"source", "supply_v", "speed_rpm", "torque_nm"}
+    if not isinstance(row, Mapping) or set(row) != keys:
+        raise MotorError(f"pull_out has {', '.join(sorted(keys))}, all of them")
+    if row["source"] not in texts:
+        raise MotorError(f"pull_out: there is no source {row['source']!r}; describe it under [sources]")
+    speed, torque = row["speed_rpm"], row["torque_nm"]
+    if not all(isinstance(points, list) for points in (speed, torque)) or len(speed) != len(torque) or not speed:
+        raise MotorError("pull_out: speed_rpm and torque_nm are lists of the same length")
+    for value in (row["supply_v"], *speed, *torque):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
+            raise MotorError(f"pull_out: {value!r} is not a number of 0 or more")
+    if any(after <= before for before, after in itertools.pairwise(speed)):
+        raise MotorError(f"pull_out: speed_rpm must increase: {speed}")
+    return PullOut(float(row["supply_v"]), tuple(each * RPM for each in speed), tuple(map(float, torque)))
+
+
+def _refuse(keys: Iterable[str], values: Mapping[str, float], why: str) -> None:
+    """Raise MotorError for a number that this kind of motor does not have."""
+    for key in keys:
+        if key in values:
+            raise MotorError(f"{key}: {why}")
+
+
 def _one_of(quantity: tuple[str, ...], values: Mapping[str, float]) -> None:
     """Raise MotorError unless a quantity is given, in one form."""
     given = [key for key in quantity if key in values]
@@ -323,6 +467,11 @@ def _rated_current(values: Mapping[str, float], torque: float, k: float | None, 
     if k is None:
         raise MotorError(f"{' or '.join(TORQUE_CONSTANT)} is missing, or the rated current, from which it follows")
     return torque / k
+
+
+def motors_of(kinds: Collection[str]) -> dict[str, Motor]:
+    """Return the motors of the catalogue that are of one of these kinds, by name."""
+    return {name: motor for name, motor in MOTORS.items() if motor.kind in kinds}
 
 
 MOTORS: dict[str, Motor] = {path.stem: load_motor(path) for path in sorted(FOLDER.glob("*.toml"))}

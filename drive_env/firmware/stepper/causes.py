@@ -1,0 +1,112 @@
+"""What stepper drives watch: the shared causes, and those of the driver's bridges and the encoder.
+
+Status flags are the driver's error flags, 2102h (TMCM-3313 manual, table 155).
+"""
+
+from __future__ import annotations
+
+from drive_env.firmware.common import causes
+from drive_env.firmware.common.protection import (
+    BLOCKS_NEGATIVE,
+    BLOCKS_POSITIVE,
+    COMMUNICATION,
+    CUT,
+    FAULT_RESET,
+    FOLLOWING_ERROR,
+    LIMIT,
+    LIMIT_REGISTER,
+    STOP,
+    WARN,
+    Cause,
+)
+from mechanics.compiled import stage
+
+OPEN_LOAD_TIME = 0.05  # s for which a phase must stay without the current that is asked for
+OPEN_LOAD_DEMAND = 0.3  # of the amplitude, that must be asked of a phase
+OPEN_LOAD_CURRENT = 0.05  # of the amplitude, below which there is none
+
+
+@stage
+def watch_phases(drive, lane, dt):
+    """Measure for how long a phase carries no current although the table asks for it."""
+    on = drive.stage_on[lane] > 0.0
+    asked = OPEN_LOAD_DEMAND * drive.amplitude[lane]
+    flows = OPEN_LOAD_CURRENT * drive.amplitude[lane]
+    if not on or drive.peak_a[lane] >= flows:
+        drive.open_load_time_a[lane] = 0.0
+    elif drive.amplitude[lane] * abs(drive.cos_ref[lane]) > asked:
+        drive.open_load_time_a[lane] += dt
+    if not on or drive.peak_b[lane] >= flows:
+        drive.open_load_time_b[lane] = 0.0
+    elif drive.amplitude[lane] * abs(drive.sin_ref[lane]) > asked:
+        drive.open_load_time_b[lane] += dt
+
+
+@stage
+def forget_peaks(drive, lane, dt):
+    """Begin the next period's largest currents, after protection has looked at this one's."""
+    drive.peak_a[lane] = 0.0
+    drive.peak_b[lane] = 0.0
+
+
+@stage
+def overcurrent_high_side(drive, lane, told):
+    """Return whether a short circuit across the DC link draws too much."""
+    drawn = drive.u_dc[lane] * drive.short_conductance[lane]
+    return drive.short_protection_off[lane] == 0.0 and drawn > drive.overcurrent[lane]
+
+
+@stage
+def overcurrent_a(drive, lane, told):
+    """Return whether phase A had too large a current."""
+    return drive.short_protection_off[lane] == 0.0 and drive.peak_a[lane] > drive.overcurrent[lane]
+
+
+@stage
+def overcurrent_b(drive, lane, told):
+    """Return whether phase B had too large a current."""
+    return drive.short_protection_off[lane] == 0.0 and drive.peak_b[lane] > drive.overcurrent[lane]
+
+
+@stage
+def open_load_a(drive, lane, told):
+    """Return whether phase A has carried no current for long, although it should."""
+    return drive.open_load_time_a[lane] > OPEN_LOAD_TIME
+
+
+@stage
+def open_load_b(drive, lane, told):
+    """Return whether phase B has carried no current for long, although it should."""
+    return drive.open_load_time_b[lane] > OPEN_LOAD_TIME
+
+
+@stage
+def following_error(drive, lane, told):
+    """Return whether the encoder is farther from the demand than the window of 6065h: the motor has lost steps."""
+    window = drive.following_error_window[lane]
+    error = abs(drive.position_demand[lane] - drive.position_actual[lane])
+    return drive.drive_function[lane] > 0.0 and window > 0.0 and error > window
+
+
+CAUSES = (
+    Cause(FAULT_RESET, WARN, 0x00, 0x0),
+    Cause("overcurrent_high_side", CUT, 0x02, 0x10, overcurrent_high_side, held=True),
+    Cause("overcurrent_bridge_a", CUT, 0x02, 0x01, overcurrent_a, held=True),
+    Cause("overcurrent_bridge_b", CUT, 0x02, 0x02, overcurrent_b, held=True),
+    Cause("undervoltage", CUT, 0x04, 0x20, causes.undervoltage),
+    Cause("overvoltage", CUT, 0x04, 0x0, causes.overvoltage),
+    Cause("overtemperature", CUT, 0x08, 0x80, causes.overtemperature),
+    Cause("shutdown_switch", CUT, 0x80, 0x0, causes.shutdown_switch),
+    Cause("open_load_a", STOP, 0x80, 0x04, open_load_a, held=True),
+    Cause("open_load_b", STOP, 0x80, 0x08, open_load_b, held=True),
+    Cause(FOLLOWING_ERROR, STOP, 0x20, 0x0, following_error),
+    Cause("overtemperature_warning", WARN, 0x08, 0x40, causes.warm),
+    Cause("positive_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.above_limit, BLOCKS_POSITIVE, software=True),
+    Cause("negative_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.below_limit, BLOCKS_NEGATIVE, software=True),
+    Cause("positive_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, causes.positive_switch, BLOCKS_POSITIVE),
+    Cause("negative_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, causes.negative_switch, BLOCKS_NEGATIVE),
+    # From outside the axis: its network was stopped or lost.
+    Cause(COMMUNICATION, STOP, 0x10, 0x0),
+    # The axis has left its limits: 0000h too, as CiA 301 has it, but no command, and nothing else ends with it.
+    Cause(FAULT_RESET, WARN, 0x00, 0x0),
+)

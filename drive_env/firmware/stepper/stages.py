@@ -1,0 +1,156 @@
+"""The firmware of stepper drives: which stages run when."""
+
+from __future__ import annotations
+
+from drive_env.firmware.common import start_up
+from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
+from drive_env.firmware.common.dc_link import derive_link
+from drive_env.firmware.common.encoder import encoder_count, shake_encoders
+from drive_env.firmware.common.warming import warmed
+from drive_env.firmware.cycle import FirmwareStages, compose
+from drive_env.firmware.record import LANES
+from drive_env.firmware.stepper import causes, fields
+from drive_env.firmware.stepper.chopper import choose_drive, find_ripple
+from drive_env.firmware.stepper.current_scale import scale_current
+from drive_env.firmware.stepper.sensors import derive_encoder, measure_motion
+from drive_env.firmware.stepper.steps import derive_steps, make_steps, plan_steps
+from drive_env.firmware.stepper.winding import chop, move_rotor, power_stage, refresh_winding
+from mechanics.compiled import inlined, stage
+
+LARGEST_SQUARE = 1e12  # A^2
+
+
+@inlined
+def collect_torque(drive, s, weight, moment):
+    """Add this tick's share to mean and first moment of the torque of physics step s of the window."""
+    for lane in range(LANES):
+        drive.tau_window[s, lane] += weight * (drive.tau_m[lane] + drive.tau_detent[lane])
+    for lane in range(LANES):
+        drive.moment_window[s, lane] += moment * (drive.tau_m[lane] + drive.tau_detent[lane])
+
+
+@stage
+def run_tick(drive, rates, k):
+    """Run the current loop once: steps, chopper, winding, torque for the load's next steps.
+
+    One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
+    """
+    make_steps(drive, rates.tick)
+    chop(drive)
+    power_stage(drive)
+    move_rotor(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
+    collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
+    for s in range(1, rates.substeps):
+        collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+
+
+@stage
+def read_motion(drive, rates):
+    """Read step counter and encoder."""
+    if drive.block_has_noisy_encoder[0]:
+        shake_encoders(drive)
+    measure_motion(drive, rates.window)
+
+
+@stage
+def prepare_chopper(drive, rates):
+    """Find how the bridges drive in this window, and the winding's exact step for its ticks."""
+    for s in range(rates.substeps):
+        for lane in range(LANES):
+            drive.tau_window[s, lane] = 0.0
+            drive.moment_window[s, lane] = 0.0
+    refresh_winding(drive, rates.tick, rates.window)
+    choose_drive(drive)
+    find_ripple(drive)
+
+
+@stage
+def warm(drive, rates):
+    """Move temperatures on: copper loss of currents and ripple."""
+    for lane in range(LANES):
+        square = drive.i_a[lane] * drive.i_a[lane] + drive.i_b[lane] * drive.i_b[lane]
+        square += drive.ripple[lane] * drive.ripple[lane] * (1.0 / 6.0)
+        square = square if square < LARGEST_SQUARE else 0.0  # a frozen lane's currents may be no numbers
+        warmed(drive, lane, drive.R_s[lane] * square, drive.on_resistance[lane] * square, rates.period)
+
+
+@stage
+def prepare_quotients(drive, rates):
+    """Compute what windows and ticks need as quotients."""
+    derive_encoder(drive)
+    derive_steps(drive)
+    derive_link(drive, rates.tick)
+
+
+@stage
+def spread_steps(drive, rates):
+    """Plan the steps of the coming period, and leave out of it what no drive of a block needs."""
+    if rates.period > 0.0:
+        plan_steps(drive, rates.period)
+    drive.block_has_noisy_encoder[0] = 0
+    for lane in range(LANES):
+        # Once more after the noise has ended, so that none of it is left in the angle.
+        if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
+            drive.block_has_noisy_encoder[0] = 1
+
+
+@stage
+def tell_status(drive, lane):
+    """Write 2102h: the driver's error flags of the causes that hold."""
+    drive.status_flags[lane] = drive.cause_flags[lane]
+
+
+@stage
+def halt(drive, lane):
+    """Leave no number behind that is none."""
+    drive.velocity_filter_z[0, lane] = 0.0
+    drive.velocity_filter_z[1, lane] = 0.0
+    drive.step_rate[lane] = 0.0
+    drive.i_a[lane] = 0.0
+    drive.i_b[lane] = 0.0
+    drive.tau_detent[lane] = 0.0
+
+
+@stage
+def power_on(drive, lane):
+    """Begin anew: the steps at zero, the table at its first entry, wherever the rotor stands; the encoder at zero."""
+    drive.init_state[lane] = start_up.DONE
+    drive.step_position[lane] = 0.0
+    drive.step_rate[lane] = 0.0
+    drive.steps_done[lane] = 0.0
+    drive.in_full_steps[lane] = 0.0
+    drive.standstill_time[lane] = 0.0
+    drive.velocity_before[lane] = 0.0
+    drive.current_scale[lane] = 0.0
+    drive.i_a[lane] = 0.0
+    drive.i_b[lane] = 0.0
+    drive.tau_detent[lane] = 0.0
+    drive.velocity_filter_z[0, lane] = 0.0
+    drive.velocity_filter_z[1, lane] = 0.0
+    s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
+    drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
+    edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI
+    drive.count[lane] = encoder_count(edges * drive.encoder_gain[lane], drive.encoder_true_direction[lane])
+    drive.count_zero[lane] = drive.count[lane]
+    drive.theta_encoder[lane] = 0.0
+    drive.omega_encoder[lane] = 0.0
+    drive.position_actual[lane] = 0.0
+
+
+STAGES = FirmwareStages(
+    name="stepper",
+    parameters=fields.PARAMETERS,
+    state=fields.STATE,
+    causes=causes.CAUSES,
+    begin_period=(warm, prepare_quotients),
+    measure=(causes.watch_phases,),
+    switch=(causes.forget_peaks, scale_current),
+    tell=(tell_status,),
+    end_period=(spread_steps,),
+    window=(read_motion, prepare_chopper),
+    tick=(run_tick,),
+    power_on=(power_on,),
+    halt=(halt,),
+)
+
+FIRMWARE = compose(STAGES, __name__)
