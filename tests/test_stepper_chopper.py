@@ -279,7 +279,8 @@ def test_above_the_full_step_threshold_the_chosen_modes_act():
         assert np.ptp(np.array(seen)[:, 0]) > 0.5
         # Without fast decay a current cannot be pushed down.
         np.testing.assert_array_equal(lane(drives, "lowest_share")[[0, 1, 3]], [-1.0, -1.0, -1.0])
-        assert lane(drives, "lowest_share")[2] > 0.0
+        # The least on-time against twice the off time of 172 clocks.
+        assert lane(drives, "lowest_share")[2] == pytest.approx(36 / (36 + 2 * 172))
 
 
 def test_an_off_time_of_0_lets_the_motor_run_free():
