@@ -36,7 +36,7 @@ from drive_env.emulator.parameters import (
 )
 from drive_env.emulator.prepared_record import PreparedRecord
 from drive_env.faults.machine_faults import MachineFaults
-from drive_env.firmware import cycle
+from drive_env.firmware import cycle, default_motor
 from drive_env.firmware.cycle import Call
 from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.master.quantities import integers, is_quantity
@@ -95,7 +95,7 @@ class EmulatedDrives:
         ValueError: For an unknown name, a motor that the device does not turn, or a machine that cannot be.
     """
 
-    DEFAULT_MOTOR = "qbl4208"
+    DEFAULT_MOTOR = default_motor("servo")
     # Of the Drives interface: what emulated drives do not have, and their time, which passes when it is asked to.
     bus = None
     safety = None
