@@ -171,13 +171,15 @@ def test_constant_off_time_has_the_ripple_mean_and_frequency_of_one_that_is_swit
     assert found["ripple"] == pytest.approx(by_hand, rel=1e-3)
 
 
-@pytest.mark.parametrize(("toff", "hstrt", "hend", "hdec"), [(2, 3, 0, 0), (5, 8, 2, 3), (5, 4, 10, 1), (12, 8, 12, 0)])
+@pytest.mark.parametrize(
+    ("toff", "hstrt", "hend", "hdec"), [(2, 3, 0, 0), (5, 8, 2, 3), (5, 4, 10, 1), (12, 8, 12, 0), (12, 0, 0, 0)]
+)
 def test_spread_cycle_has_the_ripple_mean_and_frequency_of_one_that_is_switched(toff, hstrt, hend, hdec):
     found = settled(o2097=toff, o2096=hstrt, o2095=hend, o2094=hdec)
     mean, ripple, frequency = switched(AMPLITUDE, constant=False, toff=toff, hstrt=hstrt, hend=hend, hdec=hdec)
-    assert found["ripple"] == pytest.approx(ripple, rel=0.2)
-    assert found["chopper_frequency"] == pytest.approx(frequency, rel=0.2)
-    assert found["i_a"] == pytest.approx(mean, rel=0.01)
+    assert found["ripple"] == pytest.approx(ripple, rel=0.04)
+    assert found["chopper_frequency"] == pytest.approx(frequency, rel=0.04)
+    assert found["i_a"] == pytest.approx(mean, rel=5e-4)
 
 
 def test_every_setting_of_the_chopper_changes_its_ripple():
@@ -195,7 +197,8 @@ def test_the_ripple_costs_what_its_mean_square_dissipates():
     still, rough = settled(o2093=1, o2097=2, o2096=0), settled(o2093=1, o2097=15, o2096=8)
     for found in (still, rough):
         copper = R * (found["i_a"] ** 2 + found["i_b"] ** 2 + found["ripple"] ** 2 / 6.0)
-        assert found["bridge_power"] == pytest.approx(copper, rel=2e-3)
+        assert found["bridge_power"] == pytest.approx(copper, rel=1e-4)
+    assert rough["ripple"] ** 2 / 6.0 > 5e-4 * rough["i_a"] ** 2  # or nothing would have been seen
 
 
 def test_a_blank_time_keeps_a_small_current_up():
@@ -276,7 +279,8 @@ def test_above_the_full_step_threshold_the_chosen_modes_act():
         assert np.ptp(np.array(seen)[:, 0]) > 0.5
         # Without fast decay a current cannot be pushed down.
         np.testing.assert_array_equal(lane(drives, "lowest_share")[[0, 1, 3]], [-1.0, -1.0, -1.0])
-        assert lane(drives, "lowest_share")[2] > 0.0
+        # The least on-time against twice the off time of 172 clocks.
+        assert lane(drives, "lowest_share")[2] == pytest.approx(36 / (36 + 2 * 172))
 
 
 def test_an_off_time_of_0_lets_the_motor_run_free():

@@ -200,7 +200,6 @@ def test_a_motor_of_the_other_kind_is_refused_with_the_remedy(device, motor, mes
 
 
 def test_drives_have_a_motor_of_their_kind_unless_one_is_named():
-    with EmulatedDrives(stepper_rig.BARE, "inertia") as drives:
-        assert drives.motor.kind == "stepper"
-    with EmulatedDrives("tmcm1636", "inertia") as drives:
-        assert drives.motor.kind == "servo"
+    for device, kind in ((stepper_rig.BARE, "stepper"), ("tmcm1636", "pmsm")):
+        with EmulatedDrives(device, "inertia") as drives:
+            assert drives.motor.kind == kind

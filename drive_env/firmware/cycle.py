@@ -299,6 +299,7 @@ def reset_shared_state(drive, lane):
     drive.position_demand[lane] = 0.0
     drive.velocity_demand[lane] = 0.0
     drive.torque_demand[lane] = 0.0
+    drive.ramp_wait_left[lane] = 0.0
     drive.cause_flags[lane] = 0
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drive_env import cia402
-from drive_env.firmware.common import fsa, profiles
+from drive_env.firmware.common import fsa, profiles, six_point
 from drive_env.firmware.common.limits import ROUNDING, corrected_maximum, corrected_minimum
 from mechanics.compiled import stage
 
@@ -57,9 +57,13 @@ def generate(drive, lane, ramp, dt):
     if up > 0.0 and v_max > 0.0:
         # Factory values of 6081h and 6083h are 0: then there is no speed to move with, and the axis stays.
         down = drive.deceleration[lane] if drive.deceleration[lane] > 0.0 else up
-        x, v = profiles.trapezoid(x, v, target, v_max, up, down, dt)
-        drive.position_demand[lane] = x
-        drive.velocity_demand[lane] = v
+        if six_point.is_set(drive, lane):
+            six_point.advance(drive, lane, target, v_max, up, down, dt)
+        else:
+            x, v = profiles.trapezoid(x, v, target, v_max, up, down, dt)
+            drive.position_demand[lane] = x
+            drive.velocity_demand[lane] = v
+        x, v = drive.position_demand[lane], drive.velocity_demand[lane]
     window = drive.position_window[lane]
     if window == 0.0 or window > 1e300:
         drive.target_reached[lane] = 1 if x == target and v == 0.0 else 0
