@@ -1,0 +1,321 @@
+"""The TMCM-6212's object dictionary against its maker's EDS and the manuals, axis by axis.
+
+A row: object, type, access, whether PDOs carry it, default, range. Types, access, mapping and defaults are those of the
+maker's EDS of firmware 3.22 (1000h: of the manual; 300Eh: four inputs); ranges those of the manual of the TMCM-3313, or
+of the chip's registers. Where either is silent stands -.
+"""
+
+from __future__ import annotations
+
+import configparser
+from pathlib import Path
+
+import pytest
+
+from drive_env.dictionary.entries import ObjectDictionary
+
+EDS = Path(__file__).parents[1] / "research" / "stepper_drives" / "tmcm6212" / "tmcm6212.eds"
+NODE, AXES = 5, 6
+BITS = {"U8": (8, False), "U16": (16, False), "U32": (32, False), "I8": (8, True), "I16": (16, True), "I32": (32, True)}
+
+ROWS = """
+1000:0 U32 const 0 0xFFFC0192 -
+1001:0 U8 ro 0 - -
+1005:0 U32 rw 0 0x00000080 -
+1008:0 STR const 0 - -
+1009:0 STR const 0 - -
+100A:0 STR const 0 - -
+100C:0 U16 rw 0 0x00000000 -
+100D:0 U8 rw 0 0x00000000 -
+1010:0 U8 ro 0 0xA -
+1010:1 U32 rw 0 - -
+1010:2 U32 rw 0 - -
+1010:3 U32 rw 0 - -
+1010:4 U32 rw 0 - -
+1010:5 U32 rw 0 - -
+1010:6 U32 rw 0 - -
+1010:7 U32 rw 0 - -
+1010:8 U32 rw 0 - -
+1010:9 U32 rw 0 - -
+1010:A U32 rw 0 - -
+1011:0 U8 ro 0 0xA -
+1011:1 U32 rw 0 - -
+1011:2 U32 rw 0 - -
+1011:3 U32 rw 0 - -
+1011:4 U32 rw 0 - -
+1011:5 U32 rw 0 - -
+1011:6 U32 rw 0 - -
+1011:7 U32 rw 0 - -
+1011:8 U32 rw 0 - -
+1011:9 U32 rw 0 - -
+1011:A U32 rw 0 - -
+1014:0 U32 rw 0 $NODEID+0x80 -
+1015:0 U16 rw 0 0x0000 -
+1016:0 U8 ro 0 0x1 -
+1016:1 U32 rw 0 0x0 -
+1017:0 U16 rw 0 0x0 -
+1018:0 U8 ro 0 0x4 -
+1018:1 U32 ro 0 0x286 -
+1018:2 U32 ro 0 0x1844 -
+1018:3 U32 ro 0 - -
+1018:4 U32 ro 0 - -
+1029:0 U8 ro 0 0x2 -
+1029:1 U8 rw 0 0x0 -
+1029:2 U8 rw 0 0x1 -
+1400:0 U8 ro 0 0x02 -
+1400:1 U32 rw 0 $NODEID+0x40000200 -
+1400:2 U8 ro 0 0xFF -
+1401:0 U8 ro 0 0x02 -
+1401:1 U32 rw 0 $NODEID+0x40000300 -
+1401:2 U8 ro 0 0xFF -
+1402:0 U8 ro 0 0x02 -
+1402:1 U32 rw 0 $NODEID+0x40000400 -
+1402:2 U8 ro 0 0xFF -
+1403:0 U8 ro 0 0x02 -
+1403:1 U32 rw 0 $NODEID+0xC0000500 -
+1403:2 U8 ro 0 0xFE -
+1600:0 U8 rw 0 0x01 0...3
+1600:1 U32 rw 0 0x60400010 -
+1600:2 U32 rw 0 0x00000000 -
+1600:3 U32 rw 0 0x00000000 -
+1601:0 U8 rw 0 0x02 -
+1601:1 U32 rw 0 0x60400010 -
+1601:2 U32 rw 0 0x60600008 -
+1601:3 U32 rw 0 0x00000000 -
+1602:0 U8 rw 0 0x02 -
+1602:1 U32 rw 0 0x60400010 -
+1602:2 U32 rw 0 0x607A0020 -
+1602:3 U32 rw 0 0x00000000 -
+1603:0 U8 rw 0 0x02 -
+1603:1 U32 rw 0 0x60400010 -
+1603:2 U32 rw 0 0x60FF0020 -
+1603:3 U32 rw 0 0x00000000 -
+1800:0 U8 ro 0 0x05 -
+1800:1 U32 rw 0 $NODEID+0x40000180 -
+1800:2 U8 rw 0 0xFF -
+1800:3 U16 rw 0 0x0 -
+1800:4 U8 ro 0 - -
+1800:5 U16 rw 0 0x0 -
+1801:0 U8 ro 0 0x05 -
+1801:1 U32 rw 0 $NODEID+0x40000280 -
+1801:2 U8 rw 0 0xFF -
+1801:3 U16 rw 0 0x0 -
+1801:4 U8 ro 0 - -
+1801:5 U16 rw 0 0x0 -
+1802:0 U8 ro 0 0x05 -
+1802:1 U32 rw 0 $NODEID+0x40000380 -
+1802:2 U8 rw 0 0x1 -
+1802:3 U16 rw 0 0x0 -
+1802:4 U8 ro 0 - -
+1802:5 U16 rw 0 0x0 -
+1803:0 U8 ro 0 0x05 -
+1803:1 U32 rw 0 $NODEID+0xC0000480 -
+1803:2 U8 rw 0 0xFE -
+1803:3 U16 rw 0 0x0 -
+1803:4 U8 ro 0 - -
+1803:5 U16 rw 0 0x0 -
+1A00:0 U8 rw 0 0x01 0...3
+1A00:1 U32 rw 0 0x60410010 -
+1A00:2 U32 rw 0 0x00000000 -
+1A00:3 U32 rw 0 0x00000000 -
+1A01:0 U8 rw 0 0x02 -
+1A01:1 U32 rw 0 0x60410010 -
+1A01:2 U32 rw 0 0x60610008 -
+1A01:3 U32 rw 0 0x00000000 -
+1A02:0 U8 rw 0 0x02 -
+1A02:1 U32 rw 0 0x60410010 -
+1A02:2 U32 rw 0 0x60640020 -
+1A02:3 U32 rw 0 0x00000000 -
+1A03:0 U8 rw 0 0x02 -
+1A03:1 U32 rw 0 0x60410010 -
+1A03:2 U32 rw 0 0x606C0020 -
+1A03:3 U32 rw 0 0x00000000 -
+2000:0 U8 rw 0 - 0...8
+2001:0 U16 rw 0 0xC8 0...65535
+2003:0 U8 rw 0 - 0...255
+2004:0 U8 rw 0 - 0...255
+2005:0 U32 rw 0 - 0...63
+2010:0 U32 rw 0 0x00 0...249999
+2011:0 U32 rw 0 0x00 0...7629278
+2012:0 U32 rw 0 0x00 0...999999
+2013:0 U32 rw 0 0x00 0...7629278
+2015:0 U16 rw 0 0x0 0...65535
+2089:0 U16 rw 0 0x0 0...65535
+208C:0 U8 rw 0 - -
+208E:0 U8 ro 0 - -
+2092:0 U8 rw 0 - 0...3
+2093:0 U8 rw 0 - 0...1
+2094:0 U8 rw 0 - 0...3
+2095:0 I8 rw 0 - -3...12
+2096:0 U8 rw 0 - 0...8
+2097:0 U8 rw 0 - -
+20A1:0 U8 rw 0 - 0...1
+20A3:0 U8 rw 0 - 0...1
+20B0:0 U32 rw 0 0x00 0...16777215
+20B1:0 U8 rw 0 0x00 0...255
+20B2:0 U8 rw 0 0x00 0...255
+20B6:0 U32 rw 0 0x0 0...7999511
+20B7:0 U8 rw 0 0x0 0...1
+20B8:0 U8 rw 0 0x0 0...1
+20B9:0 U8 rw 0 0x0 0...15
+2100:0 I32 ro 0 0x0 -
+2102:0 U8 ro 0 - 0...255
+2107:0 U8 ro 0 - 0...8
+2121:0 U8 ro 0 0x00 0...255
+2122:0 I32 ro 0 0x0 -
+3002:0 U32 ro 1 - -
+3003:0 U8 const 0 0x2 -
+3003:1 U32 rww 1 0x0 -
+3003:2 U32 rw 0 0x0 -
+3004:0 U16 rw 0 - 20...1000
+3005:0 U8 rw 0 - 1...127
+3006:0 U8 const 0 0x1 -
+3006:1 U32 rw 0 - -
+3007:0 U16 ro 0 - 20...1000
+3008:0 U8 ro 0 - 1...127
+300E:0 U8 ro 0 4 -
+300E:1 U32 ro 1 - 0...65535
+300E:2 U32 ro 1 - 0...65535
+300E:3 U32 ro 1 - 0...65535
+300E:4 U32 ro 1 - 0...65535
+6040:0 U16 rww 1 - -
+6041:0 U16 ro 1 - -
+605A:0 I16 rw 0 0x0002 -
+605B:0 I16 ro 0 0x0000 -
+605C:0 I16 ro 0 0x0001 -
+605D:0 I16 ro 0 0x0001 -
+605E:0 I16 ro 0 0x0002 -
+6060:0 I8 rww 1 0x00 -
+6061:0 I8 ro 1 - -
+6062:0 I32 ro 1 - -
+6063:0 I32 ro 1 - -
+6064:0 I32 ro 1 - -
+6065:0 U32 rw 0 - 0...2147483647
+6067:0 U32 rw 0 0xFFFFFFFF -
+6068:0 U16 rw 0 0x0000 -
+606A:0 I16 rw 0 - -
+606C:0 I32 ro 1 - -
+607A:0 I32 rww 1 0x0 -
+607C:0 I32 rw 0 0x0 -
+607D:0 U8 const 0 0x2 -
+607D:1 I32 rw 0 0x80000001 -
+607D:2 I32 rw 0 0x7FFFFFFF -
+6081:0 U32 rw 0 - 0...7999511
+6082:0 U32 rw 0 0x0 0...249999
+6083:0 U32 rw 0 - 0...7629278
+6084:0 U32 rw 0 - 0...7629278
+6085:0 U32 rw 0 - 0...7629278
+608F:0 U8 const 0 0x00000002 -
+608F:1 U32 rw 0 - 0...2147483647
+608F:2 U32 ro 0 0x00000001 -
+6098:0 I8 rw 0 0x00 -
+6099:0 U8 const 0 0x2 -
+6099:1 U32 rw 0 - 0...7999511
+6099:2 U32 rw 0 - 0...7999511
+609A:0 U32 rw 0 - 0...7629278
+60B0:0 I32 rw 0 0x0 -
+60B1:0 I32 rw 0 0x00 -
+60C2:0 U8 const 0 0x02 -
+60C2:1 U8 rw 0 0x01 -
+60C2:2 I8 rw 0 0xFD -3...3
+60F2:0 U16 rw 0 0x00 0...2
+60FD:0 U32 ro 1 - -
+60FF:0 I32 rw 1 0x0 -
+6502:0 U32 ro 0 0x000001A5 -
+67FF:0 U32 ro 0 0x00040192 -
+"""
+
+TABLE = {
+    tuple(int(part, 16) for part in row.split()[0].split(":")): row.split()[1:] for row in ROWS.strip().splitlines()
+}
+
+
+@pytest.fixture(scope="module")
+def dictionary():
+    return ObjectDictionary(EDS, NODE)
+
+
+def of_axis(index, axis):
+    """Return the index of an object of axis 0 on another axis: section 2.5.1 of the manual, and its PDO numbers."""
+    if 0x2000 <= index < 0x2200:
+        return index + 0x200 * axis
+    if 0x6000 <= index < 0x6800:
+        return index + 0x800 * axis
+    return index + 0x40 * axis if 0x1400 <= index < 0x1C00 else index
+
+
+def number(text, signed, bits):
+    """Return a default; identifiers follow the node."""
+    value = sum(NODE if part == "$NODEID" else int(part, 0) for part in text.split("+"))
+    return value - 2**bits if signed and value >= 2 ** (bits - 1) else value
+
+
+@pytest.mark.parametrize("key", TABLE, ids=lambda key: f"{key[0]:04X}-{key[1]:X}")
+def test_an_entry_is_as_its_maker_has_it_on_every_axis(dictionary, key):
+    kind, access, mappable, default, limits = TABLE[key]
+    for axis in range(AXES):
+        entry = dictionary.find((of_axis(key[0], axis), key[1]))
+        assert (entry.access, entry.pdo_mappable) == (access, mappable == "1")
+        if kind == "STR":
+            assert entry.bits is None
+            continue
+        bits, signed = BITS[kind]
+        assert (entry.bits, entry.signed) == (bits, signed)
+        if limits != "-":
+            assert f"{entry.low}...{entry.high}" == limits
+        assert entry.low <= entry.default <= entry.high
+        if default != "-":
+            is_further_pdo = axis > 0 and 0x1400 <= key[0] < 0x1C00
+            expected = number(default, signed, bits)
+            if is_further_pdo and key[1] == 1 and key[0] & 0x200 == 0:
+                expected = 0xC0000000  # off, without an identifier
+            elif is_further_pdo and key[1] and key[0] & 0x200 and expected:
+                expected += axis * 0x800 << 16  # the same object of this axis
+            assert entry.default == expected
+
+
+def test_there_is_nothing_else(dictionary):
+    expected = {(of_axis(index, axis), sub) for index, sub in TABLE for axis in range(AXES)}
+    assert {(entry.index, entry.sub) for entry in dictionary} == expected
+
+
+def test_the_numbers_of_pdos_are_the_manuals(dictionary):
+    """Section 1.1: 1 to 4, 65 to 68, 129 to 132, 193 to 196, 257 to 260, 321 to 324, with three objects each."""
+    numbers = [first + k for first in (1, 65, 129, 193, 257, 321) for k in range(4)]
+    for base in (0x1400, 0x1600, 0x1800, 0x1A00):
+        there = sorted({entry.index - base + 1 for entry in dictionary if base <= entry.index < base + 0x200})
+        assert there == numbers
+    mapped = [entry for entry in dictionary if entry.index in range(0x1600, 0x1800) and entry.sub == 0]
+    assert {entry.high for entry in mapped} == {3}
+
+
+@pytest.mark.parametrize("base", [0x1600, 0x1A00])
+def test_what_the_factory_maps_can_be_mapped(dictionary, base):
+    for entry in dictionary:
+        if entry.index in range(base, base + 0x200) and entry.sub and entry.default:
+            mapped = dictionary.find((entry.default >> 16, entry.default >> 8 & 0xFF))
+            assert mapped.pdo_mappable and mapped.bits == entry.default & 0xFF
+            assert mapped.access == "ro" or base == 0x1600
+
+
+def test_names_are_unique(dictionary):
+    names = [entry.name.casefold() for entry in dictionary]
+    assert len(names) == len(set(names))
+
+
+def test_the_file_is_ascii_and_lists_its_objects():
+    eds = configparser.RawConfigParser(comment_prefixes=(";",))
+    eds.optionxform = str
+    eds.read_string(EDS.read_bytes().decode("ascii"))
+    indices = [int(name, 16) for name in eds.sections() if len(name) == 4 and set(name) <= set("0123456789ABCDEF")]
+    listed = {}
+    for group in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
+        count = int(eds[group]["SupportedObjects"])
+        listed[group] = [int(eds[group][str(k)], 16) for k in range(1, count + 1)]
+    assert listed["MandatoryObjects"] == [0x1000, 0x1001, 0x1018]
+    assert listed["ManufacturerObjects"] == [index for index in sorted(indices) if 0x2000 <= index < 0x6000]
+    assert sorted(index for group in listed.values() for index in group) == sorted(indices)
+    for index in indices:
+        if "SubNumber" in eds[f"{index:04X}"]:
+            subs = [name for name in eds.sections() if name.startswith(f"{index:04X}sub")]
+            assert int(eds[f"{index:04X}"]["SubNumber"], 16) == len(subs)
