@@ -10,10 +10,13 @@ limits here: a real motor must be free to turn, and an emergency stop in reach.
 """
 
 import argparse
+import sys
 import time
 
+import can
 import canopen
 from canopen.profiles.p402 import BaseNode402
+from canopen.sdo.exceptions import SdoError
 
 TURN = 65536  # increments of a revolution
 MASTER, SILENCE = 0x7D, 500  # node-ID of our heartbeats; ms without them after which the drive stops
@@ -88,4 +91,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (OSError, ValueError, can.CanError, SdoError) as error:
+        sys.exit(f"{sys.argv[0]}: {error}; check --channel, --node, and that --eds is the drive's (`drive-env scan`)")

@@ -156,3 +156,24 @@ def test_a_real_signal_over_a_served_bus(tmp_path, how):
         with CanDrives("tmcm1636", **bus) as drives:
             np.testing.assert_array_equal(gains(drives), before)
             assert is_off(drives)
+
+
+def test_a_fault_before_the_gains_are_written_rejects_its_axis_alone(monkeypatch, tmp_path):
+    """The drive is enabled, and its shutdown switch opens once all is verified: the other machine keeps its gains."""
+
+    first_alone = np.array([True, False])
+
+    def faulty(bench):
+        drives = bench.target.drives
+        motion.enable(drives, mode="csv", where=first_alone)
+        drives.machine.fault("enable_lost", duration=0.02, where=first_alone)
+        drives.advance(0.05)
+
+    monkeypatch.setattr(auto_module, "tell_of_lateness", faulty)
+    with emulated(load="inertia", num_machines=2, num_threads=1) as target:
+        found = auto(target, tmp_path / "before.toml")
+        left = gains(target.drives)
+    first, second = found.axes
+    assert first.reason.startswith("the drive went into fault while its gains were verified: shutdown switch (5441h)")
+    assert left[0].tolist() == list(first.before)
+    assert second.accepted and left[1].tolist() == list(second.after) != list(second.before)

@@ -94,6 +94,7 @@ def write(bench: AutoBench, fresh: Mask, gains: Integers, transaction: Transacti
         gains: Raw, (num_axes, count).
         transaction: With the state before.
     """
+    bench.drop_faults("its gains were verified")
     going = bench.going
     bench.stop(~going, "another axis of its machine was rejected")
     if not going.any():

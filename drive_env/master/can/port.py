@@ -8,6 +8,7 @@ supervisor's (drive_env/safety/supervisor.py): one receives for both.
 from __future__ import annotations
 
 import os
+import re
 import select
 import threading
 import time
@@ -30,6 +31,7 @@ SEND_TIMEOUT = 0.5  # [s]
 _LINE_TIME = 0.002  # for the rest of a frame that has begun to arrive (slcan: a line of text) [s]
 _ORPHANED = 0.05  # s for which whoever has the turn does nothing with it
 _TURN = 0.0003  # how often a thread looks for what another one has received for it [s]
+_ADDRESS = re.compile(r"[\w.-]+:\d+")  # HOST:PORT
 
 
 def open_bus(interface: str | None = None, channel: str | None = None, **options: Any) -> can.BusABC:
@@ -62,9 +64,10 @@ def open_bus(interface: str | None = None, channel: str | None = None, **options
         )
     if interface is None:
         if not over_tcp:
+            served = f"; a hub of `drive-env serve` is socket://{channel}" if _ADDRESS.fullmatch(channel) else ""
             raise OpenError(
                 f"channel {channel!r} needs an interface: give one that python-can knows (socketcan, pcan, kvaser, "
-                f"slcan, ...), or set {INTERFACE_VARIABLE}"
+                f"slcan, ...), or set {INTERFACE_VARIABLE}{served}"
             )
         interface = "slcan"
     if over_tcp:
