@@ -38,7 +38,7 @@ def test_train_judge_resume_export(tmp_path, shrunk):
     out = tmp_path / "run"
     found = run("train", "tracking", "--config", shrunk, "--load", "gantry", "--seed", 5, "--out", out)
     assert found.exit_code == 0, found.output
-    assert "ServoDrive/Tracking-v0 ppo: 208 of 200 steps" in found.output and "tracking 0." in found.output
+    assert "ServoDrive/Tracking-v0 ppo: 208 of 208 steps" in found.output and "tracking 0." in found.output
     assert re.search(r"RMS following error \[rev\]: \S+ \(95 % of \S+ to \S+\), median", found.output)
     bundle = AgentFile.load(out / "agent.npz")
     assert bundle.configuration["load"] == "gantry" and bundle.settings["activation"] == "relu"

@@ -118,17 +118,18 @@ def test_a_wiring_is_0_or_1():
 
 
 @pytest.mark.parametrize(
-    ("motor", "randomise", "drawn"),
+    ("commissioned", "randomise", "drawn"),
     [
-        (None, True, True),  # factory values: whoever commissions it looks
-        (None, False, False),
-        ("qbl4208", True, False),  # the preset is taken for granted
-        ("qbl4208", ["motor"], False),
-        ("qbl4208", ["motor.encoder_direction"], True),
+        (False, True, True),  # factory values: whoever commissions it looks
+        (False, False, False),
+        (True, True, False),  # the preset is taken for granted
+        (True, ["motor"], False),
+        (True, ["motor.encoder_direction"], True),
     ],
 )
-def test_wiring_is_drawn_with_the_rest_where_nobody_takes_it_for_granted(motor, randomise, drawn):
-    with EmulatedDrives(load="inertia", motor=motor, num_machines=40, seed=1, randomise=randomise) as drives:
+def test_wiring_is_drawn_with_the_rest_where_nobody_takes_it_for_granted(commissioned, randomise, drawn):
+    options = {"commissioned": commissioned, "randomise": randomise}
+    with EmulatedDrives(load="inertia", num_machines=40, seed=1, **options) as drives:
         found = drives.machine.parameters["motor.encoder_direction"]
     assert set(found) == ({0.0, 1.0} if drawn else {float(MOTOR.encoder_direction)})
     if drawn:
