@@ -510,10 +510,12 @@ def start_and_wait_for_a_shard(config, out, *more):
     process = subprocess.Popen(
         arguments(config, out, *more), env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    deadline = time.monotonic() + PATIENCE
-    while not (log.exists() and log.stat().st_size > 1000) and process.poll() is None:
+    deadline, size, before = time.monotonic() + PATIENCE, 0, -1
+    # While a shard is being written it is none yet, and who is killed then leaves nothing to go on from.
+    while not (size > 1000 and size == before) and process.poll() is None:
         assert time.monotonic() < deadline, "no shard was done"
-        time.sleep(0.002)
+        time.sleep(0.01)
+        size, before = log.stat().st_size if log.exists() else 0, size
     return process
 
 
