@@ -169,7 +169,7 @@ class Judging:
                 self._stop_for(
                     f"axis {axis}: the current is {row[axis]} for {CURRENT_CYCLES} cycles, and its limit is "
                     f"{bounds.current[axis]}",
-                    "check the current loop's gains 2041h and the motor's wiring",
+                    "check the gains of the current loop and the motor's wiring",
                 )
 
     def _trip(
