@@ -122,5 +122,6 @@ STATE = (
     Field("latch_steps", "f8", "rad", "200Fh:02: position by the steps at that index"),
     Field("latch_encoder", "f8", "rad", "200Fh:03: position by the encoder at that index"),
     Field("position_actual", "f8", "rad", "6064h: by the sensor that 606Ah names"),
+    Field("deviation", "f8", "rad", "by which that lies behind the steps, wherever home is"),
     Field("status_flags", "i4", "", "2102h: errors of the driver"),
 )
