@@ -1,4 +1,4 @@
-"""The brake output: its delays and currents (TMCM-3313 manual, 2002h, 200Ah, 200Ch), and a hanging load on its brake."""
+"""The brake output: delays and currents (TMCM-3313 manual, 2002h, 200Ah, 200Ch), and a hanging load on its brake."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The encoder's index: homing by it (CiA 402, methods 1, 2, 3, 5, 33, 34), and its latch (TMCM-3313 manual, 200Bh, 200Fh).
+"""The encoder's index: homing by it (CiA 402, methods 1, 2, 3, 5, 33, 34), its latch (TMCM-3313 manual, 200Fh).
 
 The disc's index begins at a true angle of the rotor and is one count wide, so home is known in closed form: where the
 steps were when the rotor came to that angle.
@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 import pytest
-from stepper_rig import SMOOTH, build, lane
+from stepper_rig import SMOOTH, build
 
 from drive_env import motion
 from drive_env.firmware.record import set_lanes
