@@ -162,6 +162,16 @@ def test_enabling_that_is_called_off_never_enables(word, state):
         assert first(watch(drives, 250), 0, ENABLED) == 200
 
 
+def test_an_axis_that_is_not_enabled_in_time_is_not_enabled_later():
+    with build(num_machines=2, parameters=DAMPED) as drives:
+        commission(drives, enable=[300, 0])
+        with pytest.raises(TimeoutError, match="axis 0 did not reach operation enabled in 0.1 s"):
+            motion.enable(drives, mode="pp", timeout=0.1)
+        drives.advance(0.5)
+        assert (drives.read(0x6041) & 0x6F).tolist() == [READY, ENABLED]
+        motion.enable(drives, timeout=0.5)
+
+
 def test_a_fault_on_the_way_to_operation_enabled_ends_it():
     with build(parameters=DAMPED) as drives:
         commission(drives, enable=100)
