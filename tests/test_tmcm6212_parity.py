@@ -137,7 +137,8 @@ def test_the_same_script_gives_the_same_integers(name, safety):
         assert_equal([np.asarray(part)], [np.asarray(other)])
     watched = [part for part in expected if isinstance(part, np.ndarray) and part.ndim == 3]
     moved = np.concatenate(watched, axis=1)[WATCHED.index(0x6064)]
-    assert (np.ptp(moved, axis=0) > 50).all(), "every axis moves"
+    trips = (EACH == 3) & (name == "fault")
+    assert ((np.ptp(moved, axis=0) > 50) | trips).all(), "every axis moves"
     if name == "fault":
         assert [(one[0], one[1]) for one in expected[1]] == [(2, 0x8611)]
         assert (expected[3] & 0x6F == np.where(EACH == 3, 0x40, 0x27)).all()
