@@ -1,4 +1,4 @@
-"""The recipes of the manual as they stand there, and every writable object varied as an engineer would: it has an effect.
+"""The recipes of the manual as they stand there, and every writable object varied as an engineer would.
 
 Recipes: TMCM-3313 manual, sections 6.2, 7.2 and 8.3, whose objects and values those of the TMCM-6212 are.
 """
@@ -6,6 +6,8 @@ Recipes: TMCM-3313 manual, sections 6.2, 7.2 and 8.3, whose objects and values t
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,8 +81,7 @@ class Scene(NamedTuple):
 
     play: Any
     load: Any = "inertia"
-    rows: dict = {}
-    options: dict = {}
+    rows: Mapping[Any, int] = MappingProxyType({})
 
 
 TRUE = (
