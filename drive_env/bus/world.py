@@ -15,7 +15,8 @@ from drive_env.node.axis import ObjectPort
 
 CYCLE = 0.001  # s: the communication cycle
 SYNC_OBJECT = (0x1005, 0)
-TRANSMIT_BUFFER = 64  # frames of a node that wait for the bus; ours, since no manual says. More are lost.
+# Frames of a node that wait for the bus, for each of its axes; ours, since no manual says. More are lost.
+TRANSMIT_BUFFER = 64
 MAX_NODE_ID = 127
 
 
@@ -79,12 +80,15 @@ class World:
         self.cycles = 0
         self._answering: list[Node] = []  # whose SDO answers take time
         self._sync_objects: list[ObjectPort] = []  # 1005h of each node
+        self._room: dict[int, int] = {}  # node identifier -> frames that may wait
         self._on: set[int] = set()
         self._overflowed: set[int] = set()
         self._off: dict[int, float] = {}  # node identifier -> when its controller is back [s]
 
     def add(self, drives: EmulatedDrives, node_ids: Sequence[int], store: Path | None = None) -> list[Node]:
         """Put drives on the bus, one node per device, and return the nodes.
+
+        Axes of the last node that the machines leave over have no motor connected.
 
         Args:
             drives: The drives; machines of several one-axis devices have as many nodes as axes.
@@ -96,13 +100,14 @@ class World:
                 that the device does not have.
         """
         per_node = drives.device.num_axes
-        needed = drives.num_axes // per_node
+        needed = -(-drives.num_axes // per_node)
         if len(node_ids) != needed:
             raise ValueError(
-                f"{drives.num_axes} axes ({drives.num_machines} x load {drives.load.name!r}) take "
-                f"{drives.num_axes / per_node:g} nodes of {drives.device.name}, which drives {per_node} axes; "
-                f"{len(node_ids)} node identifiers were given"
+                f"{drives.num_axes} axes ({drives.num_machines} x load {drives.load.name!r}) take {needed} nodes of "
+                f"{drives.device.name}, which drives {per_node} axes; {len(node_ids)} node identifiers were given"
             )
+        left_over = needed * per_node - drives.num_axes
+        spare = _without_motors(drives, left_over) if left_over else None
         nodes: list[Node] = []
         for k, node_id in enumerate(node_ids):
             path = None if store is None else store / f"node-{node_id}-{Path(drives.device.name).stem}.json"
@@ -111,14 +116,16 @@ class World:
                 bit_rate = round(self.wire.bit_rate)
                 real = not self.lockstep  # docs/decisions/bus.md has why nothing takes time in lockstep
                 node = Node(
-                    node_ids[k], drives, k * per_node, send=send, store=path, bit_rate=bit_rate, takes_time=real
-                )
+                    node_ids[k], drives, k * per_node, send=send, store=path, bit_rate=bit_rate, takes_time=real,
+                    spare=spare if k == needed - 1 else None,
+                )  # fmt: skip
                 nodes.append(node)
                 return node
 
+            self._room[node_id] = TRANSMIT_BUFFER * per_node
             self.attach(node_id, make)
             self._sync_objects.append(nodes[-1].dictionary.port(*SYNC_OBJECT))
-        self.drives.append(drives)
+        self.drives += [drives] if spare is None else [drives, spare]
         self._answering += nodes
         return nodes
 
@@ -196,7 +203,7 @@ class World:
         for node_id in [node_id for node_id, back in self._off.items() if back <= self.time]:
             del self._off[node_id]
             self.nodes[node_id].bus_on(self.time)
-        for node_id in [i for i in self._overflowed if self.wire.waiting(("node", i)) < TRANSMIT_BUFFER // 2]:
+        for node_id in [i for i in self._overflowed if self.wire.waiting(("node", i)) < self._room_of(i) // 2]:
             self._overflowed.remove(node_id)
             self.nodes[node_id].overrun(self.time, "transmit")
         for node in self.nodes.values():
@@ -235,9 +242,13 @@ class World:
         """Return when the next SDO answer is ready [s]."""
         return min((node.next_answer for node in self._answering), default=math.inf)
 
+    def _room_of(self, node_id: int) -> int:
+        """Return how many frames of a node may wait."""
+        return self._room.get(node_id, TRANSMIT_BUFFER)
+
     def _send(self, node_id: int, frame: Frame) -> None:
         sender = ("node", node_id)
-        if self.wire.waiting(sender) < TRANSMIT_BUFFER:
+        if self.wire.waiting(sender) < self._room_of(node_id):
             self.wire.send(frame, sender, self.time)
         else:  # the node is told once there is room for its emergency
             self._overflowed.add(node_id)
@@ -272,3 +283,11 @@ class World:
         elif sender is not None and ended.outcome == "bus off":
             self._off[sender] = self.time + self.wire.recovery_time
             self.nodes[sender].bus_off(self.time)
+
+
+def _without_motors(drives: EmulatedDrives, number: int) -> EmulatedDrives:
+    """Return as many axes of the same device as nobody has commissioned and no motor is connected to."""
+    open_phases = {"motor.open_a": 1.0, "motor.open_b": 1.0}
+    return EmulatedDrives(
+        drives.device.name, "inertia", drives.motor, number, commissioned=False, parameters=open_phases, num_threads=1
+    )
