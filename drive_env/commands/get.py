@@ -91,10 +91,10 @@ def set_object(
 ) -> None:
     """Write an object over SDO, read it back and show its value.
 
-    Put -- before a negative value: drive-env set 60FF -- -1000. If an axis is enabled it asks first. A controlword that
-    enables is refused, since nothing would monitor the motor; one that stops (0, 2, 6, 7) is always sent, after a quick
-    stop to rest where it takes the voltage away (0, 6). What an enabled axis stops by when its master dies (1016h,
-    100Ch, 100Dh, 1029h, 6007h) is not changed.
+    If an axis is enabled it asks first. A controlword that enables is refused, since nothing would monitor the motor;
+    one that stops (0, 2, 6, 7) is always sent, after a quick stop to rest where it takes the voltage away (0, 6). What
+    an enabled axis stops by when its master dies (1016h, 100Ch, 100Dh, 1029h, 6007h) is not changed; if another program
+    enables an axis meanwhile, the value of before is written back.
     """
     from drive_env.master import quantities
     from drive_env.master.can.error_control import is_of_a_watchdog
@@ -140,14 +140,6 @@ def set_object(
         # Stores and the like take a signature and read something else.
         if differs and not command(entry.index, drives.description.hints).endswith("a service"):
             fail(f"{entry.label} was written, but reads back another value than {asked[0]}", REFUSED)
-
-
-def _write(drives: BusDrives, entry: Entry, axes: list[int], value: Any) -> None:
-    """Write an object of some axes; a text has none."""
-    import numpy as np
-
-    where = None if isinstance(value, str) else np.isin(np.arange(drives.num_axes), axes)
-    drives.write((entry.index, entry.sub), value, where=where)
 
 
 def _tell_plan(
@@ -243,6 +235,42 @@ def _keep_watchdog(drives: BusDrives, entry: Entry) -> None:
             "whoever set it: it was not changed, and --yes does not change that. Switch the axis off first, in the "
             "program that enabled it or with drive-env set 6040 2"
         )
+
+
+def _write(drives: BusDrives, entry: Entry, axes: list[int], value: Any) -> None:
+    """Write an object of some axes (a text has none); one of a watchdog is put back where one was enabled meanwhile.
+
+    Between our look at the statusword and our write another master may enable, and nothing on the bus keeps it from
+    that. So we look again, and an axis that does not answer counts as enabled.
+
+    Raises:
+        RuntimeError: If an axis was enabled meanwhile.
+    """
+    import numpy as np
+
+    from drive_env.dictionary.aborts import ObjectAccessError
+    from drive_env.master.can.error_control import is_of_a_watchdog
+    from drive_env.master.errors import BusError
+
+    key = entry.index, entry.sub
+    where = None if isinstance(value, str) else np.isin(np.arange(drives.num_axes), axes)
+    if not is_of_a_watchdog(entry.index):
+        drives.write(key, value, where=where)
+        return
+    before = [int(one) for one in drives.read(key)]  # last before the write: it may be another program's by now
+    drives.write(key, value, where=where)
+    try:
+        who = _live(drives)
+    except (BusError, ObjectAccessError) as error:
+        who = f"an axis whose statusword could not be read ({error})"
+    if not who:
+        return
+    drives.write(key, before, where=where)
+    raise RuntimeError(
+        f"{who} was enabled by another program while {entry.label} was written, which is part of what stops it when "
+        f"its master dies: {', '.join(map(str, before))} was written back, as it was before. Stop the axis with "
+        "drive-env set 6040 2 where nothing monitors its master"
+    )
 
 
 def _ask_where_live(drives: BusDrives, what: str, yes: bool) -> None:

@@ -41,6 +41,12 @@ def larger(x, y):
 
 
 @inlined
+def slow_decay_clocks(off_time):
+    """Return how long a slow decay takes [clocks] (2097h)."""
+    return larger(12.0 + 32.0 * off_time, 64.0)
+
+
+@inlined
 def choose_drive(drive):
     """Choose chopper or voltage PWM for this window, by the speed of the steps: writes in_pwm and pwm_scale.
 
@@ -109,16 +115,14 @@ def constant_off_cycle(rise, lost, off, blank, dropped, fast_decay):
 def find_ripple(drive):
     """Find what the chopper's cycle does to the mean current in this window.
 
-    Writes ripple, chopper_frequency, current_shift, current_gain and lowest_share.
+    Writes ripple, chopper_frequency, in_spread_cycle, current_shift, current_gain and lowest_share.
     """
     for lane in range(LANES):
         clock = 1.0 / drive.chopper_clock[lane]
-        fullstep = drive.fullstep_threshold[lane]
-        fast_chopper = drive.high_speed_chopper[lane] if fullstep > 0.0 else 0.0
-        fast_chopper = fast_chopper if abs(drive.step_rate[lane]) > fullstep else 0.0
+        fast_chopper = drive.high_speed_chopper[lane] * drive.at_high_speed[lane]
         is_constant = drive.chopper_mode[lane] > 0.5 or fast_chopper > 0.5
         # The high speed chopper has no fast decay, and doubles the off time (TMC5160 data sheet, vhighchm).
-        off = larger(12.0 + 32.0 * drive.off_time[lane], 64.0) * clock * (1.0 + fast_chopper)
+        off = slow_decay_clocks(drive.off_time[lane]) * clock * (1.0 + fast_chopper)
         blank = blank_clocks(drive.chopper_blank[lane]) * clock
         fast_decay = 32.0 * drive.hysteresis_start[lane] * clock * (1.0 - fast_chopper)
         # Slopes of a current of the set-point's size against the whole back-EMF [A/s].
@@ -137,6 +141,7 @@ def find_ripple(drive):
         steady, steady_time, below = constant_off_cycle(rise, lost, off, blank, fast_decay * fast, fast_decay)
         chops = drive.stage_on[lane] * (1.0 - drive.in_pwm[lane])
         drive.ripple[lane] = (steady if is_constant else spread) * chops
+        drive.in_spread_cycle[lane] = 0.0 if is_constant else 1.0
         drive.chopper_frequency[lane] = chops / (steady_time if is_constant else spread_time)
         # A spread cycle's losses are small where the current is; those of the other do distort the zero crossing.
         drive.current_shift[lane] = end - below if is_constant else 0.0
