@@ -277,6 +277,14 @@ ELSEWHERE = {
     (0x3004, 0): "bit rate after a reset: below",
     (0x3005, 0): "node-ID after a reset: below",
     (0x3006, 1): "a service that stores both: below",
+} | {
+    (index, 0): f"its figures: {test}.py"
+    for test, indices in {
+        "test_stepper_cool_step": (0x2098, 0x2099, 0x209A, 0x209B, 0x209C, 0x209D, 0x20A5),
+        "test_stepper_stall_guard": (0x209E, 0x20A4),
+        "test_stepper_dc_step": (0x20B3, 0x20B4, 0x20B5),
+    }.items()
+    for index in indices
 }
 
 
