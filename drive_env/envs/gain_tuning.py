@@ -247,7 +247,9 @@ class GainTuning(VectorEnvironment):
 
     def _spaces(self) -> tuple[gymnasium.Space[Any], Box]:
         c = self.config
-        rows = rows_of(self._axes, len(c.chosen), c.waveform, int(self._device.gains.highest.max()))
+        known = self._device.gains
+        greatest = known.highest[known.columns(c.chosen)] if known.is_open_loop else known.highest
+        rows = rows_of(self._axes, len(c.chosen), c.waveform, int(greatest.max()))
         low, high = (np.array([getattr(row, end) for row in rows], np.float32) for end in ("low", "high"))
         self._low, self._high = low, high
         observation: gymnasium.Space[Any] = Box(low, high, dtype=np.float32)
@@ -303,7 +305,7 @@ class GainTuning(VectorEnvironment):
         # Environments outside the mask keep theirs: nothing of what it follows from has changed.
         self._move = planned
         supply = np.full(drives.num_axes, float(self.motor.voltage))
-        rule = self._method.rule(self._identified, planned, supply)
+        rule = self._method.keep(self._method.rule(self._identified, planned, supply), self._safe)
         self._rule = np.where(axes[:, None], rule, self._rule)
         self._best = np.where(axes[:, None], self._rule, self._best)
         self._best_is_stable = np.where(axes, False, self._best_is_stable)

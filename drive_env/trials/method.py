@@ -82,6 +82,10 @@ class Cascade(NamedTuple):
         """Return slow ones."""
         return self._rule(SAFE_RULE, found, supply)
 
+    def keep(self, gains: Integers, present: Integers) -> Integers:
+        """Return gains as they are: all of them are the rule's."""
+        return gains
+
     def trials(self, drives: Drives, axes: int) -> Trials:
         """Return what runs trials."""
         return Trials(drives, self.motor, axes, self.t_0())
@@ -152,6 +156,13 @@ class OpenLoop(NamedTuple):
     def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
         """Return the rated current: nothing holds a stepper better."""
         return self.first(supply)
+
+    def keep(self, gains: Integers, present: Integers) -> Integers:
+        """Return gains with the settings of the load detection that drives have at present: they are no currents."""
+        currents = self.device.gains.columns(self.device.gains.outer)
+        kept = present.copy()
+        kept[:, currents] = gains[:, currents]
+        return kept
 
     def trials(self, drives: Drives, axes: int) -> OpenLoopTrials:
         """Return what runs trials."""

@@ -129,6 +129,11 @@ class OpenLoopTrial(NamedTuple):
         return open_loop_cost(self.terms._replace(disturbance=disturbance, tripped=self.aborted))
 
 
+def encoder_age(device: Device) -> float:
+    """Return how old an encoder's count is when it is read [s]: it is taken once in each period of the motion loops."""
+    return 1.0 / device.velocity_rate
+
+
 def open_loop_softness(device: Device, gains: Integers) -> Floats:
     """Return what the deflection by a load at rest is proportional to, (num_axes,): one over the standby current.
 
@@ -198,7 +203,7 @@ class OpenLoopTrials(Trials):
 
     def go(self, target: Integers, where: Mask) -> None:
         """Set off for a position of the encoder."""
-        start(self._drives, wrapped(target + self._shift()).astype(np.int64), where)
+        start(self._drives, wrapped(target + self.shift()).astype(np.int64), where)
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
         """Move there and back with the currents that are; return what the load angle says, and where the axes began.
@@ -209,7 +214,7 @@ class OpenLoopTrials(Trials):
         drives, motor = self._drives, self._motor
         drives.advance(STILL * CYCLE)
         self._zero = None
-        self._shift()
+        self.shift()
         origin = drives.read(cia402.POSITION_ACTUAL)
         scaler = drives.read(Role.POSITION_SCALE)
         move = plan_move(motor, np.full(drives.num_axes, 3.0 * motor.inertia), scaler, reach)
@@ -218,7 +223,7 @@ class OpenLoopTrials(Trials):
         traces = []
         self._prepare(objects)
         for target in (origin + move.distance, origin):
-            shift = self._shift()
+            shift = self.shift()
             self.go(target, where)
             trace = self._record(objects, TRIAL)
             traces.append((trace[cia402.POSITION_ACTUAL], trace[cia402.POSITION_DEMAND] - shift))
@@ -227,6 +232,7 @@ class OpenLoopTrials(Trials):
         angle = wrapped(position - origin) / move.increments
         lag = wrapped(demand - position) / move.increments
         held = holding_torque(motor, run_and_standby(device_of(drives), read_gains(drives))[0])
+        lag -= np.gradient(wrapped(demand - origin) / move.increments, axis=0) / CYCLE * encoder_age(device_of(drives))
         # The rotor's angle in the field is the torque that it takes; as a current of the motor's torque constant.
         current = held * np.sin(motor.n_p * lag) / motor.torque_constant
         # The rotor swings a hundred times a second: the impulse is summed by trapezoids, up to the speed's own sample.
@@ -273,7 +279,7 @@ class OpenLoopTrials(Trials):
         self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask, full_step: Floats
     ) -> tuple[Floats, Floats, Mask, Mask, Mask]:
         """Move; return position, lag, machines stopped so far, axes that caused it now, and those with steps lost."""
-        drives, shift = self._drives, self._shift()
+        drives, shift = self._drives, self.shift()
         objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.STATUSWORD]
         positions, lags = [], []
         culprit, fell = np.zeros((2, len(stopped)), bool)
@@ -298,7 +304,7 @@ class OpenLoopTrials(Trials):
                 clear(drives, down)
         return np.concatenate(positions), np.concatenate(lags), stopped, culprit, fell
 
-    def _shift(self) -> Floats:
+    def shift(self) -> Floats:
         """Return what the step counter has more than the encoder [inc], by whole teeth of what it had at first.
 
         Only steps that were lost are made up for: what load and friction turn the rotor by in the field is not.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,7 @@ class TrialBench:
 
     Attributes:
         t_0: Settling times are relative to this [s].
+        began: Where the axes were before their first trial [inc], (num_axes,).
     """
 
     def __init__(self, target: Target, *, anew: bool = False) -> None:
@@ -100,20 +101,39 @@ class TrialBench:
         }
         self._stops = 0
 
+    @property
+    def trials(self) -> Any:
+        """What runs the trials."""
+        return self._trials
+
+    @property
+    def reach(self) -> Floats:
+        """How far the rotors may turn from where they began, the longer way, with its sign [rad], (num_axes,)."""
+        return self._reach
+
+    @property
+    def origin(self) -> Integers:
+        """Where the next trial starts [inc], (num_axes,)."""
+        return self._origin
+
     def identify(self) -> None:
         """Find inertia and friction with gains from the data sheet alone; plan the moves, the rule's and safe gains."""
         target, drives = self.target, self.target.drives
         if self._anew:
             machine_of(drives).reset()
-        gains = first_gains(target)
+        present = read_gains(target)
+        gains = self.method.keep(first_gains(target), present)
         write_gains(drives, gains)  # before anything is enabled: the drives may have any
         self._trials.recover(self._where)
         drives.advance(CALM)
         self.identified, self._origin = self._moved(gains)
+        self.began = self._origin.copy()
         self._trials.recover(self._where)
         self.move = plan_move(target.motor, self.identified.inertia, drives.read(Role.POSITION_SCALE), self._reach)
-        self.rule = self.method.rule(self.identified, self.move, target.supply)
-        self.safe = self.method.safe(self.identified, self.move, target.supply)
+        self.rule, self.safe = (
+            self.method.keep(rule(self.identified, self.move, target.supply), present)
+            for rule in (self.method.rule, self.method.safe)
+        )
         self.incumbent = self.safe.copy()
         write_gains(drives, self.safe)
         drives.advance(TRIAL * CYCLE)  # the first gains may leave an axis swinging
