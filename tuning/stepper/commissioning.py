@@ -92,8 +92,8 @@ def commission(
         for k in np.flatnonzero(short):
             found.reject(
                 np.arange(target.num_axes) == k,
-                f"the travel is too short: {abs(moves.reach[k]):.2g} rad to go, and {moves.least_reach(speed)[k]:.2g} rad "
-                f"are needed for the load reading at {speed:.3g} rad/s; allow more with --travel",
+                f"the travel is too short: {abs(moves.reach[k]):.2g} rad to go, and {moves.least_reach(speed)[k]:.2g} "
+                f"rad are needed for the load reading at {speed:.3g} rad/s; allow more with --travel",
             )
         if found.going().any():
             say("finding the StallGuard threshold", 0.3)
@@ -153,8 +153,8 @@ def _prove(target: Target, detection: LoadDetection, moves: WorkingMoves, speed:
     if not can_load(target):
         for k in np.flatnonzero(found.going()):
             found.reservations[k].append(
-                "stop on stall was not proved with a load: only an emulated machine of one axis can be loaded; hold the "
-                f"shaft in a slow move and see whether it stops (above {found.stop_speed[k]:.3g} rad/s)"
+                "stop on stall was not proved with a load: only an emulated machine of one axis can be loaded; hold "
+                f"the shaft in a slow move and see whether it stops (above {found.stop_speed[k]:.3g} rad/s)"
             )
         return {"lost": lost}
     going = found.going()

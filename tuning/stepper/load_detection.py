@@ -84,7 +84,8 @@ class Found:
     @classmethod
     def nothing(cls, count: int) -> Found:
         """Return it before anything was found."""
-        return cls(*np.full((7, count), np.nan), [""] * count, [[] for _ in range(count)])
+        a, b, c, d, e, f, g = (np.full(count, np.nan) for _ in range(7))
+        return cls(a, b, c, d, e, f, g, [""] * count, [[] for _ in range(count)])
 
     def going(self) -> Mask:
         """Return which axes have not been given up."""
@@ -170,7 +171,7 @@ class LoadDetection:
         for k in map(int, np.flatnonzero(found.going())):
             if last.lowest[k] <= 0.0 or last.reading[k] < max(CLEAR * last.spread[k], LEAST_MARGIN):
                 found.reasons[k] = (
-                    f"the load reading of the axis' own load is {last.reading[k]:.0f}, {last.lowest[k]:.0f} at the least: "
+                    f"the load reading of the axis' own load is {last.reading[k]:.0f}, {last.lowest[k]:.0f} at least: "
                     "too near to 0, where it would stop; raise the run current or lower the load"
                 )
 

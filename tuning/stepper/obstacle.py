@@ -1,4 +1,4 @@
-"""A load and an obstacle on the axis, which exist on emulated machines alone: does a stall stop the motor in time?"""
+"""A load and an obstacle on the axis, of emulated machines alone: whether a stall stops the motor in time."""
 
 from __future__ import annotations
 
