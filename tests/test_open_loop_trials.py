@@ -102,13 +102,15 @@ def test_inertia_and_friction_are_identified_by_the_load_angle_alone(stepper):
 
 def test_the_rule_sets_the_current_by_the_load_and_never_above_the_rated_one(stepper):
     runs = []
-    for rotors in (1, 30, 100):
+    for rotors in (1, 60, 120):
         with target(stepper, parameters={"load.inertia": rotors * MOTOR.inertia}) as found:
             bench = TrialBench(found, anew=True)
             bench.identify()
             runs.append(bench.rule[0, 0])
-            assert np.all(bench.rule <= bench.highest) and np.all(bench.safe == rated_setting(found.device, MOTOR))
-    assert runs[0] < runs[1] < runs[2]
+            assert np.all(bench.rule <= bench.highest) and np.all(
+                bench.safe[:, :2] == rated_setting(found.device, MOTOR)
+            )
+    assert runs[0] < min(runs[1:])
     assert runs[0] == setting_of(find_device(stepper), current_for(MOTOR, 0.3 * MOTOR.rated_torque))
 
 
@@ -155,7 +157,7 @@ def test_a_search_finds_currents_that_cost_less_than_the_rules(stepper):
 def test_a_safe_search_starts_at_the_rated_current_and_loses_no_step(stepper):
     with target(stepper) as found:
         result = optimise(found, Settings(trials=10, safe=True))
-        assert result.rows[0].gains.tolist() == [[rated_setting(found.device, MOTOR)] * 2]
+        assert result.rows[0].gains[:, :2].tolist() == [[rated_setting(found.device, MOTOR)] * 2]
         assert result.aborts.sum() == 0
         assert result.cost[0] < result.rows[0].cost
 
@@ -181,7 +183,7 @@ def test_gain_tuning_tunes_currents_and_its_robust_cost_asks_for_a_torque_reserv
         down = np.tile(np.float32([-0.5, -0.5]), (2, 1))
         _, reward, *_, info = env.step(down)
         np.testing.assert_allclose(reward, info["reward_terms"]["tuning"] + info["reward_terms"]["abort"])
-        assert np.all(info["trial_gains"] < env._rule.reshape(2, 1, 2))
+        assert np.all(info["trial_gains"][:, 0, :2] < env._rule[:, :2])
         # Just enough for the load step, and not with a fifth less: the robust cost says so, the trial's own J does not.
         tight = env._rule.copy()
         tight[:, 0] = setting_of(find_device(stepper), 0.36 * MOTOR.rated_current)

@@ -49,6 +49,7 @@ TOOTH = 4.0  # full steps: what a rotor falls behind
 BAND_STEPS = 0.05  # of a full step, in which an axis has settled at least: dry friction holds it off the field's angle
 ENCODER = 0  # of 606Ah
 STILL = 20  # samples at rest by which demand and encoder are compared
+REST, LONGEST_ROLL = 0.25, 100  # full steps in that time, of a rotor at rest; times that it is waited for
 LEAST_WAY = 0.25  # of a move that an encoder must show
 
 # Scales of the terms of J.
@@ -174,6 +175,7 @@ class OpenLoopTrials(Trials):
         super().__init__(drives, motor, axes, t_0)
         self.sensor: Integers | None = None
         self._zero: Floats | None = None
+        self._fell = False  # steps were lost, and the rotor may still be on its way to the next tooth
 
     def recover(self, where: Mask) -> None:
         """Bring axes to pp, enabled, by the encoder, whatever state they are in."""
@@ -279,7 +281,10 @@ class OpenLoopTrials(Trials):
         self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask, full_step: Floats
     ) -> tuple[Floats, Floats, Mask, Mask, Mask]:
         """Move; return position, lag, machines stopped so far, axes that caused it now, and those with steps lost."""
-        drives, shift = self._drives, self.shift()
+        drives = self._drives
+        if self._fell:
+            self._come_to_rest(full_step)
+        shift = self.shift()
         objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.STATUSWORD]
         positions, lags = [], []
         culprit, fell = np.zeros((2, len(stopped)), bool)
@@ -293,16 +298,27 @@ class OpenLoopTrials(Trials):
             down = where & ~cia402.matches(trace[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
             out = where & (np.abs(lag) > LOST * full_step).any(axis=0)
             fell |= out
+            self._fell = self._fell or bool(out.any())
             new = self._whole_lanes(down | out) & where & ~stopped
             if new.any():
                 write_gains(drives, incumbent, new)
-                # The steps end, and the rotor finds the field again.
-                drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=new & ~down)
                 stopped = stopped | new
                 culprit |= new & (down | out)
+            if (on := (new | out) & ~down).any():  # the steps end, and the rotor finds the field again
+                drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=on)
             if down.any():
                 clear(drives, down)
         return np.concatenate(positions), np.concatenate(lags), stopped, culprit, fell
+
+    def _come_to_rest(self, full_step: Floats) -> None:
+        """Wait until no rotor moves: a heavy load rolls over many teeth before the field catches it."""
+        drives = self._drives
+        for _ in range(LONGEST_ROLL):
+            before = drives.read(cia402.POSITION_ACTUAL)
+            drives.advance(STILL * CYCLE)
+            if np.all(np.abs(wrapped(drives.read(cia402.POSITION_ACTUAL) - before)) < REST * full_step):
+                break
+        self._fell = False
 
     def shift(self) -> Floats:
         """Return what the step counter has more than the encoder [inc], by whole teeth of what it had at first.
