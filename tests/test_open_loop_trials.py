@@ -259,3 +259,10 @@ def test_commands_refuse_in_one_line_before_anything_moves(stepper, command, rea
     result = run(*command, "--device", stepper, *motor)
     assert result.exit_code == 2 and reason in result.output
     assert not list(Path(tmp_path).iterdir())
+
+
+def test_tracking_says_that_it_needs_a_measured_torque(stepper):
+    from drive_env.envs.tracking import Tracking
+
+    with pytest.raises(ValueError, match=r"no torque actual value \(6077h\) .* take GainTuning"):
+        Tracking(1, device=stepper, motor=NAME, load="inertia")
