@@ -25,7 +25,7 @@ STALL = "stall"  # in what a drive says by itself
 
 
 @dataclass(frozen=True)
-class Proof:
+class ObstacleProof:
     """What load and obstacle did to the axes, (num_axes,) each.
 
     withstood: Neither stopped nor lost steps with the acceptable load. stopped: Stopped by a stall at the obstacle.
@@ -42,7 +42,7 @@ def can_load(target: Target) -> bool:
     return target.drives.machine is not None and target.axes_per_machine == 1
 
 
-def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floats, where: Mask) -> Proof:
+def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floats, where: Mask) -> ObstacleProof:
     """Move with the acceptable load, then against an obstacle; the axes are enabled again afterwards.
 
     Args:
@@ -82,7 +82,7 @@ def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floa
     tooth = 2.0 * np.pi * moves.increments / motor.n_p
     lost = np.abs(moves.trials.shift() - before) / tooth
     enabled = cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
-    return Proof(where & ~loaded.failed, where & blocked.stopped & stalled & enabled, np.rint(lost))
+    return ObstacleProof(where & ~loaded.failed, where & blocked.stopped & stalled & enabled, np.rint(lost))
 
 
 def _lever(target: Target) -> Floats:
