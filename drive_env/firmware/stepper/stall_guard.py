@@ -90,6 +90,7 @@ def stop_stalled(drive):
     """Make no more steps on a motor that has stalled, from this window on."""
     for lane in range(LANES):
         drive.step_rate[lane] = 0.0 if drive.stalled[lane] > 0.5 else drive.step_rate[lane]
+        drive.planned_rate[lane] = 0.0 if drive.stalled[lane] > 0.5 else drive.planned_rate[lane]
 
 
 @stage
