@@ -8,7 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
-from stepper_rig import BARE
+from stepper_rig import BARE, lane
 from test_parity import WorldBus
 from typer.testing import CliRunner
 
@@ -108,6 +108,42 @@ def test_a_load_that_is_acceptable_does_not_stop_it_and_an_obstacle_does(stepper
         assert not prove_with_load(found, moves, SPEED, run, np.ones(1, bool)).stopped.any()
 
 
+# --- CoolStep ---------------------------------------------------------------------------------------------------------
+def test_coolstep_lowers_the_current_by_what_the_load_angle_says_and_no_step_is_lost(stepper):
+    """The truth is the amplitude in the drive's record, which no bus shows."""
+    with target(stepper) as found:
+        detection, moves = detection_of(found)
+        detection.find_threshold()
+        detection.find_coolstep()
+        got = detection.found
+        assert not got.reasons[0] and not got.reservations[0]
+        full = amplitude(found.device, detection.gains[:, 0])[0]
+        amplitudes = []
+        moves.run(SPEED, np.ones(1, bool), lambda leg, t: amplitudes.append(lane(found.drives, "amplitude")[0]))
+        least = min(amplitudes)
+        assert 0.5 * full - 1e-9 <= least < 0.8 * full  # a half is the least that 2098h = 0 allows
+        assert got.saved == pytest.approx(1.0 - least / full, abs=0.1)
+        assert got.cooled_angle < STALL_ANGLE
+
+
+def test_coolstep_is_left_off_where_it_loses_steps(stepper, monkeypatch):
+    """Steps are lost whenever CoolStep works: it is switched off again, and the axis keeps the rest."""
+    run = WorkingMoves.run
+
+    def losing(self, speed, where, *rest, **more):
+        steady = run(self, speed, where, *rest, **more)
+        on = self.drives.read((0x209C, 0)) > 0
+        return steady._replace(lost=steady.lost | on)
+
+    monkeypatch.setattr(WorkingMoves, "run", losing)
+    with target(stepper) as found:
+        detection, _ = detection_of(found)
+        detection.find_threshold()
+        detection.find_coolstep()
+        assert found.drives.read((0x209C, 0)) == 0 and not detection.found.reasons[0]
+        assert "CoolStep is left off" in detection.found.reservations[0][0]
+
+
 # --- the run ----------------------------------------------------------------------------------------------------------
 def test_a_stepper_is_commissioned_by_its_load(stepper, tmp_path):
     with target(stepper) as found:
@@ -194,6 +230,24 @@ def test_a_search_of_currents_finds_the_same_in_process_and_over_the_bus():
     with EmulatedDrives("tmcm6212", **MACHINES) as drives:
         inside = act(drives)
     assert on_bus("tmcm6212", act) == inside and len(inside) == 12
+
+
+def test_commissioning_finds_the_same_in_process_and_over_the_bus(tmp_path):
+    """What is a number in both; only the machine in this process can be loaded, which the node's verdict says."""
+
+    def act(drives):
+        result = commission(six_axes(drives), tmp_path / f"{id(drives)}.toml", keep=False)
+        return [(axis.after, axis.figures, axis.verdict, axis.reservations) for axis in result.axes]
+
+    with EmulatedDrives("tmcm6212", **MACHINES) as drives:
+        inside = act(drives)
+    outside = on_bus("tmcm6212", act)
+    obstacle = "teeth lost at an obstacle"
+    for (after, figures, verdict, _), (far, seen, told, reservations) in zip(inside, outside, strict=True):
+        assert after == far and verdict == "accepted" and told == "accepted with reservations"
+        assert figures | {obstacle: None} == seen | {obstacle: None}
+        assert seen[obstacle] is None and len(reservations) == 1 and "not proved with a load" in reservations[0]
+        assert after["stall_threshold"] != 0 or after["coolstep_lower"] > 0
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

@@ -17,14 +17,15 @@ from numpy.typing import NDArray
 
 from drive_env import cia402, motion
 from drive_env.dictionary.roles import Role
+from drive_env.drives.speeds import per_increment
 from drive_env.gains import read_gains, write_gains
 from drive_env.phase_current import amplitude, holding_torque, run_and_standby
 from drive_env.trials.open_loop import encoder_age
 from tuning.search.trial_bench import TrialBench
 from tuning.snapshot import Transaction, restore
-from tuning.stepper.load_detection import STALL_ANGLE, LoadDetection, has_coolstep, lacks_load_detection
+from tuning.stepper.load_detection import LOWER, STALL_ANGLE, LoadDetection, has_coolstep, lacks_load_detection
 from tuning.stepper.moves import WorkingMoves
-from tuning.stepper.obstacle import can_load, prove_with_load
+from tuning.stepper.obstacle import REACTION, can_load, prove_with_load
 from tuning.stepper.result import StepperAxis, StepperResult, figure
 from tuning.target import Target, timed
 
@@ -37,6 +38,7 @@ Files = Callable[[StepperResult], AbstractContextManager[object]]
 WORKING_SHARE = 0.7  # of the motor's corner speed: the current is in full force, and the back-EMF clear
 ACCELERATION_SHARE = 0.3  # of the holding torque at the run current
 MOST_ACCELERATION = 2000.0  # rad/s^2
+PROFILE_SHARE = 0.95  # of the highest acceleration that the drive takes
 REACH_SHARE, LONGEST = 0.9, 100.0  # of the travel, and at most [rad]
 MOST_LOST = 3.0  # teeth, until a stall has stopped the motor
 
@@ -138,7 +140,12 @@ def _moves(bench: TrialBench, gains: Integers) -> WorkingMoves:
     target = bench.target
     torque = ACCELERATION_SHARE * holding_torque(target.motor, run_and_standby(target.device, gains)[0])
     reach = np.clip(REACH_SHARE * np.nan_to_num(bench.reach, posinf=LONGEST, neginf=-LONGEST), -LONGEST, LONGEST)
-    acceleration = np.minimum(torque / bench.identified.inertia, MOST_ACCELERATION)
+    # The drive's profiles end somewhere, too.
+    entry = target.device.new_dictionary().find(cia402.PROFILE_ACCELERATION)
+    assert entry.high is not None, "an acceleration is a number"
+    counts = target.increments() * per_increment(target.drives, cia402.PROFILE_ACCELERATION)
+    most = np.minimum(MOST_ACCELERATION, PROFILE_SHARE * entry.high / counts)
+    acceleration = np.minimum(torque / bench.identified.inertia, most)
     # A trial may have ended away from where the axes began; the way is counted from there.
     return WorkingMoves(
         target.drives, target.motor, bench.trials, bench.began, reach, acceleration, target.increments(),
@@ -161,6 +168,12 @@ def _prove(target: Target, detection: LoadDetection, moves: WorkingMoves, speed:
     if going.any():
         run, _ = run_and_standby(target.device, detection.gains)
         proof = prove_with_load(target, moves, speed, run, going)
+        lower = target.device.gains.column(*LOWER)
+        if lower is not None and (cooled := going & ~proof.withstood & (detection.gains[:, lower] > 0)).any():
+            detection.leave_coolstep_off(
+                cooled, "with it a load of 30 % of the holding torque, which comes within 0.15 s, stops the axis"
+            )
+            proof = prove_with_load(target, moves, speed, run, going)
         found.reject(going & ~proof.withstood, "it stops or loses steps with a load of 30 % of the holding torque")
         found.reject(going & ~proof.stopped, "an obstacle does not stop it: no stall was seen before steps were lost")
         lost = np.where(proof.stopped, proof.lost, np.nan)
@@ -190,7 +203,11 @@ def _leave(
 ) -> None:
     """Leave the accepted axes with their settings and all else as it was, disabled."""
     drives = bench.target.drives
-    motion.disable(drives)
+    everywhere = np.ones(bench.target.num_axes, bool)
+    if bench.trials.down().any():  # one that was given up is in fault
+        drives.advance(REACTION)
+        bench.trials.recover(everywhere)
+    motion.disable(drives, where=~bench.trials.down())
     bench.trials.leave()
     if not accepted.any():
         return

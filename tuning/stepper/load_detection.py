@@ -35,7 +35,7 @@ Mask = NDArray[np.bool_]
 THRESHOLD = ("load detection", "threshold")  # loop and part of the gain
 LOWER, WIDTH, LEAST, DOWN, UP = (("CoolStep", part) for part in ("lower", "width", "least", "down", "up"))
 STALL_ANGLE = math.radians(60.0)  # of the load angle, at which the reading is to fall to 0
-COOL_ANGLE = math.radians(45.0)  # down to which CoolStep takes current away
+COOL_ANGLE = math.radians(30.0)  # down to which CoolStep takes current away
 SLOW = 0.7  # of the working speed, at which the reading is compared
 FULL_READING = 1023.0
 CLEAR = 3.0  # standard deviations, by which a reading must be above 0
@@ -44,7 +44,7 @@ SHARE_AT_STOP_SPEED = 0.5  # of the margin, that is left at the speed above whic
 LEAST_STOP_SPEED = 0.5  # of the working speed
 LIFT = 16  # steps of the threshold, by which a reading of 0 is lifted
 COOL_UNIT = 32.0  # counts of the reading of a step of CoolStep's thresholds
-COOL_WIDTH, COOL_DOWN, COOL_UP = 2, 2, 2  # width of the band, 2 readings for a step down, 4 steps up for one below it
+COOL_WIDTH, COOL_DOWN, COOL_UP = 2, 2, 3  # width of the band, 2 readings for a step down, 8 steps up for one below it
 COOL_RAISES = 3  # of the lower threshold, where steps were lost
 
 
@@ -205,6 +205,13 @@ class LoadDetection:
             found.reservations[k].append(
                 "CoolStep does not lower the current at the working speed: the load reading leaves it no room"
             )
+
+    def leave_coolstep_off(self, where: Mask, why: str) -> None:
+        """Switch CoolStep off again, with a reservation."""
+        self._set(LOWER, np.where(where, 0, self.gains[:, self._column(LOWER)]))
+        for k in map(int, np.flatnonzero(where)):
+            self.found.reservations[k].append(f"CoolStep is left off: {why}")
+            self.found.saved[k] = np.nan
 
     # --- drives -------------------------------------------------------------------------------------------------------
     def prove(self) -> None:

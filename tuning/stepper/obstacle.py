@@ -70,6 +70,7 @@ def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floa
 
     # A load that comes by and by: the rotor would swing in its field by a sudden one.
     loaded = with_torque(np.full(target.num_axes, LOAD_SHARE * motor.rated_torque), ramp, RISE)
+    drives.advance(REACTION if loaded.stopped.any() else SETTLE)
     moves.trials.recover(where)
     drives.advance(SETTLE)
     told_causes(drives)
