@@ -47,7 +47,7 @@ PROBE = 0.8  # run current of the probe over that of the trial
 LOST = 2.0  # full steps between field and rotor: beyond the unstable balance, from where it falls to the next tooth
 TOOTH = 4.0  # full steps: what a rotor falls behind
 BAND_STEPS = 0.05  # of a full step, in which an axis has settled at least: dry friction holds it off the field's angle
-ENCODER = 0  # of 606Ah
+ENCODER, NO_WINDOW = 0, 0  # of 606Ah and 6065h
 STILL = 20  # samples at rest by which demand and encoder are compared
 REST, LONGEST_ROLL = 0.25, 100  # full steps in that time, of a rotor at rest; times that it is waited for
 LEAST_WAY = 0.25  # of a move that an encoder must show
@@ -167,13 +167,15 @@ def with_run_current(device: Device, gains: Integers, factor: float | Floats) ->
 class OpenLoopTrials(Trials):
     """Runs trials on open-loop steppers, as `Trials` does on servo drives; the axes of a machine are stopped together.
 
-    606Ah is set to the encoder while the drives are disabled; `sensor` is what it was. Positions are the encoder's;
+    606Ah is set to the encoder while the drives are disabled, and 6065h watches no longer, with which no axis that has
+    lost steps could be enabled again; `sensor` and `window` are what they were. Positions are the encoder's;
     what has been lost in steps is made up for in the targets that the step counter gets.
     """
 
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:
         super().__init__(drives, motor, axes, t_0)
         self.sensor: Integers | None = None
+        self.window: Integers | None = None
         self._zero: Floats | None = None
         self._fell = False  # steps were lost, and the rotor may still be on its way to the next tooth
 
@@ -182,7 +184,9 @@ class OpenLoopTrials(Trials):
         drives = self._drives
         now = drives.read(cia402.SENSOR_SELECTION)
         if self.sensor is None:
-            self.sensor = now
+            self.sensor, self.window = now, drives.read(cia402.FOLLOWING_WINDOW)
+            if np.any(self.window != NO_WINDOW):
+                drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
         blind = where & (now != ENCODER)
         if blind.any():
             on = blind & ~self.down()
@@ -198,7 +202,9 @@ class OpenLoopTrials(Trials):
 
     def leave(self) -> None:
         """Give 606Ah back what it was; the axes must be disabled."""
-        if self.sensor is not None:
+        if self.sensor is not None and self.window is not None:
+            if np.any(drifted := self._drives.read(cia402.FOLLOWING_WINDOW) != self.window):
+                self._drives.write(cia402.FOLLOWING_WINDOW, self.window, where=drifted)
             changed = self._drives.read(cia402.SENSOR_SELECTION) != self.sensor
             if changed.any():
                 self._drives.write(cia402.SENSOR_SELECTION, self.sensor, where=changed)
