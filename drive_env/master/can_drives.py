@@ -40,7 +40,8 @@ class CanDrives(BusDrives):
         pace: "real-time": time passes by the clock, one SYNC per communication cycle. "lockstep": time passes by
             SYNC, for an emulator served so.
         cycle: Time between two SYNCs in real time [s]: whole communication cycles of the drives, one by default. What
-            many axes exchange takes a longer one: frames that do not fit into a cycle are refused.
+            many axes exchange takes a longer one: frames that do not fit into a cycle are refused. Write 60C2h to it
+            for csp and csv; `advance` lets whole ones pass, and `record` takes such a `period`.
         bus: An open python-can bus in place of interface and channel; it stays open afterwards.
         timeout: Longest wait for an answer [s]; the device's own by default.
         timeouts: Object -> time-out [s], for those that need another.
@@ -82,7 +83,8 @@ class CanDrives(BusDrives):
             raise ValueError(f"pace is 'real-time' or 'lockstep', not {pace!r}")
         checked_limits(safety)
         if cycle is not None:
-            description.cycle = _checked_cycle(cycle, description.cycle, pace)
+            description.cycles_per_sync = _cycles_per_sync(cycle, description.cycle, pace)
+            description.cycle *= description.cycles_per_sync
         # A dry run has nothing to wait for either.
         by_sync = pace == "lockstep" or bool(dry_run)
         paced: Pace = LockstepPace() if by_sync else RealTimePace(description.cycle)
@@ -103,12 +105,12 @@ class CanDrives(BusDrives):
         return self._port
 
 
-def _checked_cycle(cycle: float, least: float, pace: str) -> float:
-    """Return a time between SYNCs [s]; ValueError for one that cannot be."""
+def _cycles_per_sync(cycle: float, least: float, pace: str) -> int:
+    """Return how many communication cycles [s] pass from SYNC to SYNC [s]; ValueError for what cannot be."""
     if pace == "lockstep":
         raise ValueError(f"cycle={cycle:g} s is for real time: in lockstep each SYNC is a cycle of {least:g} s")
     if not least <= cycle <= LONGEST_CYCLE:
         raise ValueError(
             f"cycle={cycle:g} s must be from {least:g} s, the drives' communication cycle, to {LONGEST_CYCLE:g} s"
         )
-    return whole_cycles(cycle, least) * least
+    return whole_cycles(cycle, least)
