@@ -184,7 +184,8 @@ def notes(device: Device, entry: Entry, by_place: dict[tuple[int, int], object])
     if place in device.write_states:
         found.append(f"written in {device.write_states[place].replace('_', ' ').lower()} only")
     if place in device.unsupported:
-        found.append("a service of a node on a bus")
+        reason = device.unsupported[place]
+        found.append(f"always refused: {reason}" if reason else "a service of a node on a bus")
     return "; ".join(found)
 
 

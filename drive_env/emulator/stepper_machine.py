@@ -32,6 +32,10 @@ _FIELDS = {
     "motor.thermal_time": "thermal_time",
     "motor.ambient": "ambient",
     "motor.encoder_broken": "encoder_broken",
+    "motor.index_angle": "index_angle",
+    "motor.index_inverted": "index_inverted",
+    "motor.brake_opens_in": "brake_opens_in",
+    "motor.brake_closes_in": "brake_closes_in",
     "motor.open_a": "open_a",
     "motor.open_b": "open_b",
     "motor.encoder_line_error": "encoder_line_error",
@@ -45,6 +49,8 @@ _FIELDS = {
     "stage.thermal_resistance": "stage_thermal_resistance",
     "stage.thermal_time": "stage_thermal_time",
     "stage.short_conductance": "short_conductance",
+    "stage.short_a": "short_a",
+    "stage.short_b": "short_b",
 }
 _AT_TEMPERATURE = {"motor.R_s": "R_s", "motor.psi_m": "psi_m"}
 _ENCODER_DIRECTION = "motor.encoder_direction"
@@ -94,9 +100,18 @@ def motor_parameters(motor: Motor) -> list[MachineParameter]:
 
 
 def wiring_parameters(motor: Motor) -> list[MachineParameter]:
-    """Return how the motor's cables may be wired."""
+    """Return how the motor's cables may be wired, where its encoder's index is, and how quick a brake on it is."""
     wired = float(motor.encoder_direction)
-    return [MachineParameter(_ENCODER_DIRECTION, "1", wired, 0.0, 1.0, wired)]
+    return [
+        MachineParameter(_ENCODER_DIRECTION, "1", wired, 0.0, 1.0, wired),
+        MachineParameter("motor.index_angle", "rad", 0.0, 0.0, 2.0 * np.pi, 0.0),
+        MachineParameter("stage.short_a", "S", 0.0, 0.0, 0.0, 0.0),
+        MachineParameter("stage.short_b", "S", 0.0, 0.0, 0.0, 0.0),
+        MachineParameter("motor.index_inverted", "1", 0.0, 0.0, 0.0, 0.0),
+        # Usual for brakes of some newton metres that a spring closes.
+        MachineParameter("motor.brake_opens_in", "s", 0.04, 0.02, 0.08, 0.04),
+        MachineParameter("motor.brake_closes_in", "s", 0.02, 0.01, 0.04, 0.02),
+    ]
 
 
 def apply(records: Records, device: Device, motor: Motor, name: str, values: Floats, axes: Mask) -> None:

@@ -10,7 +10,7 @@ from drive_env.firmware.common.warming import warmed
 from drive_env.firmware.cycle import FirmwareStages, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper import causes, fields
-from drive_env.firmware.stepper.chopper import choose_drive, find_ripple
+from drive_env.firmware.stepper.chopper import choose_drive, drain_shorts, find_ripple
 from drive_env.firmware.stepper.cool_step import adapt_current, forget_reduction
 from drive_env.firmware.stepper.current_scale import scale_current
 from drive_env.firmware.stepper.dc_step import forget_waiting, release_steps, slow_ramp
@@ -83,6 +83,7 @@ def prepare_chopper(drive, rates):
     refresh_winding(drive, rates.tick, rates.window)
     choose_drive(drive)
     find_ripple(drive)
+    drain_shorts(drive)
 
 
 @stage
@@ -92,7 +93,14 @@ def warm(drive, rates):
         square = drive.i_a[lane] * drive.i_a[lane] + drive.i_b[lane] * drive.i_b[lane]
         square += drive.ripple[lane] * drive.ripple[lane] * (1.0 / 6.0)
         square = square if square < LARGEST_SQUARE else 0.0  # a frozen lane's currents may be no numbers
-        warmed(drive, lane, drive.R_s[lane] * square, drive.on_resistance[lane] * square, rates.period)
+        # What a short to ground carries warms the stage alone, while its bridge is on.
+        u_dc = drive.u_dc[lane]
+        shorts = drive.short_a[lane] * drive.short_a[lane] * abs(drive.u_a[lane])
+        shorts += drive.short_b[lane] * drive.short_b[lane] * abs(drive.u_b[lane])
+        shorted = drive.stage_on[lane] * u_dc * shorts
+        shorted = shorted if shorted < LARGEST_SQUARE else 0.0
+        in_stage = drive.on_resistance[lane] * (square + shorted)
+        warmed(drive, lane, drive.R_s[lane] * square, in_stage, rates.period)
 
 
 @stage
@@ -142,6 +150,8 @@ def power_on(drive, lane):
     drive.step_position[lane] = 0.0
     drive.step_rate[lane] = 0.0
     drive.steps_done[lane] = 0.0
+    drive.steps_low[lane] = 0.0
+    drive.steps_high[lane] = 0.0
     drive.in_full_steps[lane] = 0.0
     drive.standstill_time[lane] = 0.0
     drive.velocity_before[lane] = 0.0
@@ -154,6 +164,13 @@ def power_on(drive, lane):
     s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
     drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
     edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI
+    drive.true_edges[lane] = edges
+    drive.step_seen[lane] = 0.0
+    drive.step_shift[lane] = 0.0
+    drive.index_seen[lane] = 0.0
+    drive.latch_armed[lane] = 0.0
+    drive.latch_steps[lane] = 0.0
+    drive.latch_encoder[lane] = 0.0
     drive.count[lane] = encoder_count(edges * drive.encoder_gain[lane], drive.encoder_true_direction[lane])
     drive.count_zero[lane] = drive.count[lane]
     drive.theta_encoder[lane] = 0.0
@@ -169,7 +186,7 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_quotients),
     measure=(causes.watch_phases,),
-    switch=(causes.forget_peaks, slow_ramp, hold_stalled, scale_current),
+    switch=(causes.forget_peaks, slow_ramp, hold_stalled, causes.switch_brake, scale_current),
     tell=(tell_status,),
     end_period=(spread_steps,),
     window=(watch_load, read_motion, prepare_chopper),

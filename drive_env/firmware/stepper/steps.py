@@ -17,6 +17,7 @@ from mechanics.compiled import inlined
 
 HALF_PI = 1.5707963267948966
 SMALLEST_WAY = 1e-6  # microsteps
+HALF = 4294967296.0  # 2^32: of a counter of 64 bits
 
 
 @inlined
@@ -39,7 +40,7 @@ def plan_steps(drive, dt):
     Writes planned_rate, step_rate, at_high_speed and in_full_steps.
     """
     for lane in range(LANES):
-        way = drive.position_demand[lane] + drive.home_shift[lane] - drive.step_position[lane]
+        way = drive.position_demand[lane] + drive.home_shift[lane] + drive.step_shift[lane] - drive.step_position[lane]
         # What rounding has left of the last period's way is no motion.
         way = 0.0 if abs(way) * drive.steps_per_rad[lane] < SMALLEST_WAY else way
         rate = way / dt
@@ -63,9 +64,13 @@ def plan_steps(drive, dt):
 
 @inlined
 def count_steps(drive, h):
-    """Count the microsteps of the coming window of h [s]: writes steps_done."""
+    """Count the microsteps of the coming window of h [s]: writes steps_low, steps_high and steps_done."""
     for lane in range(LANES):
-        drive.steps_done[lane] += abs(drive.step_rate[lane]) * h * drive.steps_per_rad[lane]
+        counted = drive.steps_low[lane] + abs(drive.step_rate[lane]) * h * drive.steps_per_rad[lane]
+        carry = 1.0 if counted >= HALF else 0.0
+        drive.steps_low[lane] = counted - carry * HALF
+        drive.steps_high[lane] += carry
+        drive.steps_done[lane] = drive.steps_high[lane] * HALF + drive.steps_low[lane]
 
 
 @inlined
