@@ -78,6 +78,7 @@ def test_an_axis_that_is_jogged_to_its_limit_switch_stops_there(bus):
     assert (drives.read(0x6064)[:5] == 0).all()
 
 
+@pytest.mark.slow
 def test_it_is_found_backed_up_and_watched(bus, tmp_path):
     run, _ = bus
     found = CliRunner().invoke(drive_env.commands.cli.app, ["scan", "--first", "1", "--last", "2"])

@@ -120,7 +120,10 @@ SCRIPTS = {script.__name__: script for script in LOADS}
 
 @pytest.mark.parametrize(
     ("name", "safety"),
-    [pytest.param(name, True, marks=pytest.mark.slow if name == "homing" else ()) for name in SCRIPTS]
+    [
+        pytest.param(name, True, marks=pytest.mark.slow if name in ("homing", "six_point", "csv") else ())
+        for name in SCRIPTS
+    ]
     + [("csp", False), ("fault", False)],
 )
 def test_the_same_script_gives_the_same_integers(name, safety):
