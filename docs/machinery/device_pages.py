@@ -6,6 +6,7 @@ from tables import table, unit
 
 from drive_env.devices import AXIS, Device, device_names, find_device
 from drive_env.dictionary.entries import Entry
+from drive_env.firmware import motor_kinds
 
 FOLDER = "reference/devices"
 SECTIONS = (
@@ -48,6 +49,7 @@ def page(device: Device) -> str:
 
 def facts(device: Device) -> str:
     """Return the device's figures."""
+    peak = "peak of a phase" if "stepper" in motor_kinds(device.firmware_name) else "peak i_q"
     rows = [
         ("axes", device.num_axes, ""),
         ("current loop", f"{device.current_rate:g}", "Hz"),
@@ -55,8 +57,8 @@ def facts(device: Device) -> str:
         ("supervision, modes and profiles", f"{device.supervision_rate:g}", "Hz"),
         ("communication cycle", f"{1e3 / device.communication_rate:g}", "ms"),
         ("supply voltage", f"{device.undervoltage:g} to {device.overvoltage:g}", "V"),
-        ("current that it carries continuously, peak i_q", f"{device.nominal_current:g}", "A"),
-        ("overcurrent, peak i_q", f"{device.overcurrent:g}", "A"),
+        (f"current that it carries continuously, {peak}", f"{device.nominal_current:g}", "A"),
+        (f"overcurrent, {peak}", f"{device.overcurrent:g}", "A"),
         ("temperature: warning, error", f"{device.warning_temperature:g}, {device.error_temperature:g}", "°C"),
         ("longest wait for an SDO answer", f"{device.master.timeout:g}", "s"),
     ]

@@ -84,7 +84,8 @@ def open_load_b(drive, lane, told):
 def following_error(drive, lane, told):
     """Return whether the encoder is farther from the demand than the window of 6065h: the motor has lost steps."""
     window = drive.following_error_window[lane]
-    error = abs(drive.position_demand[lane] - drive.position_actual[lane])
+    # Not from position_actual: homing has moved demand and steps in this period, and that not yet.
+    error = abs(drive.position_demand[lane] - drive.theta_meas[lane] + drive.deviation[lane])
     return drive.drive_function[lane] > 0.0 and window > 0.0 and error > window
 
 

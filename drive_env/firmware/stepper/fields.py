@@ -111,5 +111,6 @@ STATE = (
     Field("theta_encoder", "f8", "rad", "position by the encoder"),
     Field("omega_encoder", "f8", "rad/s", "2122h: speed by the encoder, filtered"),
     Field("position_actual", "f8", "rad", "6064h: by the sensor that 606Ah names"),
+    Field("deviation", "f8", "rad", "by which that lies behind the steps, wherever home is"),
     Field("status_flags", "i4", "", "2102h: errors of the driver"),
 )

@@ -23,7 +23,8 @@ def derive_encoder(drive):
 def measure_motion(drive, h):
     """Read step counter and encoder once per window of h [s].
 
-    Writes theta_meas and omega_meas, which are the steps', theta_encoder, omega_encoder and position_actual.
+    Writes theta_meas and omega_meas, which are the steps', theta_encoder, omega_encoder, position_actual and
+    deviation.
     """
     for lane in range(LANES):
         s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
@@ -39,7 +40,9 @@ def measure_motion(drive, h):
         drive.theta_meas[lane] = steps
         drive.omega_meas[lane] = drive.step_rate[lane]
         drive.theta_encoder[lane] = encoder
-        drive.position_actual[lane] = encoder if drive.position_sensor[lane] > -0.5 else steps
+        actual = encoder if drive.position_sensor[lane] > -0.5 else steps
+        drive.position_actual[lane] = actual
+        drive.deviation[lane] = steps - actual
         raw = (count - before) * per_count / h
         b = drive.velocity_filter_b[lane]
         omega = b * raw + drive.velocity_filter_z[0, lane]

@@ -135,6 +135,7 @@ def power_on(drive, lane):
     drive.theta_encoder[lane] = 0.0
     drive.omega_encoder[lane] = 0.0
     drive.position_actual[lane] = 0.0
+    drive.deviation[lane] = 0.0
 
 
 STAGES = FirmwareStages(
