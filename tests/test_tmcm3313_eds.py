@@ -15,7 +15,7 @@ import pytest
 
 from drive_env.dictionary.entries import ObjectDictionary
 
-EDS = Path(__file__).parents[1] / "research" / "stepper_drives" / "tmcm3313" / "tmcm3313.eds"
+EDS = Path(__file__).parents[1] / "drive_env" / "devices" / "tmcm3313" / "tmcm3313.eds"
 NODE, AXES = 5, 3
 BITS = {"U8": (8, False), "U16": (16, False), "U32": (32, False), "U64": (64, False), "I8": (8, True),
         "I16": (16, True), "I32": (32, True)}  # fmt: skip

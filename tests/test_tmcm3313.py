@@ -1,0 +1,295 @@
+"""The TMCM-3313: its manual's recipes and tables, its node on CAN, and the bus against calls in process."""
+
+from __future__ import annotations
+
+import re
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from canopen_wire import Wire
+from test_parity import WorldBus
+
+from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env.bus.world import World
+from drive_env.devices import find_device
+from drive_env.dictionary.aborts import (
+    CANNOT_BE_STORED,
+    UNSUPPORTED_ACCESS,
+    VALUE_RANGE,
+    VALUE_TOO_HIGH,
+    VALUE_TOO_LOW,
+)
+from drive_env.firmware import find_firmware
+from drive_env.node.process_image import ProcessImage
+
+AXES = 3
+SAMPLED = (0x6041, 0x6064, 0x606C)
+
+
+def index_of(index, axis):
+    """Return the index of an object of axis 0 on another axis: section 2.4.1."""
+    return index + (0x800 if index >= 0x6000 else 0x200) * axis
+
+
+@pytest.fixture
+def wire():
+    with EmulatedDrives("tmcm3313", load="inertia", num_machines=AXES, num_threads=1) as drives:
+        yield Wire(drives)
+
+
+SIZES = {0x2005: 4, 0x6040: 2, 0x6060: 1, 0x607A: 4, 0x6098: 1, 0x6099: 4, 0x60FF: 4}
+
+
+class Recipe:
+    """A recipe of the manual, step by step on one axis of a node on CAN."""
+
+    def __init__(self, wire, axis):
+        self.wire, self.axis = wire, axis
+
+    def write(self, index, raw, sub=0):
+        assert self.wire.download(index_of(index, self.axis), sub, raw, SIZES[index]) == 0, f"{index:04X}h"
+
+    def read(self, index):
+        return self.wire.value(index_of(index, self.axis))
+
+
+@pytest.fixture(params=range(AXES))
+def recipe(wire, request):
+    return Recipe(wire, request.param)
+
+
+# --- the manual's recipes ---------------------------------------------------------------------------------------------
+def test_how_to_move_a_motor_in_pp_mode(recipe, wire):
+    """Section 6.2, of a drive whose velocity and acceleration were set; the factory's are 0."""
+    recipe.write(0x2005, 3)
+    recipe.write(0x6060, 1)
+    for word, state in ((6, 0x21), (7, 0x23), (15, 0x27)):
+        recipe.write(0x6040, word)
+        assert recipe.read(0x6041) & 0x6F == state
+    recipe.write(0x607A, 500_000)
+    recipe.write(0x6040, 31)
+    wire.wait(2)
+    recipe.write(0x6040, 15)
+    wire.wait(1000)
+    assert 0 < recipe.read(0x6064) < 500_000
+    assert not recipe.read(0x6041) & 0x0400
+    wire.wait(4500)
+    assert recipe.read(0x6064) == recipe.read(0x6062) == 500_000
+    assert recipe.read(0x6041) & 0x0400, "table 211: target reached"
+    others = [wire.value(index_of(0x6064, axis)) for axis in range(AXES) if axis != recipe.axis]
+    assert others == [0, 0]
+
+
+def test_how_to_move_a_motor_in_pv_mode(recipe, wire):
+    """Section 7.2."""
+    recipe.write(0x2005, 3)
+    recipe.write(0x6060, 3)
+    for word in (6, 7, 15):
+        recipe.write(0x6040, word)
+    recipe.write(0x60FF, 100_000)
+    wire.wait(500)
+    assert recipe.read(0x606C) == pytest.approx(100_000, rel=0.02)
+    assert recipe.read(0x6041) & 0x4400 == 0x4400, "table 256: the motor turns; table 257: it has its speed"
+    recipe.write(0x60FF, 0)
+    wire.wait(500)
+    assert abs(recipe.read(0x606C)) < 1000 and not recipe.read(0x6041) & 0x4000
+
+
+@pytest.mark.parametrize("axis", range(AXES))
+def test_how_to_start_a_homing_in_hm_mode(axis):
+    """Section 8.3, whose home switch is pressed by the portal in place of a hand."""
+    with EmulatedDrives("tmcm3313", load="portal", num_threads=1) as drives:
+        wire = Wire(drives)
+        recipe = Recipe(wire, axis)
+        drives.machine.brake = "with_stage"
+        recipe.write(0x6060, 6)
+        for word in (6, 7, 15):
+            recipe.write(0x6040, word)
+        recipe.write(0x6098, 19)
+        recipe.write(0x6099, 50_000, 1)
+        recipe.write(0x6099, 10_000, 2)
+        recipe.write(0x6040, 31)
+        for _ in range(120):
+            wire.wait(1000)
+            if recipe.read(0x6041) & 0x1400 == 0x1400:
+                break
+        assert recipe.read(0x6041) & 0x3400 == 0x1400, "table 294: home attained, target reached, no error"
+        recipe.write(0x6040, 15)
+        way = 2.0 * np.pi / np.array(drives.load.gears)[axis] / 51200  # m per microstep
+        home = drives.machine.joint_positions[0, axis] - recipe.read(0x6064) * way
+        edges = np.array([-0.06, -0.02])
+        assert np.abs(home - edges).min() < 10_000 * 2e-3 * way + 5e-5, home
+
+
+# --- table 380 --------------------------------------------------------------------------------------------------------
+TABLE_380 = {
+    (0x0000, 0): "fault_reset",
+    (0x1000, 1): "open_load_a",
+    (0x1000, 2): "open_load_b",
+    (0x2310, 0): "overcurrent_high_side",
+    (0x2311, 0): "overcurrent_bridge_b",
+    (0x2312, 0): "overcurrent_bridge_a",
+    (0x4310, 1): "overtemperature_warning",
+    (0x4310, 2): "overtemperature",
+    (0x5441, 0): "shutdown_switch",
+    (0x6320, 0): "pdo_not_accepted",
+    (0x8611, 0): "following_error",
+    (0xFF00, 0): "undervoltage",
+    (0xFF01, 1): "positive_software_limit",
+    (0xFF01, 2): "negative_software_limit",
+    (0xFF01, 3): "positive_limit_switch",
+    (0xFF01, 4): "negative_limit_switch",
+}
+
+
+@pytest.mark.parametrize(("code", "first"), TABLE_380)
+def test_an_emergency_is_as_table_380_has_it(code, first):
+    row = find_device("tmcm3313").emergencies[TABLE_380[code, first]]
+    whole_module = code in (0x5441, 0x6320)
+    for axis in range(AXES):
+        assert row.of_axis(axis) == (code, (first, 255 if whole_module else axis, 0, 0, 0))
+
+
+def test_every_cause_of_the_firmware_has_a_row():
+    assert {cause.name for cause in find_firmware("stepper").causes} <= set(find_device("tmcm3313").emergencies)
+
+
+# --- objects that act -------------------------------------------------------------------------------------------------
+# Objects that can be written, and are neither a field of the record nor refused.
+SERVED = {
+    0x2703: "the module's outputs",
+    0x208C: "takes the one unit that is emulated",
+    0x605B: "takes one value (tables 176 to 187)",
+    0x605C: "takes one value",
+    0x605D: "takes one value",
+    0x605E: "takes one value",
+}
+
+
+def test_what_can_be_written_acts_or_is_refused():
+    device = find_device("tmcm3313")
+    for entry in device.new_dictionary():
+        if entry.access != "rw" or entry.name.startswith("CAN: "):
+            continue
+        key = (device.locate(entry.index)[1], entry.sub)
+        assert (key in device.bindings) + (key in device.unsupported) + (key[0] in SERVED) == 1, entry.label
+
+
+@pytest.mark.parametrize("index", [0x208C, 0x605B, 0x605C, 0x605D, 0x605E])
+def test_objects_of_one_value_take_no_other(wire, index):
+    only = wire.value(index)
+    size = 1 if index == 0x208C else 2
+    assert wire.download(index, 0, only, size) == 0
+    for other in {0, 1, 2} - {only}:
+        assert wire.download(index, 0, other, size) in (VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW)
+
+
+# --- the extension for CAN --------------------------------------------------------------------------------------------
+def test_the_node_has_the_identity_and_none_but_the_axes_of_the_manual(wire):
+    assert [wire.value(0x1018, sub) for sub in range(4)] == [3, 0x286, 3313, 0x00010009]
+    wire.play("""
+        rx 605  40 40 78 00 00 00 00 00   # controlword of a fourth axis
+        tx 585  80 40 78 00 00 00 02 06
+        rx 605  40 10 10 00 00 00 00 00   # it stores nothing
+        tx 585  80 10 10 00 00 00 02 06
+    """)
+
+
+@pytest.mark.parametrize("index", [0x1600, 0x1A00, 0x1C00, 0x1C12, 0x1C13])
+def test_the_image_is_read_over_can_and_not_changed(wire, index):
+    image = ProcessImage(wire.drives)
+    for sub in (0, 1):
+        assert wire.value(index, sub) == image.dictionary.port(index, sub).read()
+    assert wire.download(index, 0, 0, 1) == CANNOT_BE_STORED
+
+
+def test_pdos_of_axis_0_are_those_of_cia_301_and_the_others_have_no_identifier(wire):
+    wire.start()
+    wire.play("""
+        rx 305  06 00 03                  # RPDO 66: shut down, pv
+        wait 1 ms
+        tx 185  31 02                     # TPDO 65: ready to switch on
+        tx 285  31 02 03                  # TPDO 66
+    """)
+    assert wire.download(0x1481, 1, 0x40000321, 4) == 0
+    wire.play("""
+        rx 321  06 00 08                  # RPDO 130, of axis 1: csp
+        wait 1 ms
+    """)
+    assert [wire.value(index_of(0x6061, axis)) for axis in range(AXES)] == [3, 8, 0]
+
+
+def test_a_pdo_on_can_carries_eight_bytes(wire):
+    assert wire.download(0x1642, 0, 0, 1) == UNSUPPORTED_ACCESS, "in use"
+    assert wire.download(0x1442, 1, 0xC0000405, 4) == wire.download(0x1642, 0, 0, 1) == 0
+    for sub, word in enumerate((0x60400010, 0x607A0020, 0x60FF0020), 1):
+        assert wire.download(0x1642, sub, word, 4) == 0
+    assert wire.download(0x1642, 0, 3, 1) == 0x06040042
+    assert wire.download(0x1642, 0, 2, 1) == 0
+
+
+def cyclic_move(drives):
+    """Return what a move of all axes, each its own way, shows in csp."""
+    motion.enable(drives, mode="csp")
+    way = np.linspace(0.0, 1.0, 60)[:, None] * 4000.0 * np.array([1, -2, 3])
+    trace = drives.record(SAMPLED, 0.06, play={0x607A: np.rint(way).astype(np.int64)})
+    motion.disable(drives)
+    return np.stack([trace[name] for name in SAMPLED])
+
+
+def test_cyclic_targets_over_can_are_what_they_are_in_process():
+    with EmulatedDrives("tmcm3313", load="portal", num_threads=1, seed=4) as inside:
+        expected = cyclic_move(inside)
+    world = World(lockstep=True)
+    world.add(EmulatedDrives("tmcm3313", load="portal", num_threads=1, seed=4), [1])
+    bus = WorldBus(world)
+    try:
+        with CanDrives("tmcm3313", bus=bus, nodes=(1,), pace="lockstep") as drives:
+            found = cyclic_move(drives)
+    finally:
+        bus.shutdown()
+        world.close()
+    np.testing.assert_array_equal(found, expected)
+    assert np.abs(expected[1, -1]).min() > 3000
+
+
+def test_the_image_does_what_the_objects_do_one_by_one():
+    """A move of all axes in pp, commanded by the image and read from it, against one by calls."""
+    traces = []
+    targets = np.array([20_000, -25_000, 15_000])
+    for by_image in (False, True):
+        with EmulatedDrives("tmcm3313", load="portal", num_threads=1, seed=4) as drives:
+            motion.enable(drives, mode="pp")
+            if by_image:
+                image = ProcessImage(drives)
+                words = [part for target in targets.tolist() for part in (0x1F, target, 0)]
+                assert image.write_outputs(struct.pack("<" + "Hii" * AXES, *words))
+            else:
+                drives.write(0x607A, targets)
+                drives.write(0x6040, 0x1F)
+            rows = []
+            for _ in range(200):
+                drives.advance(0.001)
+                rows.append(
+                    struct.unpack("<" + "Hii" * AXES, image.read_inputs())
+                    if by_image
+                    else [value for axis in range(AXES) for value in [drives.read(name)[axis] for name in SAMPLED]]
+                )
+            traces.append(np.array(rows))
+    np.testing.assert_array_equal(*traces)
+
+
+# --- the example ------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("speed", "is_lost"), [(0.2, False), (1.2, True)])
+def test_the_example_of_three_axes_runs(speed, is_lost):
+    script = Path(__file__).parent.parent / "examples" / "portal.py"
+    done = subprocess.run([sys.executable, script, "--speed", str(speed)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    behind = {name: int(worst) for name, worst in re.findall(r"([xyz]): at most (\d+) um", done.stdout)}
+    assert set(behind) == set("xyz")
+    assert ("axis 0: following_error" in done.stdout) == is_lost
+    assert (max(behind.values()) > 1000) == is_lost, "a full step of the belts is 160 um"
