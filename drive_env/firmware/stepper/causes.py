@@ -19,6 +19,7 @@ from drive_env.firmware.common.protection import (
     WARN,
     Cause,
 )
+from drive_env.firmware.stepper.stall_guard import stalled
 from mechanics.compiled import stage
 
 OPEN_LOAD_TIME = 0.05  # s for which a phase must stay without the current that is asked for
@@ -101,6 +102,7 @@ CAUSES = (
     Cause("open_load_a", STOP, 0x80, 0x04, open_load_a, held=True),
     Cause("open_load_b", STOP, 0x80, 0x08, open_load_b, held=True),
     Cause(FOLLOWING_ERROR, STOP, 0x20, 0x0, following_error),
+    Cause("stall", STOP, 0x20, 0x0, stalled),
     Cause("overtemperature_warning", WARN, 0x08, 0x40, causes.warm),
     Cause("positive_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.above_limit, BLOCKS_POSITIVE, software=True),
     Cause("negative_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.below_limit, BLOCKS_NEGATIVE, software=True),

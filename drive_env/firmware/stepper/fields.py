@@ -37,6 +37,9 @@ PARAMETERS = (
     Field("fullstep_threshold", "f8", "rad/s", "20B6h: speed above which the high speed modes act; 0: never"),
     Field("high_speed_chopper", "f8", "", "20B7h: 1: constant off time without fast decay above that speed"),
     Field("high_speed_fullstep", "f8", "", "20B8h: 1: full steps above that speed"),
+    Field("load_filter", "f8", "", "209Dh: 1: a load reading is the mean of four full steps"),
+    Field("stall_threshold", "f8", "", "209Eh: -64...63; shifts the load reading, higher is less sensitive"),
+    Field("stall_speed", "f8", "rad/s", "20A4h: speed above which a load reading of 0 stops the motor; 0: never"),
     Field("position_sensor", "f8", "", "606Ah: 0 the encoder tells the position, -1 the step counter", -1.0),
     # --- data of the device ---------------------------------------------------------------------------------------
     Field("full_scale_current", "f8", "A", "largest amplitude of a phase, vsense 0", 1.0),
@@ -78,6 +81,16 @@ STATE = (
     Field("current_gain", "f8", "1", "by which factor the mean current differs from the set-point", 1.0),
     Field("ripple", "f8", "A", "of the phase currents, peak to peak"),
     Field("chopper_frequency", "f8", "Hz", ""),
+    Field("in_spread_cycle", "f8", "1", "1: the chopper, if it works, makes spread cycles"),
+    # --- load by StallGuard2 --------------------------------------------------------------------------------------
+    Field("load_value", "f8", "", "2101h: 0...1023, lower with load"),
+    Field("load_is_fresh", "f8", "1", "1: the reading was taken in this window"),
+    Field("load_direction", "f8", "1", "sign of the speed at which the measurement under way began; 0: none is"),
+    Field("load_start", "f8", "rad", "where the steps were when it began"),
+    Field("load_windows", "f8", "", "windows that it has lasted"),
+    Field("u_along", "f8", "V", "voltage along the field, summed over its ticks"),
+    Field("u_across", "f8", "V", "voltage a quarter of a period ahead of the field, summed likewise"),
+    Field("stalled", "f8", "1", "1: a stall has stopped the steps"),
     # --- power stage and winding ----------------------------------------------------------------------------------
     Field("psi", "f8", "V*s", "flux that acts at the present current"),
     Field("sin_e", "f8", "1", "sine of the rotor's electrical angle at the tick's start"),
