@@ -246,12 +246,14 @@ def test_a_closed_brake_holds_against_the_motor_up_to_twice_its_rated_torque():
             assert (abs(drives.machine.rotor_speed[0]) < STILL) == holds
 
 
-def test_a_brake_is_one_of_three():
+def test_a_brake_is_one_of_three_where_the_drive_has_no_output_for_it():
     with EmulatedDrives(load="gantry") as drives:
-        with pytest.raises(ValueError, match="a brake is open, closed, with_stage, not 'shut'"):
+        with pytest.raises(ValueError, match="a brake of tmcm1636 is open, closed, with_stage, not 'shut'"):
             drives.machine.brake = "shut"
         with pytest.raises(ValueError, match="not 'shut'"):
             drives.machine.brake = ["closed", "shut"]
+        with pytest.raises(ValueError, match="not 'output'"):
+            drives.machine.brake = "output"
         assert drives.machine.brake.tolist() == ["open", "open"]
         drives.machine.brake = ["closed", "with_stage"]
         assert drives.machine.brake.tolist() == ["closed", "with_stage"]

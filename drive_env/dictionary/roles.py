@@ -37,6 +37,7 @@ class Role(Enum):
     FLUX_ERROR_SUM = "error sum of the flux current"
     BRAKE_CHOPPER = "brake chopper"
     BRAKE_CHOPPER_VOLTAGE = "voltage of the brake chopper"
+    BRAKE_RELEASE_CURRENT = "current of the brake output while the brake is released"
     DIGITAL_INPUTS = "digital inputs that belong to no axis"
     OUTPUTS = "digital outputs"
     OUTPUTS_MASK = "mask of the digital outputs"

@@ -5,7 +5,7 @@ Status flags are the driver's error flags, 2102h (TMCM-3313 manual, table 155).
 
 from __future__ import annotations
 
-from drive_env.firmware.common import causes
+from drive_env.firmware.common import brake, causes
 from drive_env.firmware.common.protection import (
     BLOCKS_NEGATIVE,
     BLOCKS_POSITIVE,
@@ -113,3 +113,14 @@ CAUSES = (
     # The axis has left its limits: 0000h too, as CiA 301 has it, but no command, and nothing else ends with it.
     Cause(FAULT_RESET, WARN, 0x00, 0x0),
 )
+
+CUTS = sum(1 << row for row, cause in enumerate(CAUSES) if row and cause.reaction == CUT)
+
+
+@stage
+def switch_brake(drive, lane, dt):
+    """Move output and brake on by dt [s]; what cuts the stage also cuts a current that waits for the brake alone."""
+    if drive.present[lane] & CUTS:
+        drive.holding[lane] = 0
+    brake.drive_output(drive, lane, dt)
+    brake.follow_output(drive, lane, dt)

@@ -145,6 +145,13 @@ def power_on(drive, lane):
     s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
     drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
     edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI
+    drive.true_edges[lane] = edges
+    drive.step_seen[lane] = 0.0
+    drive.step_shift[lane] = 0.0
+    drive.index_seen[lane] = 0.0
+    drive.latch_armed[lane] = 0.0
+    drive.latch_steps[lane] = 0.0
+    drive.latch_encoder[lane] = 0.0
     drive.count[lane] = encoder_count(edges * drive.encoder_gain[lane], drive.encoder_true_direction[lane])
     drive.count_zero[lane] = drive.count[lane]
     drive.theta_encoder[lane] = 0.0
@@ -160,7 +167,11 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_quotients),
     measure=(causes.watch_phases,),
+<<<<<<< HEAD
     switch=(causes.forget_peaks, hold_stalled, scale_current),
+=======
+    switch=(causes.forget_peaks, causes.switch_brake, scale_current),
+>>>>>>> h-axis
     tell=(tell_status,),
     end_period=(spread_steps,),
     window=(read_motion, watch_load, prepare_chopper),
