@@ -167,11 +167,7 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_quotients),
     measure=(causes.watch_phases,),
-<<<<<<< HEAD
-    switch=(causes.forget_peaks, hold_stalled, scale_current),
-=======
-    switch=(causes.forget_peaks, causes.switch_brake, scale_current),
->>>>>>> h-axis
+    switch=(causes.forget_peaks, causes.switch_brake, hold_stalled, scale_current),
     tell=(tell_status,),
     end_period=(spread_steps,),
     window=(read_motion, watch_load, prepare_chopper),
