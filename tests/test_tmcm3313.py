@@ -6,6 +6,7 @@ import re
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from drive_env.dictionary.aborts import (
 )
 from drive_env.firmware import find_firmware
 from drive_env.node.process_image import ProcessImage
+from mechanics.loads import find_load
 
 AXES = 3
 SAMPLED = (0x6041, 0x6064, 0x606C)
@@ -125,6 +127,41 @@ def test_how_to_start_a_homing_in_hm_mode(axis):
         assert np.abs(home - edges).min() < 10_000 * 2e-3 * way + 5e-5, home
 
 
+# Table 286: the edge that a method ends at, or from which on, and which way, it looks for an index.
+EDGES = {"left": -0.23, "right": 0.23, "home left": -0.06, "home right": -0.02}
+START, BELT, INDEX = -0.1, 0.032, 1.0  # m; m per turn; rad of the rotor from the start
+METHODS = {1: ("left", 1), 2: ("right", -1), 3: ("home left", -1), 5: ("home right", 1), 17: ("left", 0),
+           18: ("right", 0), 19: ("home left", 0), 21: ("home right", 0), 33: ("", -1), 34: ("", 1)}  # fmt: skip
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_homing_methods_end_where_table_286_says(method):
+    edge, way = METHODS[method]
+    expected = EDGES.get(edge, START)
+    if way:
+        turn = (expected - START) / BELT - INDEX / (2.0 * np.pi)
+        expected = START + ((np.ceil(turn) if way > 0 else np.floor(turn)) + INDEX / (2.0 * np.pi)) * BELT
+    load = replace(find_load("portal"), start={"x": START})
+    first = np.array([True, False, False])
+    with EmulatedDrives("tmcm3313", load=load, num_threads=1, parameters={"motor.index_angle": INDEX}) as drives:
+        drives.machine.brake = "with_stage"
+        drives.write(0x6098, method)
+        drives.write((0x6099, 1), 204_800)
+        drives.write((0x6099, 2), 20_000)
+        drives.write(0x609A, 1_000_000)
+        drives.write(0x6060, 6)
+        motion.enable(drives, where=first)
+        drives.write(0x6040, 0x1F, where=first)
+        for _ in range(20):
+            drives.advance(1.0)
+            if drives.read(0x6041)[0] & 0x1400 == 0x1400:
+                break
+        assert drives.read(0x6041)[0] & 0x3400 == 0x1400, "table 294"
+        home = drives.machine.joint_positions[0, 0] - drives.read(0x6064)[0] * BELT / 51200
+    # Edges are seen once a millisecond; the rotor lags the steps by an eighth of a full step at most.
+    assert home == pytest.approx(expected, abs=20_000 * 1e-3 * BELT / 51200 + BELT / 1600 + 2e-5)
+
+
 # --- table 380 --------------------------------------------------------------------------------------------------------
 TABLE_380 = {
     (0x0000, 0): "fault_reset",
@@ -133,6 +170,7 @@ TABLE_380 = {
     (0x2310, 0): "overcurrent_high_side",
     (0x2311, 0): "overcurrent_bridge_b",
     (0x2312, 0): "overcurrent_bridge_a",
+    (0x3230, 0): "stall",
     (0x4310, 1): "overtemperature_warning",
     (0x4310, 2): "overtemperature",
     (0x5441, 0): "shutdown_switch",
