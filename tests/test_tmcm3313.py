@@ -24,7 +24,6 @@ from drive_env.dictionary.aborts import (
     VALUE_TOO_HIGH,
     VALUE_TOO_LOW,
 )
-from drive_env.firmware import find_firmware
 from drive_env.node.process_image import ProcessImage
 from mechanics.loads import find_load
 
@@ -193,7 +192,7 @@ def test_an_emergency_is_as_table_380_has_it(code, first):
 
 
 def test_every_cause_of_the_firmware_has_a_row():
-    assert {cause.name for cause in find_firmware("stepper").causes} <= set(find_device("tmcm3313").emergencies)
+    assert {cause.name for cause in find_device("tmcm3313").firmware.causes} <= set(find_device("tmcm3313").emergencies)
 
 
 # --- objects that act -------------------------------------------------------------------------------------------------
