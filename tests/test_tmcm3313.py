@@ -6,6 +6,7 @@ import re
 import struct
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,9 @@ from drive_env.dictionary.aborts import (
     VALUE_TOO_HIGH,
     VALUE_TOO_LOW,
 )
+from drive_env.dictionary.roles import Role
+from drive_env.emulator.inertia_check import MisfitWarning
+from drive_env.motors import MOTORS
 from drive_env.node.process_image import ProcessImage
 from mechanics.loads import find_load
 
@@ -250,6 +254,60 @@ def test_homing_methods_end_where_table_286_says(method):
         home = drives.machine.joint_positions[0, 0] - drives.read(0x6064)[0] * BELT / 51200
     # Edges are seen once a millisecond; the rotor lags the steps by an eighth of a full step at most.
     assert home == pytest.approx(expected, abs=20_000 * 1e-3 * BELT / 51200 + BELT / 1600 + 2e-5)
+
+
+# --- commissioning ----------------------------------------------------------------------------------------------------
+DEVICE = find_device("tmcm3313")
+
+
+@pytest.mark.parametrize("name", DEVICE.motors)
+def test_field_weakening_begins_where_the_run_current_takes_the_whole_supply(name):
+    """Of the phase's voltage R i + psi w along the back-EMF and L i w across it, by a scan."""
+    motor, preset = MOTORS[name], DEVICE.preset(MOTORS[name])
+    current = 3.0 * (preset["Maximum current"] // 8 + 1) / 32
+    assert current <= motor.rated_current * (1.0 + 1e-9)
+    w = np.linspace(1.0, 60_000.0, 600_000)
+    psi = motor.psi_m / np.sqrt(1.0 + motor.saturation * current**2)
+    u = np.hypot(motor.R_s * current + psi * w, motor.L_q * current * w)
+    corner = w[np.argmax(u > min(motor.voltage, 48.0))] / (2.0 * np.pi) * 1024
+    assert preset["Field weakening minimum velocity"] == pytest.approx(corner, rel=1e-3, abs=50)
+
+
+@pytest.mark.parametrize("name", DEVICE.motors)
+def test_the_preset_closes_the_loop_of_every_motor(name):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MisfitWarning)
+        drives = EmulatedDrives("tmcm3313", "inertia", name, num_threads=1)
+    with drives:
+        drives.write(0x606A, 0)
+        motion.enable(drives, mode="pp")
+        drives.write(Role.LOOP_MODE, 1)
+        for _ in range(35):
+            drives.advance(0.1)
+            if drives.read(Role.LOOP_INITIALISED).all():
+                break
+        scale = drives.read(Role.POSITION_SCALE)
+        motion.move_to(drives, scale)
+        drives.advance(0.5)
+        assert np.abs(drives.read(0x6064) - scale).max() <= 64 and drives.emergencies() == []
+        assert drives.read(0x2033)[0] < 255, "2029h: less current at rest"
+        motion.disable(drives)
+
+
+def test_an_s_shaped_ramp_by_the_preset_takes_the_time_of_its_bows(wire):
+    """6086h = 1: a ramp of v / a + a / j, the bows of 60A4h being 1/20 s of the acceleration."""
+    drives = wire.drives
+    drives.write(0x6086, [0, 1, 1])
+    drives.write(0x2015, [1, 1, 4])
+    motion.enable(drives, mode="pv")
+    drives.write(0x60FF, 102_400)
+    demand = drives.record((0x6062,), 0.4)[0x6062]
+    rate = np.diff(demand, axis=0) * 1000
+    reached = np.argmax(rate >= 102_300, axis=0) / 1000
+    acceleration, short = 512_000, 100  # usteps/s^2; usteps/s of what is looked for
+    jerk = acceleration / 0.05 * np.array([1, 4])
+    curved = 102_400 / acceleration + acceleration / jerk - np.sqrt(2 * short / jerk)
+    np.testing.assert_allclose(reached, [0.2, *curved], atol=2e-3)
 
 
 # --- table 380 --------------------------------------------------------------------------------------------------------
