@@ -11,7 +11,7 @@ from drive_env import EmulatedDrives, motion
 from drive_env.dictionary.roles import Role
 
 CYCLE = 1e-3  # s, between two set-points
-SETTLE = 0.3  # s, in which the tool comes to rest
+SETTLE = 1.5  # s, in which the tool comes to rest, and a late axis arrives
 
 
 def helix(radius: float, depth: float, turns: int, speed: float, ramp: float = 0.3) -> np.ndarray:
@@ -31,11 +31,17 @@ def main() -> None:
     parser.add_argument("--depth", type=float, default=0.06, help="how far down it goes [m]")
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--speed", type=float, default=0.2, help="along the path [m/s]")
+    parser.add_argument("--closed-loop", action="store_true", help="let the encoders commutate")
     options = parser.parse_args()
     path = helix(options.radius, options.depth, options.turns, options.speed)
     with EmulatedDrives("tmcm3313", load="portal") as drives:
         drives.write("Sensor selection code", 0)  # positions by the encoders: lost steps would show
         motion.enable(drives, mode="csp")
+        if options.closed_loop:
+            drives.write("Following error window", 0)  # it may fall behind, and catches up
+            drives.write(Role.LOOP_MODE, 1)
+            while not drives.read(Role.LOOP_INITIALISED).all():
+                drives.advance(0.1)
         # A rotor's turn is so many microsteps, and moves the axis so far.
         microsteps = drives.read(Role.POSITION_SCALE) * np.array(drives.load.gears) / (2 * np.pi)
         targets = drives.read("Position actual value") + np.rint(path * microsteps).astype(int)

@@ -470,12 +470,17 @@ def test_the_image_does_what_the_objects_do_one_by_one():
 
 
 # --- the example ------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(("speed", "is_lost"), [(0.2, False), (1.2, True)])
-def test_the_example_of_three_axes_runs(speed, is_lost):
+@pytest.mark.parametrize(
+    ("options", "is_lost", "is_late"),
+    [(("0.2",), False, False), (("1.2",), True, True), (("1.2", "--closed-loop"), False, True)],
+)
+def test_the_example_of_three_axes_runs(options, is_lost, is_late):
     script = Path(__file__).parent.parent / "examples" / "portal.py"
-    done = subprocess.run([sys.executable, script, "--speed", str(speed)], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, script, "--speed", *options], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    behind = {name: int(worst) for name, worst in re.findall(r"([xyz]): at most (\d+) um", done.stdout)}
-    assert set(behind) == set("xyz")
+    behind = re.findall(r"([xyz]): at most (\d+) um behind its set-point, (\d+) um at the end", done.stdout)
+    worst, end = (np.array([int(row[k]) for row in behind]) for k in (1, 2))
+    assert [row[0] for row in behind] == list("xyz")
     assert ("axis 0: following_error" in done.stdout) == is_lost
-    assert (max(behind.values()) > 1000) == is_lost, "a full step of the belts is 160 um"
+    assert (worst.max() > 1000) == is_late, "a full step of the belts is 160 um"
+    assert (end.max() > 100) == is_lost
