@@ -212,7 +212,7 @@ class Images:
     def check_played(self, entries):
         self._check(entries, "ro", "played")
 
-    def choose(self, wanted, welcome):
+    def choose(self, wanted, welcome, played=()):
         chosen = list(wanted)
         if self._size(chosen) > IMAGE:
             raise ObjectAccessError(PDO_LENGTH_EXCEEDED, f"{len(chosen)} objects are beyond {IMAGE} bytes; take fewer")

@@ -127,6 +127,20 @@ def test_after_a_stop_the_axis_waits():
     assert 75 <= begins[0] <= 85  # since the later of the two had come to rest before the 20 ms
 
 
+def test_before_it_turns_round_the_axis_waits_too():
+    """With nothing to jump from, it comes to rest on the way: 100 ms there, and on as without."""
+    with build(num_machines=2, parameters=SMOOTH) as drives:
+        set_ramp(drives, [RAMP | {"wait": 100, "end": 0, "start": 0}, RAMP | {"end": 0, "start": 0}])
+        motion.enable(drives, mode="pp")
+        motion.start_move(drives, 30_000)
+        drives.advance(0.2)
+        motion.start_move(drives, -30_000)
+        _, u = states(drives, 1500)
+    first = [int(np.argmax(u[:, k] < 0.0)) for k in range(2)]
+    assert first[0] - first[1] == pytest.approx(100, abs=1)
+    np.testing.assert_allclose(u[first[0] : first[0] + 100, 0], u[first[1] : first[1] + 100, 1], rtol=0.01, atol=0.02)
+
+
 CHANGES = {  # what changes at 0.4 s: target, and numbers of the ramp
     "farther": (150_000, {}),
     "behind": (-20_000, {}),

@@ -15,7 +15,8 @@ from drive_env.node.axis import ObjectPort
 
 CYCLE = 0.001  # s: the communication cycle
 SYNC_OBJECT = (0x1005, 0)
-TRANSMIT_BUFFER = 64  # frames of a node that wait for the bus; ours, since no manual says. More are lost.
+# Frames of a node that wait for the bus, for each of its axes; ours, since no manual says. More are lost.
+TRANSMIT_BUFFER = 64
 MAX_NODE_ID = 127
 
 
@@ -79,6 +80,7 @@ class World:
         self.cycles = 0
         self._answering: list[Node] = []  # whose SDO answers take time
         self._sync_objects: list[ObjectPort] = []  # 1005h of each node
+        self._room: dict[int, int] = {}  # node identifier -> frames that may wait
         self._on: set[int] = set()
         self._overflowed: set[int] = set()
         self._off: dict[int, float] = {}  # node identifier -> when its controller is back [s]
@@ -120,6 +122,7 @@ class World:
                 nodes.append(node)
                 return node
 
+            self._room[node_id] = TRANSMIT_BUFFER * per_node
             self.attach(node_id, make)
             self._sync_objects.append(nodes[-1].dictionary.port(*SYNC_OBJECT))
             axes = slice(k * per_node, (k + 1) * per_node)
@@ -202,7 +205,7 @@ class World:
         for node_id in [node_id for node_id, back in self._off.items() if back <= self.time]:
             del self._off[node_id]
             self.nodes[node_id].bus_on(self.time)
-        for node_id in [i for i in self._overflowed if self.wire.waiting(("node", i)) < TRANSMIT_BUFFER // 2]:
+        for node_id in [i for i in self._overflowed if self.wire.waiting(("node", i)) < self._room_of(i) // 2]:
             self._overflowed.remove(node_id)
             self.nodes[node_id].overrun(self.time, "transmit")
         for node in self.nodes.values():
@@ -244,9 +247,13 @@ class World:
         """Return when the next SDO answer is ready [s]."""
         return min((node.next_answer for node in self._answering), default=math.inf)
 
+    def _room_of(self, node_id: int) -> int:
+        """Return how many frames of a node may wait."""
+        return self._room.get(node_id, TRANSMIT_BUFFER)
+
     def _send(self, node_id: int, frame: Frame) -> None:
         sender = ("node", node_id)
-        if self.wire.waiting(sender) < TRANSMIT_BUFFER:
+        if self.wire.waiting(sender) < self._room_of(node_id):
             self.wire.send(frame, sender, self.time)
         else:  # the node is told once there is room for its emergency
             self._overflowed.add(node_id)

@@ -11,6 +11,7 @@ import typer
 from drive_env import cia402
 from drive_env.commands.options import (
     REFUSED,
+    AxisOfNode,
     Bitrate,
     Channel,
     DeviceName,
@@ -22,6 +23,7 @@ from drive_env.commands.options import (
     WouldDo,
     Yes,
     ask,
+    axes_of,
     axis_name,
     axis_place,
     connect,
@@ -45,6 +47,7 @@ def get(
     interface: Interface = None,
     channel: Channel = None,
     node: Nodes = None,
+    axis: AxisOfNode = None,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
     bitrate: Bitrate = None,
@@ -61,13 +64,13 @@ def get(
         increments = [None] * drives.num_axes if raw else increments_per_revolution(drives)
         rows = []
         for entry in entries:
-            for axis, value in enumerate(drives.read((entry.index, entry.sub))):
-                rows.append((axis, entry, value, increments[axis]))
+            values = drives.read((entry.index, entry.sub))
+            rows += [(k, entry, values[k], increments[k]) for k in axes_of(drives, entry, axis)]
         if json:
-            print_json([axis_place(drives, axis) | _row(*row) for axis, *row in rows])
+            print_json([axis_place(drives, k) | _row(*row) for k, *row in rows])
             return
-        for axis, entry, value, scale in rows:
-            print(f"{axis_name(drives, axis)}  {entry.label} = {_text(value, entry, scale, raw)}")
+        for k, entry, value, scale in rows:
+            print(f"{axis_name(drives, k)}  {entry.label} = {_text(value, entry, scale, raw)}")
 
 
 def set_object(
@@ -76,6 +79,7 @@ def set_object(
     interface: Interface = None,
     channel: Channel = None,
     node: Nodes = None,
+    axis: AxisOfNode = None,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
     bitrate: Bitrate = None,
@@ -102,6 +106,7 @@ def set_object(
             look_first(interface, channel, node or [1], bitrate, device, eds, timeout)
         drives = stack.enter_context(connect(interface, channel, node, device, eds, **options))
         entry = drives.description.dictionary.find(object_name(name))
+        chosen = axes_of(drives, entry, axis)
         is_controlword = cia402.of_first_axis(entry.index) == cia402.CONTROLWORD
         # A controlword has no unit, and one that stops is not kept waiting for what one would need.
         increments = [None] * drives.num_axes if raw or is_controlword else increments_per_revolution(drives)
@@ -116,32 +121,37 @@ def set_object(
         if is_of_a_watchdog(entry.index):
             _keep_watchdog(drives, entry)
         if dry_run:
-            _tell_plan(drives, entry, wanted, increments, value, raw=raw, json=json)
+            _tell_plan(drives, entry, chosen, wanted, increments, value, raw=raw, json=json)
             return
         if not is_controlword:
             _ask_where_live(drives, f"{entry.label} = {value}", yes)
         elif cia402.cuts_voltage(wanted[0]):
-            _bring_to_rest(drives, entry)
-        _write(drives, entry, wanted if drives.description.is_number(entry) else value)
-        rows = []
+            _bring_to_rest(drives, chosen)
+        _write(drives, entry, chosen, wanted if drives.description.is_number(entry) else value)
         readable = entry.access != "wo"
         found = drives.read((entry.index, entry.sub)) if readable else wanted
-        for axis in range(drives.num_axes):
-            rows.append((axis, entry, found[axis], increments[axis]))
         if json:
-            print_json([axis_place(drives, axis) | _row(*row) for axis, *row in rows])
+            print_json([axis_place(drives, k) | _row(entry, found[k], increments[k]) for k in chosen])
         else:
-            for axis, _, now, scale in rows:
-                print(f"{axis_name(drives, axis)}  {entry.label} = {_text(now, entry, scale, raw)}")
-        wanted = _without_remote_frames(entry, wanted, list(found))
-        differs = readable and any(a != b for a, b in zip(found, wanted, strict=True))
+            for k in chosen:
+                print(f"{axis_name(drives, k)}  {entry.label} = {_text(found[k], entry, increments[k], raw)}")
+        asked = _without_remote_frames(entry, [wanted[k] for k in chosen], [found[k] for k in chosen])
+        differs = readable and any(found[k] != one for k, one in zip(chosen, asked, strict=True))
         # Stores and the like take a signature and read something else.
         if differs and not command(entry.index, drives.description.hints).endswith("a service"):
-            fail(f"{entry.label} was written, but reads back another value than {wanted[0]}", REFUSED)
+            fail(f"{entry.label} was written, but reads back another value than {asked[0]}", REFUSED)
 
 
 def _tell_plan(
-    drives: BusDrives, entry: Entry, wanted: list[Any], increments: list[Any], text: str, *, raw: bool, json: bool
+    drives: BusDrives,
+    entry: Entry,
+    axes: list[int],
+    wanted: list[Any],
+    increments: list[Any],
+    text: str,
+    *,
+    raw: bool,
+    json: bool,
 ) -> None:
     """Say what the drive has, and what would be written; raises for a value that the object cannot take."""
     from drive_env.dictionary.access import check_limits, check_writable
@@ -155,11 +165,12 @@ def _tell_plan(
         rows = [
             axis_place(drives, axis) | {"object": f"{entry.index:04X}h:{entry.sub:02X}", "is": found[axis],
                                         "would be": wanted[axis]}
-            for axis in range(drives.num_axes)
+            for axis in axes
         ]  # fmt: skip
         print_json(rows)
         return
-    for axis, scale in enumerate(increments):
+    for axis in axes:
+        scale = increments[axis]
         now = "" if found[axis] is None else f" is {_text(found[axis], entry, scale, raw)};"
         then = _text(wanted[axis], entry, scale, raw) if is_number else text
         print(f"{axis_name(drives, axis)}  {entry.label}{now} {then} would be written (dry run: nothing was written)")
@@ -174,15 +185,13 @@ def _refuse_to_enable(entry: Any, controlword: int) -> None:
         )
 
 
-def _bring_to_rest(drives: BusDrives, controlword: Entry) -> None:
-    """Stop what a controlword takes the voltage from: a motor that turns would coast."""
+def _bring_to_rest(drives: BusDrives, chosen: list[int]) -> None:
+    """Stop the axes that a controlword takes the voltage from: a motor that turns would coast."""
     from drive_env.commands.replayed_motors import Stopped, name, stop_axes
     from drive_env.master.can_drives import CanDrives
 
     assert isinstance(drives, CanDrives), "a command's drives are on CAN"
-    first = (controlword.index - cia402.CONTROLWORD) // cia402.AXIS_OFFSET
-    parts = [first] if first else range(drives.description.num_axes)
-    axes = [(node, part) for node in drives.nodes for part in parts]
+    axes = [(drives.nodes[node], part) for node, part in (divmod(k, drives.description.num_axes) for k in chosen)]
     clients = {node: drives.sdo(k) for k, node in enumerate(drives.nodes)}
     for outcome in stop_axes(drives.port, clients, axes, drives.description.answer_timeout):
         if not isinstance(outcome, Stopped):
@@ -228,8 +237,8 @@ def _keep_watchdog(drives: BusDrives, entry: Entry) -> None:
         )
 
 
-def _write(drives: BusDrives, entry: Entry, value: Any) -> None:
-    """Write an object; one of a watchdog is written back where another program has enabled an axis meanwhile.
+def _write(drives: BusDrives, entry: Entry, axes: list[int], value: Any) -> None:
+    """Write an object of some axes (a text has none); one of a watchdog is put back where an axis was enabled meanwhile.
 
     Between our look at the statusword and our write another master may enable, and nothing on the bus keeps it from
     that. So we look again, and an axis that does not answer counts as enabled.
@@ -237,23 +246,26 @@ def _write(drives: BusDrives, entry: Entry, value: Any) -> None:
     Raises:
         RuntimeError: If an axis was enabled meanwhile.
     """
+    import numpy as np
+
     from drive_env.dictionary.aborts import ObjectAccessError
     from drive_env.master.can.error_control import is_of_a_watchdog
     from drive_env.master.errors import BusError
 
     key = entry.index, entry.sub
+    where = None if isinstance(value, str) else np.isin(np.arange(drives.num_axes), axes)
     if not is_of_a_watchdog(entry.index):
-        drives.write(key, value)
+        drives.write(key, value, where=where)
         return
     before = [int(one) for one in drives.read(key)]  # last before the write: it may be another program's by now
-    drives.write(key, value)
+    drives.write(key, value, where=where)
     try:
         who = _live(drives)
     except (BusError, ObjectAccessError) as error:
         who = f"an axis whose statusword could not be read ({error})"
     if not who:
         return
-    drives.write(key, before)
+    drives.write(key, before, where=where)
     raise RuntimeError(
         f"{who} was enabled by another program while {entry.label} was written, which is part of what stops it when "
         f"its master dies: {', '.join(map(str, before))} was written back, as it was before. Stop the axis with "

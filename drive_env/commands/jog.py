@@ -21,12 +21,13 @@ from drive_env.commands.options import (
     Json,
     Timeout,
     WouldDo,
+    axis_name,
     connect,
+    cycle_for,
     errors_as_exit_codes,
     fail,
     increments_per_revolution,
     look_first,
-    object_name,
     print_json,
 )
 from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
@@ -36,11 +37,12 @@ if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
+AxisNumber = Annotated[int, typer.Option("--axis", help="Axis of a node with several, from 0.")]
 DEFAULT_KEYS = [(int(name, 16), 0) for name in DEFAULT]
-CYCLE = 0.001  # s between two samples
-FIRST, LAST = 20, 500  # samples at rest before a movement that is recorded, and besides the time that it should take
+BEFORE, AFTER = 0.02, 0.5  # s recorded at rest before a movement, and besides the time that it should take
 RELATIVE = cia402.ENABLE_OPERATION | cia402.RELATIVE
 INTERNAL_LIMIT = 0x0800  # bit 11 of the statusword
+STANDSTILL = 0.05  # s, that the drives get to come to rest
 LOOK, STANDS = 0.2, 0.05  # s between two looks, and the share of the speed asked for below which an axis stands
 LEAST, ENOUGH = 0.01, 0.9  # of the way asked for: less is no movement, and less with an emergency was stopped by that
 
@@ -52,6 +54,7 @@ def jog(
     interface: Interface = None,
     channel: Channel = None,
     node: Node = 1,
+    axis: AxisNumber = 0,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
     bitrate: Bitrate = None,
@@ -77,46 +80,85 @@ def jog(
         from drive_env.master.description import describe
         from drive_env.safety.limits import Limits
 
-        known = describe(device, eds).dictionary
+        description = describe(device, eds)
+        known = description.dictionary
+        if not 0 <= axis < description.num_axes:
+            raise ValueError(f"--axis {axis}: a {description.name} has {description.num_axes} axes, from 0")
         current = None if max_current is None else quantities.parse(max_current, known.find(cia402.TORQUE_ACTUAL), None)
         if current is not None and current <= 0:
             raise ValueError(f"--max-current {max_current} must be above 0 A; leave it out for the drive's own limit")
         if not 0.001 <= duration <= 3600.0:
             raise ValueError(f"--for {duration:g} s must be at least 0.001 s and at most an hour")
         files = None if out is None else new_files(out)
-        options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout}
+        options: dict[str, Any] = {"bitrate": bitrate, "timeout": timeout, "cycle": cycle_for(description)}
         if dry_run:
             look_first(interface, channel, [node], bitrate, device, eds, timeout)
         with connect(interface, channel, [node], device, eds, safety=Limits(current=current), **options) as drives:
-            scale = increments_per_revolution(drives)[0]
-            movement = _asked_for(drives, known, scale, speed, by, duration)
-            start = int(drives.read(cia402.POSITION_ACTUAL)[0])
+            one = _OneAxis(drives, axis)
+            scale = increments_per_revolution(drives)[axis]
+            movement = _asked_for(one, known, scale, speed, by, duration)
+            start = one.read(cia402.POSITION_ACTUAL)
             if dry_run:
-                _tell_plan(motion, drives, speed, by, duration, start, scale, json=json)
+                _tell_plan(one, speed, by, duration, start, scale, json=json)
                 return
             reasons: list[str] = []
             trace: Any = None
             with _what_stops(reasons):
-                trace = movement.run(motion, drives, is_recorded=files is not None)
+                trace = movement.run(motion, one, is_recorded=files is not None)
             with _what_stops([]):
-                motion.disable(drives)
+                motion.disable(drives, where=one.where)
             drives.advance(0.1)
-            moved = int(drives.read(cia402.POSITION_ACTUAL)[0]) - start
-            emergencies = [message._asdict() for message in drives.emergencies()]
+            moved = one.read(cia402.POSITION_ACTUAL) - start
+            emergencies = [message._asdict() for message in drives.emergencies() if message.axis == axis]
             if files is not None and trace is not None:
-                _write(files, trace, known, scale)
+                _write(files, trace, known, scale, axis)
         meant = _speed_in_words(speed, movement.velocity, known.find(cia402.TARGET_VELOCITY), scale)
         stopped = _verdict(moved, movement.way, reasons, emergencies, meant)
         if json:
             print_json({"moved": moved, "start": start, "emergencies": emergencies, "stopped": stopped})
         else:
-            print(f"node {node} moved by {quantities.show(moved, known.find(cia402.POSITION_ACTUAL), scale)}")
+            print(f"{one.name} moved by {quantities.show(moved, known.find(cia402.POSITION_ACTUAL), scale)}")
             for message in emergencies:
                 print(f"emergency {_told(message)}")
             if files is not None:
                 print("nothing was recorded" if trace is None else f"recorded in {files[0]} and {files[1]}")
         if stopped:
             fail(stopped, REFUSED)
+
+
+class _OneAxis:
+    """The axis that turns, and the others of its node, which are let alone."""
+
+    def __init__(self, drives: BusDrives, axis: int) -> None:
+        import numpy as np
+
+        self.drives, self.axis = drives, axis
+        self.where = np.arange(drives.num_axes) == axis
+        self.name = axis_name(drives, axis)
+        self.cycle = drives.description.cycle
+
+    def read(self, name: int) -> int:
+        """Return an object of it."""
+        return int(self.drives.read(name)[self.axis])
+
+    def write(self, name: int, raw: int) -> None:
+        """Write an object of it."""
+        self.drives.write(name, raw, where=self.where)
+
+    def rows(self, raw: list[int], others: int) -> Any:
+        """Return rows of what is played: of it, and of the others what does nothing."""
+        import numpy as np
+
+        return np.where(self.where, np.array(raw, int)[:, None], others)
+
+    def cycles(self, duration: float) -> int:
+        """Return how many cycles a time [s] takes, one at least."""
+        return max(round(duration / self.cycle), 1)
+
+    def record(self, duration: float, play: dict[int, Any]) -> Any:
+        """Return the samples of those default objects that the drive has, while something is played."""
+        keys = [key for key in DEFAULT_KEYS if self.drives.description.has(key)]
+        return self.drives.record(keys, duration, play=play, period=self.cycle)
 
 
 @dataclass(frozen=True)
@@ -132,15 +174,15 @@ class _Movement:
         """How far the axis turns if nothing stops it."""
         return self.velocity * self.duration if self.distance is None else self.distance
 
-    def run(self, motion: Any, drives: BusDrives, is_recorded: bool) -> Any:
+    def run(self, motion: Any, one: _OneAxis, is_recorded: bool) -> Any:
         """Enable the axis and move it; return the samples that were wanted of it."""
         if self.distance is None:
-            return _turn(motion, drives, self.velocity, round(self.duration, 3), is_recorded)
-        return _go(motion, drives, abs(self.velocity), self.distance, is_recorded)
+            return _turn(motion, one, self.velocity, round(self.duration, 3), is_recorded)
+        return _go(motion, one, abs(self.velocity), self.distance, is_recorded)
 
 
 def _asked_for(
-    drives: BusDrives, known: ObjectDictionary, scale: float | None, speed: str, by: str | None, duration: float
+    one: _OneAxis, known: ObjectDictionary, scale: float | None, speed: str, by: str | None, duration: float
 ) -> _Movement:
     """Return the movement that the arguments ask for, before the axis is enabled; ValueError for one that cannot be."""
     from drive_env.dictionary.access import check_limits
@@ -152,8 +194,8 @@ def _asked_for(
     distance = None if by is None else quantities.parse(by, known.find(cia402.TARGET_POSITION), scale)
     check_limits(known.find(cia402.TARGET_VELOCITY), velocity)
     check_limits(known.find(cia402.TARGET_POSITION), distance or 0)
-    has_acceleration = drives.description.has(cia402.PROFILE_ACCELERATION)
-    if has_acceleration and int(drives.read(cia402.PROFILE_ACCELERATION)[0]) == 0:
+    has_acceleration = one.drives.description.has(cia402.PROFILE_ACCELERATION)
+    if has_acceleration and one.read(cia402.PROFILE_ACCELERATION) == 0:
         raise ValueError(
             "the drive's profile acceleration 6083h is 0, so nothing would move; set it "
             "(drive-env set 6083 '500 rev/s^2'), or commission the drive"
@@ -161,10 +203,10 @@ def _asked_for(
     return _Movement(velocity, duration, distance)
 
 
-def _write(files: tuple[Path, Path], trace: Any, known: ObjectDictionary, scale: float | None) -> None:
+def _write(files: tuple[Path, Path], trace: Any, known: ObjectDictionary, scale: float | None, axis: int) -> None:
     """Write a recorded movement as table and picture, as scope does."""
-    entries = [known.find(object_name(name)) for name in DEFAULT]
-    rows = {entry: trace[entry.index, entry.sub] for entry in entries}
+    entries = [known.find(key) for key in DEFAULT_KEYS if known.has(key)]
+    rows = {entry: trace[entry.index, entry.sub][:, axis : axis + 1] for entry in entries}
     write_table(files[0], entries, [""], trace.t, rows)
     draw(files[1], entries, [""], [scale], trace.t, rows)
 
@@ -219,8 +261,7 @@ def _told(message: dict[str, Any]) -> str:
 
 
 def _tell_plan(
-    motion: Any,
-    drives: BusDrives,
+    one: _OneAxis,
     speed: str,
     by: str | None,
     duration: float,
@@ -232,72 +273,83 @@ def _tell_plan(
     """Say where the axis is and what would be done; raises for one in fault, which could not be enabled."""
     from drive_env.master import quantities
 
-    status = int(drives.read(cia402.STATUSWORD)[0])
+    status = one.read(cia402.STATUSWORD)
     if cia402.matches(status, cia402.FAULT_BIT):
         raise RuntimeError(f"the drive is in fault ({status:04X}h) and would not be enabled; reset it first")
     what = f"turn at {speed} for {duration:g} s" if by is None else f"turn by {by} at {speed}"
     if json:
         print_json({"would": what, "start": start, "statusword": status, "moved": 0})
         return
-    here = quantities.show(start, drives.description.dictionary.find(cia402.POSITION_ACTUAL), scale)
+    here = quantities.show(start, one.drives.description.dictionary.find(cia402.POSITION_ACTUAL), scale)
     print(
-        f"node {drives.nodes[0]} is at {here} ({status:04X}h) and would be enabled, {what}, and be switched off again "
+        f"{one.name} is at {here} ({status:04X}h) and would be enabled, {what}, and be switched off again "
         "(dry run: nothing was done)"
     )
 
 
-def _turn(motion: Any, drives: BusDrives, velocity: int, duration: float, is_recorded: bool) -> Any:
+def _turn(motion: Any, one: _OneAxis, velocity: int, duration: float, is_recorded: bool) -> Any:
     """Turn in pv, then let the drive brake with its own deceleration; return the samples that were wanted of it."""
-    motion.enable(drives, mode="pv")
+    drives, cycle = one.drives, one.cycle
+    if is_recorded:  # mapping takes a while: not with an axis enabled
+        one.record(0.0, {cia402.TARGET_VELOCITY: one.rows([], 0)})
+    motion.enable(drives, mode="pv", where=one.where)
     trace = None
     if is_recorded:
-        rows = [0] * FIRST + [velocity] * round(duration / CYCLE) + [0] * LAST
-        trace = drives.record(DEFAULT_KEYS, len(rows) * CYCLE, play={cia402.TARGET_VELOCITY: rows})
+        rows = [0] * one.cycles(BEFORE) + [velocity] * one.cycles(duration) + [0] * one.cycles(AFTER)
+        trace = one.record(len(rows) * cycle, {cia402.TARGET_VELOCITY: one.rows(rows, 0)})
     else:
-        drives.write(cia402.TARGET_VELOCITY, velocity)
-        drives.advance(duration)
-    drives.write(cia402.TARGET_VELOCITY, 0)
+        one.write(cia402.TARGET_VELOCITY, velocity)
+        drives.advance(one.cycles(duration) * cycle)
+    one.write(cia402.TARGET_VELOCITY, 0)
     # Bit 10 in pv tells that the ramp has ended.
-    motion.wait_for(drives, cia402.TARGET_REACHED, 10.0, "standstill")
-    drives.advance(0.05)
+    motion.wait_for(drives, cia402.TARGET_REACHED, 10.0, "standstill", one.where)
+    drives.advance(one.cycles(STANDSTILL) * cycle)
     return trace
 
 
-def _go(motion: Any, drives: BusDrives, velocity: int, distance: int, is_recorded: bool) -> Any:
+def _go(motion: Any, one: _OneAxis, velocity: int, distance: int, is_recorded: bool) -> Any:
     """Move in pp, and give the drive its profile velocity back; return the samples that were wanted of it."""
+    drives, cycle = one.drives, one.cycle
     trace = None
-    before = int(drives.read(cia402.PROFILE_VELOCITY)[0])
-    drives.write(cia402.PROFILE_VELOCITY, velocity)
+    before = one.read(cia402.PROFILE_VELOCITY)
+    one.write(cia402.PROFILE_VELOCITY, velocity)
     try:
-        motion.enable(drives, mode="pp")
+        if is_recorded:  # mapping takes a while: not with an axis enabled
+            nothing = one.rows([], 0)
+            one.record(0.0, {cia402.TARGET_POSITION: nothing, cia402.CONTROLWORD: nothing})
+        motion.enable(drives, mode="pp", where=one.where)
         if is_recorded:
-            count = FIRST + round(abs(distance) / velocity / CYCLE) + LAST
-            words = [RELATIVE] * FIRST + [RELATIVE | cia402.NEW_SET_POINT] * FIRST + [RELATIVE] * (count - 2 * FIRST)
-            play = {cia402.TARGET_POSITION: [distance] * count, cia402.CONTROLWORD: words}
-            trace = drives.record(DEFAULT_KEYS, count * CYCLE, play=play)
+            first = one.cycles(BEFORE)
+            count = first + one.cycles(abs(distance) / velocity) + one.cycles(AFTER)
+            words = [RELATIVE] * first + [RELATIVE | cia402.NEW_SET_POINT] * first + [RELATIVE] * (count - 2 * first)
+            play = {
+                cia402.TARGET_POSITION: one.rows([distance] * count, 0),
+                cia402.CONTROLWORD: one.rows(words, cia402.DISABLE_VOLTAGE),
+            }
+            trace = one.record(count * cycle, play)
         else:
-            motion.start_move(drives, distance, relative=True)
-        _arrive(motion, drives, velocity, 10.0 + 2.0 * abs(distance) / velocity)
+            motion.start_move(drives, distance, relative=True, where=one.where)
+        _arrive(motion, one, velocity, 10.0 + 2.0 * abs(distance) / velocity)
     finally:
-        drives.write(cia402.PROFILE_VELOCITY, before)
+        one.write(cia402.PROFILE_VELOCITY, before)
     return trace
 
 
-def _arrive(motion: Any, drives: BusDrives, velocity: int, timeout: float) -> None:
+def _arrive(motion: Any, one: _OneAxis, velocity: int, timeout: float) -> None:
     """Wait until the target is reached; RuntimeError for an axis that stands at a limit."""
     from drive_env.master.errors import BusError
 
-    waited, before = 0.0, int(drives.read(cia402.POSITION_ACTUAL)[0])
+    waited, before = 0.0, one.read(cia402.POSITION_ACTUAL)
     while True:
         try:
-            motion.wait_for(drives, cia402.TARGET_REACHED, LOOK, "its target")
+            motion.wait_for(one.drives, cia402.TARGET_REACHED, LOOK, "its target", one.where)
         except BusError:
             raise
         except TimeoutError:
             waited += LOOK
-            here = int(drives.read(cia402.POSITION_ACTUAL)[0])
+            here = one.read(cia402.POSITION_ACTUAL)
             is_still = abs(here - before) < STANDS * velocity * LOOK
-            if is_still and int(drives.read(cia402.STATUSWORD)[0]) & INTERNAL_LIMIT:
+            if is_still and one.read(cia402.STATUSWORD) & INTERNAL_LIMIT:
                 raise RuntimeError("it is at a limit switch, or at a position limit") from None
             if waited >= timeout:
                 raise TimeoutError(f"it did not reach its target within {waited:.1f} s") from None

@@ -20,6 +20,7 @@ from drive_env.commands.options import (
     axis_name,
     check_time,
     connect,
+    default_objects,
     errors_as_exit_codes,
     increments_per_revolution,
     object_name,
@@ -60,7 +61,7 @@ def monitor(
         check_time("--duration", duration)
         with connect(interface, channel, node, device, eds, **options) as drives:
             known = drives.description.dictionary
-            entries = [known.find(object_name(name)) for name in objects or DEFAULT]
+            entries = [known.find(object_name(name)) for name in objects or default_objects(known, DEFAULT)]
             end = time.monotonic() + (float("inf") if duration is None else duration)
             try:
                 if json:

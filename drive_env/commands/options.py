@@ -16,10 +16,12 @@ import typer
 from drive_env.programs import CLOSED, output_is_closed
 
 if TYPE_CHECKING:
-    from drive_env.dictionary.entries import ObjectName
+    from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
     from drive_env.master.bus_drives import BusDrives
+    from drive_env.master.description import Description
 
 REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
+AXIS_CYCLE = 0.001  # s of a bus of 1 Mbit/s for each axis of a node: seven frames
 
 Interface = Annotated[
     str | None,
@@ -38,6 +40,10 @@ Channel = Annotated[
 ]
 Bitrate = Annotated[int | None, typer.Option(help="Bit rate [bit/s], if the interface sets it.")]
 Nodes = Annotated[list[int] | None, typer.Option("--node", "-n", help="Node-ID; may be repeated.", show_default="1")]
+AxisOfNode = Annotated[
+    int | None,
+    typer.Option("--axis", help="Axis of nodes with several, from 0.", show_default="all that have the object"),
+]
 DeviceName = Annotated[
     str, typer.Option("--device", help="Device by name, or your own by its path: a folder, or a variant's .toml.")
 ]
@@ -235,6 +241,38 @@ def increments_per_revolution(drives: BusDrives) -> list[float | None]:
     from drive_env.master import quantities
 
     return quantities.increments_per_revolution(drives)
+
+
+def default_objects(known: ObjectDictionary, names: Iterable[str]) -> list[str]:
+    """Return those of a command's default objects that a drive has: a stepper's tells no current."""
+    return [name for name in names if known.has(object_name(name))]
+
+
+def cycle_for(known: Description) -> float | None:
+    """Return a time between SYNCs [s] in which the bus has room for all axes of a node; None of a node with one."""
+    return None if known.num_axes == 1 else AXIS_CYCLE * known.num_axes
+
+
+def axes_of(drives: BusDrives, entry: Entry, axis: int | None) -> list[int]:
+    """Return the axes whose object an entry is: all, or the one that was asked for, of every node.
+
+    An object of a further axis is of that axis alone, and what belongs to the node is the first axis'.
+
+    Raises:
+        ValueError: For an axis that the nodes do not have, or that the object does not belong to.
+    """
+    known, key = drives.description, (entry.index, entry.sub)
+    count = known.num_axes
+    if axis is not None and not 0 <= axis < count:
+        raise ValueError(f"--axis {axis}: a {known.name} has {count} axes, from 0")
+    parts = list(range(count)) if axis is None else [axis]
+    if (found := known.of_further_axes().get(key)) is not None:
+        if axis not in (None, found[1]):
+            raise ValueError(f"{entry.label} is an object of axis {found[1]}, not of --axis {axis}; leave --axis out")
+        parts = [found[1]]
+    elif known.key(entry, 1) == key:
+        parts = [0]
+    return [node * count + part for node in range(len(drives.nodes)) for part in parts]
 
 
 def axis_name(drives: BusDrives, axis: int) -> str:

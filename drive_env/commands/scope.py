@@ -24,6 +24,7 @@ from drive_env.commands.options import (
     check_free,
     check_writable,
     connect,
+    default_objects,
     errors_as_exit_codes,
     fail,
     increments_per_revolution,
@@ -85,7 +86,7 @@ def scope(
         _listen(interface, channel, node, bitrate)
         with connect(interface, channel, node, device, eds, **options) as drives:
             known = drives.description.dictionary
-            entries = [known.find(object_name(name)) for name in objects or DEFAULT]
+            entries = [known.find(object_name(name)) for name in objects or default_objects(known, DEFAULT)]
             condition = None if trigger is None else _parse(trigger, known)
             scales = increments_per_revolution(drives)
             labels = [axis_name(drives, axis) for axis in range(drives.num_axes)]

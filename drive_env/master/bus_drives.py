@@ -144,13 +144,15 @@ class BusDrives:
     def advance(self, duration: float) -> None:
         """Let `duration` [s] pass, whole communication cycles, with a SYNC in each.
 
-        In real time the duration is kept: where this computer was late, SYNCs are left out.
+        Where SYNCs come less often (`CanDrives(cycle=...)`) it is rounded up to whole times between two. In real time
+        the duration is kept: where this computer was late, SYNCs are left out.
 
         Raises:
             SafetyError: If a limit is passed meanwhile; the drives are in quick stop then.
         """
         self._enter()
-        cycles = self._cycles(duration)
+        per_sync = self._description.cycles_per_sync
+        cycles = -(-whole_cycles(duration, self._description.cycle / per_sync) // per_sync)
         if cycles == 0:
             return
         self._cycle_runner.pass_time(cycles, self.safety)
@@ -388,10 +390,18 @@ class BusDrives:
                 if entry.default and found != entry.default:
                     raise BusError(
                         f"node {node} is not a {self._description.name}: its {what} ({entry.label}) is {found:X}h, and "
-                        f"the EDS says {entry.default:X}h; give its own EDS (eds=..., --eds)"
+                        f"the EDS says {entry.default:X}h; {self._who_it_is(kind, axis)}"
                     )
             self._check_variant(node, kind)
             self._link.welcome(k)
+
+    def _who_it_is(self, kind: int, axis: int) -> str:
+        """Return what to open a node as that is another device."""
+        vendor, product = (self.read_axis(self._description.dictionary.find(key), axis) for key in list(_IDENTITY)[:2])
+        other = device_of(kind, vendor, product)
+        if other is None:
+            return "give its own EDS (eds=..., --eds)"
+        return f"it is a {other}: name it so (device={other!r}, --device {other})"
 
     def _check_variant(self, node: int, kind: int) -> None:
         """Raise BusError for a node that is another variant of the device, which may count in other units."""

@@ -9,7 +9,9 @@ from typing import Any, Literal
 import can
 
 from drive_env.dictionary.entries import ObjectName
+from drive_env.drives.arguments import whole_cycles
 from drive_env.master.bus_drives import BusDrives, checked_limits
+from drive_env.master.can.bus_time import BIT_RATE, BusTime
 from drive_env.master.can.can_link import CanLink
 from drive_env.master.can.dry_run import DryPort
 from drive_env.master.can.network import check_nodes
@@ -17,6 +19,8 @@ from drive_env.master.can.port import Port, open_bus
 from drive_env.master.description import check_timeout, describe
 from drive_env.master.pace import LockstepPace, Pace, RealTimePace
 from drive_env.safety.limits import Limits
+
+LONGEST_CYCLE = 0.1  # s: slower, nobody watches
 
 
 class CanDrives(BusDrives):
@@ -35,6 +39,9 @@ class CanDrives(BusDrives):
         nodes: Node-IDs, all of this device.
         pace: "real-time": time passes by the clock, one SYNC per communication cycle. "lockstep": time passes by
             SYNC, for an emulator served so.
+        cycle: Time between two SYNCs in real time [s]: whole communication cycles of the drives, one by default. What
+            many axes exchange takes a longer one: frames that do not fit into a cycle are refused. Write 60C2h to it
+            for csp and csv; `advance` lets whole ones pass, and `record` takes such a `period`.
         bus: An open python-can bus in place of interface and channel; it stays open afterwards.
         timeout: Longest wait for an answer [s]; the device's own by default.
         timeouts: Object -> time-out [s], for those that need another.
@@ -57,6 +64,7 @@ class CanDrives(BusDrives):
         channel: str | None = None,
         nodes: Iterable[int] = (1,),
         pace: Literal["real-time", "lockstep"] = "real-time",
+        cycle: float | None = None,
         bus: can.BusABC | None = None,
         timeout: float | None = None,
         timeouts: Mapping[ObjectName, float] | None = None,
@@ -74,6 +82,9 @@ class CanDrives(BusDrives):
         if pace not in ("real-time", "lockstep"):
             raise ValueError(f"pace is 'real-time' or 'lockstep', not {pace!r}")
         checked_limits(safety)
+        if cycle is not None:
+            description.cycles_per_sync = _cycles_per_sync(cycle, description.cycle, pace)
+            description.cycle *= description.cycles_per_sync
         # A dry run has nothing to wait for either.
         by_sync = pace == "lockstep" or bool(dry_run)
         paced: Pace = LockstepPace() if by_sync else RealTimePace(description.cycle)
@@ -85,9 +96,21 @@ class CanDrives(BusDrives):
         else:
             port = Port(open_bus(interface, channel, **options))
         self._port = port
-        super().__init__(CanLink(port, node_ids, description), description, paced, safety)
+        bus_time = BusTime() if by_sync else BusTime(float(options.get("bitrate") or BIT_RATE), description.cycle)
+        super().__init__(CanLink(port, node_ids, description, bus_time), description, paced, safety)
 
     @property
     def port(self) -> Port:
         """The bus."""
         return self._port
+
+
+def _cycles_per_sync(cycle: float, least: float, pace: str) -> int:
+    """Return how many communication cycles [s] pass from SYNC to SYNC [s]; ValueError for what cannot be."""
+    if pace == "lockstep":
+        raise ValueError(f"cycle={cycle:g} s is for real time: in lockstep each SYNC is a cycle of {least:g} s")
+    if not least <= cycle <= LONGEST_CYCLE:
+        raise ValueError(
+            f"cycle={cycle:g} s must be from {least:g} s, the drives' communication cycle, to {LONGEST_CYCLE:g} s"
+        )
+    return whole_cycles(cycle, least)

@@ -190,11 +190,11 @@ class CycleRunner:
     def _map(self, call: RecordCall, envelope: Envelope | None) -> None:
         """Have a call's objects mapped, and what the envelope watches if it fits besides, from now on."""
         watched = NOTHING if envelope is None else envelope.watched()
+        played = tuple(dict.fromkeys(call.played))
         if call.watched is not watched:
-            call.watched, call.chosen, call.mapping = watched, self._process.choose(call.sampled, watched), -1
+            call.watched, call.chosen, call.mapping = watched, self._process.choose(call.sampled, watched, played), -1
         if call.mapping == self._process.mapping:
             return
-        played = tuple(dict.fromkeys(call.played))
         if not self._process.is_mapped(played, call.chosen):
             self._start()
             self._process.map(played, call.chosen)

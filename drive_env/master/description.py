@@ -65,7 +65,8 @@ class Description:
         hints: What else a master must know of it.
         timeouts: Time-outs of objects that the user gave [s].
         timeout: Time-out of the others that the user gave [s]; None takes the device's.
-        cycle: Communication cycle [s].
+        cycle: Time between two SYNCs [s].
+        cycles_per_sync: Communication cycles of the drives in it.
     """
 
     name: str
@@ -76,6 +77,7 @@ class Description:
     timeout: float | None = None
     timeouts: dict[Key, float] = field(default_factory=dict)
     cycle: float = CYCLE
+    cycles_per_sync: int = 1
     _types: dict[Key, ODVariable] = field(default_factory=dict)
 
     @property

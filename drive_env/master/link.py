@@ -130,8 +130,15 @@ class ProcessData(Protocol):
     def check_played(self, entries: Sequence[Entry]) -> None:
         """Raise ObjectAccessError 06040041h for an object that cannot be sent with every cycle."""
 
-    def choose(self, wanted: Sequence[Entry], welcome: Sequence[Entry]) -> tuple[Entry, ...]:
+    def choose(
+        self, wanted: Sequence[Entry], welcome: Sequence[Entry], played: Sequence[Entry] = ()
+    ) -> tuple[Entry, ...]:
         """Return what to sample: what is wanted, and of what is welcome besides, in its order, as much as fits.
+
+        Args:
+            wanted: To be sampled.
+            welcome: If there is room for it.
+            played: What goes into the drives meanwhile.
 
         Raises:
             ObjectAccessError: 06040042h if not even what is wanted fits.

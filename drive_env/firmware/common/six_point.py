@@ -150,6 +150,8 @@ def advance(drive, lane, target, v_max, up, down, dt):
         if u < 0.0:
             speed, way, t = slow_down(drive, lane, -u, floor, down, left)
             x, v = x - sign * way, -sign * speed
+            if v == 0.0:  # before it turns round, too (TMC5130 data sheet, TZEROWAIT)
+                drive.ramp_wait_left[lane] = drive.ramp_wait[lane]
         elif brakes:
             speed, way, t = slow_down(drive, lane, u, floor, down, left)
             x, v = x + sign * way, sign * speed

@@ -10,6 +10,7 @@ from drive_env.canopen.frames import SYNC
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.master.can.borrowed_identifiers import BorrowedIdentifiers
+from drive_env.master.can.bus_time import BusTime
 from drive_env.master.can.dry_run import DryPort, DrySdoClient
 from drive_env.master.can.error_control import ErrorControls
 from drive_env.master.can.network import PRE_OPERATIONAL, START, Network
@@ -32,9 +33,16 @@ class CanLink:
         port: The bus; a `DryPort` for a dry run.
         nodes: Node-IDs.
         description: What device they are.
+        bus_time: What the bus carries in a cycle.
     """
 
-    def __init__(self, port: Port, nodes: Sequence[int], description: Description) -> None:
+    def __init__(
+        self,
+        port: Port,
+        nodes: Sequence[int],
+        description: Description,
+        bus_time: BusTime = BusTime(),  # noqa: B008
+    ) -> None:
         self.port = port
         self.nodes = tuple(nodes)
         self.is_dry = isinstance(port, DryPort)
@@ -55,7 +63,7 @@ class CanLink:
             self._clients += clients
         borrowed = BorrowedIdentifiers(port, self.nodes, description.num_axes)
         pdos = [PdoConfiguration(*one, description, borrowed) for one in zip(self.nodes, self._clients, strict=True)]
-        self.process = PdoProcessData(port, description, pdos, self.is_dry)
+        self.process = PdoProcessData(port, description, pdos, self.is_dry, bus_time)
 
     @cached_property
     def watch(self) -> ErrorControls:

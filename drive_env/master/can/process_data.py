@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.dictionary.aborts import PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
+from drive_env.master.can.bus_time import BusTime
 from drive_env.master.can.pdo import (
     INTO_DRIVE,
     OUT_OF_DRIVE,
@@ -53,14 +55,22 @@ class PdoProcessData:
         description: What device the nodes are.
         configurations: The PDOs of each node.
         dry: Nobody is there: nothing is sampled.
+        bus_time: What the bus carries in a cycle.
 
     Attributes:
         mapping: Its number: it grows with every change.
     """
 
     def __init__(
-        self, port: Port, description: Description, configurations: Sequence[PdoConfiguration], dry: bool = False
+        self,
+        port: Port,
+        description: Description,
+        configurations: Sequence[PdoConfiguration],
+        dry: bool = False,
+        bus_time: BusTime = BusTime(),  # noqa: B008
     ) -> None:
+        self._bus_time = bus_time
+        self._axes = len(configurations) * description.num_axes
         self._port = port
         self._description = description
         self._configurations = configurations
@@ -77,16 +87,25 @@ class PdoProcessData:
         """Raise ObjectAccessError 06040041h for an object that no RPDO can carry."""
         check_mappable(self._description, entries, INTO_DRIVE)
 
-    def choose(self, wanted: Sequence[Entry], welcome: Sequence[Entry]) -> tuple[Entry, ...]:
+    def choose(
+        self, wanted: Sequence[Entry], welcome: Sequence[Entry], played: Sequence[Entry] = ()
+    ) -> tuple[Entry, ...]:
         """Return what to sample: what is wanted, and of what is welcome besides, in its order, as much as fits.
+
+        Args:
+            wanted: To be sampled.
+            welcome: If PDOs and bus have room for it.
+            played: What goes into the drives meanwhile.
 
         Raises:
             ObjectAccessError: 06040042h if not even what is wanted fits.
         """
         besides = [entry for entry in welcome if entry not in wanted]
+        into = self._plan(INTO_DRIVE, tuple(played)) or []
         while True:
             entries = (*wanted, *besides)
-            if self._plan(OUT_OF_DRIVE, entries) is not None:
+            out = self._plan(OUT_OF_DRIVE, entries)
+            if out is not None and (not besides or self._bus_time.has_room_besides((*into, *out), self._axes)):
                 return entries
             if not besides:
                 raise too_many(self._description, wanted, OUT_OF_DRIVE)
@@ -100,8 +119,11 @@ class PdoProcessData:
         """Map entries of every axis to PDOs that go with SYNC, as far as they are not mapped.
 
         Raises:
-            ObjectAccessError: If they do not fit or a drive refuses them.
+            ObjectAccessError: If they do not fit, into PDOs or into a cycle of the bus, or a drive refuses them.
         """
+        groups = [*(self._plan(INTO_DRIVE, played) or []), *(self._plan(OUT_OF_DRIVE, sampled) or [])]
+        if (excess := self._bus_time.excess(groups, self._axes)) is not None:
+            raise ObjectAccessError(PDO_LENGTH_EXCEEDED, excess)
         if played and played != self._entries(INTO_DRIVE):
             self._map(INTO_DRIVE, played)
         if not self._carries(sampled):

@@ -1,0 +1,309 @@
+"""The node of a TMCM-6212, as transcripts: its six axes by SDO, NMT, PDO, EMCY (manual, sections 1.1, 2.2, 2.5)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from canopen_wire import Wire
+
+from drive_env import EmulatedDrives
+from drive_env.bus.bits import frame_bits
+from drive_env.bus.wire import Wire as Bus
+from drive_env.bus.world import World
+from drive_env.canopen.frames import Frame
+from drive_env.cia402 import State, state_of
+from drive_env.dictionary.aborts import (
+    CANNOT_BE_MAPPED,
+    CANNOT_BE_STORED,
+    NO_SUCH_OBJECT,
+    NO_SUCH_SUB_INDEX,
+    READ_ONLY,
+    VALUE_RANGE,
+    VALUE_TOO_HIGH,
+    WRONG_STATE,
+)
+
+AXES = 6
+EACH = range(AXES)
+PROFILE, MOTOR, PDO = 0x800, 0x200, 0x40  # from an axis to the next
+OFF = 0x8000_0000
+DISABLED, READY = State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON
+ENABLED, FAULT = State.OPERATION_ENABLED, State.FAULT
+
+
+@pytest.fixture(scope="module")
+def drives():
+    with EmulatedDrives("tmcm6212", "inertia", num_machines=AXES, num_threads=1) as made:
+        yield made
+
+
+@pytest.fixture
+def wire(drives):
+    """Node 5, pre-operational."""
+    drives.machine.reset()
+    drives.machine.enable_input = True
+    drives.machine.set_temperatures(25.0, 25.0)
+    return Wire(drives)
+
+
+def enable(wire, axes=EACH, mode=3):
+    for axis in axes:
+        assert wire.download(0x6060 + PROFILE * axis, 0, mode, 1) == 0
+        for word in (6, 7, 15):
+            assert wire.download(0x6040 + PROFILE * axis, 0, word, 2) == 0
+
+
+def states(wire):
+    return [state_of(wire.value(0x6041 + PROFILE * axis)) for axis in EACH]
+
+
+# --- SDO --------------------------------------------------------------------------------------------------------------
+def test_it_says_what_it_is(wire):
+    wire.play("""
+        rx 605  40 00 10 00 00 00 00 00
+        tx 585  43 00 10 00 92 01 FC FF   # several axes, of steppers
+        rx 605  40 18 10 02 00 00 00 00
+        tx 585  43 18 10 02 44 18 00 00   # product code: 6212
+        rx 605  40 08 10 00 00 00 00 00
+        tx 585  41 08 10 00 09 00 00 00   # nine letters, in segments
+        rx 605  60 00 00 00 00 00 00 00
+        tx 585  00 54 4D 43 4D 2D 36 32   # TMCM-62
+        rx 605  70 00 00 00 00 00 00 00
+        tx 585  1B 31 32 00 00 00 00 00   # 12
+    """)
+
+
+@pytest.mark.parametrize("axis", EACH)
+def test_an_axis_has_its_own_objects(wire, axis):
+    """Written on one, read on all: that one alone has changed."""
+    for index, step, raw, size in ((0x2003, MOTOR, 100 + axis, 1), (0x6081, PROFILE, 70_000 + axis, 4)):
+        before = [wire.value(index + step * other) for other in EACH]
+        assert wire.download(index + step * axis, 0, raw, size) == 0
+        after = [wire.value(index + step * other) for other in EACH]
+        assert after == [raw if other == axis else before[other] for other in EACH]
+
+
+@pytest.mark.parametrize(
+    ("index", "sub", "raw", "size", "abort"),
+    [
+        (0x6041, 0, 0, 2, READ_ONLY),
+        (0x8841, 0, 0, 2, READ_ONLY),
+        (0x9041, 0, 0, 2, NO_SUCH_OBJECT),  # a seventh axis
+        (0x2C03, 0, 0, 1, NO_SUCH_OBJECT),
+        (0x1580, 1, 0, 4, NO_SUCH_OBJECT),
+        (0x1440, 2, 1, 1, READ_ONLY),  # received PDOs are asynchronous for ever
+        (0x1840, 2, 245, 1, VALUE_RANGE),
+        (0x8860, 0, 10, 1, VALUE_RANGE),  # cst
+        (0x2A01, 0, 0, 2, VALUE_RANGE),
+        (0x1B40, 4, 0, 4, NO_SUCH_SUB_INDEX),  # a fourth object in a PDO
+        (0x300E, 1, 0, 4, READ_ONLY),
+        (0x1010, 9, 0, 4, CANNOT_BE_STORED),  # without the signature
+    ],
+)
+def test_what_no_axis_takes(wire, index, sub, raw, size, abort):
+    assert wire.download(index, sub, raw, size) == abort
+
+
+@pytest.mark.parametrize("axis", EACH)
+def test_limit_switches_and_units_are_chosen_before_an_axis_is_enabled(wire, axis):
+    assert wire.download(0x2005 + MOTOR * axis, 0, 3, 4) == 0
+    enable(wire, [axis])
+    assert wire.download(0x2005 + MOTOR * axis, 0, 0, 4) == WRONG_STATE
+    other = (axis + 1) % AXES
+    assert wire.download(0x2005 + MOTOR * other, 0, 3, 4) == 0, "that is its own affair"
+
+
+# --- NMT --------------------------------------------------------------------------------------------------------------
+def test_stopped_takes_every_enabled_axis_to_fault_and_no_other(wire):
+    """Section 2.2 of the manual: the one link between the two automata."""
+    wire.start()
+    enable(wire, (0, 2, 5))
+    wire.take()
+    wire.play("""
+        rx 000  02 05
+    """)
+    wire.wait(1)
+    assert wire.take() == [], "a stopped node sends no emergency"
+    assert states(wire) == [FAULT if axis in (0, 2, 5) else DISABLED for axis in EACH]
+    wire.play("""
+        rx 000  80 05
+        tx 085  00 81 .. 00 FF 00 00 00   # told once it may be
+    """)
+
+
+def test_a_reset_restarts_all_axes(wire):
+    enable(wire)
+    assert states(wire) == [ENABLED] * AXES
+    wire.play("""
+        rx 000  81 05
+        tx 705  00
+    """)
+    assert states(wire) == [DISABLED] * AXES
+
+
+# --- PDO --------------------------------------------------------------------------------------------------------------
+def test_factory_pdos_are_those_of_axis_0(wire):
+    wire.start()
+    wire.play(
+        """
+        rx 205  06 00                 # RPDO 1: controlword
+        wait 1 ms
+        tx 185  31 02                 # TPDO 1: statusword
+        tx 285  31 02 00              # TPDO 2: statusword, mode
+        rx 305  07 00 01              # RPDO 2: controlword, mode
+        wait 1 ms
+        tx 185  33 02
+        tx 285  33 02 01
+        rx 405  0F 00 10 27 00 00     # RPDO 3: controlword, target position
+        wait 1 ms
+        tx 185  37 ..
+        tx 285  37 .. 01
+        rx 080
+        tx 385  .. .. 00 00 00 00     # TPDO 3 with SYNC: statusword, position
+    """
+    )
+    assert wire.value(0x607A) == 10_000
+    assert states(wire) == [ENABLED] + [DISABLED] * 5
+    for index in (0x1403, 0x1803, *(base + PDO * axis + k for base in (0x1400, 0x1800) for axis in range(1, AXES)
+                                    for k in range(4))):  # fmt: skip
+        assert wire.value(index, 1) & OFF, f"{index:04X}h is off"
+
+
+def give(wire, index, can_id, kind=None, objects=None):
+    """Give a PDO an identifier, a transmission type, and objects: off, none, these, their number, on."""
+    assert wire.download(index, 1, can_id | OFF, 4) == 0
+    if kind is not None:
+        assert wire.download(index, 2, kind, 1) == 0
+    if objects is not None:
+        assert wire.download(index + 0x200, 0, 0, 1) == 0
+        for sub, raw in enumerate(objects, 1):
+            assert wire.download(index + 0x200, sub, raw, 4) == 0
+        assert wire.download(index + 0x200, 0, len(objects), 1) == 0
+    assert wire.download(index, 1, can_id, 4) == 0
+
+
+@pytest.mark.parametrize("place", range(4))
+@pytest.mark.parametrize("axis", EACH)
+def test_each_of_the_24_received_pdos_drives_its_axis(wire, axis, place):
+    """Numbers 1 to 4, 65 to 68, 129 to 132, ...: with the factory's mapping, once they have an identifier."""
+    give(wire, 0x1400 + PDO * axis + place, 0x234)
+    wire.start()
+    data = ["06 00", "06 00 03", "06 00 D2 04 00 00", "06 00 2E FB FF FF"][place]
+    wire.receive(0x234, data)
+    wire.wait(1)
+    assert states(wire) == [READY if other == axis else DISABLED for other in EACH]
+    of_axis = lambda index: wire.value(index + PROFILE * axis)  # noqa: E731
+    assert (of_axis(0x6060), of_axis(0x607A), of_axis(0x60FF)) == [(0, 0, 0), (3, 0, 0), (0, 1234, 0), (0, 0, -1234)][
+        place
+    ]
+    assert not any(wire.value(index + PROFILE * other) for other in EACH if other != axis
+                   for index in (0x6060, 0x607A, 0x60FF))  # fmt: skip
+
+
+@pytest.mark.parametrize("place", range(4))
+@pytest.mark.parametrize("axis", EACH)
+def test_each_of_the_24_sent_pdos_tells_of_its_axis(wire, axis, place):
+    enable(wire, [axis])
+    give(wire, 0x1800 + PDO * axis + place, 0x345, 1)
+    wire.start()
+    assert wire.download(0x60FF + PROFILE * axis, 0, 51_200, 4) == 0
+    wire.wait(200)
+    wire.take()
+    (frame,) = [one for one in wire.receive(0x80) if one.can_id == 0x345]
+    status = int.from_bytes(frame.data[:2], "little")
+    assert status & 0x6F == 0x27
+    rest = int.from_bytes(frame.data[2:], "little", signed=True)
+    assert rest == [0, 3, wire.value(0x6064 + PROFILE * axis), wire.value(0x606C + PROFILE * axis)][place]
+    assert place < 2 or rest > 1000
+
+
+def test_a_pdo_carries_three_objects_of_any_axes(wire):
+    enable(wire, (1, 4))
+    words = [0x6041 + PROFILE * axis << 16 | 0x10 for axis in (1, 2, 4)]
+    give(wire, 0x1800, 0x185, 1, words)
+    wire.start()
+    wire.take()
+    (frame,) = [one for one in wire.receive(0x80) if one.can_id == 0x185]
+    assert [int.from_bytes(frame.data[2 * k : 2 * k + 2], "little") & 0x6F for k in range(3)] == [0x27, 0x40, 0x27]
+    assert wire.download(0x1800, 1, 0x185 | OFF, 4) == 0
+    assert wire.download(0x1A00, 0, 4, 1) in (VALUE_RANGE, VALUE_TOO_HIGH)
+    assert wire.download(0x1A00, 0, 0, 1) == 0
+    assert wire.download(0x1A00, 1, 0x2003_0008, 4) == CANNOT_BE_MAPPED
+
+
+def test_thirty_frames_per_sync_take_four_milliseconds_of_a_bus_of_1_mbit_s(wire):
+    """24 sent PDOs and six received ones: too many for a cycle of 1 ms, not for one of 4 ms."""
+    for axis in EACH:
+        for place in range(4):
+            give(wire, 0x1800 + PDO * axis + place, 0x300 + 4 * axis + place, 1)
+        give(wire, 0x1402 + PDO * axis, 0x211 + axis)
+    sync = Frame(0x80)
+    targets = [Frame(0x211 + axis, bytes.fromhex("0F 00 D2 04 00 00")) for axis in EACH]
+    wire.start()
+    wire.take()
+    for frame in targets:
+        wire.node.receive(frame, wire.now)
+    answers = wire.receive(0x80)
+    assert len(answers) == 24
+    bits = [frame_bits(frame) for frame in (sync, *targets, *answers)]
+    took = sum(bits) / 1e6
+    assert 0.002 < took < 0.004, "s"
+    bus = Bus(1_000_000)
+    for k, frame in enumerate((sync, *targets, *answers)):
+        bus.send(frame, k, 0.0)
+    time, count = 0.0, 0
+    while (event := bus.next_event()) < 1.0:
+        time = event
+        count += bus.take(time) is not None
+    assert count == 31
+    assert time == pytest.approx(took, rel=0.02)
+
+
+# --- EMCY -------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("axis", EACH)
+def test_an_emergency_names_its_motor(wire, drives, axis):
+    enable(wire)
+    drives.machine.set_temperatures(25.0, np.where(np.arange(AXES) == axis, 151.0, 25.0))
+    wire.play(f"""
+        wait 1 ms
+        tx 085  10 43 09 02 {axis:02X} 00 00 00   # overtemperature
+        tx 085  10 43 09 01 {axis:02X} 00 00 00
+    """)
+    assert states(wire) == [FAULT if other == axis else ENABLED for other in EACH]
+    assert wire.value(0x1001) == 9
+    drives.machine.set_temperatures(25.0, 25.0)
+    wire.play(f"""
+        rx 605  2B {0x40:02X} {0x60 + 8 * axis:02X} 00 80 00 00 00
+        tx 585  60 {0x40:02X} {0x60 + 8 * axis:02X} 00 00 00 00 00
+        wait 1 ms
+        tx 085  00 00 00 00 {axis:02X} 00 00 00
+    """)
+
+
+def test_the_enable_input_belongs_to_the_module(wire, drives):
+    enable(wire, (0, 3))
+    drives.machine.enable_input = False
+    wire.wait(1)
+    told = {str(frame) for frame in wire.take()}
+    assert told == {"085  41 54 81 00 FF 00 00 00"}
+    assert states(wire) == [FAULT if axis in (0, 3) else DISABLED for axis in EACH]
+
+
+# --- in real time -----------------------------------------------------------------------------------------------------
+def test_a_set_of_received_pdos_of_all_axes_is_taken_in_one_cycle():
+    """24 frames within a communication cycle of a node that takes time: none is lost."""
+    world = World(lockstep=False)
+    with EmulatedDrives("tmcm6212", "inertia", num_machines=AXES, num_threads=1) as made:
+        (node,) = world.add(made, [5])
+        world.power_on()
+        world.run_until(0.1)
+        port = lambda index, sub=0: node.dictionary.port(index, sub)  # noqa: E731
+        for axis in EACH:
+            for place in range(4):
+                port(0x1400 + PDO * axis + place, 1).write(0x200 + 4 * axis + place)
+        node.receive(Frame(0, bytes((1, 5))), world.time)
+        for axis in EACH:
+            frames = ("06 00", "06 00 03", "06 00 D2 04 00 00", "06 00 2E FB FF FF")
+            for place, data in enumerate(frames):
+                node.receive(Frame(0x200 + 4 * axis + place, bytes.fromhex(data)), world.time)
+        assert [port(0x60FF + PROFILE * axis).read() for axis in EACH] == [-1234] * AXES
