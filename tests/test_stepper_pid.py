@@ -64,12 +64,12 @@ def test_the_answer_to_a_step_of_the_load_is_the_linear_models(name):
         drives.advance(0.4)
         held = holding_torque(MOTOR, np.hypot(lane(drives, "i_a"), lane(drives, "i_b"))[0])
         step = math.asin(share * MOTOR.rated_torque / held) / 50.0 * PPS
-        start = lane(drives, "deviation")[0] * PPS
+        start = lane(drives, "loop_deviation")[0] * PPS
         assert start == pytest.approx(step, rel=0.03)
         drives.write(0x2022, SETTINGS[name][0])
         found = []
         for _ in range(300):
-            found.append(lane(drives, "deviation")[0] * PPS)
+            found.append(lane(drives, "loop_deviation")[0] * PPS)
             drives.advance(0.001)
     expected = model(SETTINGS[name], start, 0.0, 0.3, alone=False)
     np.testing.assert_allclose(found, expected, atol=0.04 * step + 1.5)
@@ -87,7 +87,7 @@ def test_on_the_ramps_velocity_the_axis_follows_without_lag_and_alone_with_that_
         drives.advance(1.5)
         speed = lane(drives, "omega_m") * PPS
         np.testing.assert_allclose(speed, velocity, rtol=0.04)
-        deviation = lane(drives, "deviation") * PPS
+        deviation = lane(drives, "loop_deviation") * PPS
         np.testing.assert_allclose(deviation, [0.0, velocity * 256 / p, 0.0], atol=3.0)
 
 
@@ -101,7 +101,7 @@ def test_the_answer_of_mode_3_to_a_ramp_is_the_linear_models():
         drives.write(0x60FF, 5_000)
         found = []
         for _ in range(400):
-            found.append(lane(drives, "deviation")[0] * PPS)
+            found.append(lane(drives, "loop_deviation")[0] * PPS)
             drives.advance(0.001)
     expected = model(setting, 0.0, 5_000.0, 0.4, alone=True)
     np.testing.assert_allclose(found[2:], expected[1:-1], atol=0.03 * expected.max() + 2.0)
@@ -113,7 +113,7 @@ def test_within_the_tolerance_nothing_is_corrected():
         close_loop(drives, 2)
         drives.machine.load_torque = -0.5 * MOTOR.rated_torque  # some 85 microsteps
         drives.advance(1.0)
-        behind = lane(drives, "deviation") * PPS
+        behind = lane(drives, "loop_deviation") * PPS
         assert 70 < behind[0] < 100
         assert behind[1] <= 41
         assert lane(drives, "field_position")[0] == pytest.approx(lane(drives, "step_position")[0], abs=1e-9)

@@ -31,7 +31,7 @@ def correct(drive, h):
     Writes field_rate, rate_low and rate_high; correction_sum and the D part's state.
     """
     for lane in range(LANES):
-        e = drive.deviation[lane]
+        e = drive.loop_deviation[lane]
         outside = abs(e) > drive.correction_tolerance[lane] or drive.correction_tolerance[lane] == 0.0
         closed = drive.loop_closed[lane]
         is_pid = closed > 1.5

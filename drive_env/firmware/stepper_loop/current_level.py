@@ -47,7 +47,7 @@ def scale_by_load(drive, h):
 def tell_torque(drive):
     """Write torque_current: across the rotor's flux where the encoder commutates, else the size of the current."""
     for lane in range(LANES):
-        rotor = drive.step_position[lane] - drive.deviation[lane] + drive.field_shift[lane]
+        rotor = drive.step_position[lane] - drive.loop_deviation[lane] + drive.field_shift[lane]
         s, c = sine_cosine(electrical_angle(drive, lane, rotor))
         across = drive.i_b[lane] * c - drive.i_a[lane] * s
         size = (drive.i_a[lane] * drive.i_a[lane] + drive.i_b[lane] * drive.i_b[lane]) ** 0.5

@@ -20,13 +20,13 @@ def encoder_position(drive, lane):
 def see_axis(drive):
     """Let an axis in a loop be where the encoder sees it.
 
-    Writes deviation; in a loop theta_meas, omega_meas, theta_encoder and position_actual.
+    Writes loop_deviation; in a loop theta_meas, omega_meas, theta_encoder and position_actual.
     """
     for lane in range(LANES):
         encoder = encoder_position(drive, lane) + drive.loop_offset[lane]
         shown = encoder - drive.home_shift[lane]
         closed = drive.loop_closed[lane] > 0.5
-        drive.deviation[lane] = drive.step_position[lane] - encoder
+        drive.loop_deviation[lane] = drive.step_position[lane] - encoder
         drive.theta_meas[lane] = shown if closed else drive.theta_meas[lane]
         drive.omega_meas[lane] = drive.omega_encoder[lane] if closed else drive.omega_meas[lane]
         drive.theta_encoder[lane] = shown if closed else drive.theta_encoder[lane]

@@ -44,7 +44,7 @@ STATE = (
     Field("loop_closed", "f8", "", "mode of 2020h that acts now"),
     Field("corrects", "f8", "", "1: a PID may move the field"),
     Field("settle_time", "f8", "s", "for which the initialisation has held the rotor"),
-    Field("deviation", "f8", "rad", "of the encoder from the steps"),
+    Field("loop_deviation", "f8", "rad", "of the encoder from the steps"),
     # --- the field ------------------------------------------------------------------------------------------------
     Field("field_position", "f8", "rad", "where the current vector points, in the rotor's angle"),
     Field("field_rate", "f8", "rad/s", "its speed where no encoder commutates"),

@@ -1,7 +1,7 @@
 """When the loop closes: what 2020h asks for, and how the encoder is aligned with the field (2028h, 2120h).
 
 Load angle control commutates by the encoder, so it must know where the field holds the rotor: the axis stands, run
-current flows, the rotor swings in, and its position is taken. A load that pulls at it meanwhile is not seen: its angle
+current flows, the rotor swings in, and its position is taken. A load that pulls at it meanwhile cannot be told from it: its angle
 stays in the offset. A PID does not commutate; its encoder begins where the steps are, at once.
 """
 
@@ -38,7 +38,7 @@ def forget_corrections(drive, lane):
     drive.correction_sum[lane] = 0.0
     drive.derivative_time[lane] = 0.0
     drive.derivative_part[lane] = 0.0
-    drive.deviation_before[lane] = drive.deviation[lane]
+    drive.deviation_before[lane] = drive.loop_deviation[lane]
 
 
 @stage
@@ -46,7 +46,7 @@ def close_loop(drive, lane, mode):
     """Align the encoder with the steps and close the loop."""
     drive.loop_offset[lane] = drive.step_position[lane] - encoder_position(drive, lane)
     drive.field_shift[lane] = drive.field_position[lane] - drive.step_position[lane]
-    drive.deviation[lane] = 0.0
+    drive.loop_deviation[lane] = 0.0
     drive.loop_closed[lane] = mode
     drive.loop_initialised[lane] = 1 if mode == LOAD_ANGLE else 0
     drive.tracks_rotor[lane] = 1.0 if mode == LOAD_ANGLE else 0.0
@@ -103,7 +103,7 @@ def power_on(drive, lane):
     drive.field_shift[lane] = 0.0
     drive.loop_offset[lane] = 0.0
     drive.loop_scale[lane] = 255.0
-    drive.deviation[lane] = 0.0
+    drive.loop_deviation[lane] = 0.0
     drive.torque_current[lane] = 0.0
     drive.asks_torque[lane] = 0.0
     open_loop(drive, lane)
@@ -112,7 +112,7 @@ def power_on(drive, lane):
 @stage
 def halt(drive, lane):
     """Leave no number behind that is none."""
-    drive.deviation[lane] = 0.0
+    drive.loop_deviation[lane] = 0.0
     drive.omega_encoder[lane] = 0.0
     drive.field_position[lane] = drive.step_position[lane]
     drive.field_rate[lane] = 0.0

@@ -78,5 +78,5 @@ def electrical_angle(drive, lane, position):
 @inlined
 def lead_of_field(drive, lane):
     """Return by how much the field leads the rotor [rad], as the loop sees it."""
-    rotor = drive.step_position[lane] - drive.deviation[lane]
+    rotor = drive.step_position[lane] - drive.loop_deviation[lane]
     return np.abs(drive.field_position[lane] - drive.field_shift[lane] - rotor)
