@@ -14,7 +14,7 @@ import pytest
 
 from drive_env.dictionary.entries import ObjectDictionary
 
-EDS = Path(__file__).parents[1] / "research" / "stepper_drives" / "tmcm6212" / "tmcm6212.eds"
+EDS = Path(__file__).parents[1] / "drive_env" / "devices" / "tmcm6212" / "tmcm6212.eds"
 NODE, AXES = 5, 6
 BITS = {"U8": (8, False), "U16": (16, False), "U32": (32, False), "I8": (8, True), "I16": (16, True), "I32": (32, True)}
 

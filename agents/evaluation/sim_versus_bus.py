@@ -146,7 +146,7 @@ def _add_robust_cost(machines: Sequence[Machine], sides: Sequence[Evaluation]) -
     from tuning.compare.suite import SuiteMachine
 
     group = [
-        SuiteMachine(str(k), row.device, row.load, row.motor, row.parameters, find_motor(row.motor).voltage)
+        SuiteMachine(str(k), row.device, row.load, row.motor_name, row.parameters, find_motor(row.motor_name).voltage)
         for k, row in enumerate(machines)
     ]
     yardstick = Yardstick(group, num_threads=1)

@@ -6,6 +6,7 @@ from tables import table, unit
 
 from drive_env.devices import AXIS, Device, device_names, find_device
 from drive_env.dictionary.entries import Entry
+from drive_env.firmware import motor_kinds
 
 FOLDER = "reference/devices"
 SECTIONS = (
@@ -42,12 +43,15 @@ def page(device: Device) -> str:
             f"A variant of [`{device.variant_of}`]({device.variant_of}.md): what differs is in its `device.toml`, and "
             "all of it is below.\n"
         )
+    if device.about:
+        parts.append(f"{device.about}\n")
     parts += [facts(device), gains(device), roles(device), emergencies(device), objects(device)]
     return "\n".join(parts)
 
 
 def facts(device: Device) -> str:
     """Return the device's figures."""
+    peak = "peak of a phase" if "stepper" in motor_kinds(device.firmware_name) else "peak i_q"
     rows = [
         ("axes", device.num_axes, ""),
         ("current loop", f"{device.current_rate:g}", "Hz"),
@@ -55,8 +59,8 @@ def facts(device: Device) -> str:
         ("supervision, modes and profiles", f"{device.supervision_rate:g}", "Hz"),
         ("communication cycle", f"{1e3 / device.communication_rate:g}", "ms"),
         ("supply voltage", f"{device.undervoltage:g} to {device.overvoltage:g}", "V"),
-        ("current that it carries continuously, peak i_q", f"{device.nominal_current:g}", "A"),
-        ("overcurrent, peak i_q", f"{device.overcurrent:g}", "A"),
+        (f"current that it carries continuously, {peak}", f"{device.nominal_current:g}", "A"),
+        (f"overcurrent, {peak}", f"{device.overcurrent:g}", "A"),
         ("temperature: warning, error", f"{device.warning_temperature:g}, {device.error_temperature:g}", "°C"),
         ("longest wait for an SDO answer", f"{device.master.timeout:g}", "s"),
     ]
@@ -182,7 +186,7 @@ def notes(device: Device, entry: Entry, by_place: dict[tuple[int, int], object])
     if place in device.write_states:
         found.append(f"written in {device.write_states[place].replace('_', ' ').lower()} only")
     if place in device.unsupported:
-        found.append("a service of a node on a bus")
+        found.append("refused where the service behind it is not there")
     return "; ".join(found)
 
 

@@ -24,18 +24,26 @@ class BusConfigError(ValueError):
 class Machine:
     """One emulated machine: device, load, motor and the identifiers of its nodes.
 
-    Drives that are not `commissioned` for their motor have their factory values. `parameters` are true machine
+    `motor` is by default the device's usual one. Drives that are not `commissioned` for their motor have their factory
+    values. Axes of the last node that the load does not need have no motor connected. `parameters` are true machine
     parameters [SI] that replace defaults, as those of EmulatedDrives; `ideal` takes a stage, encoder and bearings
     without faults.
     """
 
     device: str = "tmcm1636"
     load: str = "two_mass"
-    motor: str = "qbl4208"
+    motor: str | None = None
     nodes: tuple[int, ...] = (1,)
     commissioned: bool = True
     ideal: bool = False
     parameters: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def motor_name(self) -> str:
+        """Name or file of its motor."""
+        from drive_env.devices import find_device
+
+        return self.motor or find_device(self.device).default_motor
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,8 @@ class World:
     def add(self, drives: EmulatedDrives, node_ids: Sequence[int], store: Path | None = None) -> list[Node]:
         """Put drives on the bus, one node per device, and return the nodes.
 
+        Axes of the last node that the machines leave over have no motor connected.
+
         Args:
             drives: The drives; machines of several one-axis devices have as many nodes as axes.
             node_ids: Identifiers 1 to 127 in the order of the axes.
@@ -96,13 +98,14 @@ class World:
                 that the device does not have.
         """
         per_node = drives.device.num_axes
-        needed = drives.num_axes // per_node
+        needed = -(-drives.num_axes // per_node)
         if len(node_ids) != needed:
             raise ValueError(
-                f"{drives.num_axes} axes ({drives.num_machines} x load {drives.load.name!r}) take "
-                f"{drives.num_axes / per_node:g} nodes of {drives.device.name}, which drives {per_node} axes; "
-                f"{len(node_ids)} node identifiers were given"
+                f"{drives.num_axes} axes ({drives.num_machines} x load {drives.load.name!r}) take {needed} nodes of "
+                f"{drives.device.name}, which drives {per_node} axes; {len(node_ids)} node identifiers were given"
             )
+        left_over = needed * per_node - drives.num_axes
+        spare = _without_motors(drives, left_over) if left_over else None
         nodes: list[Node] = []
         for k, node_id in enumerate(node_ids):
             path = None if store is None else store / f"node-{node_id}-{Path(drives.device.name).stem}.json"
@@ -111,14 +114,15 @@ class World:
                 bit_rate = round(self.wire.bit_rate)
                 real = not self.lockstep  # docs/decisions/bus.md has why nothing takes time in lockstep
                 node = Node(
-                    node_ids[k], drives, k * per_node, send=send, store=path, bit_rate=bit_rate, takes_time=real
-                )
+                    node_ids[k], drives, k * per_node, send=send, store=path, bit_rate=bit_rate, takes_time=real,
+                    spare=spare if k == needed - 1 else None,
+                )  # fmt: skip
                 nodes.append(node)
                 return node
 
             self.attach(node_id, make)
             self._sync_objects.append(nodes[-1].dictionary.port(*SYNC_OBJECT))
-        self.drives.append(drives)
+        self.drives += [drives] if spare is None else [drives, spare]
         self._answering += nodes
         return nodes
 
@@ -272,3 +276,11 @@ class World:
         elif sender is not None and ended.outcome == "bus off":
             self._off[sender] = self.time + self.wire.recovery_time
             self.nodes[sender].bus_off(self.time)
+
+
+def _without_motors(drives: EmulatedDrives, number: int) -> EmulatedDrives:
+    """Return as many axes of the same device as nobody has commissioned and no motor is connected to."""
+    open_phases = {"motor.open_a": 1.0, "motor.open_b": 1.0}
+    return EmulatedDrives(
+        drives.device.name, "inertia", drives.motor, number, commissioned=False, parameters=open_phases, num_threads=1
+    )

@@ -9,7 +9,7 @@ from drive_env.canopen.frames import Frame
 from drive_env.devices import EmergencyCode
 
 EPSILON = 1e-6  # s: times are sums of cycles
-QUEUE = 8
+QUEUE = 8  # messages for each axis of the node
 
 
 class EmergencyProducer:
@@ -17,13 +17,15 @@ class EmergencyProducer:
 
     Args:
         send: Takes a frame.
+        num_axes: Axes of the node.
 
     Attributes:
         told: Error register of the last message that was queued; 0 before the first.
     """
 
-    def __init__(self, send: Callable[[Frame], None]) -> None:
+    def __init__(self, send: Callable[[Frame], None], num_axes: int = 1) -> None:
         self.told = 0
+        self._room = QUEUE * num_axes
         self._send = send
         self._waiting: deque[bytes] = deque()
         self._sent_at: float | None = None
@@ -36,7 +38,7 @@ class EmergencyProducer:
 
     def push(self, emergency: EmergencyCode, error_register: int) -> None:
         """Queue a message; a full queue loses the newest, as a transmit buffer does."""
-        if self._can_id is not None and len(self._waiting) < QUEUE:
+        if self._can_id is not None and len(self._waiting) < self._room:
             head = emergency.code.to_bytes(2, "little") + bytes((error_register,))
             self._waiting.append(head + bytes(emergency.extra))
             self.told = error_register

@@ -53,6 +53,7 @@ class Node:
             is mute and deaf, as its controller understands nothing. None: the factory's, and whatever is stored fits.
         takes_time: Its firmware takes no more frames in a cycle than it can, the next wait in its receive buffer; from
             an NMT reset to the boot-up message it needs the device's time, deaf and mute, and so does an SDO answer.
+        spare: Drives of the node's last axes, those that `drives` have none for.
 
     Raises:
         ValueError: For a number that no node can have, axes that the drives do not have, a bit rate that the device
@@ -76,15 +77,11 @@ class Node:
         store: Path | None = None,
         bit_rate: int | None = None,
         takes_time: bool = False,
+        spare: EmulatedDrives | None = None,
     ) -> None:
         device = drives.device
         if not 1 <= node_id <= 127:
             raise ValueError(f"node {node_id} is impossible: CANopen has nodes 1 to 127")
-        if not 0 <= first_axis <= drives.num_axes - device.num_axes:
-            raise ValueError(
-                f"first_axis={first_axis}: {device.name} has {device.num_axes} of the {drives.num_axes} axes there "
-                f"are; use 0 to {drives.num_axes - device.num_axes}"
-            )
         self._bus_bit_rate = None if bit_rate is None else known_bit_rate(device, bit_rate)
         self.node_id = self._given_id = node_id
         self.state = NmtState.INITIALISING
@@ -96,10 +93,7 @@ class Node:
         self._now = 0.0
         self._is_online = False
         self._leaves_for_bootloader = False
-        self._axes = [Axis(self._objects, first_axis + k) for k in range(device.num_axes)]
-        self._mask = np.zeros(drives.num_axes, bool)
-        self._mask[first_axis : first_axis + device.num_axes] = True
-
+        self._take_axes(drives, first_axis, spare)
         entries = self._objects.entries
         self._module = ModuleObjects(device, entries, self._configure)
         self._add_services()
@@ -122,11 +116,27 @@ class Node:
         self._received: deque[Frame] = deque()
         self._has_lost = False  # frames, since its receive buffer was last half empty
 
+    def _take_axes(self, drives: EmulatedDrives, first_axis: int, spare: EmulatedDrives | None) -> None:
+        """Take the node's axes, in their order, and remember which of the drives' they are."""
+        number = self._device.num_axes - (0 if spare is None else spare.num_axes)
+        if not 0 <= first_axis <= drives.num_axes - number:
+            raise ValueError(
+                f"first_axis={first_axis}: {self._device.name} has {number} of the {drives.num_axes} axes there are; "
+                f"use 0 to {drives.num_axes - number}"
+            )
+        mask = np.zeros(drives.num_axes, bool)
+        mask[first_axis : first_axis + number] = True
+        self._axes = [Axis(self._objects, int(k)) for k in np.flatnonzero(mask)]
+        self._sets = [(self._objects, mask)]
+        if spare is not None:
+            self._axes += [Axis(spare.inside.objects, k) for k in range(spare.num_axes)]
+            self._sets.append((spare.inside.objects, np.ones(spare.num_axes, bool)))
+
     def _make_services(self, indices: Sequence[int]) -> None:
         """Make SDO server, emergencies, error control and the PDOs of the dictionary's indices."""
         device = self._device
         self._sdo = SdoServer(self.dictionary.port, device.canopen.sdo_timeout)
-        self._emergency = EmergencyProducer(self._transmit)
+        self._emergency = EmergencyProducer(self._transmit, device.num_axes)
         self._told_last = 0  # axis of the last emergency
         self._conditions: dict[Hashable, ErrorCondition] = {}
         self._heartbeat = HeartbeatProducer()
@@ -142,7 +152,7 @@ class Node:
     @property
     def bit_rate(self) -> int:
         """Bit rate [kbit/s] of its controller."""
-        return self._module.role("active_bit_rate")
+        return self._bit_rate
 
     def power_on(self, now: float) -> None:
         """Switch the device on, or off and on: stored values, boot-up, pre-operational."""
@@ -287,19 +297,29 @@ class Node:
                 "rate, or the node another store",
                 self.node_id, self.bit_rate, self._bus_bit_rate,
             )  # fmt: skip
-        self._objects.restart(self._mask)
+        self._restart_axes()
         self._reset_communication(now)
+
+    def _restart_axes(self) -> None:
+        """Restore the stored values of the axes and start their firmware anew; the motors are off."""
+        for objects, mask in self._sets:
+            objects.restart(mask)
 
     def _restore_bus(self) -> None:
         """Let bit rate and node ID that were stored become the active ones; never stored, they are the given ones."""
         objects, bus = self._device.canopen.objects, self._store.sections.get("bus")
         factory = self._module.factory(self._given_id)
+        active = {"bit_rate": self._bus_bit_rate or 0, "node_id": self._given_id}
         for role, given in (("bit_rate", self._bus_bit_rate), ("node_id", self._given_id)):
-            key = objects[role]
+            key = objects.get(role)
+            if key is None:  # a device that keeps neither has what it was given
+                continue
             raw = given if bus is None and given is not None else (bus or {}).get(key, factory[key])
+            assert isinstance(raw, int), "bit rate and node-ID are numbers"
+            active[role] = raw
             self._module.set(role, raw)
             self._module.set(f"active_{role}", raw)
-        self.node_id = self._module.role("active_node_id")
+        self._bit_rate, self.node_id = active["bit_rate"], active["node_id"]
 
     def _reset_communication(self, now: float) -> None:
         """Bring the communication objects back, send the boot-up message and become pre-operational."""
@@ -373,7 +393,7 @@ class Node:
             self._enter(NmtState.PRE_OPERATIONAL)
             self._flush(now)
         elif command is Command.RESET_NODE:
-            self._objects.restart(self._mask)  # at once, however long it takes to boot: no firmware drives the motor
+            self._restart_axes()  # at once, however long it takes to boot: no firmware drives the motor
             self._restart(self._reset_application, now)
         elif command is Command.RESET_COMMUNICATION:
             self._restart(self._reset_communication, now)
@@ -425,7 +445,7 @@ class Node:
             # The boot loader does not speak CANopen, and under it no firmware drives the motor: until power-on.
             self._is_online = False
             self.state = NmtState.INITIALISING
-            self._objects.restart(self._mask)
+            self._restart_axes()
 
     def _close_sdo(self) -> None:
         """Forget an open transfer, and the answers that are under way."""
@@ -535,7 +555,8 @@ class Node:
                 module.commands[canopen.objects[role]] = signed_command(signature, code, action)
         serial = canopen.objects.get("serial_number")
         if serial is not None:
-            self._objects.engrave(serial, self._given_id, self._mask)
+            for objects, mask in self._sets:
+                objects.engrave(serial, self._given_id, mask)
             module.readers[serial] = lambda: int(self._objects.read(serial)[self.first_axis])
         subs = module.subs(communication.ERROR_HISTORY)
         self._history = ErrorHistory(len(subs))
@@ -582,7 +603,7 @@ class Node:
                 axis, base = self._device.locate(entry.index)
                 values[axis][base, entry.sub] = section.get((entry.index, entry.sub), entry.default)
         for served, stored in zip(self._axes, values, strict=True):
-            self._objects.store(served.number, stored)
+            served.store(stored)
 
     def _check_store(self, path: Path | None) -> None:
         for section in self._store.sections.values():

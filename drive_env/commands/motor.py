@@ -199,6 +199,7 @@ def _write(file: Path, data: Mapping[str, object]) -> None:
 def _tell(file: Path, row: Motor) -> None:
     """Say what the numbers make of the motor, by which a wrong one is noticed."""
     from drive_env.devices import device_names, find_device
+    from drive_env.firmware import motor_kinds
 
     no_load = row.voltage / math.sqrt(3.0) / (row.n_p * row.psi_m) if row.kind != "dc" else row.voltage / row.psi_m
     rpm = 30.0 / math.pi
@@ -210,8 +211,13 @@ def _tell(file: Path, row: Motor) -> None:
     else:
         print(f"  torque constant {row.torque_constant:.4g} N*m/A of peak i_q; {no_load * rpm:.0f} rpm without load")
         print(f"  rated power {row.rated_torque * row.rated_speed:.3g} W")
-    for name in device_names():
+    of_kind = [device for device in map(find_device, device_names()) if row.kind in motor_kinds(device.firmware_name)]
+    refused = {}
+    for device in of_kind:
         try:
-            find_device(name).preset(row)
+            device.preset(row)
         except ValueError as error:
-            print(f"  {name} cannot turn it: {error}")
+            refused[device.name] = error
+    print(f"  drives that turn it: {', '.join(one.name for one in of_kind if one.name not in refused) or 'none'}")
+    for name, why in refused.items():
+        print(f"  {name} cannot turn it: {why}")

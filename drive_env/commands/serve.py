@@ -41,14 +41,14 @@ def serve(
     load: Annotated[str | None, typer.Option(help="Load on the motor; two_mass by default.")] = None,
     motor: Annotated[
         str | None,
-        typer.Option(help="Motor, a name or a TOML file; qbl4208 by default."),
+        typer.Option(help="Motor, a name or a TOML file; the device's usual one by default."),
     ] = None,
     factory: Annotated[
         bool, typer.Option("--factory", help="Drives with factory values, not commissioned for their motor.")
     ] = False,
     node: Annotated[
         list[int] | None,
-        typer.Option("--node", "-n", help="Node identifier, 1 by default; once per axis of the machine."),
+        typer.Option("--node", "-n", help="Node identifier, 1 by default; once per drive that the machine needs."),
     ] = None,
     config: Annotated[Path | None, typer.Option(help="Several drives on one bus (TOML), as examples/bus.toml.")] = None,
     port: Annotated[int, typer.Option(help="TCP port of the hub; 0 for a free one.")] = PORT,
@@ -250,7 +250,7 @@ def _announce(
     from drive_env.bus.hub import Hub
 
     nodes = ", ".join(
-        f"node {', '.join(map(str, row.nodes))} ({row.device}, {row.motor}, {row.load}"
+        f"node {', '.join(map(str, row.nodes))} ({row.device}, {row.motor_name}, {row.load}"
         f"{'' if row.commissioned else '; factory values, not commissioned'})"
         for row in bus.machines
     )

@@ -148,6 +148,7 @@ class Device(NamedTuple):
     overcurrent: float
     undervoltage: float
     overvoltage: float
+    highest_supply: float
     warning_temperature: float
     error_temperature: float
     nominal_current: float
@@ -167,6 +168,7 @@ class Device(NamedTuple):
     gains: GainSet
     firmware_name: str
     variant_of: str = ""
+    about: str = ""  # what a reader of its page must know besides its data
 
     @property
     def firmware(self) -> Firmware:
@@ -191,6 +193,16 @@ class Device(NamedTuple):
                 f"{self.name} turns {' and '.join(KINDS[kind] for kind in kinds)} motors; {motor.name} is a "
                 f"{KINDS[motor.kind]} motor: take {', '.join(self.motors)}, or a device that turns it"
             )
+
+    def supply_of(self, motor: Motor) -> float:
+        """Return the supply voltage [V] that a motor has on it where nothing is said: its own, or the highest."""
+        return min(motor.voltage, self.highest_supply)
+
+    def torque_of(self, motor: Motor) -> float:
+        """Return the torque [N m] that it lets a motor give: the rated one, or that of its largest current."""
+        if self.current_full_scale >= motor.rated_current:
+            return motor.rated_torque
+        return motor.torque(self.current_full_scale)
 
     def new_dictionary(self, node_id: int = 1) -> ObjectDictionary:
         """Return the object dictionary of a node of this device."""
@@ -346,6 +358,7 @@ def _device(
         overcurrent=data["current"]["overcurrent"],
         undervoltage=data["supply"]["undervoltage"],
         overvoltage=data["supply"]["overvoltage"],
+        highest_supply=data["supply"].get("highest", data["supply"]["overvoltage"]),
         warning_temperature=data["temperature"]["warning"],
         error_temperature=data["temperature"]["error"],
         nominal_current=data["current"]["nominal"],
@@ -365,6 +378,7 @@ def _device(
         gains=gains,
         firmware_name=checked_firmware(data["firmware"]),
         variant_of=data.get("variant_of", ""),
+        about=data.get("about", "").strip(),
     )
 
 

@@ -57,6 +57,8 @@ UNITS: dict[str, Unit] = {
         Unit("raw", "as it is", lambda c: 1.0),
         Unit("mA", "milliamperes of peak i_q", lambda c: 1e-3),
         Unit("ms", "milliseconds", lambda c: 1e-3),
+        Unit("10ms", "hundredths of a second", lambda c: 1e-2),
+        Unit("512 clocks", "512 clocks of a ramp generator at 16 MHz", lambda c: 512.0 / 16e6),
         Unit("inc", "increments of position, as many a revolution as the scale has", _angle, follows_scale=True),
         Unit(
             "counter",

@@ -86,7 +86,7 @@ class EmulatedDrives:
             drawn where it is named ("motor.encoder_direction").
         ideal: Take a stage, encoder and bearings without faults.
         parameters: True machine parameters [SI] that replace defaults and draws: one value or one per machine.
-        supply: Supply voltage [V]; the motor's by default.
+        supply: Supply voltage [V]; by default the motor's, or the highest that the device is built for.
         num_threads: Threads that run machines; the cores that this process may use by default.
         physics_steps: Physics steps per velocity-loop period.
         integrator: "leapfrog", or "rk4", the slower oracle.
@@ -129,7 +129,7 @@ class EmulatedDrives:
         self.load = find_load(load)
         self.num_machines = num_machines
         self.num_axes = num_machines * self.load.num_axes
-        volts = checked_supply(self.motor.voltage if supply is None else supply, 1)
+        volts = checked_supply(self.device.supply_of(self.motor) if supply is None else supply, 1)
         self._firmware, self._kind = self.device.firmware, MACHINE_KINDS[self.device.firmware_name]
         self._records = self._firmware.layout.new_records(self.num_axes)
         self._threads = max(1, num_threads if num_threads is not None else usable_cores())
@@ -142,7 +142,7 @@ class EmulatedDrives:
         self._turn = np.zeros(1, np.int64)
         self._fleet = cycle.Fleet(np.array([group.machinery.address for group in self._groups], np.int64), self._turn)
         self._apply_what_was_drawn(float(volts[0]))
-        warn_of_misfits([group.load for group in self._groups], self.motor)
+        warn_of_misfits([group.load for group in self._groups], self.motor, self.device)
         self._begin()
         self.machine = Machines(self)
         self.inside = Inside(self)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from drive_env.devices import Device
 from drive_env.motors import Motor
 from mechanics.packed import PackedLoad
 from mechanics.shaft import shaft_load, way
@@ -19,12 +20,13 @@ class MisfitWarning(UserWarning):
     """A machine asks more of its motor than it can give."""
 
 
-def warn_of_misfits(loads: Sequence[PackedLoad], motor: Motor) -> None:
+def warn_of_misfits(loads: Sequence[PackedLoad], motor: Motor, device: Device) -> None:
     """Warn once for the worst machine of each kind of misfit.
 
     Args:
         loads: The packed loads of all machines.
         motor: Their motor.
+        device: Their drives, which may have too little current for the motor's torque.
     """
     turning = way(loads[0]).joints
     found = [shaft_load(load, turning) for load in loads]
@@ -34,12 +36,19 @@ def warn_of_misfits(loads: Sequence[PackedLoad], motor: Motor) -> None:
     name = loads[0].load.name
     torque = gravity + friction
     machine, axis = np.unravel_index(int(torque.argmax()), torque.shape)
-    if torque[machine, axis] > motor.rated_torque:
+    given = device.torque_of(motor)
+    if torque[machine, axis] > given:
+        limit = f"the motor is rated at {given:g} N*m"
+        if given < motor.rated_torque:
+            limit = (
+                f"{device.name} has {device.current_full_scale:g} A of the {motor.rated_current:.3g} A for the motor's "
+                f"{motor.rated_torque:g} N*m, which leaves {given:.3g} N*m"
+            )
         warnings.warn(
             f"motor {motor.name!r} cannot move axis {axis} of machine {machine}, load {name!r}, for long: it takes "
             f"{torque[machine, axis]:.3g} N*m at the shaft ({gravity[machine, axis]:.3g} against gravity, "
-            f"{friction[machine, axis]:.3g} to break away), and the motor is rated at {motor.rated_torque:g} N*m "
-            f"({np.count_nonzero(np.any(torque > motor.rated_torque, axis=1))} of {len(torque)} machines); take a "
+            f"{friction[machine, axis]:.3g} to break away), and {limit} "
+            f"({np.count_nonzero(np.any(torque > given, axis=1))} of {len(torque)} machines); take a "
             "stronger motor, a higher gear or a lighter load",
             MisfitWarning,
             stacklevel=3,

@@ -17,6 +17,7 @@ from drive_env.emulator.parameters import check_known, check_parameter
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.faults.machine_faults import InjectedFault
 from drive_env.faults.schedule import Order
+from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT, WITH_STAGE
 from drive_env.firmware.record import get_lanes, set_lanes
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 INPUTS_SHIFT = 16  # general inputs and outputs are bits 16 to 23 of their objects
-_BRAKES = ("open", "closed", "with_stage")  # numbers of firmware/cycle.py
+_BRAKES = ("open", "closed", "with_stage", "output")  # numbers of firmware/common/brake.py
 
 
 def checked_supply(value: ArrayLike, num_axes: int) -> Floats:
@@ -137,9 +138,10 @@ class Machines:
 
     @property
     def brake(self) -> NDArray[np.str_]:
-        """Holding brake of each axis: "open", "closed", or "with_stage", closed while the stage is off; set likewise.
+        """Holding brake of each axis: "open", "closed", "with_stage" or "output"; set likewise.
 
-        Its torque is twice the motor's rated torque: what holding brakes of this size are built for.
+        With the stage it is closed while that is off. At the drive's output a spring closes it, and the output's
+        current opens it, each after its time (`motor.brake_closes_in`, `motor.brake_opens_in`). Its torque is twice the motor's rated torque: what holding brakes of this size are built for.
         """
         return np.array([_BRAKES[int(mode)] for mode in self._axis_field("brake_mode")])
 
@@ -147,10 +149,25 @@ class Machines:
     def brake(self, value: ArrayLike) -> None:
         drives = self._drives
         chosen = np.broadcast_to(np.asarray(value), (drives.num_axes,))
+        known = _BRAKES if Role.BRAKE_RELEASE_CURRENT in drives.device.roles else _BRAKES[:-1]
         for state in chosen:
-            if state not in _BRAKES:
-                raise ValueError(f"a brake is {', '.join(_BRAKES)}, not {str(state)!r}")
+            if state not in known:
+                raise ValueError(f"a brake of {drives.device.name} is {', '.join(known)}, not {str(state)!r}")
         set_lanes(drives._records, "brake_mode", np.array([_BRAKES.index(state) for state in chosen], float))
+
+    @property
+    def brake_output(self) -> Floats:
+        """Current of each axis' brake output, as a share of its largest, shape (num_axes,); 0 without an output."""
+        return self._axis_field("brake_output")
+
+    @property
+    def brake_is_closed(self) -> Mask:
+        """Whether each axis' brake holds, shape (num_axes,)."""
+        mode = self._axis_field("brake_mode")
+        off = self._axis_field("stage_on") == 0.0
+        shut = self._axis_field("brake_opened") == 0.0
+        closed: Mask = (mode == CLOSED) | ((mode == WITH_STAGE) & off) | ((mode == WITH_OUTPUT) & shut)
+        return closed
 
     @property
     def joint_positions(self) -> Floats:

@@ -130,10 +130,10 @@ def draw_parameters(
 
 # Parameters that may be negative: errors, offsets and phases. Those that may be 0: losses and faults. All others are
 # positive.
-_SIGNED = ("offset", "error", "phase", "ambient")
+_SIGNED = ("offset", "error", "phase", "ambient", "index_angle")
 _MAY_VANISH = (
     "cogging_torque", "detent_torque", "saturation", "coulomb", "viscous", "broken", "open_a", "open_b",
-    "short_conductance", "noise", "dead_time", "resistance", "supply_sinks",
+    "short_conductance", "index_inverted", "brake_opens_in", "brake_closes_in", "noise", "dead_time", "resistance", "supply_sinks",
 )  # fmt: skip
 
 

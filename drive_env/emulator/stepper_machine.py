@@ -32,6 +32,10 @@ _FIELDS = {
     "motor.thermal_time": "thermal_time",
     "motor.ambient": "ambient",
     "motor.encoder_broken": "encoder_broken",
+    "motor.index_angle": "index_angle",
+    "motor.index_inverted": "index_inverted",
+    "motor.brake_opens_in": "brake_opens_in",
+    "motor.brake_closes_in": "brake_closes_in",
     "motor.open_a": "open_a",
     "motor.open_b": "open_b",
     "motor.encoder_line_error": "encoder_line_error",
@@ -94,9 +98,16 @@ def motor_parameters(motor: Motor) -> list[MachineParameter]:
 
 
 def wiring_parameters(motor: Motor) -> list[MachineParameter]:
-    """Return how the motor's cables may be wired."""
+    """Return how the motor's cables may be wired, where its encoder's index is, and how quick a brake on it is."""
     wired = float(motor.encoder_direction)
-    return [MachineParameter(_ENCODER_DIRECTION, "1", wired, 0.0, 1.0, wired)]
+    return [
+        MachineParameter(_ENCODER_DIRECTION, "1", wired, 0.0, 1.0, wired),
+        MachineParameter("motor.index_angle", "rad", 0.0, 0.0, 2.0 * np.pi, 0.0),
+        MachineParameter("motor.index_inverted", "1", 0.0, 0.0, 0.0, 0.0),
+        # Usual for brakes of some newton metres that a spring closes.
+        MachineParameter("motor.brake_opens_in", "s", 0.04, 0.02, 0.08, 0.04),
+        MachineParameter("motor.brake_closes_in", "s", 0.02, 0.01, 0.04, 0.02),
+    ]
 
 
 def apply(records: Records, device: Device, motor: Motor, name: str, values: Floats, axes: Mask) -> None:

@@ -16,7 +16,7 @@ from numba import from_dtype, types
 from numpy.typing import NDArray
 
 from drive_env import cia402
-from drive_env.firmware.common import fields, fsa, inputs, modes, protection, start_up
+from drive_env.firmware.common import brake, fields, fsa, inputs, modes, protection, start_up
 from drive_env.firmware.common.modes import hm, pp
 from drive_env.firmware.common.protection import Cause, protection_of, row_of
 from drive_env.firmware.record import LANES, Field, RecordLayout
@@ -28,9 +28,6 @@ from mechanics.plant import PackedPlant
 
 # How a played or written value acts on a field.
 REAL, INTEGER, CONTROLWORD, MODE, SET_POINT = 0, 1, 2, 3, 4
-
-# Modes of a holding brake.
-BRAKE_OPEN, BRAKE_CLOSED, BRAKE_WITH_STAGE = 0, 1, 2
 
 # Time constant of the speed that decides whether the motor rotates [s]: encoder noise must not light bit 14.
 ACTIVITY_TIME = 0.02
@@ -252,14 +249,18 @@ def mechanics_window(records, plant, rates, motion):
 def meet(records, plant):
     """Once per millisecond: brakes close and open, and the rotors learn what they turn, where that changes."""
     axes, copies = plant.jam.shape
-    brake, jam, mass, varying = plant.brake, plant.jam, plant.mass, plant.varying
+    held, jam, mass, varying = plant.brake, plant.jam, plant.mass, plant.varying
     for copy in range(copies):
         for axis in range(axes):
             drive = records[(copy * axes + axis) // LANES]
             lane = (copy * axes + axis) % LANES
             mode = drive.brake_mode[lane]
-            closed = mode == BRAKE_CLOSED or (mode == BRAKE_WITH_STAGE and drive.stage_on[lane] == 0.0)
-            brake[axis, copy] = jam[axis, copy] + (drive.brake_torque[lane] if closed else 0.0)
+            closed = (
+                mode == brake.CLOSED
+                or (mode == brake.WITH_STAGE and drive.stage_on[lane] == 0.0)
+                or (mode == brake.WITH_OUTPUT and drive.brake_opened[lane] == 0)
+            )
+            held[axis, copy] = jam[axis, copy] + (drive.brake_torque[lane] if closed else 0.0)
             if varying:
                 drive.J_rotor[lane] = mass[axis, copy]
 
@@ -269,6 +270,8 @@ def reset_shared_state(drive, lane):
     """Begin anew what all drives share; the encoder is at zero."""
     drive.fsa[lane] = fsa.NOT_READY
     drive.transition_pending[lane] = 0
+    drive.holding[lane] = 0
+    drive.brake_output[lane] = 0.0
     drive.fault[lane] = 0
     drive.error_register[lane] = 0
     drive.emergency_count[lane] = 0
@@ -549,7 +552,8 @@ def _trip(source: str, take_into_fault: Stage) -> Any:
         for axis in range(first_axis, first_axis + num_axes):
             drive = records[axis // LANES]
             lane = axis % LANES
-            if drive.fsa[lane] != fsa.ENABLED:
+            # An axis whose stage is on because it is about to be enabled is in operation, too.
+            if drive.fsa[lane] != fsa.ENABLED and drive.transition_pending[lane] != 4:
                 continue
             take_into_fault(drive, lane, cause)
             taken += 1

@@ -47,6 +47,8 @@ UNITS = {
     "0.1V": EnteredUnit("voltage", 0.1),
     "s": EnteredUnit("time", 1.0),
     "ms": EnteredUnit("time", 1e-3),
+    "10ms": EnteredUnit("time", 1e-2),
+    "512 clocks": EnteredUnit("time", 512.0 / 16e6),
     "100us": EnteredUnit("time", 1e-4),
     "us": EnteredUnit("time", 1e-6),
 }

@@ -85,6 +85,10 @@ class Motor(NamedTuple):
         """Torque per ampere of peak i_q, of a DC motor per ampere, of a stepper at small current [N*m/A]."""
         return self._phase_factor * self.n_p * self.psi_m
 
+    def torque(self, current: float) -> float:
+        """Return the torque [N m] of a current of this peak [A], of a stepper of a current vector of this size."""
+        return self.torque_constant * current / math.sqrt(1.0 + self.saturation * current * current)
+
     @property
     def thermal_resistance(self) -> float:
         """Winding to ambient [K/W]: the rated current warms the winding, then of higher resistance, by `RATED_RISE`."""

@@ -6,7 +6,7 @@ the way from an object to its place in the record is worked out once.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,6 +101,10 @@ class Axis:
         words = [self._integers[place] for place in self._queue[:count]]
         self._integers[self._count] = 0
         return [QueuedEmergency((word & 0xFF) - 1, word >> 8) for word in words]
+
+    def store(self, values: Mapping[tuple[int, int], int]) -> None:
+        """Set what a restart restores; the values are those of objects that exist, within their range."""
+        self._objects.store(self.number, values)
 
     def trip(self) -> bool:
         """Take the axis from operation enabled into fault because its network is lost; return whether it was there."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.cia402 import STATE_CODING, Pattern, State
-from drive_env.firmware.common import start_up
+from drive_env.firmware.common import brake, start_up
 from drive_env.firmware.record import EMERGENCY_QUEUE
 from mechanics.compiled import stage
 
@@ -73,6 +73,7 @@ ENABLED = int(State.OPERATION_ENABLED)
 STOPPING = int(State.QUICK_STOP_ACTIVE)
 REACTING = int(State.FAULT_REACTION_ACTIVE)
 FAULTED = int(State.FAULT)
+ENABLE_MASK, ENABLE_VALUE = int(ENABLE_OPERATION.mask), int(ENABLE_OPERATION.value)
 
 WARNING_BIT = cia402.WARNING.value
 
@@ -84,6 +85,8 @@ STANDSTILL_NOISE = 2.0  # what the unfiltered velocity may show at rest, as a mu
 
 # Option codes of 605Ah that end in switch on disabled, and those that ramp with 6085h.
 STOP_AND_STAY = 5
+# Transitions that leave a current which waits for the brake as it is; any other takes it away.
+KEEPS_HOLDING = (2, 3, 6, 15)
 
 
 @stage
@@ -107,6 +110,8 @@ def _enter(drive, lane, number, end):
     """Make transition `number` to the state `end`, with what it does to the axis."""
     drive.fsa[lane] = end
     drive.transition_pending[lane] = 0
+    if number not in KEEPS_HOLDING:
+        drive.holding[lane] = 0
     if number == 4:
         drive.position_demand[lane] = drive.theta_meas[lane]
         # An axis that turns already is taken over at its speed.
@@ -135,6 +140,12 @@ def _enter(drive, lane, number, end):
 
 
 @stage
+def _commands_operation(word):
+    """Return whether a controlword commands operation enabled."""
+    return word & ENABLE_MASK == ENABLE_VALUE
+
+
+@stage
 def command(drive, lane):
     """Process the controlword completely: every transition that it commands from the present state.
 
@@ -142,6 +153,11 @@ def command(drive, lane):
     demands; only disable voltage is obeyed at once, since it takes the energy away.
     """
     word = drive.controlword[lane]
+    if drive.transition_pending[lane] == 4 and not _commands_operation(word):
+        # Enabling is called off before the axis was enabled: the brake closes, and the stage waits for it.
+        drive.transition_pending[lane] = 0
+        drive.holding[lane] = 0
+        brake.hold_until_closed(drive, lane)
     for _ in range(2):
         state = drive.fsa[lane]
         moved = False
@@ -153,12 +169,19 @@ def command(drive, lane):
                 continue
             if drive.transition_pending[lane] == 5 and number != 9:
                 continue
-            if number == 5:
+            if number == 4 and brake.enabling_time(drive, lane) > 0.0:
+                if drive.transition_pending[lane] != 4:
+                    drive.transition_pending[lane] = 4
+                    drive.holding[lane] = 1
+                    drive.switching_time[lane] = 0.0
+            elif number == 5:
                 drive.transition_pending[lane] = 5
                 drive.stopping[lane] = 1
                 drive.stop_time[lane] = 0.0
             else:
                 _enter(drive, lane, number, end)
+                if number == 8:
+                    brake.hold_until_closed(drive, lane)
                 moved = True
             break
         if not moved:
@@ -193,15 +216,20 @@ def automatic_transitions(drive, lane, dt):
     """Make the transitions that need no command, once per period of dt [s]: 1, and what waited for standstill."""
     if drive.fsa[lane] == NOT_READY:
         _enter(drive, lane, 1, DISABLED)
+    if drive.transition_pending[lane] == 4 and drive.switching_time[lane] + 0.5 * dt > brake.enabling_time(drive, lane):
+        _enter(drive, lane, 4, ENABLED)
     if drive.fsa[lane] == STOPPING and drive.quick_stop_option[lane] >= STOP_AND_STAY:
         command(drive, lane)  # enable operation, commanded while the ramp ran
     if drive.stopping[lane] == 1 and has_stopped(drive, lane, dt):
         if drive.fsa[lane] == REACTING:
             _enter(drive, lane, 14, FAULTED)
+            brake.hold_until_closed(drive, lane)
         elif drive.fsa[lane] == STOPPING and drive.quick_stop_option[lane] < STOP_AND_STAY:
             _enter(drive, lane, 12, DISABLED)
+            brake.hold_until_closed(drive, lane)
         elif drive.transition_pending[lane] == 5:
             _enter(drive, lane, 5, SWITCHED)
+            brake.hold_until_closed(drive, lane)
             command(drive, lane)  # what was commanded while the ramp ran
 
 

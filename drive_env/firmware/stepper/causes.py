@@ -5,7 +5,7 @@ Status flags are the driver's error flags, 2102h (TMCM-3313 manual, table 155).
 
 from __future__ import annotations
 
-from drive_env.firmware.common import causes
+from drive_env.firmware.common import brake, causes
 from drive_env.firmware.common.protection import (
     BLOCKS_NEGATIVE,
     BLOCKS_POSITIVE,
@@ -19,6 +19,7 @@ from drive_env.firmware.common.protection import (
     WARN,
     Cause,
 )
+from drive_env.firmware.stepper.stall_guard import stalled
 from mechanics.compiled import stage
 
 OPEN_LOAD_TIME = 0.05  # s for which a phase must stay without the current that is asked for
@@ -84,7 +85,8 @@ def open_load_b(drive, lane, told):
 def following_error(drive, lane, told):
     """Return whether the encoder is farther from the demand than the window of 6065h: the motor has lost steps."""
     window = drive.following_error_window[lane]
-    error = abs(drive.position_demand[lane] - drive.position_actual[lane])
+    # Not from position_actual: homing has moved demand and steps in this period, and that not yet.
+    error = abs(drive.position_demand[lane] - drive.theta_meas[lane] + drive.deviation[lane])
     return drive.drive_function[lane] > 0.0 and window > 0.0 and error > window
 
 
@@ -100,6 +102,7 @@ CAUSES = (
     Cause("open_load_a", STOP, 0x80, 0x04, open_load_a, held=True),
     Cause("open_load_b", STOP, 0x80, 0x08, open_load_b, held=True),
     Cause(FOLLOWING_ERROR, STOP, 0x20, 0x0, following_error),
+    Cause("stall", STOP, 0x20, 0x0, stalled),
     Cause("overtemperature_warning", WARN, 0x08, 0x40, causes.warm),
     Cause("positive_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.above_limit, BLOCKS_POSITIVE, software=True),
     Cause("negative_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.below_limit, BLOCKS_NEGATIVE, software=True),
@@ -110,3 +113,14 @@ CAUSES = (
     # The axis has left its limits: 0000h too, as CiA 301 has it, but no command, and nothing else ends with it.
     Cause(FAULT_RESET, WARN, 0x00, 0x0),
 )
+
+CUTS = sum(1 << row for row, cause in enumerate(CAUSES) if row and cause.reaction == CUT)
+
+
+@stage
+def switch_brake(drive, lane, dt):
+    """Move output and brake on by dt [s]; what cuts the stage also cuts a current that waits for the brake alone."""
+    if drive.present[lane] & CUTS:
+        drive.holding[lane] = 0
+    brake.drive_output(drive, lane, dt)
+    brake.follow_output(drive, lane, dt)

@@ -109,7 +109,7 @@ def constant_off_cycle(rise, lost, off, blank, dropped, fast_decay):
 def find_ripple(drive):
     """Find what the chopper's cycle does to the mean current in this window.
 
-    Writes ripple, chopper_frequency, current_shift, current_gain and lowest_share.
+    Writes ripple, chopper_frequency, in_spread_cycle, current_shift, current_gain and lowest_share.
     """
     for lane in range(LANES):
         clock = 1.0 / drive.chopper_clock[lane]
@@ -137,6 +137,7 @@ def find_ripple(drive):
         steady, steady_time, below = constant_off_cycle(rise, lost, off, blank, fast_decay * fast, fast_decay)
         chops = drive.stage_on[lane] * (1.0 - drive.in_pwm[lane])
         drive.ripple[lane] = (steady if is_constant else spread) * chops
+        drive.in_spread_cycle[lane] = 0.0 if is_constant else 1.0
         drive.chopper_frequency[lane] = chops / (steady_time if is_constant else spread_time)
         # A spread cycle's losses are small where the current is; those of the other do distort the zero crossing.
         drive.current_shift[lane] = end - below if is_constant else 0.0

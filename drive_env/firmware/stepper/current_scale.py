@@ -16,7 +16,8 @@ def scale_current(drive, lane, dt):
 
     With an off time of 0 the bridges are off, and the motor runs free (2097h).
     """
-    drive.stage_on[lane] = drive.drive_function[lane] if drive.off_time[lane] > 0.0 else 0.0
+    energised = drive.drive_function[lane] > 0.0 or drive.holding[lane] == 1
+    drive.stage_on[lane] = 1.0 if energised and drive.off_time[lane] > 0.0 else 0.0
     velocity = drive.velocity_demand[lane]
     changes = velocity != drive.velocity_before[lane]
     drive.velocity_before[lane] = velocity

@@ -37,7 +37,12 @@ PARAMETERS = (
     Field("fullstep_threshold", "f8", "rad/s", "20B6h: speed above which the high speed modes act; 0: never"),
     Field("high_speed_chopper", "f8", "", "20B7h: 1: constant off time without fast decay above that speed"),
     Field("high_speed_fullstep", "f8", "", "20B8h: 1: full steps above that speed"),
+    Field("load_filter", "f8", "", "209Dh: 1: a load reading is the mean of four full steps"),
+    Field("stall_threshold", "f8", "", "209Eh: -64...63; shifts the load reading, higher is less sensitive"),
+    Field("stall_speed", "f8", "rad/s", "20A4h: speed above which a load reading of 0 stops the motor; 0: never"),
     Field("position_sensor", "f8", "", "606Ah: 0 the encoder tells the position, -1 the step counter", -1.0),
+    Field("index_polarity", "f8", "", "200Bh:01: 1: the index is the other level of N"),
+    Field("takes_encoder_position", "f8", "", "200Bh:03: 1: an axis that is off has the encoder's position"),
     # --- data of the device ---------------------------------------------------------------------------------------
     Field("full_scale_current", "f8", "A", "largest amplitude of a phase, vsense 0", 1.0),
     Field("chopper_clock", "f8", "Hz", "of the driver", 16e6),
@@ -48,6 +53,8 @@ PARAMETERS = (
     Field("n_p", "f8", "", "pole pairs: a quarter of the full steps", 50.0),
     Field("saturation", "f8", "1/A^2", "of the torque: psi = psi_m / sqrt(1 + saturation i^2)"),
     Field("detent_torque", "f8", "N*m", "amplitude, four periods in each electrical one"),
+    Field("index_angle", "f8", "rad", "of the rotor, at which the encoder's index begins; it is one count wide"),
+    Field("index_inverted", "f8", "", "1: N and its complement are exchanged"),
     Field("open_a", "f8", "", "1: the cable of phase A is broken"),
     Field("open_b", "f8", "", "1: the cable of phase B is broken"),
 )
@@ -78,6 +85,16 @@ STATE = (
     Field("current_gain", "f8", "1", "by which factor the mean current differs from the set-point", 1.0),
     Field("ripple", "f8", "A", "of the phase currents, peak to peak"),
     Field("chopper_frequency", "f8", "Hz", ""),
+    Field("in_spread_cycle", "f8", "1", "1: the chopper, if it works, makes spread cycles"),
+    # --- load by StallGuard2 --------------------------------------------------------------------------------------
+    Field("load_value", "f8", "", "2101h: 0...1023, lower with load"),
+    Field("load_is_fresh", "f8", "1", "1: the reading was taken in this window"),
+    Field("load_direction", "f8", "1", "sign of the speed at which the measurement under way began; 0: none is"),
+    Field("load_start", "f8", "rad", "where the steps were when it began"),
+    Field("load_windows", "f8", "", "windows that it has lasted"),
+    Field("u_along", "f8", "V", "voltage along the field, summed over its ticks"),
+    Field("u_across", "f8", "V", "voltage a quarter of a period ahead of the field, summed likewise"),
+    Field("stalled", "f8", "1", "1: a stall has stopped the steps"),
     # --- power stage and winding ----------------------------------------------------------------------------------
     Field("psi", "f8", "V*s", "flux that acts at the present current"),
     Field("sin_e", "f8", "1", "sine of the rotor's electrical angle at the tick's start"),
@@ -110,6 +127,14 @@ STATE = (
     # --- what is told ---------------------------------------------------------------------------------------------
     Field("theta_encoder", "f8", "rad", "position by the encoder"),
     Field("omega_encoder", "f8", "rad/s", "2122h: speed by the encoder, filtered"),
+    Field("true_edges", "f8", "", "edges of the encoder's disc at its angle of the last window"),
+    Field("index_edge", "f8", "", "edge of the disc at which the index begins"),
+    Field("step_seen", "f8", "rad", "step_position at the last window"),
+    Field("step_shift", "f8", "rad", "by which the steps are ahead of the position that the encoder gave the axis"),
+    Field("latch_armed", "f8", "", "200Fh:01: 1: the next index is latched"),
+    Field("latch_steps", "f8", "rad", "200Fh:02: position by the steps at that index"),
+    Field("latch_encoder", "f8", "rad", "200Fh:03: position by the encoder at that index"),
     Field("position_actual", "f8", "rad", "6064h: by the sensor that 606Ah names"),
+    Field("deviation", "f8", "rad", "by which that lies behind the steps, wherever home is"),
     Field("status_flags", "i4", "", "2102h: errors of the driver"),
 )

@@ -1,6 +1,13 @@
-"""What a stepper drive knows of its position: its own steps, and an encoder on the shaft where there is one."""
+"""What a stepper drive knows of its position: its own steps, and an encoder on the shaft where there is one.
+
+The encoder's index (channel N) is active for one count of each turn, at a true angle of the disc. It comes when N
+becomes what the drive takes for active: by the right polarity the counter then stands at the same count from both
+sides, by the wrong one a count beyond it. Steps are taken where they were at that moment within the window.
+"""
 
 from __future__ import annotations
+
+import numpy as np
 
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.common.encoder import encoder_count
@@ -17,14 +24,52 @@ def derive_encoder(drive):
         steps = steps if steps > 0.0 else 1.0
         drive.turns_per_count[lane] = (1.0 - 2.0 * drive.encoder_direction[lane]) / steps
         drive.counts_per_rad[lane] = drive.encoder_counts[lane] * (1.0 / TWO_PI) * drive.encoder_gain[lane]
+        # N is gated with A and B: it begins at an edge.
+        drive.index_edge[lane] = np.floor(drive.index_angle[lane] * drive.encoder_counts[lane] * (1.0 / TWO_PI))
+
+
+@inlined
+def watch_index(drive):
+    """Look for the index in the window that has passed: writes index_seen, index_position and the latch."""
+    for lane in range(LANES):
+        counts = drive.encoder_counts[lane]
+        edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * counts * (1.0 / TWO_PI)
+        before = drive.true_edges[lane]
+        up = 1.0 if edges >= before else 0.0
+        wrong = abs(drive.index_polarity[lane] - drive.index_inverted[lane])
+        # Upwards N becomes active at its first edge, downwards at its second, inverted the other way round.
+        first = drive.index_edge[lane] + abs(1.0 - up - wrong)
+        turn = np.floor((edges - first) / counts)
+        turn_before = np.floor((before - first) / counts)
+        sees = drive.encoder_broken[lane] < 0.5 and drive.encoder_gain[lane] > 0.0
+        came = sees and turn != turn_before
+        at = first + counts * (turn if turn > turn_before else turn_before)
+        moved = edges - before
+        part = (at - before) / (moved if came else 1.0)
+        seen = drive.step_seen[lane]
+        steps = seen + part * (drive.step_position[lane] - seen) - drive.step_shift[lane] - drive.home_shift[lane]
+        count = encoder_count(at * drive.encoder_gain[lane] + up - 0.5, drive.encoder_true_direction[lane])
+        per_count = TWO_PI * drive.turns_per_count[lane]
+        encoder = (count - drive.count_zero[lane]) * per_count - drive.home_shift[lane]
+        position = encoder if drive.position_sensor[lane] > -0.5 else steps
+        drive.index_seen[lane] = 1.0 if came else drive.index_seen[lane]
+        drive.index_position[lane] = position if came else drive.index_position[lane]
+        latches = came and drive.latch_armed[lane] > 0.5
+        drive.latch_steps[lane] = steps if latches else drive.latch_steps[lane]
+        drive.latch_encoder[lane] = encoder if latches else drive.latch_encoder[lane]
+        drive.latch_armed[lane] = 0.0 if latches else drive.latch_armed[lane]
+        drive.true_edges[lane] = edges
+        drive.step_seen[lane] = drive.step_position[lane]
 
 
 @inlined
 def measure_motion(drive, h):
     """Read step counter and encoder once per window of h [s].
 
-    Writes theta_meas and omega_meas, which are the steps', theta_encoder, omega_encoder and position_actual.
+    Writes theta_meas and omega_meas, which are the steps', theta_encoder, omega_encoder, position_actual and
+    deviation.
     """
+    watch_index(drive)
     for lane in range(LANES):
         s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
         drive.encoder_error[lane] = drive.encoder_line_error[lane] * s + drive.encoder_shake[lane]
@@ -33,13 +78,21 @@ def measure_motion(drive, h):
         before = drive.count[lane]
         count = before if drive.encoder_broken[lane] > 0.5 else count
         per_count = TWO_PI * drive.turns_per_count[lane]
-        steps = drive.step_position[lane] - drive.home_shift[lane]
-        encoder = (count - drive.count_zero[lane]) * per_count - drive.home_shift[lane]
+        turned = (count - drive.count_zero[lane]) * per_count
+        # Without current the rotor may be turned by hand: what the encoder sees then is where the axis is.
+        is_off = drive.drive_function[lane] < 0.5 and drive.position_sensor[lane] > -0.5
+        takes = is_off and drive.takes_encoder_position[lane] > 0.5
+        shift = drive.step_position[lane] - turned if takes else drive.step_shift[lane]
+        steps = drive.step_position[lane] - shift - drive.home_shift[lane]
+        encoder = turned - drive.home_shift[lane]
+        drive.step_shift[lane] = shift
         drive.count[lane] = count
         drive.theta_meas[lane] = steps
         drive.omega_meas[lane] = drive.step_rate[lane]
         drive.theta_encoder[lane] = encoder
-        drive.position_actual[lane] = encoder if drive.position_sensor[lane] > -0.5 else steps
+        actual = encoder if drive.position_sensor[lane] > -0.5 else steps
+        drive.position_actual[lane] = actual
+        drive.deviation[lane] = steps - actual
         raw = (count - before) * per_count / h
         b = drive.velocity_filter_b[lane]
         omega = b * raw + drive.velocity_filter_z[0, lane]

@@ -13,6 +13,13 @@ from drive_env.firmware.stepper import causes, fields
 from drive_env.firmware.stepper.chopper import choose_drive, find_ripple
 from drive_env.firmware.stepper.current_scale import scale_current
 from drive_env.firmware.stepper.sensors import derive_encoder, measure_motion
+from drive_env.firmware.stepper.stall_guard import (
+    collect_voltage,
+    forget_load,
+    hold_stalled,
+    read_load,
+    stop_stalled,
+)
 from drive_env.firmware.stepper.steps import derive_steps, make_steps, plan_steps
 from drive_env.firmware.stepper.winding import chop, move_rotor, power_stage, refresh_winding
 from mechanics.compiled import inlined, stage
@@ -38,6 +45,7 @@ def run_tick(drive, rates, k):
     make_steps(drive, rates.tick)
     chop(drive)
     power_stage(drive)
+    collect_voltage(drive)
     move_rotor(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
     collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
     for s in range(1, rates.substeps):
@@ -50,6 +58,13 @@ def read_motion(drive, rates):
     if drive.block_has_noisy_encoder[0]:
         shake_encoders(drive)
     measure_motion(drive, rates.window)
+
+
+@stage
+def watch_load(drive, rates):
+    """Read the load, and stop the steps of a motor that has stalled."""
+    read_load(drive, rates.tick, rates.ticks)
+    stop_stalled(drive)
 
 
 @stage
@@ -130,11 +145,19 @@ def power_on(drive, lane):
     s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
     drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
     edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI
+    drive.true_edges[lane] = edges
+    drive.step_seen[lane] = 0.0
+    drive.step_shift[lane] = 0.0
+    drive.index_seen[lane] = 0.0
+    drive.latch_armed[lane] = 0.0
+    drive.latch_steps[lane] = 0.0
+    drive.latch_encoder[lane] = 0.0
     drive.count[lane] = encoder_count(edges * drive.encoder_gain[lane], drive.encoder_true_direction[lane])
     drive.count_zero[lane] = drive.count[lane]
     drive.theta_encoder[lane] = 0.0
     drive.omega_encoder[lane] = 0.0
     drive.position_actual[lane] = 0.0
+    drive.deviation[lane] = 0.0
 
 
 STAGES = FirmwareStages(
@@ -144,13 +167,13 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_quotients),
     measure=(causes.watch_phases,),
-    switch=(causes.forget_peaks, scale_current),
+    switch=(causes.forget_peaks, causes.switch_brake, hold_stalled, scale_current),
     tell=(tell_status,),
     end_period=(spread_steps,),
-    window=(read_motion, prepare_chopper),
+    window=(read_motion, watch_load, prepare_chopper),
     tick=(run_tick,),
-    power_on=(power_on,),
-    halt=(halt,),
+    power_on=(power_on, forget_load),
+    halt=(halt, forget_load),
 )
 
 FIRMWARE = compose(STAGES, __name__)

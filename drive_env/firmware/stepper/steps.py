@@ -34,7 +34,7 @@ def derive_steps(drive):
 def plan_steps(drive, dt):
     """Spread the steps to the demand over the coming period of dt [s]: writes step_rate, in_full_steps, steps_done."""
     for lane in range(LANES):
-        way = drive.position_demand[lane] + drive.home_shift[lane] - drive.step_position[lane]
+        way = drive.position_demand[lane] + drive.home_shift[lane] + drive.step_shift[lane] - drive.step_position[lane]
         # What rounding has left of the last period's way is no motion.
         way = 0.0 if abs(way) * drive.steps_per_rad[lane] < SMALLEST_WAY else way
         rate = way / dt

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from drive_env.firmware.cycle import compose
 from drive_env.firmware.stepper import stages as stepper
+from drive_env.firmware.stepper.stall_guard import collect_voltage
 from drive_env.firmware.stepper.winding import chop, move_rotor, power_stage
 from drive_env.firmware.stepper_loop import fields, initialise
 from drive_env.firmware.stepper_loop.corrections import correct
@@ -25,6 +26,7 @@ def run_tick(drive, rates, k):
     move_field(drive, rates.tick)
     chop(drive)
     power_stage(drive)
+    collect_voltage(drive)
     move_rotor(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
     stepper.collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
     for s in range(1, rates.substeps):

@@ -1,4 +1,4 @@
-"""Homing mode (manual, section 8): methods 17, 18, 19, 21 and 35; 0 does nothing.
+"""Homing mode (manual, section 8): methods 1, 2, 3, 5, 17, 18, 19, 21, 33, 34 and 35; 0 does nothing.
 
 A switch is searched fast; once it is touched the axis brakes, and looks for the edge slowly, always in the same
 direction, until the switch changes; that edge is home. Then the axis returns to the edge and rests there. Search and
@@ -8,7 +8,11 @@ edge as the methods have them:
     18  search right until the right limit switch is active, edge to the left
     19  search right until the home switch is active, edge to the left; a limit switch turns the search round
     21  search left until the home switch is active, edge to the right; a limit switch turns the search round
+    1, 2, 3, 5  as 17, 18, 19, 21; from the edge on, the same way, to the encoder's next index, which is home
+    33, 34  to the next index, left or right, slowly
     35  here
+
+A way of more than a turn without an index is one on which none comes: homing fails, rather than run into a stop.
 """
 
 from __future__ import annotations
@@ -21,12 +25,33 @@ from mechanics.compiled import stage
 LEFT, RIGHT, HOME = 0, 1, 2
 
 # States of a homing run.
-IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, RETURN, STOPPED, DONE, FAILED = range(10)
+IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, TO_INDEX, RETURN, STOPPED, DONE, FAILED = range(11)
+
+BY_SWITCH = 16  # from a method with an index to the one that ends at the switch's edge
+INDEX_LEFT, INDEX_RIGHT = 33, 34
+INDEX_WAY = 1.05 * TWO_PI  # rad in which an index must come
+
+
+@stage
+def _ends_at_index(method):
+    """Return whether a method goes on from the switch's edge to an index."""
+    return 0 < method < BY_SWITCH
+
+
+@stage
+def _looks_for_index_alone(method):
+    return method == INDEX_LEFT or method == INDEX_RIGHT
+
+
+@stage
+def _by_switch(method):
+    """Return the method that finds the same edge without an index."""
+    return method + BY_SWITCH if _ends_at_index(method) else method
 
 
 @stage
 def _switch(method):
-    """Return which switch a method looks for."""
+    """Return which switch a method looks for, of those without an index."""
     if method == 17:
         return LEFT
     if method == 18:
@@ -38,6 +63,15 @@ def _switch(method):
 def _search_sign(method):
     """Return the direction in which a method searches its switch."""
     return -1.0 if method in (17, 21) else 1.0
+
+
+@stage
+def _look_for_index(drive, lane, direction):
+    """Begin to look for the index, in a direction; return the state."""
+    drive.homing_direction[lane] = direction
+    drive.index_seen[lane] = 0.0
+    drive.homing_limit[lane] = drive.theta_meas[lane] + direction * INDEX_WAY
+    return TO_INDEX
 
 
 @stage
@@ -57,12 +91,15 @@ def start_or_stop(drive, lane, word_before):
             drive.homing_attained[lane] = 1
             drive.target_reached[lane] = 1
         elif drive.fsa[lane] == fsa.ENABLED:
+            alone = _looks_for_index_alone(method)
             unable = (
-                drive.homing_fast[lane] <= 0.0
+                (drive.homing_fast[lane] <= 0.0 and not alone)
                 or drive.homing_slow[lane] <= 0.0
                 or drive.homing_acceleration[lane] <= 0.0
             )
             drive.homing_state[lane] = FAILED if method == 0 or unable else SEARCH
+            if alone and not unable:
+                drive.homing_state[lane] = _look_for_index(drive, lane, 1.0 if method == INDEX_RIGHT else -1.0)
             drive.target_reached[lane] = 1 if drive.homing_state[lane] == FAILED else 0
     elif not word & cia402.NEW_SET_POINT and SEARCH <= drive.homing_state[lane] <= RETURN:
         drive.homing_state[lane] = STOPPED
@@ -99,7 +136,7 @@ def _run(drive, lane, velocity, dt):
 @stage
 def _search(drive, lane, state, active, dt):
     """Search the switch, fast; return the state after it."""
-    method = drive.homing_method[lane]
+    method = _by_switch(drive.homing_method[lane])
     sign = _search_sign(method)
     direction = sign if state == SEARCH else -sign
     drive.homing_direction[lane] = direction
@@ -140,12 +177,28 @@ def _come_back(drive, lane, sign, active, dt):
 def _leave_switch(drive, lane, sign, active, dt):
     """Look for the edge, slowly; return the state after it."""
     if not active and drive.velocity_demand[lane] * sign < 0.0:
+        if _ends_at_index(drive.homing_method[lane]):
+            return _look_for_index(drive, lane, -sign)
         set_home(drive, lane, drive.theta_meas[lane], -drive.home_offset[lane])
         return RETURN
     if inputs.is_active(drive, lane, LEFT if sign > 0.0 else RIGHT):
         return FAILED
     _run(drive, lane, -sign * drive.homing_slow[lane], dt)
     return TO_EDGE
+
+
+@stage
+def _go_to_index(drive, lane, dt):
+    """Look for the index, slowly; return the state after it."""
+    direction = drive.homing_direction[lane]
+    if drive.index_seen[lane] > 0.0:
+        set_home(drive, lane, drive.index_position[lane], -drive.home_offset[lane])
+        return RETURN
+    too_far = (drive.theta_meas[lane] - drive.homing_limit[lane]) * direction > 0.0
+    if too_far or inputs.is_active(drive, lane, RIGHT if direction > 0.0 else LEFT):
+        return FAILED
+    _run(drive, lane, direction * drive.homing_slow[lane], dt)
+    return TO_INDEX
 
 
 @stage
@@ -175,7 +228,7 @@ def generate(drive, lane, dt):
     """Run homing for one period of dt [s]; without a run the axis holds."""
     drive.loop_level[lane] = 2
     state = drive.homing_state[lane]
-    method = drive.homing_method[lane]
+    method = _by_switch(drive.homing_method[lane])
     sign = _search_sign(method)
     active = inputs.is_active(drive, lane, _switch(method))
     if state in (SEARCH, TURNED):
@@ -186,6 +239,8 @@ def generate(drive, lane, dt):
         state = _come_back(drive, lane, sign, active, dt)
     elif state == TO_EDGE:
         state = _leave_switch(drive, lane, sign, active, dt)
+    elif state == TO_INDEX:
+        state = _go_to_index(drive, lane, dt)
     elif state == RETURN:
         state = _return_to_edge(drive, lane, dt)
     elif state in (STOPPED, FAILED):

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.motors import Motor
 
-FULL = 255  # of 2003h and 2004h
+FULL, STEPS = 255, 32  # of 2003h and 2004h: the largest, and how many steps the driver makes of them
 STANDBY = 0.5  # of the run current: half the holding torque
 MICROSTEPS = 8  # 2^8 of a full step
 REVOLUTIONS = 2.0  # rev/s of moves, within the flat part of any row's torque
@@ -22,13 +22,14 @@ def preset(device: Device, motor: Motor) -> dict[str, int]:
     """Return object name -> raw value, in the order of writing."""
     full_steps = 4 * motor.n_p
     scale = full_steps * 2**MICROSTEPS
-    amplitude = min(math.sqrt(2.0) * motor.rated_current, device.current_full_scale)
-    run = max(round(FULL * amplitude / device.current_full_scale), 8)
+    # The last of the settings that make a step of the current which is not above the rated one.
+    share = min(motor.rated_current / device.current_full_scale, 1.0)
+    run = max(math.floor(STEPS * share), 1) * (FULL + 1) // STEPS - 1
     return {
         "Microstep resolution": MICROSTEPS,
         "Full step resolution": full_steps,
         "Maximum current": run,
-        "Standby current": max(round(STANDBY * run), 8),
+        "Standby current": round(STANDBY * run),
         "Setting delay": 20,
         "Position encoder resolution.Encoder increments": motor.encoder_counts,
         "Profile velocity": round(REVOLUTIONS * scale),
