@@ -6,8 +6,9 @@ Register numbers as the TMC4361 counts (data sheet, "PID and closed-loop registe
     v_D = (e - e_before) D, e looked at with f / 128 / 202Eh; 0 stands for 256
 
 All of them together stay within 202Fh. A PID adds them to the ramp's velocity (mode 2) or moves the field by them
-alone (mode 3), and corrects nothing within 2022h. In load angle control P and I bound the field's velocity on the way
-back to the ramp's: it may follow an overload however fast. Without P and I 202Fh alone bounds it.
+alone (mode 3), and corrects nothing within 2022h, where that is not 0, whatever its sum. In load angle control P and I
+bound the field's velocity on the way back to the ramp's: it may follow an overload however fast. Without P and I 202Fh
+alone bounds it.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ def correct(drive, h):
     """
     for lane in range(LANES):
         e = drive.loop_deviation[lane]
-        outside = abs(e) > drive.correction_tolerance[lane]
+        outside = abs(e) > drive.correction_tolerance[lane] or drive.correction_tolerance[lane] == 0.0
         closed = drive.loop_closed[lane]
         is_pid = closed > 1.5
         per_second = drive.motion_clock[lane] / PRESCALER

@@ -24,7 +24,7 @@ def see_axis(drive):
     """
     for lane in range(LANES):
         encoder = encoder_position(drive, lane) + drive.loop_offset[lane]
-        shown = encoder - drive.home_shift[lane]
+        shown = encoder - drive.step_shift[lane] - drive.home_shift[lane]
         closed = drive.loop_closed[lane] > 0.5
         drive.loop_deviation[lane] = drive.step_position[lane] - encoder
         drive.theta_meas[lane] = shown if closed else drive.theta_meas[lane]
@@ -41,7 +41,7 @@ def seed_steps(drive, dt):
     So begin enabling, a stop after a fault, torque modes: none of them may move the field. Writes step_position.
     """
     for lane in range(LANES):
-        position = drive.position_demand[lane] + drive.home_shift[lane]
+        position = drive.position_demand[lane] + drive.home_shift[lane] + drive.step_shift[lane]
         way = abs(position - drive.step_position[lane])
         now, before = abs(drive.velocity_demand[lane]), abs(drive.velocity_before[lane])
         explained = (now if now > before else before) * dt * MARGIN + SMALLEST_WAY / drive.steps_per_rad[lane]

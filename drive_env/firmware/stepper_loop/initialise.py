@@ -1,8 +1,8 @@
 """When the loop closes: what 2020h asks for, and how the encoder is aligned with the field (2028h, 2120h).
 
 Load angle control commutates by the encoder, so it must know where the field holds the rotor: the axis stands, run
-current flows, the rotor swings in, and its position is taken. A load that pulls at it meanwhile is not seen: its angle
-stays in the offset. A PID does not commutate; its encoder begins where the steps are, at once.
+current flows, the rotor swings in, and its position is taken. A load that pulls at it meanwhile cannot be told from it:
+its angle stays in the offset. A PID does not commutate; its encoder begins where the steps are, at once.
 """
 
 from __future__ import annotations

@@ -45,8 +45,9 @@ def regulate(drive, rates):
 
 @stage
 def take_over(drive, rates):
-    """Let the steps be where a demand was taken from the encoder."""
-    seed_steps(drive, rates.period)
+    """Let the steps be where a demand was taken from the encoder; a period without length has taken none."""
+    if rates.period > 0.0:
+        seed_steps(drive, rates.period)
 
 
 STAGES = replace(
