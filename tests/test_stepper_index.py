@@ -97,6 +97,20 @@ def test_from_a_switch_the_next_index_on_the_side_where_it_is_released_is_home(m
         assert drives.machine.rotor_angle[0] == pytest.approx(home, abs=LAG + COUNT)
 
 
+def test_a_search_for_the_index_that_is_taken_back_stops():
+    with build(parameters=DAMPED) as drives:
+        drives.write(0x2005, 3)
+        drives.machine.set("motor.index_angle", 6.0)
+        homed(drives, 34, 0.3)
+        drives.write(0x6040, 0x0F)
+        drives.advance(0.3)
+        stands = drives.machine.rotor_angle[0]
+        assert 0.3 < stands < 5.0
+        drives.advance(0.5)
+        assert drives.machine.rotor_angle[0] == pytest.approx(stands, abs=1e-3)
+        assert drives.read(0x6041)[0] & (REACHED | ATTAINED) == REACHED
+
+
 @pytest.mark.parametrize("method", [1, 33])
 def test_an_axis_whose_index_does_not_come_gives_up_after_a_turn(method):
     with build(parameters=DAMPED) as drives:
@@ -150,7 +164,7 @@ def test_the_latch_takes_both_positions_at_the_next_index_and_disarms(speed):
 
 
 def test_both_positions_are_latched_as_they_were_at_the_same_moment():
-    """At an even speed the rotor lags by a constant angle, also at the index, wherever in the window of 200 us it comes.
+    """At an even speed the rotor lags by a constant angle, also at the index, wherever in a window of 200 us it comes.
 
     In a window the steps go on by 20; the encoder resolves 1.28.
     """

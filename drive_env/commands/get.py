@@ -238,7 +238,7 @@ def _keep_watchdog(drives: BusDrives, entry: Entry) -> None:
 
 
 def _write(drives: BusDrives, entry: Entry, axes: list[int], value: Any) -> None:
-    """Write an object of some axes (a text has none); one of a watchdog is put back where an axis was enabled meanwhile.
+    """Write an object of some axes (a text has none); one of a watchdog is put back where one was enabled meanwhile.
 
     Between our look at the statusword and our write another master may enable, and nothing on the bus keeps it from
     that. So we look again, and an axis that does not answer counts as enabled.

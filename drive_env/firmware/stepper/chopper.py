@@ -42,6 +42,12 @@ def larger(x, y):
 
 
 @inlined
+def slow_decay_clocks(off_time):
+    """Return how long a slow decay takes [clocks] (2097h)."""
+    return larger(12.0 + 32.0 * off_time, 64.0)
+
+
+@inlined
 def choose_drive(drive):
     """Choose chopper or voltage PWM for this window, by the speed of the steps: writes in_pwm and pwm_scale.
 
@@ -110,16 +116,14 @@ def constant_off_cycle(rise, lost, off, blank, dropped, fast_decay):
 def find_ripple(drive):
     """Find what the chopper's cycle does to the mean current in this window.
 
-    Writes ripple, chopper_frequency, in_spread_cycle, on_time, current_shift, current_gain and lowest_share.
+    Writes ripple, chopper_frequency, on_time, in_spread_cycle, current_shift, current_gain and lowest_share.
     """
     for lane in range(LANES):
         clock = 1.0 / drive.chopper_clock[lane]
-        fullstep = drive.fullstep_threshold[lane]
-        fast_chopper = drive.high_speed_chopper[lane] if fullstep > 0.0 else 0.0
-        fast_chopper = fast_chopper if abs(drive.step_rate[lane]) > fullstep else 0.0
+        fast_chopper = drive.high_speed_chopper[lane] * drive.at_high_speed[lane]
         is_constant = drive.chopper_mode[lane] > 0.5 or fast_chopper > 0.5
         # The high speed chopper has no fast decay, and doubles the off time (TMC5160 data sheet, vhighchm).
-        off = larger(12.0 + 32.0 * drive.off_time[lane], 64.0) * clock * (1.0 + fast_chopper)
+        off = slow_decay_clocks(drive.off_time[lane]) * clock * (1.0 + fast_chopper)
         blank = blank_clocks(drive.chopper_blank[lane]) * clock
         fast_decay = 32.0 * drive.hysteresis_start[lane] * clock * (1.0 - fast_chopper)
         # Slopes of a current of the set-point's size against the whole back-EMF [A/s].

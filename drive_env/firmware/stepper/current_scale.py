@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from drive_env.firmware.stepper.cool_step import reduction_span
 from mechanics.compiled import stage
 
 STEPS = 32.0  # of the current, 0...255 divided by eight (TMCM-3313 manual, table 33)
@@ -32,6 +33,8 @@ def scale_current(drive, lane, dt):
     if rests:
         asked = drive.standby_current[lane]
     wanted = np.floor(asked * (STEPS / 256.0))
+    drive.cool_span[lane] = reduction_span(drive, lane, wanted)
+    wanted -= min(drive.cool_reduction[lane], drive.cool_span[lane])
     if rests and drive.power_down_ramp[lane] > 0.0 and drive.current_scale[lane] > wanted:
         lowered = drive.current_scale[lane] - dt * drive.chopper_clock[lane] / (
             RAMP_CLOCKS * drive.power_down_ramp[lane]

@@ -11,7 +11,9 @@ from drive_env.firmware.cycle import FirmwareStages, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper import causes, fields
 from drive_env.firmware.stepper.chopper import choose_drive, drain_shorts, find_ripple
+from drive_env.firmware.stepper.cool_step import adapt_current, forget_reduction
 from drive_env.firmware.stepper.current_scale import scale_current
+from drive_env.firmware.stepper.dc_step import forget_waiting, release_steps, slow_ramp
 from drive_env.firmware.stepper.sensors import derive_encoder, measure_motion
 from drive_env.firmware.stepper.stall_guard import (
     collect_voltage,
@@ -20,7 +22,7 @@ from drive_env.firmware.stepper.stall_guard import (
     read_load,
     stop_stalled,
 )
-from drive_env.firmware.stepper.steps import derive_steps, make_steps, plan_steps
+from drive_env.firmware.stepper.steps import count_steps, derive_steps, make_steps, plan_steps
 from drive_env.firmware.stepper.winding import chop, move_rotor, power_stage, refresh_winding
 from mechanics.compiled import inlined, stage
 
@@ -62,9 +64,13 @@ def read_motion(drive, rates):
 
 @stage
 def watch_load(drive, rates):
-    """Read the load, and stop the steps of a motor that has stalled."""
+    """Let steps wait for the rotor, read the load, stop a motor that has stalled, and adapt the current."""
+    if drive.block_has_dc_step[0]:
+        release_steps(drive, rates.window)
     read_load(drive, rates.tick, rates.ticks)
     stop_stalled(drive)
+    count_steps(drive, rates.window)
+    adapt_current(drive)
 
 
 @stage
@@ -111,7 +117,10 @@ def spread_steps(drive, rates):
     if rates.period > 0.0:
         plan_steps(drive, rates.period)
     drive.block_has_noisy_encoder[0] = 0
+    drive.block_has_dc_step[0] = 0
     for lane in range(LANES):
+        if drive.dc_speed[lane] > 0.0:
+            drive.block_has_dc_step[0] = 1
         # Once more after the noise has ended, so that none of it is left in the angle.
         if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
             drive.block_has_noisy_encoder[0] = 1
@@ -177,13 +186,13 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_quotients),
     measure=(causes.watch_phases,),
-    switch=(causes.forget_peaks, causes.switch_brake, hold_stalled, scale_current),
+    switch=(causes.forget_peaks, slow_ramp, hold_stalled, causes.switch_brake, scale_current),
     tell=(tell_status,),
     end_period=(spread_steps,),
-    window=(read_motion, watch_load, prepare_chopper),
+    window=(watch_load, read_motion, prepare_chopper),
     tick=(run_tick,),
-    power_on=(power_on, forget_load),
-    halt=(halt, forget_load),
+    power_on=(power_on, forget_load, forget_reduction, forget_waiting),
+    halt=(halt, forget_load, forget_reduction, forget_waiting),
 )
 
 FIRMWARE = compose(STAGES, __name__)

@@ -90,6 +90,7 @@ def stop_stalled(drive):
     """Make no more steps on a motor that has stalled, from this window on."""
     for lane in range(LANES):
         drive.step_rate[lane] = 0.0 if drive.stalled[lane] > 0.5 else drive.step_rate[lane]
+        drive.planned_rate[lane] = 0.0 if drive.stalled[lane] > 0.5 else drive.planned_rate[lane]
 
 
 @stage
@@ -98,7 +99,7 @@ def hold_stalled(drive, lane, dt):
     if drive.drive_function[lane] == 0.0:
         drive.stalled[lane] = 0.0
     if drive.stalled[lane] > 0.5:
-        drive.position_demand[lane] = drive.step_position[lane] - drive.home_shift[lane]
+        drive.position_demand[lane] = drive.step_position[lane] - drive.step_shift[lane] - drive.home_shift[lane]
         drive.velocity_demand[lane] = 0.0
         drive.braking[lane] = 1
 

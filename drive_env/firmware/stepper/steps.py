@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from drive_env.cia402 import CSP
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.record import LANES
+from drive_env.firmware.stepper.chopper import larger
 from mechanics.compiled import inlined
 
 HALF_PI = 1.5707963267948966
@@ -33,21 +35,42 @@ def derive_steps(drive):
 
 @inlined
 def plan_steps(drive, dt):
-    """Spread the steps to the demand over the coming period of dt [s]: writes step_rate, in_full_steps, steps_done."""
+    """Spread the steps to the demand over the coming period of dt [s].
+
+    Writes planned_rate, step_rate, at_high_speed and in_full_steps.
+    """
     for lane in range(LANES):
         way = drive.position_demand[lane] + drive.home_shift[lane] + drive.step_shift[lane] - drive.step_position[lane]
         # What rounding has left of the last period's way is no motion.
         way = 0.0 if abs(way) * drive.steps_per_rad[lane] < SMALLEST_WAY else way
         rate = way / dt
+        # Set-points of csp that DcStep's steps wait behind are caught up with so that 6084h ends it at their speed.
+        ahead = drive.velocity_demand[lane] if drive.velocity_demand[lane] * way > 0.0 else 0.0
+        left = larger(abs(rate) - abs(ahead), 0.0) * dt
+        slows = drive.deceleration[lane] if drive.deceleration[lane] > 0.0 else drive.acceleration[lane]
+        most = abs(ahead) + (2.0 * slows * left) ** 0.5
+        catches_up = drive.dc_speed[lane] > 0.0 and drive.mode_display[lane] == CSP and slows > 0.0
+        size = most if catches_up and most < abs(rate) else abs(rate)
+        rate = size if rate > 0.0 else -size
+        drive.planned_rate[lane] = rate
         drive.step_rate[lane] = rate
-        counted = drive.steps_low[lane] + abs(way) * drive.steps_per_rad[lane]
+        threshold = drive.fullstep_threshold[lane]
+        fast = threshold > 0.0 and abs(rate) > threshold
+        # DcStep acts on them as that threshold does; voltage PWM takes its place.
+        dc_step = drive.dc_speed[lane] > 0.0 and abs(rate) >= drive.dc_speed[lane] and drive.in_pwm[lane] < 0.5
+        drive.at_high_speed[lane] = 1.0 if fast or dc_step else 0.0
+        drive.in_full_steps[lane] = drive.high_speed_fullstep[lane] * drive.at_high_speed[lane]
+
+
+@inlined
+def count_steps(drive, h):
+    """Count the microsteps of the coming window of h [s]: writes steps_low, steps_high and steps_done."""
+    for lane in range(LANES):
+        counted = drive.steps_low[lane] + abs(drive.step_rate[lane]) * h * drive.steps_per_rad[lane]
         carry = 1.0 if counted >= HALF else 0.0
         drive.steps_low[lane] = counted - carry * HALF
         drive.steps_high[lane] += carry
         drive.steps_done[lane] = drive.steps_high[lane] * HALF + drive.steps_low[lane]
-        threshold = drive.fullstep_threshold[lane]
-        fast = threshold > 0.0 and abs(rate) > threshold
-        drive.in_full_steps[lane] = drive.high_speed_fullstep[lane] if fast else 0.0
 
 
 @inlined

@@ -25,7 +25,7 @@ from mechanics.compiled import stage
 LEFT, RIGHT, HOME = 0, 1, 2
 
 # States of a homing run.
-IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, TO_INDEX, RETURN, STOPPED, DONE, FAILED = range(11)
+IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, RETURN, STOPPED, DONE, FAILED, TO_INDEX = range(11)
 
 BY_SWITCH = 16  # from a method with an index to the one that ends at the switch's edge
 INDEX_LEFT, INDEX_RIGHT = 33, 34
@@ -102,7 +102,9 @@ def start_or_stop(drive, lane, word_before):
             if alone and not unable:
                 drive.homing_state[lane] = _look_for_index(drive, lane, 1.0 if method == INDEX_RIGHT else -1.0)
             drive.target_reached[lane] = 1 if drive.homing_state[lane] == FAILED else 0
-    elif not word & cia402.NEW_SET_POINT and SEARCH <= drive.homing_state[lane] <= RETURN:
+    elif not word & cia402.NEW_SET_POINT and (
+        SEARCH <= drive.homing_state[lane] <= RETURN or drive.homing_state[lane] == TO_INDEX
+    ):
         drive.homing_state[lane] = STOPPED
 
 
