@@ -95,7 +95,7 @@ TRUE = (
     "in_full_steps",
     "T_motor",
 )
-SEEN = (0x6041, 0x6061, 0x6062, 0x6064, 0x606C, 0x2102, 0x2121, 0x2122)
+SEEN = (0x6041, 0x6061, 0x6062, 0x6064, 0x606C, 0x2101, 0x2102, 0x2121, 0x2122)
 
 
 def look(drives):
@@ -155,6 +155,13 @@ def turn(drives):
     return np.concatenate([through(drives, 0.15), through(drives, 0.3)])
 
 
+def press(drives):
+    """Turn without a load and then with one, below what half of the current bears."""
+    turn(drives)
+    drives.machine.load_torque = -0.2
+    return np.concatenate([through(drives, 0.01), through(drives, 0.1)])
+
+
 def stop_quickly(drives):
     motion.enable(drives, mode="pv")
     drives.write(0x60FF, 2 * TURN)
@@ -212,6 +219,8 @@ PWM = {0x20B0: 2 * TURN, 0x20B1: 10, 0x20B2: 60}
 FAST = {0x20B6: TURN}
 HOMING = {0x6098: 21, (0x6099, 1): TURN, (0x6099, 2): TURN // 8, 0x609A: 10 * TURN}
 ENCODER = {0x606A: 0}
+COOL = {0x2003: 255, 0x2099: 3, 0x209C: 1, 0x209E: 40}
+DC_STEP = {0x20B3: TURN, 0x20B4: 60, 0x20B7: 1, 0x20B8: 1}
 
 # Object: scene, one value, another.
 ROWS: dict[Any, tuple[Scene, int, int]] = {
@@ -232,11 +241,23 @@ ROWS: dict[Any, tuple[Scene, int, int]] = {
     0x2095: (Scene(turn), 0, 10),
     0x2096: (Scene(turn, rows={0x2094: 3}), 0, 7),
     0x2097: (Scene(turn), 2, 12),
+    0x2098: (Scene(turn, rows=COOL), 0, 1),
+    0x2099: (Scene(turn, rows=COOL), 0, 3),
+    0x209A: (Scene(turn, rows=COOL | {0x209C: 15}), 0, 15),
+    0x209B: (Scene(press, rows=COOL | {0x209C: 15, 0x209E: 22}), 0, 3),
+    0x209C: (Scene(turn, rows=COOL), 1, 0),
+    0x209D: (Scene(turn), 0, 1),
+    0x209E: (Scene(turn), 0, 20),
     0x20A1: (Scene(shorten), 0, 1),
     0x20A3: (Scene(stand), 0, 1),
+    0x20A4: (Scene(turn, rows={0x209E: -63}), 0, TURN),
+    0x20A5: (Scene(turn, rows=COOL), 0, 4 * TURN),
     0x20B0: (Scene(turn, rows=PWM), 0, 2 * TURN),
     0x20B1: (Scene(turn, rows=PWM), 10, 40),
     0x20B2: (Scene(turn, rows=PWM), 60, 20),
+    0x20B3: (Scene(turn, rows=DC_STEP), 0, TURN),
+    0x20B4: (Scene(turn, rows=DC_STEP), 20, 90),
+    0x20B5: (Scene(turn, rows=DC_STEP | {0x20A4: TURN - 1}), 0, 255),
     0x20B6: (Scene(turn, rows={0x20B8: 1}), 0, TURN),
     0x20B7: (Scene(turn, rows=FAST), 0, 1),
     0x20B8: (Scene(turn, rows=FAST), 0, 1),
@@ -277,6 +298,14 @@ ELSEWHERE = {
     (0x3004, 0): "bit rate after a reset: below",
     (0x3005, 0): "node-ID after a reset: below",
     (0x3006, 1): "a service that stores both: below",
+} | {
+    (index, 0): f"its figures: {test}.py"
+    for test, indices in {
+        "test_stepper_cool_step": (0x2098, 0x2099, 0x209A, 0x209B, 0x209C, 0x209D, 0x20A5),
+        "test_stepper_stall_guard": (0x209E, 0x20A4),
+        "test_stepper_dc_step": (0x20B3, 0x20B4, 0x20B5),
+    }.items()
+    for index in indices
 }
 
 

@@ -125,7 +125,12 @@ def take(target: Target) -> Snapshot:
 
 def _read_axes(target: Target) -> tuple[Mapping[Key, int], ...]:
     drives = _per_axis(target.drives)
-    return tuple(read_parameters(drives, axis) for axis in range(target.num_axes))
+    # The dictionary of a module lists the objects of all its axes: each axis has its own, by those of the first.
+    others = drives.description.of_further_axes()
+    return tuple(
+        {key: value for key, value in read_parameters(drives, axis).items() if key not in others}
+        for axis in range(target.num_axes)
+    )
 
 
 def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:

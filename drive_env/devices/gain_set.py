@@ -20,7 +20,11 @@ Key = tuple[int, int]
 
 
 class Gain(NamedTuple):
-    """A gain: its name in code, its title for people, its object, the greatest integer, its loop and its part in it."""
+    """A gain: its name in code, its title for people, its object, the greatest integer, its loop and its part in it.
+
+    lowest: The least integer that makes sense: of a loop's gain 1, since 0 opens it.
+    steps: How many different values the drive makes of all its integers; 0 for as many as there are.
+    """
 
     name: str
     title: str
@@ -28,6 +32,11 @@ class Gain(NamedTuple):
     highest: int
     loop: str
     part: str
+    lowest: int = 1
+    steps: int = 0
+
+
+RUN, STANDBY = ("current", "amplitude"), ("current", "standby amplitude")  # of a stepper's phases: loop and part
 
 
 @dataclass(frozen=True)
@@ -71,8 +80,20 @@ class GainSet:
 
     @property
     def outer(self) -> tuple[str, ...]:
-        """Names of those of the velocity and the position loop, which machines differ in."""
+        """Names of those that machines differ in: of the velocity and the position loop; in open loop the currents."""
+        if self.is_open_loop:
+            return tuple(row.name for row in self.rows if (row.loop, row.part) in (RUN, STANDBY))
         return tuple(self.names[k] for k in self.columns_of("velocity", "position"))
+
+    @property
+    def is_open_loop(self) -> bool:
+        """Whether the motor follows the current's amplitude and no loop is closed around it: a stepper's."""
+        return self.column(*RUN) is not None and not self.columns_of("velocity", "position")
+
+    @property
+    def lowest(self) -> Integers:
+        """The least integers, shape (count,)."""
+        return np.array([row.lowest for row in self.rows], np.int64)
 
     @property
     def highest(self) -> Integers:
@@ -93,8 +114,8 @@ class GainSet:
         return np.array([self.names.index(name) for name in names])
 
     def clipped(self, raw: ArrayLike) -> Integers:
-        """Return gains as integers within what the device takes, 1 at least: 0 opens a loop."""
-        return np.asarray(np.clip(np.rint(np.asarray(raw, float)), 1, self.highest), np.int64)
+        """Return gains as integers within what the device takes; those of a loop are 1 at least: 0 opens it."""
+        return np.asarray(np.clip(np.rint(np.asarray(raw, float)), self.lowest, self.highest), np.int64)
 
     def with_velocity_p(self, raw: Integers, factor: ArrayLike) -> Integers:
         """Return gains of shape (n, count) with velocity P times a factor, within its range.
@@ -146,6 +167,15 @@ def load_gain_set(path: Path) -> GainSet:
     for row in data["gain"]:
         index, sub = row["object"].split(":")
         rows.append(
-            Gain(row["name"], row["title"], (int(index, 16), int(sub)), row["highest"], row["loop"], row["part"])
+            Gain(
+                row["name"],
+                row["title"],
+                (int(index, 16), int(sub)),
+                row["highest"],
+                row["loop"],
+                row["part"],
+                row.get("lowest", 1),
+                row.get("steps", 0),
+            )
         )
     return GainSet(tuple(rows), data.get("cascade", ""))

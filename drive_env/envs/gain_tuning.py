@@ -29,10 +29,11 @@ from drive_env.envs.gain_observation import (
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.randomisation import Distributions, RandomMachines, shipped
 from drive_env.envs.vector_environment import Floats, Info, Mask, Reward, Stepped, VectorEnvironment, check_choice
-from drive_env.gains import read_gains, rule_gains, small_time_constants
+from drive_env.gains import read_gains
 from drive_env.motors import Motor, find_motor
-from drive_env.trials.gain_trial import PHASES, Identified, Trial, Trials, measured_cost, softness
-from drive_env.trials.positioning import TRIAL, plan_move, power_up, reach
+from drive_env.trials.gain_trial import PHASES, Identified, Trial, measured_cost
+from drive_env.trials.method import check_tried, method_of, new_score
+from drive_env.trials.positioning import TRIAL, plan_move, reach
 from drive_env.trials.score import RobustScore
 
 Integers = NDArray[np.int64]
@@ -77,6 +78,8 @@ class GainTuningConfig:
         object.__setattr__(self, "gains", known.outer if self.gains is None else tuple(self.gains))
         for name in self.chosen:
             check_choice("a gain", name, known.names)
+        if known.is_open_loop:
+            check_tried(find_device(self.device), self.chosen)
         if not self.chosen or len(set(self.chosen)) != len(self.chosen):
             raise ValueError(f"gains must be different ones of {', '.join(known.names)}, not {self.gains}")
         if self.trials < 1:
@@ -235,13 +238,18 @@ class GainTuning(VectorEnvironment):
         laws = c.distributions
         if laws is None:
             laws = c.load if c.load in shipped() else {"parameters": {}}
+            if laws == c.load and self._device.gains.is_open_loop:  # the load's set has a servo motor's laws, too
+                known = machine_of(self.drives).parameters
+                laws = Distributions.load({"include": [c.load, "stepper"], "parameters": {}}).of_machine(known)
         self._machines = RandomMachines(machine_of(self.drives).drives, Distributions.load(laws))
         self._defaults = machine_of(self.drives).parameters
-        self._score = RobustScore(c.device, c.load, c.motor, num_envs, num_threads=c.num_threads, friction=c.friction)
+        self._score = new_score(c.device, c.load, c.motor, num_envs, num_threads=c.num_threads, friction=c.friction)
 
     def _spaces(self) -> tuple[gymnasium.Space[Any], Box]:
         c = self.config
-        rows = rows_of(self._axes, len(c.chosen), c.waveform, int(self._device.gains.highest.max()))
+        known = self._device.gains
+        greatest = known.highest[known.columns(c.chosen)] if known.is_open_loop else known.highest
+        rows = rows_of(self._axes, len(c.chosen), c.waveform, int(greatest.max()))
         low, high = (np.array([getattr(row, end) for row in rows], np.float32) for end in ("low", "high"))
         self._low, self._high = low, high
         observation: gymnasium.Space[Any] = Box(low, high, dtype=np.float32)
@@ -252,8 +260,9 @@ class GainTuning(VectorEnvironment):
 
     def _prepare(self, given_reach: ArrayLike | None) -> None:
         c, n, axes = self.config, self.num_envs, self.drives.num_axes
-        t_0 = 4.0 * float(small_time_constants(self._device, self._device.stage["velocity_filter"].default))
-        self._trials = Trials(self.drives, self.motor, self._axes, t_0)
+        self._method = method_of(self._device, self.motor)
+        self._highest = self._method.highest()
+        self._trials = self._method.trials(self.drives, self._axes)
         self._columns = self._device.gains.columns(c.chosen)
         one = reach(c.load) if c.travel is None else np.full(self._axes, c.travel * 2.0 * math.pi)
         self._reach = np.tile(one, n) if given_reach is None else np.broadcast_to(np.asarray(given_reach, float), axes)
@@ -295,8 +304,8 @@ class GainTuning(VectorEnvironment):
         planned = plan_move(self.motor, self._identified.inertia, scaler, self._reach)
         # Environments outside the mask keep theirs: nothing of what it follows from has changed.
         self._move = planned
-        supply = float(self.motor.voltage)
-        rule = rule_gains(self._device, self.motor, self._identified.inertia, supply=supply)
+        supply = np.full(drives.num_axes, float(self.motor.voltage))
+        rule = self._method.keep(self._method.rule(self._identified, planned, supply), self._safe)
         self._rule = np.where(axes[:, None], rule, self._rule)
         self._best = np.where(axes[:, None], self._rule, self._best)
         self._best_is_stable = np.where(axes, False, self._best_is_stable)
@@ -357,7 +366,7 @@ class GainTuning(VectorEnvironment):
         change = np.nan_to_num(np.clip(np.asarray(action, float), -step, step)).reshape(-1, len(self._columns))
         gains: Integers = self._best.copy()
         chosen = gains[:, self._columns] * np.exp(change)
-        gains[:, self._columns] = np.clip(np.rint(chosen), 1, self._device.gains.highest[self._columns])
+        gains[:, self._columns] = np.clip(np.rint(chosen), 1, self._highest[self._columns])
         return gains
 
     # --- a trial --------------------------------------------------------------------------------------------------
@@ -377,7 +386,7 @@ class GainTuning(VectorEnvironment):
             new = (np.repeat(values[name], self._axes) for name in ("start.winding", "start.stage"))
             machine.set_temperatures(*(np.where(axes, a, b) for a, b in zip(new, (winding, stage), strict=True)))
             self._machines.plan_faults(mask)
-            power_up(drives, axes)
+            self._trials.power_up(axes)
         else:
             self._trials.recover(axes)
         if pictures is not None:
@@ -397,8 +406,8 @@ class GainTuning(VectorEnvironment):
 
     def _measure(self, gains: Integers, tried: Trial) -> Floats:
         """Return J by measured terms of the lanes: that of the worst axis."""
-        known = self._device.gains
-        costs = measured_cost(tried.costs(softness(known, gains) / softness(known, self._rule)))
+        softness = self._method.softness
+        costs = measured_cost(tried.costs(softness(gains) / softness(self._rule)))
         return np.asarray(costs.reshape(self.num_envs, -1).max(axis=1))
 
     def _stopped(self, tried: Trial) -> Mask:

@@ -11,7 +11,7 @@ import math
 import tomllib
 import zlib
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache, partial
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -166,6 +166,11 @@ class Distributions:
                 raise ValueError(f"there is no file {path} of distributions")
             return _from_file(path, ())
         return _shipped_set(str(source))
+
+    def of_machine(self, parameters: Collection[str]) -> Distributions:
+        """Return the set without the laws of parameters that a machine does not have, as those of another motor."""
+        laws = {name: law for name, law in self.laws.items() if name in parameters or name in BESIDE}
+        return Distributions(laws, self.curriculum, self.faults)
 
     def draw(self, rng: np.random.Generator, defaults: Mapping[str, float], stage: float = 1.0) -> dict[str, float]:
         """Draw one machine.

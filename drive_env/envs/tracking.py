@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.devices import Device, find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.interface import Drives
@@ -163,6 +164,16 @@ class TrackingConfig:
         return max(1, round(self.duration * self.rate))
 
 
+def _check_device(device: Device | None) -> None:
+    """Raise ValueError for drives that do not tell what is observed."""
+    if device is None or ((cia402.TORQUE_ACTUAL, 0) in device.bindings and Role.CURRENT_LIMIT in device.roles):
+        return
+    raise ValueError(
+        f"{device.name} has no torque actual value (6077h) or no current limit, both of which Tracking observes and "
+        "rewards, as drives of steppers; take GainTuning, or a drive that has them"
+    )
+
+
 class Tracking(VectorEnvironment):
     """`ServoDrive/Tracking-v0`: follow a trajectory, or stabilise the load.
 
@@ -239,6 +250,7 @@ class Tracking(VectorEnvironment):
         **options: Any,
     ) -> None:
         self.config = configured(TrackingConfig, config, options)
+        _check_device(find_device(self.config.device) if drives is None else drives.device)
         self._owned = drives is None
         self.drives = self._new_drives(num_envs) if drives is None else drives
         try:

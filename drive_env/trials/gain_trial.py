@@ -21,7 +21,18 @@ from drive_env.drives.speeds import per_increment
 from drive_env.gains import write_gains
 from drive_env.motors import Motor
 from drive_env.trials.oscillation import shakes
-from drive_env.trials.positioning import CYCLE, TRIAL, WATCH, Move, move_terms, plan_move, start, wrapped, write_profile
+from drive_env.trials.positioning import (
+    CYCLE,
+    TRIAL,
+    WATCH,
+    Move,
+    move_terms,
+    plan_move,
+    power_up,
+    start,
+    wrapped,
+    write_profile,
+)
 from drive_env.trials.score import Terms, cost
 
 Floats = NDArray[np.float64]
@@ -129,7 +140,7 @@ class Trials:
         position, velocity, current = (np.concatenate([trace[name] for trace in traces]) for name in objects)
         angle = wrapped(position - origin) / move.increments
         speed = velocity / (scaler * per_increment(drives, cia402.VELOCITY_ACTUAL)) * 2.0 * np.pi
-        return _momentum_balance(angle, speed, current * 1e-3, self._motor), origin
+        return momentum_balance(angle, speed, current * 1e-3, self._motor), origin
 
     def run(
         self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
@@ -184,6 +195,17 @@ class Trials:
                 return
             clear(drives, down)
             drives.advance(RECOVERY_TIME)
+
+    def power_up(self, where: Mask) -> None:
+        """Take drives that were just switched on to pp, enabled, in as many milliseconds whatever becomes of them."""
+        power_up(self._drives, where)
+
+    def go(self, target: Integers, where: Mask) -> None:
+        """Set off for a position [inc]."""
+        start(self._drives, _on_the_counter(target), where)
+
+    def leave(self) -> None:
+        """Give the drives back what trials have changed besides gains and profiles; the axes must be disabled."""
 
     def down(self) -> Mask:
         """Return which axes are not enabled."""
@@ -248,7 +270,7 @@ def _on_the_counter(position: Integers) -> Integers:
     return wrapped(position).astype(np.int64)
 
 
-def _momentum_balance(angle: Floats, speed: Floats, current: Floats, motor: Motor) -> Identified:
+def momentum_balance(angle: Floats, speed: Floats, current: Floats, motor: Motor) -> Identified:
     """Fit i = (J domega/dt) / K_t + coulomb sign(omega) + viscous omega + offset, integrated once over time.
 
     The integral has no derivative of a noisy speed, and an elastic load that swings has little momentum of its own.

@@ -11,6 +11,8 @@ Lower is better. Every machine is judged on its own scales:
           rated current; on a bus that of the actual current
     os  = largest way beyond the target over the move
 
+An open-loop stepper has a J of its own (`open_loop.py`).
+
 The robust cost is half of J plus half of the largest J of the machine as it is and its variants (`VARIANTS`). It is for
 scoring and training, never something to observe: a load step, and the machine's variants, do not exist on hardware.
 """
@@ -62,12 +64,13 @@ _STIFFNESS = ("jnt_stiffness", "contact_stiffness")
 
 
 class Variant(NamedTuple):
-    """A variant of the machine: factors of its inertia and stiffness, and of velocity P."""
+    """A variant of the machine: factors of its inertia and stiffness, of velocity P, or of a stepper's run current."""
 
     name: str
     inertia: float = 1.0
     stiffness: float = 1.0
     velocity_p: float = 1.0
+    run_current: float = 1.0
 
 
 VARIANTS = (
@@ -76,6 +79,7 @@ VARIANTS = (
     Variant("load inertia x 0.7", inertia=0.7),
     Variant("stiffness x 0.8", stiffness=0.8),
     Variant("velocity P x 1.5", velocity_p=1.5),
+    Variant("run current x 0.8", run_current=0.8),
 )
 
 
@@ -155,17 +159,21 @@ class RobustScore:
         num_threads: int | None = None,
         friction: str = "stribeck",
     ) -> None:
+        from drive_env.devices import find_device
         from drive_env.emulator.emulated_drives import EmulatedDrives
         from mechanics.loads import find_load
         from mechanics.shaft import one, way
 
         found = find_load(load)
+        is_open_loop = find_device(device).gains.is_open_loop
         fields = {parameter.field for parameter in found.parameters}
         self.variants = tuple(
             variant
             for variant in VARIANTS
             if (variant.inertia == 1.0 or fields & set(_INERTIA))
             and (variant.stiffness == 1.0 or fields & set(_STIFFNESS))
+            and (variant.velocity_p == 1.0 or not is_open_loop)
+            and (variant.run_current == 1.0 or is_open_loop)
         )
         self.num_machines = num_machines
         self._drives: EmulatedDrives = EmulatedDrives(
@@ -178,7 +186,7 @@ class RobustScore:
         self._load_torque = -LOAD_SHARE * self._drives.motor.rated_torque / float(lever)
         self._constant: Floats = np.zeros(num_machines * len(self.variants))
         axes = (num_machines, len(self.variants), found.num_axes)
-        self._factors = np.tile(np.repeat([v.velocity_p for v in self.variants], axes[2]), axes[0])
+        self._factors = np.tile(np.repeat([v.velocity_p * v.run_current for v in self.variants], axes[2]), axes[0])
         self._axes = axes
         self._t_0 = np.ones(self._drives.num_axes)
         self._reference = np.ones((axes[0], axes[2]))  # E_0 [rad s]
@@ -204,8 +212,7 @@ class RobustScore:
         volts = np.repeat(np.asarray(supply, float), variants * self._axes[2])
         machine.supply = np.where(np.repeat(each, self._axes[2]), volts, machine.supply)
         filters = machine.parameters["stage.velocity_filter"]
-        t_0 = 4.0 * small_time_constants(self._drives.device, filters)
-        self._t_0 = np.repeat(t_0, self._axes[2])
+        self._t_0 = np.repeat(self._settling_scale(filters), self._axes[2])
 
     def set_constant_load(self, torque: Floats) -> None:
         """Set a constant load [N*m], (num_machines,), signed as `machine.load_torque`."""
@@ -238,6 +245,10 @@ class RobustScore:
     def close(self) -> None:
         """Close the drives."""
         self._drives.close()
+
+    def _settling_scale(self, filters: Floats) -> Floats:
+        """Return t_0 of the machines with these velocity filters [s]."""
+        return 4.0 * small_time_constants(self._drives.device, filters)
 
     def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return values of (num_machines * axes,) for the axes of all variants."""

@@ -23,6 +23,7 @@ from tuning.commands.options import (
 
 if TYPE_CHECKING:
     from tuning.auto.result import AxisResult, Result
+    from tuning.stepper.result import StepperResult
     from tuning.target import Target
 
 
@@ -40,6 +41,9 @@ def auto(
 ) -> None:
     """Tune a drive: identify, search gains, try, verify and store them; an axis that fails a check is rolled back.
 
+    Of an open-loop stepper it sets the phase currents, the StallGuard threshold and CoolStep, and writes
+    stepper-certificate.json in place of certificate.json and report.html.
+
     The motor turns, for about 12 s in all. The verdict is accepted, accepted with reservations, which are listed, or
     rejected. Writes before.toml, with which `drive-tune undo` restores the state before, certificate.json and
     report.html. Exit code 1 if an axis was rejected; the reason is printed.
@@ -50,6 +54,9 @@ def auto(
         folder = provenance.run_folder("auto") if out is None else out
         provenance.check_folder(folder)
         with drive.open() as target:
+            if target.device.gains.is_open_loop:
+                _stepper(target, folder, store, json)
+                return
             result = _run(target, folder, drive.seed, store)
             _report(target, result, folder, json)
         if not result.accepted.all():
@@ -70,6 +77,61 @@ def _run(target: Target, folder: Path, seed: int, store: bool) -> Result:
             )  # fmt: skip
     except KeyboardInterrupt:
         fail(f"interrupted; {_left_behind(target, file)}", INTERRUPTED)
+
+
+def _stepper(target: Target, folder: Path, store: bool, json: bool) -> None:
+    """Commission an open-loop stepper."""
+    from tuning.stepper.commissioning import check_stepper, commission
+    from tuning.stepper.result import certificate_file
+
+    check_stepper(target)
+    if target.drives.safety is not None:
+        from tuning.commands.optimise import leave_oscillations_to_trials
+
+        leave_oscillations_to_trials(target.drives)
+    file = folder / "before.toml"
+    try:
+        with progress_bar("commissioning") as show:
+            result = commission(
+                target, file, keep=store, progress=lambda what, share: show(share),
+                files=lambda result: certificate_file(result, folder),
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        fail(f"interrupted; {_left_behind(target, file)}", INTERRUPTED)
+    _report_stepper(target, result, folder, json)
+    if not result.accepted.all():
+        raise typer.Exit(REFUSED)
+
+
+def _report_stepper(target: Target, result: StepperResult, folder: Path, json: bool) -> None:
+    from tuning.stepper.result import CERTIFICATE
+
+    files = {"snapshot": str(result.file), "certificate": str(folder / CERTIFICATE)}
+    if json:
+        print_json(result.as_dict() | files)
+        return
+    names = [title.replace(" ", "\n") for title in target.device.gains.titles]
+    rows = [
+        (str(k), name, *map(str, gains.values()))
+        for k, axis in enumerate(result.axes)
+        for name, gains in (("before", axis.before), ("after", axis.after))
+    ]
+    print_table((Column("axis"), Column("", "name"), *map(Column, names)), rows)
+    lines = []
+    for k, axis in enumerate(result.axes):
+        if not axis.accepted:
+            lines.append(f"axis {k}: rejected, and its settings from before are restored: {axis.reason}")
+            continue
+        lines.append(f"axis {k}: {axis.verdict}")
+        lines += [f"axis {k}: {name}: {'not measured' if v is None else f'{v:g}'}" for name, v in axis.figures.items()]
+        lines += [f"axis {k}: reservation: {reservation}" for reservation in axis.reservations]
+    lines.append("not measured: current and load step (no 6077h), frequency response and margins (open loop)")
+    kept = "; the settings are stored in the drive" if result.kept else ""
+    lines.append(f"{result.drive_seconds:.1f} s of drive time{kept}")
+    lines.append(f"written to {folder}: before.toml, {CERTIFICATE}")
+    if target.bus:
+        lines.append(f"drive-tune undo {result.file} restores the state before")
+    print_lines(lines)
 
 
 def _left_behind(target: Target, file: Path) -> str:

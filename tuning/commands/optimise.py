@@ -133,9 +133,11 @@ def optimise(
         if resume:
             _check_unfinished(folder, journal)
         provenance.check_folder(folder)
-        known = find_device(drive.device).gains
-        searched = tuple(gains) if gains else known.outer
-        known.columns(searched)  # before anything moves
+        from drive_env.trials.method import check_tried
+
+        device = find_device(drive.device)
+        searched = tuple(gains) if gains else device.gains.outer
+        check_tried(device, searched)  # before anything moves
         settings = Settings(
             sampler=sampler,
             trials=trials,
@@ -316,7 +318,7 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
 
     from drive_env.devices import find_device
     from tuning.search.optimise import COST
-    from tuning.search.trials_files import TITLES
+    from tuning.search.trials_files import titles as titles_of
 
     searches = sorted({row.search for row in found.rows})
     axes = len(found.gains) // max(len(searches), 1)
@@ -324,7 +326,7 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
     several = settings.objectives != (COST,)
     shown = (COST, *(name for name in settings.objectives if name != COST))
     titles = [name.replace("_", "\n") for name in find_device(device).gains.names] + [
-        _on_two_lines(TITLES[name]) for name in shown
+        _on_two_lines(titles_of(device)[name]) for name in shown
     ]
     columns = [Column("", "name"), *map(Column, titles)]
     for search in searches:
@@ -347,6 +349,12 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
             which = f"search {row.search}, trial" if len(searches) > 1 else "trial"
             lines.append(f"{which} {row.number} was stopped: the drive reported {row.cause}")
     lines += sorted({note for note in found.notes if note})
+    if find_device(device).gains.is_open_loop:
+        lines.append(
+            "J has no load step and no ripple of the current here: the drive measures no current (no 6077h). E_d/E_0 "
+            "follows from the standby current, effort from the settings; settling, load angle, vibration and lost "
+            "steps are the encoder's."
+        )
     if before is None and len(searches) > 1 and np.isfinite(found.cost).any():
         lines.append(f"search {int(np.nanargmin(found.cost))} found the best gains")
     lines.append(f"written to {folder}: trials.csv, trials.png, settings.toml")

@@ -24,7 +24,9 @@ from tuning.commands.options import (
 )
 
 BEST_ROWS = 10
-TABLE_FIGURES = ("settling [s]", "overshoot [%]", "dip [rpm]", "ripple [A]")
+TABLE_FIGURES = (
+    "settling [s]", "overshoot [%]", "dip [rpm]", "ripple [A]", "load_angle [full steps]", "effort [%]",
+)  # fmt: skip
 
 
 def sweep(
@@ -153,7 +155,11 @@ def _print_result(result: Any, folder: Path) -> None:
         _print_best(result, min(BEST_ROWS, usable))
     counts = ", ".join(
         f"{int(result.columns[flag].sum())} {word}"
-        for flag, word in (("oscillates", "oscillate"), ("fault", "end in fault"), ("diverged", "diverge"))
+        for flag, word in (
+            ("oscillates", "oscillate"),
+            ("fault", "end in fault" if result.response.lag is None else "end in fault or lose steps"),
+            ("diverged", "diverge"),
+        )
     )
     lines = [f"{usable} of {len(result.order)} points are usable; {counts}."]
     if not usable and result.columns["fault"].all():
@@ -163,6 +169,11 @@ def _print_result(result: Any, folder: Path) -> None:
         )
     elif not usable:
         lines.append("No point is usable: choose other ranges; heatmap.png and results.csv show all points.")
+    if result.response.lag is not None:
+        lines.append(
+            "This drive measures no current (no 6077h): there is no ripple and no peak current; effort is the square "
+            "of the run current that is set, load angle and lost steps are by the encoder."
+        )
     lines += [f"{name} has no effect in this experiment." for name in result.without_effect()]
     if result.simulated > 0.0:
         lines.append(
@@ -175,7 +186,7 @@ def _print_result(result: Any, folder: Path) -> None:
 
 def _print_best(result: Any, count: int) -> None:
     metric = result.experiment.metric.name
-    figures = [name for name in TABLE_FIGURES if not name.startswith(f"{metric} [")]
+    figures = [name for name in TABLE_FIGURES if name in result.columns and not name.startswith(f"{metric} [")]
     # Seven columns fit a terminal of 80 characters.
     shown = [*result.objects, result.score_column, *figures[: max(0, 6 - len(result.objects))]]
     # Seconds are read as milliseconds.
@@ -189,13 +200,13 @@ def _print_best(result: Any, count: int) -> None:
 
 
 def _show_config(config: Path | None, overrides: dict[str, Any]) -> None:
-    from tuning.runs.experiment import DEFAULT, load_experiment
+    from tuning.runs.experiment import load_experiment, shipped_experiment
 
     experiment = load_experiment(config, **overrides)
     if any(value is not None for value in overrides.values()):
         text = experiment.to_toml(experiment.versions)
     else:
-        text = (config or DEFAULT).read_text(encoding="utf-8")
+        text = (config or shipped_experiment(None)).read_text(encoding="utf-8")
     sys.stdout.write(text)
 
 
@@ -204,7 +215,7 @@ def _list_names() -> None:
     from drive_env.motors import MOTORS
     from mechanics.loads import LOADS
     from tuning.runs.experiment import gain_objects
-    from tuning.runs.metrics import METRICS, TRACKING
+    from tuning.runs.metrics import METRICS, OPEN_LOOP_METRICS, OPEN_LOOP_TRACKING, TRACKING
 
     devices = [find_device(name) for name in device_names()]
     gains: dict[tuple[str, str], list[str]] = {}  # by object and what it is: devices that have it
@@ -224,5 +235,9 @@ def _list_names() -> None:
             "loads": {load.name: load.meaning for load in LOADS.values()},
             "metrics": {f"{TRACKING.name} [{TRACKING.unit}]": combined}
             | {f"{row.name} [{row.unit}]": row.meaning for row in METRICS.values()},
+            "metrics of open-loop steppers": {f"{TRACKING.name} [{TRACKING.unit}]": OPEN_LOOP_TRACKING.meaning}
+            | {
+                f"{row.name} [{row.unit}]": row.meaning for row in OPEN_LOOP_METRICS.values() if row.name not in METRICS
+            },
         }
     )

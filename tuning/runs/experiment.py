@@ -18,17 +18,18 @@ from drive_env import cia402
 from drive_env.devices import Device, find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
-from drive_env.dictionary.roles import Role
+from drive_env.dictionary.position_scale import position_scale
 from drive_env.drives.speeds import per_increment_of
 from drive_env.gains import gain_factors
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.untrusted import read_toml
-from tuning.runs.metrics import TRACKING, metric_names
+from tuning.runs.metrics import OPEN_LOOP_TRACKING, TRACKING, combined_of, metric_names
 from tuning.toml_tables import ExperimentError as ExperimentError
 from tuning.toml_tables import as_table, as_value, check_keys, kind_of, read_table, toml, toml_lines
 
 DEFAULT = Path(__file__).parent / "sweep.toml"
+OPEN_LOOP = Path(__file__).parent / "open_loop_sweep.toml"  # of drives without loops
 MAX_POINTS = 262_144
 MAX_DURATION = 60.0  # s
 MIN_SAMPLES = 20  # in each of the two windows; fewer say nothing about ringing
@@ -148,7 +149,7 @@ def load_experiment(config: str | Path | None = None, **overrides: Any) -> Exper
     Raises:
         ExperimentError: With the key, its value, the limit and the remedy.
     """
-    path = DEFAULT if config is None else Path(config)
+    path = shipped_experiment(overrides.get("device")) if config is None else Path(config)
     try:
         data = read_toml(path)
     except (OSError, UnicodeDecodeError) as error:
@@ -160,10 +161,24 @@ def load_experiment(config: str | Path | None = None, **overrides: Any) -> Exper
         ) from None
     written = _parse(data)
     experiment = replace(written, **{key: value for key, value in overrides.items() if value is not None})
-    if config is None and experiment.device != written.device:
+    if path == DEFAULT and config is None and experiment.device != written.device:
         experiment = replace(experiment, sweep=_same_gains(written, experiment.device))
     resolve(experiment)
     return experiment
+
+
+def shipped_experiment(device: str | None) -> Path:
+    """Return the experiment that ships for a device, None for the default one.
+
+    Raises:
+        ExperimentError: For a device that is none.
+    """
+    if device is None:
+        return DEFAULT
+    try:
+        return OPEN_LOOP if find_device(device).gains.is_open_loop else DEFAULT
+    except ValueError as error:
+        raise ExperimentError(str(error)) from None
 
 
 def resolve(experiment: Experiment) -> Resolved:
@@ -183,12 +198,9 @@ def resolve(experiment: Experiment) -> Resolved:
     dictionary = device.new_dictionary()
     entries = tuple(_swept_entry(device, dictionary, k, swept) for k, swept in enumerate(experiment.sweep, 1))
     _check_grid(experiment, entries)
-    _check_metric(experiment.metric)
+    _check_metric(experiment.metric, device)
     _check_times(experiment.excitation, 1.0 / device.communication_rate)
-    scaler = int(dictionary.find(Role.POSITION_SCALE).default)
-    scaler = {dictionary.find(name).label: value for name, value in preset.items()}.get(
-        dictionary.find(Role.POSITION_SCALE).label, scaler
-    )
+    scaler = _position_scale(device, dictionary, preset)
     velocity = experiment.excitation.raw_velocity(dictionary.find(TARGET_VELOCITY), scaler)
     acceleration = experiment.excitation.raw_acceleration(dictionary.find(ACCELERATION), scaler)
     for key, raw, target in (("velocity", velocity, TARGET_VELOCITY), ("acceleration", acceleration, ACCELERATION)):
@@ -204,6 +216,17 @@ def resolve(experiment: Experiment) -> Resolved:
             "velocity other than 0 and an acceleration above 0"
         )
     return Resolved(device, entries, scaler, velocity, acceleration)
+
+
+def _position_scale(device: Device, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> int:
+    """Return the increments of a revolution as a drive has them that was commissioned with a preset."""
+    scale = position_scale(device.roles)
+    if scale is None:
+        raise ExperimentError(f"{device.name} does not say how many increments a turn has, in its roles.toml")
+    given = {dictionary.find(name).label: value for name, value in preset.items()}
+    entries = [dictionary.find(key) for key in scale.keys]
+    values = [np.array([given.get(entry.label, entry.default)], float) for entry in entries]
+    return int(scale.increments(values)[0])
 
 
 def _same_gains(experiment: Experiment, name: str) -> tuple[SweptObject, ...]:
@@ -296,10 +319,10 @@ def _check_grid(experiment: Experiment, entries: tuple[Entry, ...]) -> None:
         raise ExperimentError(f"the grid has {product} = {points} points; the limit is {MAX_POINTS}: lower a count")
 
 
-def _check_metric(metric: MetricChoice) -> None:
-    if metric.name not in metric_names():
-        raise ExperimentError(f"metric: name = {metric.name!r} is unknown; there are {', '.join(metric_names())}")
-    wanted = TRACKING.weights if metric.name == TRACKING.name else {}
+def _check_metric(metric: MetricChoice, device: Device) -> None:
+    if metric.name not in (known := metric_names(device)):
+        raise ExperimentError(f"metric: name = {metric.name!r} is unknown; there are {', '.join(known)}")
+    wanted = combined_of(device).weights if metric.name == TRACKING.name else {}
     if set(metric.weights) != set(wanted):
         needed = f"the weights {', '.join(wanted)}" if wanted else "no weights"
         raise ExperimentError(
@@ -354,6 +377,13 @@ def _raw(in_rpm: float | None, in_pps: float | None, entry: Entry, position_scal
     return round(value * per_increment_of(entry.unit, position_scaler))
 
 
+def _is_open_loop(device: object) -> bool:
+    try:
+        return find_device(str(device)).gains.is_open_loop
+    except ValueError:  # `resolve` says it
+        return False
+
+
 # --- the TOML ---------------------------------------------------------------------------------------------------------
 def _parse(data: Mapping[str, Any]) -> Experiment:
     """Return the experiment of TOML data; keys and types are checked, names and limits are not."""
@@ -372,7 +402,8 @@ def _parse(data: Mapping[str, Any]) -> Experiment:
     check_keys("metric", metric, ["name", "weights"], optional={"weights"})
     given = as_table("metric: weights", metric.get("weights", {}))
     name = as_value("metric: name", metric["name"], "str")
-    combined = dict(TRACKING.weights) if name == TRACKING.name and not given else {}
+    own = OPEN_LOOP_TRACKING if _is_open_loop(data["device"]) else TRACKING
+    combined = dict(own.weights) if name == TRACKING.name and not given else {}
     weights = combined | {key: as_value(f"metric: weight {key}", value, "float") for key, value in given.items()}
     versions = as_table("versions", data.get("versions", {}))
     return Experiment(

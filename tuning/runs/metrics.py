@@ -7,12 +7,15 @@ settles) is nan.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.trials import response
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -34,6 +37,10 @@ class MoveRecording(NamedTuple):
     current_limit: Floats  # A, shape (p,)
     t_step: float  # s
     t_load: float  # s
+    # Of an open loop, whose drive measures no current (the two above are nan): demand less encoder [full steps], shape
+    # (n, p), and the mean square of the run current that is set over the motor's rated one, shape (p,).
+    lag: Floats | None = None
+    effort: Floats | None = None
 
     def point(self, k: int) -> MoveRecording:
         """Return the recording of point k alone."""
@@ -41,6 +48,8 @@ class MoveRecording(NamedTuple):
             speed_rpm=self.speed_rpm[:, [k]].copy(),
             current=self.current[:, [k]].copy(),
             current_limit=self.current_limit[[k]],
+            lag=None if self.lag is None else self.lag[:, [k]].copy(),
+            effort=None if self.effort is None else self.effort[[k]],
         )
 
 
@@ -50,7 +59,7 @@ class Figures(NamedTuple):
     recording: MoveRecording
     step: response.StepMetrics
     disturbance: response.DisturbanceMetrics
-    current: response.CurrentMetrics
+    current: response.CurrentMetrics | None  # None in open loop
     step_error: Floats  # shape (samples, p), from the step to the load step
     load_error: Floats  # shape (samples, p), from the load step on
 
@@ -74,7 +83,9 @@ def figures(recording: MoveRecording) -> Figures:
         recording=recording,
         step=response.step_metrics(t, speed, reference, t_step=recording.t_step, t_end=recording.t_load, initial=0.0),
         disturbance=response.disturbance_metrics(t, speed, reference, t_load=recording.t_load, band=RECOVERY_BAND),
-        current=response.current_metrics(recording.current[first:], i_max=recording.current_limit),
+        current=None
+        if recording.lag is not None
+        else response.current_metrics(recording.current[first:], i_max=recording.current_limit),
         step_error=error[first : load + 1],
         load_error=error[load:],
     )
@@ -83,6 +94,8 @@ def figures(recording: MoveRecording) -> Figures:
 def oscillates(found: Figures) -> Mask:
     """Return which points ring without decaying, in the velocity or in the current, shape (p,)."""
     recording = found.recording
+    if recording.lag is not None:  # there is no current to swing
+        return np.asarray(found.step.oscillating)
     window = slice(_index(recording.t, recording.t_step), _index(recording.t, recording.t_load) + 1)
     ringing, _ = response.oscillation(
         recording.t[window] - recording.t_step,
@@ -111,9 +124,16 @@ def tracking(found: Figures, weights: Mapping[str, float]) -> Floats:
     h is the height of the velocity step, IAE_step the integral of |set-point - actual| up to the load torque step,
     IAE_load the same from there to the end, i_ripple the metric `ripple` and i_max the drive's current limit. The first
     two are seconds of full error; the weight of the third [s] is what a ripple of the whole current limit would cost:
-    with 0.2 s, one percent of it is worth 2 ms.
+    with 0.2 s, one percent of it is worth 2 ms. In open loop the third term is
+    effort * (i/i_rated)^2 of the run current.
     """
     height = abs(float(found.recording.reference_rpm[-1]))
+    if found.recording.effort is not None:
+        return (
+            weights["step"] * _iae(found) / height
+            + weights["disturbance"] * _disturbance_iae(found) / height
+            + weights["effort"] * found.recording.effort
+        )
     return (
         weights["step"] * _iae(found) / height
         + weights["disturbance"] * _disturbance_iae(found) / height
@@ -123,7 +143,7 @@ def tracking(found: Figures, weights: Mapping[str, float]) -> Floats:
 
 def score(name: str, weights: Mapping[str, float], found: Figures) -> Floats:
     """Return the metric that ranks, plain or combined, shape (p,)."""
-    return tracking(found, weights) if name == TRACKING.name else METRICS[name].function(found)
+    return tracking(found, weights) if name == TRACKING.name else (METRICS | OPEN_LOOP_METRICS)[name].function(found)
 
 
 def _iae(found: Figures) -> Floats:
@@ -136,6 +156,11 @@ def _itae(found: Figures) -> Floats:
 
 def _disturbance_iae(found: Figures) -> Floats:
     return response.iae(found.recording.t[: len(found.load_error)], found.load_error)
+
+
+def _peak_current(found: Figures) -> Floats:
+    assert found.current is not None, "a loop of the current measures it"
+    return found.current.peak
 
 
 def _rms_current(found: Figures) -> Floats:
@@ -161,11 +186,33 @@ METRICS: dict[str, Metric] = {
         Metric("recovery", "s", "until it stays within 20 % of the dip", lambda f: f.disturbance.recovery_time),
         Metric("disturbance_iae", "rpm*s", "integral of |set-point - actual velocity| from the load torque on",
                _disturbance_iae),
-        Metric("peak_current", "A", "largest |i_q| from the step on", lambda f: f.current.peak),
+        Metric("peak_current", "A", "largest |i_q| from the step on", _peak_current),
         Metric("rms_current", "A", "RMS of i_q from the step on", _rms_current),
         Metric("ripple", "A", "RMS change of i_q per sample, once the step is over", ripple),
     )
 }  # fmt: skip
+
+
+# Of an open loop: no figure of a measured current, and what encoder, step counter and settings say.
+OPEN_LOOP_METRICS: dict[str, Metric] = {
+    name: row for name, row in METRICS.items() if name not in ("peak_current", "rms_current", "ripple")
+} | {
+    row.name: row
+    for row in (
+        Metric("load_angle", "full steps", "largest |demand - encoder| from the step on; 1 is the pull-out",
+               lambda f: np.abs(_lag(f)).max(axis=0)),
+        Metric("vibration", "full steps", "RMS change of it per sample, once the step is over",
+               lambda f: response.rms(np.diff(_lag(f)[_index(f.recording.t, f.recording.t_load) // 2 :], axis=0))),
+        Metric("effort", "%", "mean square of the run current that is set, of the rated one",
+               lambda f: 100.0 * np.asarray(f.recording.effort)),
+    )
+}  # fmt: skip
+
+
+def _lag(found: Figures) -> Floats:
+    recording = found.recording
+    assert recording.lag is not None, "an open loop has a load angle"
+    return recording.lag[_index(recording.t, recording.t_step) :]
 
 
 class Combined(NamedTuple):
@@ -185,11 +232,27 @@ TRACKING = Combined(
 )
 
 
+OPEN_LOOP_TRACKING = TRACKING._replace(
+    meaning="the same in open loop: with the square of the run current over the rated one in place of the ripple",
+    weights={"step": 1.0, "disturbance": 1.0, "effort": 0.01},
+)
+
+
+def metrics_of(device: Device) -> dict[str, Metric]:
+    """Return the metrics that a device's drives can show."""
+    return OPEN_LOOP_METRICS if device.gains.is_open_loop else METRICS
+
+
+def combined_of(device: Device) -> Combined:
+    """Return the combined metric of a device."""
+    return OPEN_LOOP_TRACKING if device.gains.is_open_loop else TRACKING
+
+
 def unit_of(name: str) -> str:
     """Return the unit of a metric, plain or combined."""
-    return TRACKING.unit if name == TRACKING.name else METRICS[name].unit
+    return TRACKING.unit if name == TRACKING.name else (METRICS | OPEN_LOOP_METRICS)[name].unit
 
 
-def metric_names() -> list[str]:
-    """Return the names of all metrics, the combined one first."""
-    return [TRACKING.name, *METRICS]
+def metric_names(device: Device) -> list[str]:
+    """Return the names of all metrics of a device, the combined one first."""
+    return [TRACKING.name, *metrics_of(device)]

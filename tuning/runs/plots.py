@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mechanics.loads import find_load
 from tuning.runs import metrics
 from tuning.runs.experiment import SweptObject
+from tuning.runs.metrics import MoveRecording
 
 if TYPE_CHECKING:
     from tuning.runs.sweep import SweepResult
@@ -58,14 +59,11 @@ def best_response(result: SweepResult) -> Figure:
     speed.plot(t, recording.reference_rpm, color="black", linewidth=1.0, linestyle="--", label="set-point")
     speed.set_ylabel("velocity [rpm]")
     speed.legend(loc="lower right")
-    current.plot(t, recording.current[:, 0], color="#d55e00", linewidth=1.2, label="actual current")
-    limit = float(recording.current_limit[0])
-    if np.abs(recording.current[:, 0]).max() > 0.7 * limit:
-        for sign in (1.0, -1.0):
-            current.axhline(sign * limit, color="black", linewidth=0.8, linestyle=":",
-                            label="current limit" if sign > 0 else None)  # fmt: skip
-        current.legend(loc="best")
-    current.set_ylabel("current i_q [A]")
+    if recording.lag is not None:
+        current.plot(t, recording.lag[:, 0], color="#d55e00", linewidth=1.2)
+        current.set_ylabel("load angle [full steps]")
+    else:
+        _draw_current(current, t, recording)
     torque = np.where(recording.t >= recording.t_load - 1e-9, excitation.load_torque, 0.0)
     load.plot(t, torque, color="#009e73", linewidth=1.4, drawstyle="steps-post")
     unit = find_load(result.experiment.load).disturbance_unit
@@ -80,6 +78,18 @@ def best_response(result: SweepResult) -> Figure:
     figure.align_ylabels()
     figure.suptitle(_title(result), fontsize=11)
     return figure
+
+
+def _draw_current(current: Axes, t: Floats, recording: MoveRecording) -> None:
+    """Draw the measured current, and its limit where it comes near."""
+    current.plot(t, recording.current[:, 0], color="#d55e00", linewidth=1.2, label="actual current")
+    limit = float(recording.current_limit[0])
+    if np.abs(recording.current[:, 0]).max() > 0.7 * limit:
+        for sign in (1.0, -1.0):
+            current.axhline(sign * limit, color="black", linewidth=0.8, linestyle=":",
+                            label="current limit" if sign > 0 else None)  # fmt: skip
+        current.legend(loc="best")
+    current.set_ylabel("current i_q [A]")
 
 
 def _title(result: SweepResult) -> str:
@@ -171,7 +181,8 @@ def _legend(axes: Axes, result: SweepResult) -> None:
         handles.append(Line2D([], [], **BEST, label="best"))
     flagged = int((~result.usable).sum())
     if flagged:
-        text = f"oscillating, in fault or diverged ({flagged} points)"
+        steps = ", steps lost" if result.response.lag is not None else ""
+        text = f"oscillating, in fault{steps} or diverged ({flagged} points)"
         handles.append(Patch(facecolor=UNUSABLE, edgecolor="0.6", label=text))
     missing = int((result.usable & ~np.isfinite(result.score)).sum())
     if missing:

@@ -18,9 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import EmulatedDrives, cia402, motion
+from drive_env.devices import Device, find_device
+from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment_of
 from drive_env.drives.trace import Trace
+from drive_env.phase_current import run_and_standby
+from drive_env.trials.open_loop import ENCODER, LOST, TOOTH
+from drive_env.trials.positioning import wrapped
 from mechanics.loads import find_load
 from mechanics.model import COPIES_PER_MODEL
 from tuning.runs import metrics, provenance
@@ -205,7 +210,8 @@ def run(
     wall = time.perf_counter() - started
     simulated = experiment.excitation.duration * sum(part.last - part.first for part in left)
     in_order = [found[first] for first in sorted(found)]
-    columns = {name: np.concatenate([arrays[name] for arrays in in_order]) for name in _column_names()}
+    names = _column_names(resolved.device)
+    columns = {name: np.concatenate([arrays[name] for arrays in in_order]) for name in names}
     return _ranked(experiment, resolved, columns, _best(in_order, experiment), simulated, wall)
 
 
@@ -250,20 +256,24 @@ def simulate(shard: Shard, report: Callable[[float], None] = lambda _share: None
     worst = np.argmax(_score(columns).reshape(-1, axes), axis=1) + np.arange(len(points)) * axes
     columns = {name: values[worst] for name, values in columns.items()}
     best = recording.point(int(worst[np.argmin(_score(columns))]))
-    return columns | {f"best.{name}": np.asarray(getattr(best, name)) for name in _RECORDED}
+    return columns | {f"best.{name}": np.asarray(getattr(best, name)) for name in _recorded(experiment)}
 
 
 _RECORDED = ("t", "reference_rpm", "speed_rpm", "current", "current_limit")
 
 
-def _column_names() -> list[str]:
-    return ["score", *metrics.METRICS, *FLAGS]
+def _recorded(experiment: Experiment) -> tuple[str, ...]:
+    return (*_RECORDED, "lag", "effort") if find_device(experiment.device).gains.is_open_loop else _RECORDED
+
+
+def _column_names(device: Device) -> list[str]:
+    return ["score", *metrics.metrics_of(device), *FLAGS]
 
 
 def _best(found: list[Arrays], experiment: Experiment) -> MoveRecording:
     """Return the recording of the best point; of equals that of the first shard."""
     shard = found[int(np.argmin([_score(arrays).min() for arrays in found]))]
-    recorded = {name: shard[f"best.{name}"] for name in _RECORDED}
+    recorded = {name: shard[f"best.{name}"] for name in _recorded(experiment)}
     excitation = experiment.excitation
     return MoveRecording(**recorded, t_step=excitation.velocity_time, t_load=excitation.load_time)
 
@@ -272,7 +282,14 @@ def _compile(experiment: Experiment) -> None:
     """Compile the kernels, or load them, here and now: from a thread, Ctrl-C would have to wait for the compiler."""
     with _machines(experiment, 1, 1) as drives:
         motion.enable(drives, mode="pv")
-        drives.record([cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL], 0.001)
+        drives.record(_signals(drives.device), 0.001)
+
+
+def _signals(device: Device) -> list[ObjectName]:
+    """Return what is recorded: velocity and current, or what an open loop has in place of a measured current."""
+    if device.gains.is_open_loop:
+        return [cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL]
+    return [cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL]
 
 
 def _machines(experiment: Experiment, count: int, num_threads: int | None) -> EmulatedDrives:
@@ -295,7 +312,9 @@ def _record(
     report: Callable[[float], None],
 ) -> tuple[MoveRecording, NDArray[np.bool_]]:
     """Return the recording of every point, and which ended in fault."""
-    excitation = experiment.excitation
+    excitation, is_open_loop = experiment.excitation, resolved.device.gains.is_open_loop
+    if is_open_loop:
+        drives.write(cia402.SENSOR_SELECTION, ENCODER)
     # Enabled with the preset's gains, which are stable, so that the point's gains meet every axis in the same state.
     motion.enable(drives, mode="pv")
     drives.write((cia402.PROFILE_ACCELERATION, 0), resolved.acceleration)
@@ -309,29 +328,54 @@ def _record(
         if start == excitation.load_time:
             drives.machine.load_torque = excitation.load_torque
         period = excitation.sampling_period
-        traces.append(
-            drives.record(
-                [cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL], round((end - start) / period) * period, period=period
-            )
-        )
+        traces.append(drives.record(_signals(resolved.device), round((end - start) / period) * period, period=period))
         report(end / excitation.duration)
     t = np.arange(sum(map(len, traces)), dtype=np.float64) * excitation.sampling_period
     velocity_unit = resolved.device.bindings[cia402.VELOCITY_ACTUAL, 0].unit
     rpm = 60.0 / resolved.position_scaler / per_increment_of(velocity_unit, resolved.position_scaler)
     ramp = np.clip((t - excitation.velocity_time) * resolved.acceleration, 0.0, abs(resolved.velocity))
+    if is_open_loop:
+        signals = _open_loop_signals(drives, traces, period)
+    else:
+        signals = {
+            "speed_rpm": np.concatenate([trace[cia402.VELOCITY_ACTUAL] for trace in traces]) * rpm,
+            "current": np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * 1e-3,
+            "current_limit": drives.read(Role.CURRENT_LIMIT).astype(np.float64) * 1e-3,
+        }
     recording = MoveRecording(
         t=t,
         reference_rpm=np.sign(resolved.velocity) * ramp * rpm,
-        speed_rpm=np.concatenate([trace[cia402.VELOCITY_ACTUAL] for trace in traces]) * rpm,
-        current=np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * 1e-3,
-        current_limit=drives.read(Role.CURRENT_LIMIT).astype(np.float64) * 1e-3,
         t_step=excitation.velocity_time,
         t_load=excitation.load_time,
+        **signals,
     )
     tripped = cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
     for message in drives.emergencies():
         tripped[message.axis] = True  # a limit of travel too: what follows it says nothing of the gains
+    if recording.lag is not None:  # steps were lost
+        tripped |= (np.abs(recording.lag) > LOST).any(axis=0)
     return recording, tripped
+
+
+def _open_loop_signals(drives: EmulatedDrives, traces: list[Trace], period: float) -> dict[str, NDArray[np.float64]]:
+    """Return speed by the encoder, load angle and effort of the points, and nan for a current that nothing measures.
+
+    606Ch of these drives is the speed of the steps, whatever the rotor does.
+    """
+    demand, actual = (
+        np.concatenate([trace[name] for trace in traces]) for name in (cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL)
+    )
+    scale = np.asarray(drives.read(Role.POSITION_SCALE), float)
+    full_step = scale / (TOOTH * drives.motor.n_p)
+    run, _ = run_and_standby(drives.device, drives.device.gains.read(drives))
+    way = wrapped(actual - actual[0])
+    return {
+        "speed_rpm": np.gradient(way, period, axis=0) * 60.0 / scale,
+        "current": np.full(demand.shape, np.nan),
+        "current_limit": np.full(drives.num_axes, np.nan),
+        "lag": wrapped(demand - actual) / full_step,
+        "effort": np.asarray((run / drives.motor.rated_current) ** 2),
+    }
 
 
 def _pieces(step: float, load: float, end: float, piece: float, period: float) -> list[tuple[float, float]]:
@@ -353,7 +397,7 @@ def _evaluate(experiment: Experiment, recording: MoveRecording) -> dict[str, NDA
     found = metrics.figures(recording)
     choice = experiment.metric
     columns: dict[str, NDArray[Any]] = {"score": metrics.score(choice.name, choice.weights, found)}
-    for row in metrics.METRICS.values():
+    for row in metrics.metrics_of(find_device(experiment.device)).values():
         columns[row.name] = np.asarray(row.function(found), np.float64)
     columns["diverged"] = np.asarray(~np.isfinite(recording.speed_rpm).all(axis=0))
     columns["oscillates"] = metrics.oscillates(found)
@@ -383,7 +427,7 @@ def _ranked(
     columns: dict[str, NDArray[Any]] = {name: points[:, k] for k, name in enumerate(objects)}
     columns["rank"] = rank
     columns[f"score [{metrics.unit_of(experiment.metric.name)}]"] = score
-    for row in metrics.METRICS.values():
+    for row in metrics.metrics_of(resolved.device).values():
         columns[f"{row.name} [{row.unit}]"] = found[row.name]
     for flag in FLAGS:
         columns[flag] = found[flag]

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.gains import RAW_MAX
+from drive_env.trials.method import check_tried
 from tuning.runs.shard_log import ShardLog
 from tuning.search.samplers import SAMPLERS, Proposer, new_proposer
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
@@ -155,7 +156,8 @@ def optimise(
             "a search is continued from its log only if every trial starts from rest, and if it has no journal"
         )
     chosen = target.device.gains.outer if settings.gains is None else settings.gains
-    columns = target.device.gains.columns(chosen)  # before anything moves
+    check_tried(target.device, chosen)  # before anything moves
+    columns = target.device.gains.columns(chosen)
     with timed(target) as (watched, clock):
         bench = TrialBench(watched, anew=anew)
         bench.identify()
@@ -189,7 +191,7 @@ class _Search:
         self.rows: list[TrialRow] = []
         self.notes = [""] * machines
         self._bench, self._trials, self._settings, self._axes = bench, trials, settings, axes
-        self._columns, self._highest = columns, bench.target.device.gains.highest[columns]
+        self._columns, self._highest = columns, bench.highest[columns]
         # Machines of a search: they are its generation.
         self._members = [np.arange(machines)] if shared else [np.array([k]) for k in range(machines)]
         self._start = self._points(bench.safe if settings.safe else bench.rule)
@@ -328,25 +330,28 @@ class _Search:
                 self._tell(k, [point[k]], [point[k]], tried, gains)
             searches = [k for k in searches if not self._proved[k]]
             for k in searches:
-                point[k] = point[k] - math.log(2.0)
+                point[k] = point[k] - self._bench.method.caution * math.log(2.0)
         for k in searches:
             self._halted[k] = True
             self._note(
                 k,
-                f"the axis oscillated with the safe gains, and with 1/{2 ** (SAFE_STARTS - 1)} of them: no safe start",
+                f"the axis oscillated with the safe gains, and with 1/{2 ** (SAFE_STARTS - 1)} of them: no safe start"
+                if self._bench.method.measures_current
+                else "the axis was stopped even at its motor's rated current: no safe start",
             )
 
     def _held_back(self, k: int, point: Floats) -> Floats:
         """Return the point, in the safe search drawn near to what was proved and away from what was refuted."""
         if not self._settings.safe:
             return point
-        proved = np.array(self._proved[k])
+        proved, caution = np.array(self._proved[k]), self._bench.method.caution
         nearest = proved[np.abs(proved - point).max(axis=1).argmin()]
         step = np.clip(point - nearest, -SAFE_STEP, SAFE_STEP)
         for _ in range(SAFE_HALVINGS):
-            # Not beyond gains that oscillated: every gain as large, or nearer to them than half a step.
+            # Not beyond gains that oscillated, every one as large, nor currents that lost steps, every one as small;
+            # nor nearer to them than half a step.
             if not any(
-                np.all(nearest + step >= bad) or np.abs(nearest + step - bad).max() < 0.5 * SAFE_STEP
+                np.all(caution * (nearest + step - bad) >= 0.0) or np.abs(nearest + step - bad).max() < 0.5 * SAFE_STEP
                 for bad in self._refuted[k]
             ):
                 return np.asarray(nearest + step)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,18 +17,12 @@ from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import machine_of
 from drive_env.drives.observed import ObservedDrives
-from drive_env.gains import (
-    BASELINE_RULE,
-    Rule,
-    bandwidth_gains,
-    rule_gains,
-    small_time_constants,
-    write_gains,
-)
+from drive_env.gains import write_gains
 from drive_env.safety.envelope import SafetyError
-from drive_env.trials.gain_trial import Identified, Trial, Trials, measured_cost, softness
-from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, plan_move, start, wrapped, write_profile
-from drive_env.trials.score import TRIP, cost
+from drive_env.trials.gain_trial import Identified, Trial, measured_cost
+from drive_env.trials.method import method_of
+from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, plan_move, wrapped, write_profile
+from drive_env.trials.score import TRIP
 from tuning.auto.fallback_gains import FallbackGains
 from tuning.oscillation_watch import SOFTER, OscillationError, OscillationWatch
 from tuning.stop_causes import told_causes
@@ -39,13 +33,6 @@ Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL = 2, 3
-# What moves an axis of which nothing is known but its motor: the commissioning presets' bandwidths, three rotors.
-FIRST_HZ = {"current_hz": 1000.0, "velocity_hz": 20.0, "position_hz": 5.0}
-# The baseline rule at a third of its speed and with three times its integration time: where a safe search begins.
-SAFE_RULE = BASELINE_RULE._replace(
-    speed=BASELINE_RULE.speed / 3.0, integration=3.0 * BASELINE_RULE.integration, position=0.3 * BASELINE_RULE.position
-)
-
 CALM = 0.1  # s until what an axis did before has died away
 ASTRAY = 0.2  # of the move: an axis farther than that from where a trial starts is brought back first
 SOFTENINGS = 3  # of gains from the data sheet, with which an axis may oscillate
@@ -64,7 +51,8 @@ class Tried(NamedTuple):
         on growing a tenth as fast.
     objectives: In the order of `OBJECTIVES`, all to be small, (num_machines, 3): ln t_s/t_0 of the slower of move and
         reversal; ln of how much worse the worst phase is than move and reversal, the probe with velocity P x 1.5
-        among them; RMS increment of the current over the rated one [%].
+        among them; RMS increment of the current over the rated one [%], in open loop the RMS of the currents that are
+        set.
     aborted: Stopped in any phase, (num_machines,).
     fragile: Shook on with the incumbent's gains after it had been stopped, (num_machines,): those are none to keep.
     causes: Emergencies of the machine's drives meanwhile, texts, (num_machines,); "" where there were none.
@@ -87,6 +75,7 @@ class TrialBench:
 
     Attributes:
         t_0: Settling times are relative to this [s].
+        began: Where the axes were before their first trial [inc], (num_axes,).
     """
 
     def __init__(self, target: Target, *, anew: bool = False) -> None:
@@ -95,11 +84,13 @@ class TrialBench:
         self.aborts = np.zeros(target.num_axes, np.int64)
         self.moves = np.zeros(target.num_axes, np.int64)
         self._anew = anew and target.drives.machine is not None
-        device, motor = target.device, target.motor
-        self.t_0 = 4.0 * float(small_time_constants(device, device.stage["velocity_filter"].default))
+        motor = target.motor
+        self.method = method_of(target.device, motor)
+        self.t_0 = self.method.t_0()
+        self.highest = self.method.highest()
         self._fallback = FallbackGains(target.num_axes, motor.rated_current)
         self._drives = ObservedDrives(target.drives, self._fallback)
-        self._trials = Trials(self._drives, motor, target.axes_per_machine, self.t_0)
+        self._trials = self.method.trials(self._drives, target.axes_per_machine)
         self._reach = np.where(target.high >= -target.low, target.high, target.low)
         self._where = np.ones(target.num_axes, bool)
         self._direction = np.ones(target.num_axes, np.int64)
@@ -110,25 +101,44 @@ class TrialBench:
         }
         self._stops = 0
 
+    @property
+    def trials(self) -> Any:
+        """What runs the trials."""
+        return self._trials
+
+    @property
+    def reach(self) -> Floats:
+        """How far the rotors may turn from where they began, the longer way, with its sign [rad], (num_axes,)."""
+        return self._reach
+
+    @property
+    def origin(self) -> Integers:
+        """Where the next trial starts [inc], (num_axes,)."""
+        return self._origin
+
     def identify(self) -> None:
         """Find inertia and friction with gains from the data sheet alone; plan the moves, the rule's and safe gains."""
         target, drives = self.target, self.target.drives
         if self._anew:
             machine_of(drives).reset()
-        gains = first_gains(target)
+        present = read_gains(target)
+        gains = self.method.keep(first_gains(target), present)
         write_gains(drives, gains)  # before anything is enabled: the drives may have any
         self._trials.recover(self._where)
         drives.advance(CALM)
         self.identified, self._origin = self._moved(gains)
+        self.began = self._origin.copy()
         self._trials.recover(self._where)
         self.move = plan_move(target.motor, self.identified.inertia, drives.read(Role.POSITION_SCALE), self._reach)
         self.rule, self.safe = (
-            _rule_gains(target, self.identified.inertia, rule) for rule in (BASELINE_RULE, SAFE_RULE)
+            self.method.keep(rule(self.identified, self.move, target.supply), present)
+            for rule in (self.method.rule, self.method.safe)
         )
         self.incumbent = self.safe.copy()
         write_gains(drives, self.safe)
         drives.advance(TRIAL * CYCLE)  # the first gains may leave an axis swinging
-        self._fallback.calm = self.safe
+        if self.method.measures_current:
+            self._fallback.calm = self.safe
 
     def _moved(self, gains: Integers) -> tuple[Identified, Integers]:
         """Move there and back for identification; an axis that oscillates is switched off, and moves with softer gains.
@@ -137,13 +147,16 @@ class TrialBench:
             RuntimeError: If one oscillates with any.
         """
         target, drives = self.target, self.target.drives
+        if not self.method.measures_current:
+            self.moves += MOVES_OF_IDENTIFICATION
+            return self._trials.identify(self._reach, self._where)
         noise = target.device.stage["adc_noise"].high
         scaler = drives.read(Role.POSITION_SCALE)
         for _ in range(SOFTENINGS):
             began = drives.read(cia402.POSITION_ACTUAL)
             watch = OscillationWatch(self._where, np.full(target.num_axes, target.current), noise)
             watched = ObservedDrives(self._drives, watch)
-            trials = Trials(watched, target.motor, target.axes_per_machine, self.t_0)
+            trials = self.method.trials(watched, target.axes_per_machine)
             self.moves += MOVES_OF_IDENTIFICATION
             with suppress(OscillationError):
                 found = trials.identify(self._reach, self._where)
@@ -228,8 +241,7 @@ class TrialBench:
 
     def _cost(self, gains: Integers, tried: Trial) -> Floats:
         """Return the cost of every axis, (num_axes,): what is slow beyond J's end is still told from what is slower."""
-        known = self.target.device.gains
-        relative = softness(known, gains) / softness(known, self.rule)
+        relative = self.method.softness(gains) / self.method.softness(self.rule)
         # J is cut off at 30; with less of E_d, which enters as a factor, it is not.
         uncut = tried.costs(relative * _UNCUT) * _UNCUT**-E_D_EXPONENT
         worth = np.log(measured_cost(np.where(tried.aborted, TRIP, uncut)))
@@ -243,9 +255,9 @@ class TrialBench:
         slowest = 1.0 + (SETTLED - PROFILE) * CYCLE / self.t_0
         speed = np.log(np.where(moves, slowest, terms.settling[:2].max(axis=0)))
         # Without E_d/E_0, of which a probe with 1.5 times the gain has less in any case.
-        j = cost(terms._replace(tripped=tried.aborted))
+        j = self.method.cost(terms._replace(tripped=tried.aborted))
         worse = np.log(np.where(tried.aborted.any(axis=0), TRIP, j.max(axis=0) / j[:2].mean(axis=0)))
-        return np.stack([speed, worse, 100.0 * terms.noise[:2].mean(axis=0)], axis=-1)
+        return np.stack([speed, worse, 100.0 * self.method.current(terms)[:2].mean(axis=0)], axis=-1)
 
     def leave(self, gains: Integers) -> None:
         """Leave the drives with gains, otherwise as they were found, at standstill."""
@@ -257,6 +269,7 @@ class TrialBench:
             drives.write(
                 cia402.CONTROLWORD, cia402.SHUTDOWN, where=off
             )  # shutdown: a set-point is not taken up again when enabled anew
+        self._trials.leave()
 
     def _start_trial(self) -> None:
         if self._anew:
@@ -272,7 +285,7 @@ class TrialBench:
             return
         write_gains(drives, self.incumbent, astray)
         write_profile(drives, self.move, astray)
-        start(drives, wrapped(self._origin).astype(np.int64), astray)
+        self._trials.go(self._origin, astray)
         # The ramp takes at most as long as the farthest way at the profile's speed, and a trial's time.
         longest = np.max(way / self.move.velocity, where=astray, initial=0.0)
         drives.advance((TRIAL + math.ceil(longest / CYCLE)) * CYCLE)
@@ -281,26 +294,10 @@ class TrialBench:
 
 
 def first_gains(target: Target) -> Integers:
-    """Return gains from the data sheet alone, for a total inertia of three rotors, shape (num_axes, count)."""
-    motor = target.motor
-    return np.array(
-        [
-            bandwidth_gains(target.device, motor, 3.0 * motor.inertia, supply=float(volts), **FIRST_HZ)
-            for volts in target.supply
-        ],
-        np.int64,
-    )
+    """Return gains from the data sheet alone, shape (num_axes, count)."""
+    return method_of(target.device, target.motor).first(target.supply)
 
 
 def read_gains(target: Target) -> Integers:
     """Return the gains that the drives have, shape (num_axes, count)."""
     return target.device.gains.read(target.drives)
-
-
-def _rule_gains(target: Target, inertia: Floats, rule: Rule) -> Integers:
-    return np.concatenate(
-        [
-            rule_gains(target.device, target.motor, J, rule, supply=float(volts))
-            for J, volts in zip(inertia, target.supply, strict=True)
-        ]
-    )

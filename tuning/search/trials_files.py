@@ -32,6 +32,13 @@ MEANINGS = {
     "current": "ripple of the current [% of rated]",
 }
 
+# Of an open loop, whose drives measure no current: J has other terms, and a current is what was set.
+OPEN_LOOP_TITLES = TITLES | {"current": "current [%]"}
+OPEN_LOOP_MEANINGS = MEANINGS | {
+    COST: "J by measured terms, without load step and ripple of the current",
+    "current": "RMS of the currents that are set [% of rated]",
+}
+
 HEADER = "# All settings of the search. To repeat it: drive-tune optimise --config settings.toml\n"
 _SEARCH = ("sampler", "trials", "objectives", "gains", "width", "safe", "seed")
 _MACHINE = ("device", "motor", "load", "supply", "travel", "copies", "searches", "interface", "channel", "nodes",
@@ -55,9 +62,19 @@ def save(
     """
     table = io.StringIO()
     writer = csv.writer(table)
+    told = titles(machine["device"])
     names, gains_there_are = (COST, *OBJECTIVES), find_device(machine["device"]).gains.names
     writer.writerow(
-        ["search", "trial", "axis", *gains_there_are, *(TITLES[name] for name in names), "stopped", "fragile", "cause"]
+        [
+            "search",
+            "trial",
+            "axis",
+            *gains_there_are,
+            *(told[name] for name in names),
+            "stopped",
+            "fragile",
+            "cause",
+        ]
     )
     for row in found.rows:
         values = [f"{value:.6g}" for value in figures(row, names, found.t_0)]
@@ -71,8 +88,14 @@ def save(
     lines += ["", "[versions]", *(f"{toml(name)} = {toml(value)}" for name, value in versions.items())]
     write_whole(folder / "settings.toml", HEADER + "\n".join(lines) + "\n")
     picture = io.BytesIO()
-    trials_figure(found, settings).savefig(picture, dpi=120)
+    is_open_loop = find_device(machine["device"]).gains.is_open_loop
+    trials_figure(found, settings, is_open_loop=is_open_loop).savefig(picture, dpi=120)
     write_whole(folder / "trials.png", picture.getvalue())
+
+
+def titles(device: str) -> dict[str, str]:
+    """Return what each objective is told as, of a device."""
+    return OPEN_LOOP_TITLES if find_device(device).gains.is_open_loop else TITLES
 
 
 def figures(row: TrialRow, objectives: Sequence[str], t_0: float) -> list[float]:
@@ -117,8 +140,9 @@ def _text(value: Any) -> str:
     return f"[{', '.join(map(toml, value))}]" if isinstance(value, tuple | list) else toml(value)
 
 
-def trials_figure(found: Optimised, settings: Settings) -> Figure:
+def trials_figure(found: Optimised, settings: Settings, *, is_open_loop: bool = False) -> Figure:
     """Return the searches as a picture: cost by trial, or the first two objectives of every trial with the front."""
+    meanings = OPEN_LOOP_MEANINGS if is_open_loop else MEANINGS
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -141,14 +165,14 @@ def trials_figure(found: Optimised, settings: Settings) -> Figure:
         if front:
             axes.plot(*np.array(front).T, color=FRONT, marker="o", markersize=9, fillstyle="none", linestyle="none",
                       label="accepted, on the Pareto front")  # fmt: skip
-        axes.set_xlabel(MEANINGS[names[0]])
+        axes.set_xlabel(meanings[names[0]])
         _scale(axes.xaxis, axes.set_xscale, names[0])
         _scale(axes.yaxis, axes.set_yscale, names[1])
-    axes.set_ylabel(MEANINGS[names[min(1, len(names) - 1)]])
+    axes.set_ylabel(meanings[names[min(1, len(names) - 1)]])
     stopped, fragile = (np.array([getattr(row, name) for row in rows]) for name in ("aborted", "fragile"))
     for where, color, marker, label in (
         (~stopped & ~fragile, KEPT, "o", "trial"),
-        (stopped, STOPPED, "x", "stopped: it oscillated or went into fault"),
+        (stopped, STOPPED, "x", f"stopped: it {'lost steps' if is_open_loop else 'oscillated'} or went into fault"),
         (fragile & ~stopped, FRAGILE, "s", "not kept: it did not stop oscillating after a disturbance"),
     ):
         if where.any():

@@ -1,0 +1,214 @@
+"""How a device's gains are tried: trials, first gains, rule and cost of a cascade of loops, and of an open loop.
+
+Which of them a device has is an answer of its gain set. Whatever tries gains asks for its method and knows no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.gains import (
+    BASELINE_RULE,
+    bandwidth_gains,
+    rule_gains,
+    small_time_constants,
+)
+from drive_env.phase_current import currents_for, rated_setting, swing_period, with_currents
+from drive_env.trials.gain_trial import Identified, Trials, softness
+from drive_env.trials.open_loop import OpenLoopTrials, open_loop_cost, open_loop_softness
+from drive_env.trials.score import RobustScore, Terms, cost
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
+    from drive_env.drives.interface import Drives
+    from drive_env.motors import Motor
+    from drive_env.trials.positioning import Move
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+# What moves an axis of which nothing is known but its motor: the commissioning presets' bandwidths, three rotors.
+FIRST_HZ = {"current_hz": 1000.0, "velocity_hz": 20.0, "position_hz": 5.0}
+# The baseline rule at a third of its speed and with three times its integration time: where a safe search begins.
+SAFE_RULE = BASELINE_RULE._replace(
+    speed=BASELINE_RULE.speed / 3.0, integration=3.0 * BASELINE_RULE.integration, position=0.3 * BASELINE_RULE.position
+)
+
+
+class Cascade(NamedTuple):
+    """Loops of which a rule knows gains from the motor's data.
+
+    What tries gains asks this of a kind of gain set; gains are raw, (n, count). `measures_current` is whether the drive
+    tells the torque current, by which oscillation is seen; `caution` is 1 where higher gains come nearer to a trial
+    that is stopped, -1 where lower ones do.
+    """
+
+    device: Device
+    motor: Motor
+
+    @property
+    def measures_current(self) -> bool:
+        """It does."""
+        return True
+
+    @property
+    def caution(self) -> int:
+        """Higher gains oscillate."""
+        return 1
+
+    def t_0(self) -> float:
+        """Return four times the sum of the small time constants [s]."""
+        return 4.0 * float(small_time_constants(self.device, self.device.stage["velocity_filter"].default))
+
+    def highest(self) -> Integers:
+        """Return the greatest integers of the gains."""
+        return self.device.gains.highest
+
+    def first(self, supply: Floats) -> Integers:
+        """Return gains for a total inertia of three rotors."""
+        inertia = 3.0 * self.motor.inertia
+        rows = [bandwidth_gains(self.device, self.motor, inertia, supply=float(v), **FIRST_HZ) for v in supply]
+        return np.array(rows, np.int64)
+
+    def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
+        """Return the gains of the baseline rule."""
+        return self._rule(BASELINE_RULE, found, supply)
+
+    def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
+        """Return slow ones."""
+        return self._rule(SAFE_RULE, found, supply)
+
+    def keep(self, gains: Integers, present: Integers) -> Integers:
+        """Return gains as they are: all of them are the rule's."""
+        return gains
+
+    def trials(self, drives: Drives, axes: int) -> Trials:
+        """Return what runs trials."""
+        return Trials(drives, self.motor, axes, self.t_0())
+
+    def softness(self, gains: Integers) -> Floats:
+        """Return it by the integrators."""
+        return softness(self.device.gains, gains)
+
+    def cost(self, terms: Terms) -> Floats:
+        """Return J."""
+        return cost(terms)
+
+    def current(self, terms: Terms) -> Floats:
+        """Return its ripple."""
+        return terms.noise
+
+    def _rule(self, rule: Any, found: Identified, supply: Floats) -> Integers:
+        return np.concatenate(
+            [
+                rule_gains(self.device, self.motor, J, rule, supply=float(volts))
+                for J, volts in zip(found.inertia, supply, strict=True)
+            ]
+        )
+
+
+class OpenLoop(NamedTuple):
+    """Currents of a stepper that follows its field."""
+
+    device: Device
+    motor: Motor
+
+    @property
+    def measures_current(self) -> bool:
+        """It does not: drives of steppers have no 6077h."""
+        return False
+
+    @property
+    def caution(self) -> int:
+        """Lower currents lose steps."""
+        return -1
+
+    def t_0(self) -> float:
+        """Return the period of the rotor's swing in its field at rated current [s]."""
+        return swing_period(self.motor)
+
+    def highest(self) -> Integers:
+        """Return the greatest integers, of currents those of the motor's rated one."""
+        full = with_currents(self.device, self.motor, self.device.gains.highest.max(), self.device.gains.highest.max())
+        currents = self.device.gains.columns(self.device.gains.outer)
+        most = self.device.gains.highest.copy()
+        most[currents] = full[0, currents]
+        return most
+
+    def first(self, supply: Floats) -> Integers:
+        """Return the rated current, moving and at rest."""
+        most = rated_setting(self.device, self.motor)
+        return np.tile(with_currents(self.device, self.motor, most, most), (len(supply), 1))
+
+    def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
+        """Return currents with which the load takes 30 degrees of load angle in the move."""
+        constant = self.motor.torque_constant
+        speed, acceleration = move.velocity / move.increments, move.acceleration / move.increments
+        moving = found.inertia * acceleration + constant * (
+            found.coulomb + found.viscous * speed + np.abs(found.offset)
+        )
+        return currents_for(self.device, self.motor, moving, constant * found.offset)
+
+    def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
+        """Return the rated current: nothing holds a stepper better."""
+        return self.first(supply)
+
+    def keep(self, gains: Integers, present: Integers) -> Integers:
+        """Return gains with the settings of the load detection that drives have at present: they are no currents."""
+        currents = self.device.gains.columns(self.device.gains.outer)
+        kept = present.copy()
+        kept[:, currents] = gains[:, currents]
+        return kept
+
+    def trials(self, drives: Drives, axes: int) -> OpenLoopTrials:
+        """Return what runs trials."""
+        return OpenLoopTrials(drives, self.motor, axes, self.t_0())
+
+    def softness(self, gains: Integers) -> Floats:
+        """Return it by the standby current."""
+        return open_loop_softness(self.device, gains)
+
+    def cost(self, terms: Any) -> Floats:
+        """Return J."""
+        return np.asarray(open_loop_cost(terms))
+
+    def current(self, terms: Any) -> Floats:
+        """Return the RMS of the currents that are set."""
+        return np.asarray(np.sqrt(terms.effort))
+
+
+Method = Cascade | OpenLoop
+
+
+def method_of(device: Device, motor: Motor) -> Method:
+    """Return how the gains of a device are tried."""
+    return OpenLoop(device, motor) if device.gains.is_open_loop else Cascade(device, motor)
+
+
+def check_tried(device: Device, names: tuple[str, ...]) -> None:
+    """Raise ValueError unless trials can tell what gains of these names do, before anything moves."""
+    if not names and not device.gains.outer:
+        raise ValueError(
+            f"{device.name} has no gains of a velocity or position loop and no phase currents, which trials could "
+            "tell apart; name gains of its gains.toml"
+        )
+    device.gains.columns(names)
+    if device.gains.is_open_loop and (others := [name for name in names if name not in device.gains.outer]):
+        raise ValueError(
+            f"{', '.join(others)}: a trial of an open-loop stepper shows what the phase currents do, "
+            f"{', '.join(device.gains.outer)}; drive-tune auto finds the settings of its load detection, and "
+            "drive-tune sweep varies any gain"
+        )
+
+
+def new_score(device: str, load: Any, motor: Any, num_machines: int, **options: Any) -> RobustScore:
+    """Return what scores gains of a device on emulated machines; arguments as `RobustScore` has."""
+    from drive_env.devices import find_device
+    from drive_env.trials.open_loop_score import OpenLoopScore
+
+    kind: Callable[..., RobustScore] = OpenLoopScore if find_device(device).gains.is_open_loop else RobustScore
+    return kind(device, load, motor, num_machines, **options)

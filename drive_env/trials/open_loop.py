@@ -1,0 +1,373 @@
+"""One trial of the currents of an open-loop stepper: a move, the reversal, and the current probe.
+
+No loop is closed, and drives of steppers measure no torque current (6077h). What a master sees is the encoder against
+the step counter: their difference is the load angle, which is the torque over the holding torque, and jumps by four
+full steps where the motor falls out of step. Inertia and friction are identified from it, and settling, load angle,
+vibration and lost steps are seen by it. What the currents cost is known from their settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.devices import Device
+from drive_env.devices.gain_set import RUN
+from drive_env.dictionary.roles import Role
+from drive_env.drives import motion
+from drive_env.drives.interface import Drives, device_of
+from drive_env.gains import read_gains, write_gains
+from drive_env.motors import Motor
+from drive_env.phase_current import holding_torque, run_and_standby
+from drive_env.trials.gain_trial import PHASES, Identified, Trials, clear, momentum_balance
+from drive_env.trials.positioning import (
+    BAND,
+    BAND_COUNTS,
+    CYCLE,
+    PROFILE,
+    SETTLED,
+    TRIAL,
+    WATCH,
+    Move,
+    plan_move,
+    start,
+    wrapped,
+    write_profile,
+)
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+PROBE = 0.8  # run current of the probe over that of the trial
+LOST = 2.0  # full steps between field and rotor: beyond the unstable balance, from where it falls to the next tooth
+TOOTH = 4.0  # full steps: what a rotor falls behind
+BAND_STEPS = 0.05  # of a full step, in which an axis has settled at least: dry friction holds it off the field's angle
+ENCODER, NO_WINDOW = 0, 0  # of 606Ah and 6065h
+STILL = 20  # samples at rest by which demand and encoder are compared
+REST, LONGEST_ROLL = 0.25, 100  # full steps in that time, of a rotor at rest; times that it is waited for
+LEAST_WAY = 0.25  # of a move that an encoder must show
+
+# Scales of the terms of J.
+LOAD_ANGLE = 0.5  # full steps, 45 degrees electrical: 30 % of the torque are left
+VIBRATION = 0.1  # full steps from millisecond to millisecond
+TRIP = 30.0
+OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.02, 0.1
+
+
+class OpenLoopTerms(NamedTuple):
+    """The terms of J of an open-loop stepper, each of one shape.
+
+    settling: t_s/t_0. disturbance: E_d/E_0. noise: Vibration of the rotor about the field, full steps. overshoot: Over
+    the move. tripped: A fault, or steps lost. load_angle: Largest, full steps (one is 90 degrees electrical). effort:
+    Mean square of the currents that are set over the rated one.
+    """
+
+    settling: Floats
+    disturbance: Floats
+    noise: Floats
+    overshoot: Floats
+    tripped: Mask
+    load_angle: Floats
+    effort: Floats
+
+    def each(self, function: Callable[[NDArray[Any]], NDArray[Any]]) -> OpenLoopTerms:
+        """Return the terms with a function applied to each."""
+        return OpenLoopTerms(
+            function(self.settling),
+            function(self.disturbance),
+            function(self.noise),
+            function(self.overshoot),
+            function(self.tripped),
+            function(self.load_angle),
+            function(self.effort),
+        )
+
+
+def open_loop_cost(terms: OpenLoopTerms) -> Floats:
+    """Return J of an open-loop stepper from its terms, in their shape.
+
+    J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 q^0.4 (1 + (a/0.5)^2)^0.2 (1 + (n/0.1)^2)^0.2 (1 + max(0, os - 2 %)/10 %)
+
+    with q the effort, a the load angle and n the vibration in full steps; at most 30, which lost steps cost. The ripple
+    of the measured current that J of a servo has is not among them: there is none to measure.
+    """
+    raw = (
+        terms.settling**0.4
+        * terms.disturbance**0.4
+        * terms.effort**0.4
+        * (1.0 + (terms.load_angle / LOAD_ANGLE) ** 2) ** 0.2
+        * (1.0 + (terms.noise / VIBRATION) ** 2) ** 0.2
+        * (1.0 + np.maximum(0.0, terms.overshoot - OVERSHOOT_FREE) / OVERSHOOT_SCALE)
+    )
+    return np.where(terms.tripped | ~np.isfinite(raw), TRIP, np.minimum(raw, TRIP))
+
+
+class OpenLoopTrial(NamedTuple):
+    """What a trial showed, as `gain_trial.Trial` has it; where an axis was stopped, it had lost steps or tripped.
+
+    lost: Whether steps were lost, (phases, num_axes).
+    """
+
+    terms: OpenLoopTerms  # its disturbance is 1
+    following: Floats
+    aborted: Mask
+    error: Floats
+    culprit: Mask
+    lost: Mask
+
+    def costs(self, softness: Floats) -> Floats:
+        """Return J by measured terms of every phase, (phases, num_axes).
+
+        Args:
+            softness: Of the trial's currents over that of the rule's, (num_axes,), for E_d/E_0.
+        """
+        disturbance = np.broadcast_to(softness, self.aborted.shape)
+        return open_loop_cost(self.terms._replace(disturbance=disturbance, tripped=self.aborted))
+
+
+def encoder_age(device: Device) -> float:
+    """Return how old an encoder's count is when it is read [s]: it is taken once in each period of the motion loops."""
+    return 1.0 / device.velocity_rate
+
+
+def open_loop_softness(device: Device, gains: Integers) -> Floats:
+    """Return what the deflection by a load at rest is proportional to, (num_axes,): one over the standby current.
+
+    No load step exists on a bus; but a rotor in its field gives way by T / (n_p T_hold), and the holding torque follows
+    from the current.
+    """
+    return np.asarray(1.0 / run_and_standby(device, gains)[1])
+
+
+def effort(device: Device, motor: Motor, gains: Integers) -> Floats:
+    """Return the mean square of the currents that are set over the rated one, (num_axes,): copper loss of a trial.
+
+    The run current for the profile, the standby current for the rest. It is the setting's, whatever lowers the current
+    meanwhile (CoolStep) or delays it (the standby delay): on a bus nothing else is seen.
+    """
+    run, standby = run_and_standby(device, gains)
+    share = PROFILE / TRIAL
+    return np.asarray((share * run**2 + (1.0 - share) * standby**2) / motor.rated_current**2)
+
+
+def with_run_current(device: Device, gains: Integers, factor: float | Floats) -> Integers:
+    """Return gains of shape (n, count) with the run current times a factor, down to the next of its steps."""
+    column = device.gains.column(*RUN)
+    assert column is not None, "an open loop has a run current"
+    changed = gains.copy()
+    changed[:, column] = np.clip(np.floor(gains[:, column] * factor), 1, device.gains.rows[column].highest)
+    return changed
+
+
+class OpenLoopTrials(Trials):
+    """Runs trials on open-loop steppers, as `Trials` does on servo drives; the axes of a machine are stopped together.
+
+    606Ah is set to the encoder while the drives are disabled, and 6065h watches no longer, with which no axis that has
+    lost steps could be enabled again; `sensor` and `window` are what they were. Positions are the encoder's;
+    what has been lost in steps is made up for in the targets that the step counter gets.
+    """
+
+    def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:
+        super().__init__(drives, motor, axes, t_0)
+        self.sensor: Integers | None = None
+        self.window: Integers | None = None
+        self._zero: Floats | None = None
+        self._fell = False  # steps were lost, and the rotor may still be on its way to the next tooth
+
+    def recover(self, where: Mask) -> None:
+        """Bring axes to pp, enabled, by the encoder, whatever state they are in."""
+        drives = self._drives
+        now = drives.read(cia402.SENSOR_SELECTION)
+        if self.sensor is None:
+            self.sensor, self.window = now, drives.read(cia402.FOLLOWING_WINDOW)
+            if np.any(self.window != NO_WINDOW):
+                drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
+        blind = where & (now != ENCODER)
+        if blind.any():
+            on = blind & ~self.down()
+            if on.any():
+                motion.disable(drives, where=on)
+            drives.write(cia402.SENSOR_SELECTION, ENCODER, where=blind)
+        super().recover(where)
+
+    def power_up(self, where: Mask) -> None:
+        """Take drives that were switched on just now to pp, enabled, by the encoder."""
+        self._drives.write(cia402.SENSOR_SELECTION, ENCODER, where=where)
+        super().power_up(where)
+
+    def leave(self) -> None:
+        """Give 606Ah back what it was; the axes must be disabled."""
+        if self.sensor is not None and self.window is not None:
+            if np.any(drifted := self._drives.read(cia402.FOLLOWING_WINDOW) != self.window):
+                self._drives.write(cia402.FOLLOWING_WINDOW, self.window, where=drifted)
+            changed = self._drives.read(cia402.SENSOR_SELECTION) != self.sensor
+            if changed.any():
+                self._drives.write(cia402.SENSOR_SELECTION, self.sensor, where=changed)
+
+    def go(self, target: Integers, where: Mask) -> None:
+        """Set off for a position of the encoder."""
+        start(self._drives, wrapped(target + self.shift()).astype(np.int64), where)
+
+    def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
+        """Move there and back with the currents that are; return what the load angle says, and where the axes began.
+
+        Raises:
+            RuntimeError: If an encoder hardly moved.
+        """
+        drives, motor = self._drives, self._motor
+        drives.advance(STILL * CYCLE)
+        self._zero = None
+        self.shift()
+        origin = drives.read(cia402.POSITION_ACTUAL)
+        scaler = drives.read(Role.POSITION_SCALE)
+        move = plan_move(motor, np.full(drives.num_axes, 3.0 * motor.inertia), scaler, reach)
+        write_profile(drives, move, where)
+        objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND]
+        traces = []
+        self._prepare(objects)
+        for target in (origin + move.distance, origin):
+            shift = self.shift()
+            self.go(target, where)
+            trace = self._record(objects, TRIAL)
+            traces.append((trace[cia402.POSITION_ACTUAL], trace[cia402.POSITION_DEMAND] - shift))
+        position, demand = (np.concatenate(parts) for parts in zip(*traces, strict=True))
+        self._check_moved(position, move, where)
+        angle = wrapped(position - origin) / move.increments
+        lag = wrapped(demand - position) / move.increments
+        held = holding_torque(motor, run_and_standby(device_of(drives), read_gains(drives))[0])
+        lag -= np.gradient(wrapped(demand - origin) / move.increments, axis=0) / CYCLE * encoder_age(device_of(drives))
+        # The rotor's angle in the field is the torque that it takes; as a current of the motor's torque constant.
+        current = held * np.sin(motor.n_p * lag) / motor.torque_constant
+        # The rotor swings a hundred times a second: the impulse is summed by trapezoids, up to the speed's own sample.
+        current[1:] = 0.5 * (current[1:] + current[:-1])
+        speed = np.gradient(angle, CYCLE, axis=0)
+        return momentum_balance(angle, speed, current, motor), origin
+
+    def run(  # type: ignore[override]
+        self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
+    ) -> OpenLoopTrial:
+        """Try currents in a move from the origin, back, and there again with less; as `Trials.run` has it.
+
+        Where an axis loses steps or goes into fault, its machine stops, gets the incumbent back and continues with it.
+        """
+        drives, device, count = self._drives, device_of(self._drives), self._drives.num_axes
+        away = origin + direction * move.distance
+        shape = (len(PHASES), count)
+        aborted, lost = np.zeros(shape, bool), np.zeros(shape, bool)
+        stopped, culprit = np.zeros((2, count), bool)
+        settling, noise, overshoot, following, load_angle, efforts = (np.zeros(shape) for _ in range(6))
+        first_error = np.zeros((TRIAL, count))
+        size = np.maximum(np.abs(move.distance), 1).astype(float)
+        full_step = 2.0 * np.pi * move.increments / (TOOTH * self._motor.n_p)
+        write_profile(drives, move, where)
+        probe = with_run_current(device, gains, PROBE)
+        for phase, (target, tried) in enumerate(((away, gains), (origin, gains), (away, probe))):
+            used = np.where(stopped[:, None], incumbent, tried)
+            write_gains(drives, used, where)
+            position, lag, stopped, new, fell = self._try(target, incumbent, stopped, where, full_step)
+            culprit |= new
+            aborted[phase], lost[phase] = stopped, fell
+            sign = np.where(move.distance < 0, -1, 1) * direction * (-1 if phase == 1 else 1)
+            settling[phase], noise[phase], overshoot[phase], load_angle[phase] = open_loop_terms(
+                position, lag, move, self._t_0, target, sign, full_step
+            )
+            efforts[phase] = effort(device, self._motor, used)
+            following[phase] = np.maximum(np.abs(lag / size).sum(axis=0), 0.5) * CYCLE
+            if phase == 0:
+                first_error = lag / size
+        terms = OpenLoopTerms(settling, np.ones(shape), noise, overshoot, aborted, load_angle, efforts)
+        return OpenLoopTrial(terms, following, aborted, first_error, culprit, lost)
+
+    def _try(
+        self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask, full_step: Floats
+    ) -> tuple[Floats, Floats, Mask, Mask, Mask]:
+        """Move; return position, lag, machines stopped so far, axes that caused it now, and those with steps lost."""
+        drives = self._drives
+        if self._fell:
+            self._come_to_rest(full_step)
+        shift = self.shift()
+        objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.STATUSWORD]
+        positions, lags = [], []
+        culprit, fell = np.zeros((2, len(stopped)), bool)
+        self._prepare(objects)
+        start(drives, wrapped(target + shift).astype(np.int64), where)
+        for _ in range(TRIAL // WATCH):
+            trace = self._record(objects, WATCH)
+            lag = wrapped(trace[cia402.POSITION_DEMAND] - trace[cia402.POSITION_ACTUAL] - shift)
+            positions.append(trace[cia402.POSITION_ACTUAL])
+            lags.append(lag)
+            down = where & ~cia402.matches(trace[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
+            out = where & (np.abs(lag) > LOST * full_step).any(axis=0)
+            fell |= out
+            self._fell = self._fell or bool(out.any())
+            new = self._whole_lanes(down | out) & where & ~stopped
+            if new.any():
+                write_gains(drives, incumbent, new)
+                stopped = stopped | new
+                culprit |= new & (down | out)
+            if (on := (new | out) & ~down).any():  # the steps end, and the rotor finds the field again
+                drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=on)
+            if down.any():
+                clear(drives, down)
+        return np.concatenate(positions), np.concatenate(lags), stopped, culprit, fell
+
+    def _come_to_rest(self, full_step: Floats) -> None:
+        """Wait until no rotor moves: a heavy load rolls over many teeth before the field catches it."""
+        drives = self._drives
+        for _ in range(LONGEST_ROLL):
+            before = drives.read(cia402.POSITION_ACTUAL)
+            drives.advance(STILL * CYCLE)
+            if np.all(np.abs(wrapped(drives.read(cia402.POSITION_ACTUAL) - before)) < REST * full_step):
+                break
+        self._fell = False
+
+    def shift(self) -> Floats:
+        """Return what the step counter has more than the encoder [inc], by whole teeth of what it had at first.
+
+        Only steps that were lost are made up for: what load and friction turn the rotor by in the field is not.
+        """
+        drives = self._drives
+        now = wrapped(drives.read(cia402.POSITION_DEMAND) - drives.read(cia402.POSITION_ACTUAL))
+        if self._zero is None:
+            self._zero = now
+        tooth = np.asarray(drives.read(Role.POSITION_SCALE), float) / self._motor.n_p
+        return np.asarray(np.rint(self._zero + tooth * np.rint((now - self._zero) / tooth)))
+
+    def _check_moved(self, position: Integers, move: Move, where: Mask) -> None:
+        way = np.abs(wrapped(position - position[0])).max(axis=0)
+        still = np.flatnonzero(where & (way < LEAST_WAY * np.abs(move.distance)))
+        if still.size:
+            k = int(still[0])
+            raise RuntimeError(
+                f"axis {k}: the encoder showed {way[k]:.0f} of {abs(int(move.distance[k]))} increments of a move at "
+                "rated current: it is not connected, its scale or direction is wrong, or the motor does not turn; "
+                "without an encoder nothing is seen of an open-loop stepper that could be scored"
+            )
+
+
+def open_loop_terms(
+    position: Floats, lag: Floats, move: Move, t_0: float | Floats, target: Integers, sign: Integers, full_step: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return t_s/t_0, vibration [full steps], overshoot and load angle [full steps] of a move, (num_axes,) each.
+
+    Args:
+        position: The encoder's, from the set-point on, one row per ms, (SETTLED or more, num_axes).
+        lag: Demand less encoder [inc], as long.
+        move: The move.
+        t_0: Settling times are relative to this [s].
+        target: Where it goes [inc].
+        sign: The direction, 1 or -1.
+        full_step: Increments.
+    """
+    size = np.maximum(np.abs(move.distance), 1).astype(float)
+    width = np.maximum(np.maximum(BAND * size, BAND_COUNTS / move.counts * move.increments), BAND_STEPS * full_step)
+    error = wrapped(target - position[:SETTLED])
+    settling = 1.0 + np.minimum(1.0, np.abs(error[PROFILE:]) / width).sum(axis=0) * CYCLE / t_0
+    vibration = np.sqrt(np.mean(np.diff(lag[:PROFILE], axis=0) ** 2, axis=0)) / full_step
+    beyond = np.maximum((-error * sign).max(axis=0), 0.0) / size
+    return settling, vibration, beyond, np.abs(lag[:SETTLED]).max(axis=0) / full_step

@@ -1,0 +1,1 @@
+"""Commissioning of open-loop steppers: phase currents, load detection (StallGuard) and current by load (CoolStep)."""

@@ -1,0 +1,253 @@
+"""Automatic commissioning of an open-loop stepper: currents, StallGuard threshold, CoolStep; certified or rolled back.
+
+What an engineer does by hand, on all axes at the same time: identify the load by the load angle, set the run current by
+it, move at the working speed, raise the threshold until the load reading is above 0 and falls to 0 before the pull-out,
+let CoolStep take current away, and prove that no step is lost. The state before is in a file before anything changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402, motion
+from drive_env.dictionary.roles import Role
+from drive_env.drives.speeds import per_increment
+from drive_env.gains import read_gains, write_gains
+from drive_env.phase_current import amplitude, holding_torque, run_and_standby
+from drive_env.trials.open_loop import encoder_age
+from tuning.search.trial_bench import TrialBench
+from tuning.snapshot import Transaction, restore
+from tuning.stepper.load_detection import LOWER, STALL_ANGLE, LoadDetection, has_coolstep, lacks_load_detection
+from tuning.stepper.moves import WorkingMoves
+from tuning.stepper.obstacle import REACTION, can_load, prove_with_load
+from tuning.stepper.result import StepperAxis, StepperResult, figure
+from tuning.target import Target, timed
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Progress = Callable[[str, float], None]
+Files = Callable[[StepperResult], AbstractContextManager[object]]
+
+WORKING_SHARE = 0.7  # of the motor's corner speed: the current is in full force, and the back-EMF clear
+ACCELERATION_SHARE = 0.3  # of the holding torque at the run current
+MOST_ACCELERATION = 2000.0  # rad/s^2
+PROFILE_SHARE = 0.95  # of the highest acceleration that the drive takes
+REACH_SHARE, LONGEST = 0.9, 100.0  # of the travel, and at most [rad]
+MOST_LOST = 3.0  # teeth, until a stall has stopped the motor
+
+
+def check_stepper(target: Target) -> None:
+    """Raise ValueError unless a target's drives have a load detection to be set, before anything is done."""
+    if lacks := lacks_load_detection(target.device):
+        raise ValueError(
+            f"{target.device.name}: the load detection of this drive cannot be set: {lacks}; drive-tune sweep and "
+            "optimise find its phase currents by trials"
+        )
+
+
+def commission(
+    target: Target,
+    file: str | Path,
+    *,
+    keep: bool = True,
+    progress: Progress | None = None,
+    files: Files = nullcontext,
+) -> StepperResult:
+    """Commission the axes of a target; an axis that fails a check is rolled back, and the reason is in the result.
+
+    Args:
+        target: The drives; they are off afterwards.
+        file: File for the state before.
+        keep: Whether drives on a bus store the settings.
+        progress: Called with the present step, and the share done.
+        files: As `tuning.auto.one_button.auto` takes it.
+
+    Raises:
+        ValueError: For a drive without load detection, before anything is done.
+        BusError: If the drives cannot be reached any more; OSError if a file cannot be written.
+    """
+    check_stepper(target)
+    say = progress or (lambda what, share: None)
+    with Transaction(target, file) as transaction, timed(target) as (watched, clock):
+        say("identifying", 0.0)
+        on = cia402.matches(target.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+        if on.any():
+            motion.disable(target.drives, where=on)
+        before, roles = read_gains(target.drives), _roles(target)
+        bench = TrialBench(watched)
+        bench.identify()
+        speed = WORKING_SHARE * min(target.speed, target.motor.rated_speed)
+        say("trying the currents", 0.15)
+        gains, weak = _currents(bench)
+        moves = _moves(bench, gains)
+        detection = LoadDetection(watched.drives, target.motor, moves, gains, speed)
+        found = detection.found
+        found.reject(weak, "it loses steps or goes into fault in trials with the motor's rated current")
+        short = np.abs(moves.reach) < moves.least_reach(speed)
+        for k in np.flatnonzero(short):
+            found.reject(
+                np.arange(target.num_axes) == k,
+                f"the travel is too short: {abs(moves.reach[k]):.2g} rad to go, and {moves.least_reach(speed)[k]:.2g} "
+                f"rad are needed for the load reading at {speed:.3g} rad/s; allow more with --travel",
+            )
+        if found.going().any():
+            say("finding the StallGuard threshold", 0.3)
+            detection.find_threshold()
+        if found.going().any() and has_coolstep(target.device):
+            say("finding the CoolStep setting", 0.6)
+            detection.find_coolstep()
+        if found.going().any():
+            say("proving", 0.8)
+            detection.prove()
+        proof_figures = _prove(watched, detection, moves, speed)
+        say("writing", 0.95)
+        accepted = found.going()
+        _leave(bench, transaction, detection.gains, accepted, roles)
+        kept = keep and bool(accepted.any()) and bool(target.bus)
+        result = StepperResult(
+            tuple(_axis(k, target, bench, before, detection, proof_figures) for k in range(target.num_axes)),
+            target.device.name, target.motor.name, target.machine, speed, clock.seconds, transaction.path, kept,
+            can_load(target),
+        )  # fmt: skip
+        with files(result):
+            if kept:
+                transaction.store(accepted)
+        transaction.commit(accepted)
+    say("done", 1.0)
+    return result
+
+
+def _currents(bench: TrialBench) -> tuple[Integers, Mask]:
+    """Return the rule's currents, the rated ones where these lose steps in a trial, and who loses steps with those."""
+    axes = bench.target.axes_per_machine
+    tried = bench.run(bench.rule)
+    gains = np.where(np.repeat(tried.aborted, axes)[:, None], bench.safe, bench.rule)
+    weak = np.zeros(bench.target.num_axes, bool)
+    if tried.aborted.any():
+        weak = np.repeat(bench.run(gains).aborted, axes)
+    write_gains(bench.target.drives, gains)
+    return gains, weak
+
+
+def _moves(bench: TrialBench, gains: Integers) -> WorkingMoves:
+    target = bench.target
+    torque = ACCELERATION_SHARE * holding_torque(target.motor, run_and_standby(target.device, gains)[0])
+    reach = np.clip(REACH_SHARE * np.nan_to_num(bench.reach, posinf=LONGEST, neginf=-LONGEST), -LONGEST, LONGEST)
+    # The drive's profiles end somewhere, too.
+    entry = target.device.new_dictionary().find(cia402.PROFILE_ACCELERATION)
+    assert entry.high is not None, "an acceleration is a number"
+    counts = target.increments() * per_increment(target.drives, cia402.PROFILE_ACCELERATION)
+    most = np.minimum(MOST_ACCELERATION, PROFILE_SHARE * entry.high / counts)
+    acceleration = np.minimum(torque / bench.identified.inertia, most)
+    # A trial may have ended away from where the axes began; the way is counted from there.
+    return WorkingMoves(
+        target.drives, target.motor, bench.trials, bench.began, reach, acceleration, target.increments(),
+        encoder_age(target.device),
+    )  # fmt: skip
+
+
+def _prove(target: Target, detection: LoadDetection, moves: WorkingMoves, speed: float) -> dict[str, Floats]:
+    """Put load and obstacle on the axes, or say that nobody did."""
+    found = detection.found
+    lost = np.full(target.num_axes, np.nan)
+    if not can_load(target):
+        for k in np.flatnonzero(found.going()):
+            found.reservations[k].append(
+                "stop on stall was not proved with a load: only an emulated machine of one axis can be loaded; hold "
+                f"the shaft in a slow move and see whether it stops (above {found.stop_speed[k]:.3g} rad/s)"
+            )
+        return {"lost": lost}
+    going = found.going()
+    if going.any():
+        run, _ = run_and_standby(target.device, detection.gains)
+        proof = prove_with_load(target, moves, speed, run, going)
+        lower = target.device.gains.column(*LOWER)
+        if lower is not None and (cooled := going & ~proof.withstood & (detection.gains[:, lower] > 0)).any():
+            detection.leave_coolstep_off(
+                cooled, "with it a load of 30 % of the holding torque, which comes within 0.15 s, stops the axis"
+            )
+            proof = prove_with_load(target, moves, speed, run, going)
+        found.reject(going & ~proof.withstood, "it stops or loses steps with a load of 30 % of the holding torque")
+        found.reject(going & ~proof.stopped, "an obstacle does not stop it: no stall was seen before steps were lost")
+        lost = np.where(proof.stopped, proof.lost, np.nan)
+        for k in np.flatnonzero(found.going() & (proof.lost > MOST_LOST)):
+            found.reservations[k].append(
+                f"at an obstacle the rotor slipped by {proof.lost[k]:.0f} teeth before the stall stopped it: home it "
+                "after a stall"
+            )
+    return {"lost": lost}
+
+
+def _roles(target: Target) -> dict[Role, tuple[int, int]]:
+    """Return the objects beside the gains that are set."""
+    return {
+        role: target.device.roles[role]
+        for role in (Role.STALL_SPEED, Role.COOLSTEP_SPEED)
+        if role in target.device.roles
+    }
+
+
+def _leave(
+    bench: TrialBench,
+    transaction: Transaction,
+    gains: Integers,
+    accepted: Mask,
+    roles: dict[Role, tuple[int, int]],
+) -> None:
+    """Leave the accepted axes with their settings and all else as it was, disabled."""
+    drives = bench.target.drives
+    everywhere = np.ones(bench.target.num_axes, bool)
+    if bench.trials.down().any():  # one that was given up is in fault
+        drives.advance(REACTION)
+        bench.trials.recover(everywhere)
+    motion.disable(drives, where=~bench.trials.down())
+    bench.trials.leave()
+    if not accepted.any():
+        return
+    axes = []
+    for k, values in enumerate(transaction.before.axes):
+        wanted = dict(values)
+        wanted |= {key: int(gains[k, column]) for column, key in enumerate(bench.target.device.gains.keys)}
+        wanted |= {key: int(drives.read(role)[k]) for role, key in roles.items()}
+        axes.append(wanted)
+    restore(drives, replace(transaction.before, axes=tuple(axes)), accepted, whole=False)
+
+
+def _axis(
+    k: int,
+    target: Target,
+    bench: TrialBench,
+    before: Integers,
+    detection: LoadDetection,
+    proof: dict[str, Floats],
+) -> StepperAxis:
+    found, names, constant = detection.found, target.device.gains.names, target.motor.torque_constant
+    reason = found.reasons[k]
+    after = before[k] if reason else detection.gains[k]
+    known = target.device.gains
+    run = known.column("current", "amplitude")
+    assert run is not None, "an open loop has a run current"
+    identified = bench.identified
+    figures = {
+        "inertia [kg m^2]": figure(identified.inertia[k]),
+        "dry friction [N m]": figure(identified.coulomb[k] * constant),
+        "constant load [N m]": figure(identified.offset[k] * constant),
+        "run current [A]": figure(float(amplitude(target.device, after[run]))),
+        "load angle at the working speed [deg electrical]": figure(float(np.degrees(found.angle[k]))),
+        "load reading of the axis' own load": figure(found.margin[k]),
+        "load angle at which the reading is to be 0 [deg electrical]": figure(float(np.degrees(STALL_ANGLE))),
+        "stop on stall above [rad/s]": figure(found.stop_speed[k]),
+        "current saved by CoolStep, by the load angle [%]": figure(100.0 * found.saved[k]),
+        "teeth lost at an obstacle": figure(proof["lost"][k]),
+    }
+    return StepperAxis(
+        dict(zip(names, map(int, before[k]), strict=True)), dict(zip(names, map(int, after), strict=True)), reason,
+        tuple(found.reservations[k]), figures,
+    )  # fmt: skip

@@ -1,0 +1,265 @@
+"""A StallGuard threshold and a CoolStep setting for the load that an axis has, found by moves at the working speed.
+
+The threshold shifts the load reading. In spread cycle the reading is all but linear in the voltage that a falling phase
+gives back against its current i at speed w, with the load angle d (electrical):
+
+    u = L i n_p w + n_p psi w (cos d - sin d) - R i
+
+How many counts a volt has is not published; two speeds tell it, since L and psi are the data sheet's. The threshold is
+then raised until the reading of the axis' own load is what lies between its load angle and `STALL_ANGLE`: the reading
+falls to 0 there, before the motor falls out of step at 90 degrees. CoolStep lowers the current down to `COOL_ANGLE`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env.devices import Device
+from drive_env.devices.gain_set import GainSet
+from drive_env.dictionary.roles import Role
+from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.speeds import per_increment
+from drive_env.gains import write_gains
+from drive_env.motors import Motor
+from drive_env.phase_current import run_and_standby
+from tuning.stepper.moves import Steady, WorkingMoves
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+THRESHOLD = ("load detection", "threshold")  # loop and part of the gain
+LOWER, WIDTH, LEAST, DOWN, UP = (("CoolStep", part) for part in ("lower", "width", "least", "down", "up"))
+STALL_ANGLE = math.radians(60.0)  # of the load angle, at which the reading is to fall to 0
+COOL_ANGLE = math.radians(30.0)  # down to which CoolStep takes current away
+SLOW = 0.7  # of the working speed, at which the reading is compared
+FULL_READING = 1023.0
+CLEAR = 3.0  # standard deviations, by which a reading must be above 0
+LEAST_MARGIN = 16.0  # counts of the reading, that an axis' own load must be above 0
+SHARE_AT_STOP_SPEED = 0.5  # of the margin, that is left at the speed above which a stall stops
+LEAST_STOP_SPEED = 0.5  # of the working speed
+LIFT = 16  # steps of the threshold, by which a reading of 0 is lifted
+COOL_UNIT = 32.0  # counts of the reading of a step of CoolStep's thresholds
+COOL_WIDTH, COOL_DOWN, COOL_UP = 2, 2, 3  # width of the band, 2 readings for a step down, 8 steps up for one below it
+COOL_RAISES = 3  # of the lower threshold, where steps were lost
+
+
+def lacks_load_detection(device: Device) -> str:
+    """Return what a device lacks for its load detection to be set, "" for nothing."""
+    if device.gains.column(*THRESHOLD) is None:
+        return "its gains.toml has no threshold of a load detection"
+    missing = [role.value for role in (Role.LOAD_VALUE, Role.STALL_SPEED) if role not in device.roles]
+    return f"it has no {' and no '.join(missing)}" if missing else ""
+
+
+def has_coolstep(device: Device) -> bool:
+    """Return whether a device's current can follow the load."""
+    parts = (LOWER, WIDTH, LEAST, DOWN, UP)
+    return Role.COOLSTEP_SPEED in device.roles and all(device.gains.column(*part) is not None for part in parts)
+
+
+@dataclass
+class Found:
+    """What was found of the axes, (num_axes,) each; nan and 0 where nothing was.
+
+    per_volt: Counts of the reading of a volt given back. margin: Reading of the axis' own load with the threshold.
+    wanted: What that was to be. angle: Load angle at the working speed [rad]. stop_speed: Above which a stall stops
+    [rad/s]. saved: Share of the current that CoolStep took away, by the load angle. reasons: Why axes were given up.
+    """
+
+    per_volt: Floats
+    margin: Floats
+    wanted: Floats
+    angle: Floats
+    stop_speed: Floats
+    saved: Floats
+    cooled_angle: Floats
+    reasons: list[str]
+    reservations: list[list[str]] = field(default_factory=list)
+
+    @classmethod
+    def nothing(cls, count: int) -> Found:
+        """Return it before anything was found."""
+        a, b, c, d, e, f, g = (np.full(count, np.nan) for _ in range(7))
+        return cls(a, b, c, d, e, f, g, [""] * count, [[] for _ in range(count)])
+
+    def going(self) -> Mask:
+        """Return which axes have not been given up."""
+        return np.array([not reason for reason in self.reasons])
+
+    def reject(self, where: Mask, reason: str) -> None:
+        """Give axes up."""
+        for k in map(int, np.flatnonzero(where & self.going())):
+            self.reasons[k] = reason
+
+
+class LoadDetection:
+    """Finds the settings on drives that moves turn; `gains` are what the drives have, raw, (num_axes, count)."""
+
+    def __init__(self, drives: Drives, motor: Motor, moves: WorkingMoves, gains: Integers, speed: float) -> None:
+        self.gains = gains.copy()
+        self.found = Found.nothing(drives.num_axes)
+        self._drives, self._motor, self._moves, self._speed = drives, motor, moves, speed
+        self._known: GainSet = device_of(drives).gains
+        self._run, _ = run_and_standby(device_of(drives), gains)
+
+    # --- the threshold ------------------------------------------------------------------------------------------------
+    def find_threshold(self) -> None:
+        """Set the threshold by which the reading falls to 0 at `STALL_ANGLE`, and the speed above which it stops."""
+        found = self.found
+        self._write_stop_speed(np.zeros_like(self._run))
+        if has_coolstep(device_of(self._drives)):
+            self._set(LOWER, np.zeros(len(self._run)))
+        self._set(THRESHOLD, np.zeros(len(self._run)))
+        slow = self._lifted(SLOW * self._speed)
+        fast = self._run_moves(self._speed)
+        found.angle = fast.angle
+        volts = self._volts(self._speed, fast.angle) - self._volts(SLOW * self._speed, slow.angle)
+        found.per_volt = (fast.reading - slow.reading) / volts
+        found.reject(
+            ~(found.per_volt > 0.0) | (fast.reading >= FULL_READING),
+            "the load reading does not rise with the speed, as the back-EMF has it: it tells nothing of the load here; "
+            "let the axis go faster, and check that the chopper is a spread cycle",
+        )
+        per_angle = found.per_volt * self._flux() * self._speed
+        found.wanted = per_angle * (_falls(fast.angle) - _falls(STALL_ANGLE))
+        self._raise_threshold(fast)
+        slope = (fast.reading - slow.reading) / ((1.0 - SLOW) * self._speed)
+        stop = self._speed - SHARE_AT_STOP_SPEED * found.margin / slope
+        found.stop_speed = np.maximum(stop, LEAST_STOP_SPEED * self._speed)
+        self._write_stop_speed(np.where(found.going(), found.stop_speed, 0.0))
+
+    def _lifted(self, speed: float) -> Steady:
+        """Return moves at a speed with the threshold so high that the reading is not 0."""
+        column = self._column(THRESHOLD)
+        while True:
+            steady = self._run_moves(speed)
+            low = self.found.going() & (steady.lowest <= 0.0)
+            highest = self._known.rows[column].highest
+            self.found.reject(
+                low & (self.gains[:, column] >= highest),
+                f"the load reading is 0 at {speed:.3g} rad/s even with the highest threshold: too slow for the "
+                "back-EMF of this motor; let the axis go faster (--travel)",
+            )
+            low &= self.found.going()
+            if not low.any():
+                return steady
+            self._set(THRESHOLD, np.where(low, self.gains[:, column] + LIFT, self.gains[:, column]))
+
+    def _raise_threshold(self, fast: Steady) -> None:
+        """Find the least threshold with the reading that is wanted; a step of it shifts all readings alike."""
+        found, column = self.found, self._column(THRESHOLD)
+        row = self._known.rows[column]
+        first = self.gains[:, column].astype(float)
+        other = np.where(first + LIFT <= row.highest, first + LIFT, first - LIFT)
+        self._set(THRESHOLD, other)
+        per_step = (self._run_moves(self._speed).reading - fast.reading) / (other - first)
+        found.reject(~(per_step > 0.0), "the load reading does not follow its threshold: check the chopper's mode")
+        threshold = np.ceil(first + (found.wanted - fast.reading) / np.where(per_step > 0.0, per_step, 1.0))
+        found.reject(
+            threshold > row.highest,
+            f"the load reading cannot be raised enough: a threshold of {row.highest} is the highest; let the axis go "
+            "faster",
+        )
+        self._set(THRESHOLD, np.nan_to_num(threshold))
+        last = self._run_moves(self._speed)
+        found.margin = last.reading
+        for k in map(int, np.flatnonzero(found.going())):
+            if last.lowest[k] <= 0.0 or last.reading[k] < max(CLEAR * last.spread[k], LEAST_MARGIN):
+                found.reasons[k] = (
+                    f"the load reading of the axis' own load is {last.reading[k]:.0f}, {last.lowest[k]:.0f} at least: "
+                    "too near to 0, where it would stop; raise the run current or lower the load"
+                )
+
+    # --- CoolStep -----------------------------------------------------------------------------------------------------
+    def find_coolstep(self) -> None:
+        """Set CoolStep so that it lowers the current of the axis' own load without a lost step, and prove it."""
+        found = self.found
+        falls = found.per_volt * self._flux() * self._speed * (_falls(COOL_ANGLE) - _falls(STALL_ANGLE))
+        highest = self._known.rows[self._column(LOWER)].highest
+        lower = np.clip(np.ceil(np.nan_to_num(falls, nan=COOL_UNIT) / COOL_UNIT), 1, highest)
+        for part, value in ((WIDTH, COOL_WIDTH), (LEAST, 0), (DOWN, COOL_DOWN), (UP, COOL_UP)):
+            self._set(part, np.full(len(lower), value))
+        self._write_speed(Role.COOLSTEP_SPEED, np.where(found.going(), found.stop_speed, 0.0))
+        plain = self._run_moves(self._speed)
+        for _ in range(COOL_RAISES):
+            self._set(LOWER, np.where(found.going(), lower, 0))
+            cooled = self._moves.run(self._speed, found.going())
+            failed = found.going() & (cooled.failed | (cooled.settled > STALL_ANGLE))
+            if not failed.any():
+                break
+            self._moves.trials.recover(found.going())
+            lower = np.where(failed, np.minimum(lower + 1, highest), lower)
+        else:
+            self._set(LOWER, np.where(failed, 0, lower))
+            for k in map(int, np.flatnonzero(failed)):
+                found.reservations[k].append("CoolStep is left off: with it the axis lost steps or stopped")
+        found.cooled_angle = np.where(failed, np.nan, cooled.settled)
+        # The torque is the same: the current is as much less as the sine of the load angle is more.
+        found.saved = np.where(failed, np.nan, 1.0 - np.sin(plain.settled) / np.sin(cooled.settled))
+        for k in map(int, np.flatnonzero(found.going() & ~failed & ~(found.saved > 0.05))):
+            found.reservations[k].append(
+                "CoolStep does not lower the current at the working speed: the load reading leaves it no room"
+            )
+
+    def leave_coolstep_off(self, where: Mask, why: str) -> None:
+        """Switch CoolStep off again, with a reservation."""
+        self._set(LOWER, np.where(where, 0, self.gains[:, self._column(LOWER)]))
+        for k in map(int, np.flatnonzero(where)):
+            self.found.reservations[k].append(f"CoolStep is left off: {why}")
+            self.found.saved[k] = np.nan
+
+    # --- drives -------------------------------------------------------------------------------------------------------
+    def prove(self) -> None:
+        """Move with everything on: an axis that stops or loses steps is given up."""
+        where = self.found.going()
+        last = self._moves.run(self._speed, where)
+        self.found.reject(where & last.stopped, "it was stopped in a move with its own load: a false stall")
+        self.found.reject(where & last.lost, "it lost steps in a move with its own load")
+
+    def _run_moves(self, speed: float) -> Steady:
+        going = self.found.going()
+        steady = self._moves.run(speed, going)
+        failed = going & steady.failed
+        if failed.any():
+            self.found.reject(failed & steady.lost, f"it lost steps at {speed:.3g} rad/s with its run current")
+            self.found.reject(failed, f"it went into fault at {speed:.3g} rad/s")
+        return steady
+
+    def _volts(self, speed: float, angle: Floats) -> Floats:
+        """Return what a falling phase gives back [V], but for the resistance, which is alike at all speeds."""
+        motor, i = self._motor, self._run
+        return np.asarray(speed * (motor.L_q * i * motor.n_p + self._flux() * _falls(angle)))
+
+    def _flux(self) -> Floats:
+        """Return the back-EMF constant at the run current [V s/rad]."""
+        motor = self._motor
+        return np.asarray(motor.torque_constant / np.sqrt(1.0 + motor.saturation * self._run**2))
+
+    def _column(self, part: tuple[str, str]) -> int:
+        column = self._known.column(*part)
+        assert column is not None, f"a device with load detection has {' '.join(part)}"
+        return column
+
+    def _set(self, part: tuple[str, str], value: Floats) -> None:
+        column = self._column(part)
+        row = self._known.rows[column]
+        self.gains[:, column] = np.clip(np.rint(value), row.lowest, row.highest)
+        write_gains(self._drives, self.gains, self.found.going())
+
+    def _write_stop_speed(self, speed: Floats) -> None:
+        self._write_speed(Role.STALL_SPEED, speed)
+
+    def _write_speed(self, role: Role, speed: Floats) -> None:
+        drives = self._drives
+        key = device_of(drives).roles[role]
+        raw = np.ceil(speed * self._moves.increments * per_increment(drives, key)).astype(np.int64)
+        drives.write(role, raw, where=self.found.going())
+
+
+def _falls(angle: Floats | float) -> Floats:
+    return np.asarray(np.cos(angle) - np.sin(angle))

@@ -1,0 +1,162 @@
+"""Moves at the working speed, there and back, with load reading and load angle of their steady parts.
+
+Load readings are read by SDO, some milliseconds apart: drives of steppers do not map them into process data. An axis
+that loses steps is stopped with the next sample, and stays out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.dictionary.roles import Role
+from drive_env.drives.interface import Drives
+from drive_env.motors import Motor
+from drive_env.trials.open_loop import LOST, TOOTH, OpenLoopTrials
+from drive_env.trials.positioning import CYCLE, Move, wrapped, write_profile
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+SAMPLE = 4 * CYCLE  # s between two samples
+SETTLE = 0.06  # s after the ramp, until the rotor's swing has died away
+STEADY, LEAST_STEADY = 0.3, 0.06  # s at constant speed: wanted, and at least
+LEAST_STEPS = 20.0  # full steps at constant speed
+REST = 0.1  # s at the end of a move
+
+
+class Steady(NamedTuple):
+    """What the steady parts of moves there and back showed, of shape (num_axes,); nan where nothing was seen.
+
+    reading, lowest, spread: Mean, lowest and standard deviation of the load reading. angle, settled: Mean load angle
+    against the motion, electrical [rad], and that of the last quarter. lost: Steps were lost. stopped: In fault.
+    """
+
+    reading: Floats
+    lowest: Floats
+    spread: Floats
+    angle: Floats
+    settled: Floats
+    lost: Mask
+    stopped: Mask
+
+    @property
+    def failed(self) -> Mask:
+        """Which axes did not make it there and back."""
+        return self.lost | self.stopped
+
+
+@dataclass
+class WorkingMoves:
+    """Moves axes between where they began and a place in their travel.
+
+    Attributes:
+        drives: The drives, enabled by trials.
+        motor: Of every axis.
+        trials: What keeps count of lost steps.
+        origin: Where the axes began [inc].
+        reach: How far they may go, with the sign [rad].
+        acceleration: Of the ramps [rad/s^2].
+        increments: Of a radian.
+        age: Of an encoder's count that is read [s].
+    """
+
+    drives: Drives
+    motor: Motor
+    trials: OpenLoopTrials
+    origin: Integers
+    reach: Floats
+    acceleration: Floats
+    increments: Floats
+    age: float
+
+    def steady_time(self, speed: float) -> Floats:
+        """Return how long the axes can go at a speed within their reach [s], (num_axes,)."""
+        ramps = speed**2 / self.acceleration + speed * SETTLE
+        return np.asarray(np.minimum((np.abs(self.reach) - ramps) / speed, STEADY))
+
+    def least_reach(self, speed: float) -> Floats:
+        """Return how far the axes must go for a speed to be measured at [rad]."""
+        steady = max(LEAST_STEADY, LEAST_STEPS * 2.0 * math.pi / (TOOTH * self.motor.n_p) / speed)
+        return np.asarray(speed**2 / self.acceleration + speed * (SETTLE + steady))
+
+    def run(
+        self,
+        speed: float,
+        where: Mask,
+        look: Callable[[int, float], None] | None = None,
+        *,
+        until_stopped: bool = False,
+    ) -> Steady:
+        """Go there and back at a speed [rad/s].
+
+        Args:
+            speed: The speed.
+            where: Axes that move.
+            look: Called with 0 on the way out, 1 on the way back, and the time since it began, at each sample.
+            until_stopped: End once no axis goes on.
+        """
+        count = len(where)
+        steady = np.maximum(self.steady_time(speed), LEAST_STEADY)
+        way = np.copysign(speed * (steady + SETTLE) + speed**2 / self.acceleration, self.reach)
+        distance = np.rint(way * self.increments).astype(np.int64)
+        move = Move(
+            distance,
+            np.ceil(speed * self.increments).astype(np.int64),
+            np.ceil(self.acceleration * self.increments).astype(np.int64),
+            self.increments,
+            1.0,
+        )
+        write_profile(self.drives, move, where)
+        full_step = 2.0 * np.pi * self.increments / (TOOTH * self.motor.n_p)
+        lost, stopped = np.zeros((2, count), bool)
+        readings: list[Floats] = []
+        angles: list[Floats] = []
+        ramp = speed / self.acceleration
+        for leg, target in enumerate((self.origin + distance, self.origin)):
+            shift = self.trials.shift()
+            self.trials.go(target, where & ~lost & ~stopped)
+            end = 2.0 * float(ramp.max()) + SETTLE + float(steady.max()) + REST
+            for k in range(1, math.ceil(end / SAMPLE) + 1):
+                self.drives.advance(SAMPLE)
+                t = k * SAMPLE
+                lag = wrapped(
+                    self.drives.read(cia402.POSITION_DEMAND) - self.drives.read(cia402.POSITION_ACTUAL) - shift
+                )
+                enabled = cia402.matches(self.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+                stopped |= where & ~enabled
+                out = where & ~lost & (np.abs(lag) > LOST * full_step)
+                if np.any(halted := out & enabled):
+                    self.drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=halted)
+                lost |= out
+                if look is not None:
+                    look(leg, t)
+                if until_stopped and not np.any(where & ~stopped):
+                    break
+                is_steady = where & ~lost & ~stopped & (t > ramp + SETTLE) & (t < ramp + SETTLE + steady)
+                if is_steady.any():
+                    reading = np.asarray(self.drives.read(Role.LOAD_VALUE), float)
+                    readings.append(np.where(is_steady, reading, np.nan))
+                    along = np.sign(target - self.origin - (distance if leg else 0)) * lag / self.increments
+                    angle = (along - speed * self.age) * self.motor.n_p
+                    angles.append(np.where(is_steady, angle, np.nan))
+        return _steady(readings, angles, lost, stopped)
+
+
+def _steady(readings: list[Floats], angles: list[Floats], lost: Mask, stopped: Mask) -> Steady:
+    seen, angle = np.array(readings).reshape(-1, len(lost)), np.array(angles).reshape(-1, len(lost))
+    mean, lowest, spread, lag, settled = np.full((5, len(lost)), np.nan)
+    for k in range(len(lost)):
+        own = seen[~np.isnan(seen[:, k]), k]
+        if own.size:
+            mean[k], lowest[k], spread[k] = own.mean(), own.min(), own.std()
+            sizes = angle[~np.isnan(angle[:, k]), k]
+            lag[k], settled[k] = sizes.mean(), sizes[-max(own.size // 4, 1) :].mean()
+    return Steady(mean, lowest, spread, lag, settled, lost, stopped)

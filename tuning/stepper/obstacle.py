@@ -1,0 +1,95 @@
+"""A load and an obstacle on the axis, of emulated machines alone: whether a stall stops the motor in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drive_env import cia402
+from drive_env.drives.interface import machine_of
+from drive_env.phase_current import LOAD_SHARE, holding_torque
+from tuning.stepper.moves import SETTLE, Steady, WorkingMoves
+from tuning.stop_causes import told_causes
+from tuning.target import Target
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+OBSTACLE = 1.3  # of the holding torque at the run current: more than the motor can move
+RISE = 0.15  # s in which the load comes
+REACTION = 0.3  # s that a fault reaction takes at most
+AFTER = 0.05  # s at constant speed until the obstacle is there
+STALL = "stall"  # in what a drive says by itself
+
+
+@dataclass(frozen=True)
+class ObstacleProof:
+    """What load and obstacle did to the axes, (num_axes,) each.
+
+    withstood: Neither stopped nor lost steps with the acceptable load. stopped: Stopped by a stall at the obstacle.
+    lost: Whole teeth (four full steps) that were lost until then.
+    """
+
+    withstood: Mask
+    stopped: Mask
+    lost: Floats
+
+
+def can_load(target: Target) -> bool:
+    """Return whether a torque can be put on every axis by itself: emulated machines of one axis."""
+    return target.drives.machine is not None and target.axes_per_machine == 1
+
+
+def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floats, where: Mask) -> ObstacleProof:
+    """Move with the acceptable load, then against an obstacle; the axes are enabled again afterwards.
+
+    Args:
+        target: Emulated machines of one axis.
+        moves: Moves at the working speed.
+        speed: That [rad/s].
+        run: Amplitudes of the run current [A].
+        where: Axes that take part.
+    """
+    machine, drives, motor = machine_of(target.drives), target.drives, target.motor
+    against = -np.sign(moves.reach) / _lever(target)
+    calm = np.asarray(machine.load_torque, float).copy()
+
+    ramp = float((speed / moves.acceleration).max()) + SETTLE
+
+    def with_torque(torque: Floats, begin: float, rise: float) -> Steady:
+        def load(leg: int, t: float) -> None:
+            share = float(np.clip((t - begin) / rise, 0.0, 1.0)) if leg == 0 else 0.0
+            machine.load_torque = calm + np.where(where, share * against * torque, 0.0)
+
+        try:
+            return moves.run(speed, where, load, until_stopped=True)
+        finally:
+            machine.load_torque = calm
+
+    # A load that comes by and by: the rotor would swing in its field by a sudden one.
+    loaded = with_torque(np.full(target.num_axes, LOAD_SHARE * motor.rated_torque), ramp, RISE)
+    drives.advance(REACTION if loaded.stopped.any() else SETTLE)
+    moves.trials.recover(where)
+    drives.advance(SETTLE)
+    told_causes(drives)
+    before = moves.trials.shift()
+    blocked = with_torque(OBSTACLE * holding_torque(motor, run), ramp + AFTER, RISE / 5.0)
+    stalled = np.array([STALL in told for told in told_causes(drives)])
+    drives.advance(REACTION)
+    moves.trials.recover(where)
+    drives.advance(SETTLE)
+    tooth = 2.0 * np.pi * moves.increments / motor.n_p
+    lost = np.abs(moves.trials.shift() - before) / tooth
+    enabled = cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+    return ObstacleProof(where & ~loaded.failed, where & blocked.stopped & stalled & enabled, np.rint(lost))
+
+
+def _lever(target: Target) -> Floats:
+    """Return how a torque on the load turns the rotor of its axis."""
+    from mechanics.shaft import one, way
+
+    drives = machine_of(target.drives).drives
+    packed = one(drives.load)
+    return np.full(target.num_axes, float(np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max()))

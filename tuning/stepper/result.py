@@ -1,0 +1,122 @@
+"""The result of commissioning a stepper: what became of each axis, as the certificate has it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.certificate.certificate import verdict
+from tuning.runs.provenance import versions
+
+CERTIFICATE = "stepper-certificate.json"
+
+
+@dataclass(frozen=True)
+class StepperAxis:
+    """What became of one axis; figures are None where they were not measured.
+
+    Attributes:
+        before, after: Gains by name.
+        reason: Why it was rejected; "" where it was not.
+        reservations: What could not be proved, or is near a limit.
+        figures: What was measured, by name with its unit.
+    """
+
+    before: dict[str, int]
+    after: dict[str, int]
+    reason: str
+    reservations: tuple[str, ...]
+    figures: dict[str, float | None]
+
+    @property
+    def accepted(self) -> bool:
+        """Whether all checks passed, with reservations or without."""
+        return not self.reason
+
+    @property
+    def verdict(self) -> str:
+        """Which of `tuning.certificate.certificate.VERDICTS` it is."""
+        return verdict(self.accepted, self.reservations)
+
+
+@dataclass(frozen=True)
+class StepperResult:
+    """The result of a run.
+
+    Attributes:
+        axes: Of the target.
+        device, motor, machine: What was commissioned.
+        speed: The working speed [rad/s].
+        drive_seconds: Time that passed on the drives [s].
+        file: The state before.
+        kept: Whether drives on a bus stored the settings.
+        proved_with_load: Whether load and obstacle were put on the axis: emulated machines of one axis only.
+    """
+
+    axes: tuple[StepperAxis, ...]
+    device: str
+    motor: str
+    machine: str
+    speed: float
+    drive_seconds: float
+    file: Path
+    kept: bool
+    proved_with_load: bool
+
+    @property
+    def accepted(self) -> NDArray[np.bool_]:
+        """Which axes passed, (num_axes,)."""
+        return np.array([axis.accepted for axis in self.axes])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        return {
+            "device": self.device,
+            "motor": self.motor,
+            "machine": self.machine,
+            "working speed [rad/s]": round(self.speed, 4),
+            "drive seconds": round(self.drive_seconds, 3),
+            "stored": self.kept,
+            "load and obstacle tried": self.proved_with_load,
+            "not measured": "current, load step: the drive has no 6077h; frequency response, margins: open loop",
+            "axes": [
+                {
+                    "axis": k,
+                    "verdict": axis.verdict,
+                    "reason": axis.reason,
+                    "reservations": list(axis.reservations),
+                    "before": axis.before,
+                    "after": axis.after,
+                    "figures": axis.figures,
+                }
+                for k, axis in enumerate(self.axes)
+            ],
+            "versions": versions(),
+        }
+
+
+def figure(value: float, digits: int = 5) -> float | None:
+    """Return a number as the certificate has it: None for what was not measured."""
+    return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+
+
+@contextmanager
+def certificate_file(result: StepperResult, folder: Path) -> Iterator[Path]:
+    """Write the certificate, complete or not at all; it is removed if the block fails."""
+    from drive_env.whole_file import write_whole
+
+    path = folder / CERTIFICATE
+    write_whole(path, json.dumps(result.as_dict(), indent=1) + "\n")
+    try:
+        yield path
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
