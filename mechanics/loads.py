@@ -41,6 +41,8 @@ _SHAFT = {"motor": 1.0, "twist": 1.0}
 _END_SHAFT = {"motor": 1.0, "first_twist": 1.0, "second_twist": 1.0}
 _CARRIAGE = {"pulley": 1.0, "stretch": 1.0}
 _PULLEY = 0.04 / (2.0 * pi)  # m, 40 mm of belt per turn
+_TOOTH_BELT = 0.032 / (2.0 * pi)  # m, 32 mm of belt per turn
+_COLUMN_LEAD = 0.01 / (2.0 * pi)  # m/rad
 _LEAD = 0.005 / (2.0 * pi)  # m/rad
 _NUT = {"table": 1.0, "screw": -_LEAD}
 _TEETH = {"joint": 1.0, "motor": -1.0 / 50.0}
@@ -283,6 +285,30 @@ _ROWS = (
             Contact("left stops", _LEFT, -0.3, 0.3, 4e4, 60.0),
             Contact("right stops", _RIGHT, -0.3, 0.3, 4e4, 60.0),
         ),
+        disturbance_unit="N",
+    ),
+    Load(
+        MODELS / "portal.xml",
+        joints=("x", "y", "z"),
+        gear=(1.0 / _TOOTH_BELT, 1.0 / _TOOTH_BELT, 1.0 / _COLUMN_LEAD),
+        disturbance={"x": 1.0, "sway_x": 0.12},
+        frictions=(
+            _guide("bridge", {"x": 1.0}),
+            _guide("carriage", {"y": 1.0}),
+            Friction("column", {"z": 1.0}, 3.0, 4.0, 0.01, 20.0, bristle=1e-5),
+        ),
+        parameters=(
+            Parameter("mass", "kg", "body_mass", "bridge", 0.5, 2.0, "of the bridge"),
+            Parameter("payload", "kg", "body_mass", "arm", 0.3, 2.0, "of the tool and its arm"),
+            Parameter("stiffness", "N*m/rad", "jnt_stiffness", "sway_x", 0.5, 2.5, "of the arm along x"),
+            Parameter("damping", "N*m*s/rad", "dof_damping", "sway_x", 0.5, 3.0, "of the arm along x"),
+            *_friction("bridge", "m"),
+        ),
+        meaning="three axes at right angles under gravity: two belts, a screw, a tool that sways",
+        energy_bound=1e-3,
+        travel=((-0.25, 0.25),) * 3,
+        switches=_linear_switches(0.25, axes=3),
+        contacts=tuple(Contact(f"{joint} stops", {joint: 1.0}, -0.25, 0.25, 4e4, 60.0) for joint in ("x", "y", "z")),
         disturbance_unit="N",
     ),
     Load(

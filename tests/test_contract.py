@@ -224,6 +224,7 @@ class Life:
 
     def cst(self):
         """A tenth of the rated current, but at least one that the measurement resolves; then none."""
+        self.close_loop(1)
         self.mode("cst")
         current = max(100.0 * self.drives.motor.rated_current, 300.0)  # mA
         trace = self.run(0.02, {0x6071: np.full(20, round(current))})
@@ -231,6 +232,18 @@ class Life:
         assert np.all(np.abs(np.mean(trace[0x6077][5:], axis=0) - current) < 0.25 * current + 60.0)
         trace = self.run(0.02, {0x6071: np.zeros(20, int)})
         assert np.all(np.abs(np.mean(trace[0x6077][5:], axis=0)) < 0.1 * current + 60.0)
+
+        self.close_loop(0)
+
+    def close_loop(self, mode):
+        """Let a stepper's encoder commutate, without which it makes no torque that is asked for; others do always."""
+        if Role.LOOP_MODE not in self.drives.device.roles:
+            return
+        self.mode("pp")
+        self.drives.write(0x606A, 0 if mode else -1)
+        self.drives.write(Role.LOOP_MODE, mode)
+        self.run(1.0)
+        assert np.all(self.drives.read(Role.LOOP_INITIALISED) == mode)
 
     def no_mode(self):
         """Mode 0 brings a turning axis to rest and holds it there."""

@@ -419,9 +419,11 @@ FIELDS = {
 def test_the_machines_that_are_coupled_to_drives_are_there():
     assert set(LOADS) >= {
         "inertia", "two_mass", "three_mass", "belt", "ball_screw", "vertical_screw", "geared_joint", "arm",
-        "cart_pendulum", "inverted_pendulum", "fan", "winder", "gantry", "robot",
+        "cart_pendulum", "inverted_pendulum", "fan", "winder", "gantry", "portal", "robot",
     }  # fmt: skip
-    assert {name: row.num_axes for name, row in LOADS.items() if row.num_axes > 1} == {"gantry": 2, "robot": 6}
+    assert {name: row.num_axes for name, row in LOADS.items() if row.num_axes > 1} == {
+        "gantry": 2, "portal": 3, "robot": 6,
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", list(LOADS))

@@ -433,6 +433,33 @@ def test_two_drives_pull_the_gantry_straight():
     assert abs(yaw) < 1e-4
 
 
+def test_the_tool_of_the_portal_sways_as_arm_and_gravity_let_it():
+    """Axes held: the arm's stiffness and its weight against its inertia, about the arm's upper end."""
+    load = replace(find_load("portal"), start={"sway_x": 0.01, "sway_y": -0.005})
+    with drives_of(load, friction="none") as drives:
+        drives.machine.brake = "closed"
+        sway = watch(drives, 1.0, lambda: drives.machine.joint_positions[0, 3:])
+    rate = math.sqrt((9.0 + 0.15 * G * 0.12) / (4e-5 + 0.15 * 0.12**2))
+    damping = 2.5e-3 / (4e-5 + 0.15 * 0.12**2) / 2.0
+    t = np.arange(1, len(sway) + 1) * 1e-3 - 0.5 * H
+    free = np.exp(-damping * t) * np.cos(math.sqrt(rate**2 - damping**2) * t)
+    np.testing.assert_allclose(sway[:, 0], 0.01 * free, atol=5e-4)
+    np.testing.assert_allclose(sway[:, 1], -0.005 * free, atol=2.5e-4)
+
+
+def test_the_axes_of_the_portal_go_their_own_ways_and_one_carries_the_weight():
+    ways = np.array([0.032, 0.032, 0.01])  # m per turn
+    turns = np.array([2.0, -3.0, 4.0])
+    with drives_of("portal", friction="none", parameters={"load.stiffness": 1e3}) as drives:
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, np.rint(turns * TURN).astype(int))
+        drives.advance(0.5)
+        seen = watch(drives, 0.2, lambda: (drives.machine.joint_positions[0, :3], drives.machine.motor_torque))
+    np.testing.assert_allclose(seen[:, 0].mean(axis=0), turns * ways, atol=1e-5)
+    weight = (0.12 + 0.15) * G * 0.01 / (2 * math.pi)
+    np.testing.assert_allclose(seen[:, 1].mean(axis=0), [0.0, 0.0, weight], atol=0.03 * weight)
+
+
 def test_a_robot_holds_its_pose():
     with drives_of("robot") as drives:
         motion.enable(drives, mode="pp")

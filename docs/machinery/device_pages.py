@@ -43,6 +43,8 @@ def page(device: Device) -> str:
             f"A variant of [`{device.variant_of}`]({device.variant_of}.md): what differs is in its `device.toml`, and "
             "all of it is below.\n"
         )
+    if device.about:
+        parts.append(f"{device.about}\n")
     parts += [facts(device), gains(device), roles(device), emergencies(device), objects(device)]
     return "\n".join(parts)
 
@@ -185,7 +187,7 @@ def notes(device: Device, entry: Entry, by_place: dict[tuple[int, int], object])
         found.append(f"written in {device.write_states[place].replace('_', ' ').lower()} only")
     if place in device.unsupported:
         reason = device.unsupported[place]
-        found.append(f"always refused: {reason}" if reason else "a service of a node on a bus")
+        found.append(f"always refused: {reason}" if reason else "refused where the service behind it is not there")
     return "; ".join(found)
 
 

@@ -17,6 +17,7 @@ from drive_env.devices import Device
 from drive_env.dictionary.aborts import INCOMPATIBLE_PARAMETER, VALUE_RANGE, WRONG_STATE, ObjectAccessError
 from drive_env.dictionary.access import check_allowed, check_limits
 from drive_env.dictionary.entries import EdsText, Entry, ObjectDictionary
+from drive_env.emulator.live_dictionary import check_supported
 from drive_env.node import mapping
 from drive_env.node.axis import ObjectPort
 
@@ -93,10 +94,6 @@ class ModuleObjects:
         assert isinstance(raw, int), "a text is not a number"
         return raw
 
-    def role(self, role: str) -> int:
-        """Return the number in the object that has a role."""
-        return self.value(*self._device.canopen.objects[role])
-
     def port(self, entry: Entry) -> ObjectPort:
         """Return the way to one of these objects."""
         key = (entry.index, entry.sub)
@@ -113,6 +110,7 @@ class ModuleObjects:
 
         def checked(raw: int) -> None:
             check_limits(entry, raw)
+            check_supported(self._device, entry)
             # A device's data name the PDOs of the first axis; those of the others take the same values.
             allowed = self._device.allowed_values.get((self._device.locate(entry.index)[1], entry.sub))
             if allowed is not None:
@@ -238,8 +236,12 @@ def _rule(index: int) -> Rule | None:
 
 # --- commands and bit rates -------------------------------------------------------------------------------------------
 def known_bit_rate(device: Device, bit_rate: int) -> int:
-    """Return a bit rate [bit/s] as 2704h counts it [kbit/s]; ValueError if the device does not have it."""
-    known = device.allowed_values.get(device.canopen.objects["bit_rate"])
+    """Return a bit rate [bit/s] as 2704h counts it [kbit/s]; ValueError if the device does not have it.
+
+    One without such an object has every bit rate.
+    """
+    key = device.canopen.objects.get("bit_rate")
+    known = None if key is None else device.allowed_values.get(key)
     if known is not None and bit_rate not in [1000 * rate for rate in known]:
         rates = ", ".join(str(1000 * rate) for rate in known)
         raise ValueError(f"{device.name} has no bit rate of {bit_rate} bit/s; it has {rates}")

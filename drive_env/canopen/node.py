@@ -153,7 +153,7 @@ class Node:
     @property
     def bit_rate(self) -> int:
         """Bit rate [kbit/s] of its controller."""
-        return self._module.role("active_bit_rate")
+        return self._bit_rate
 
     def power_on(self, now: float) -> None:
         """Switch the device on, or off and on: stored values, boot-up, pre-operational."""
@@ -315,12 +315,17 @@ class Node:
         """Let bit rate and node ID that were stored become the active ones; never stored, they are the given ones."""
         objects, bus = self._device.canopen.objects, self._store.sections.get("bus")
         factory = self._module.factory(self._given_id)
+        active = {"bit_rate": self._bus_bit_rate or 0, "node_id": self._given_id}
         for role, given in (("bit_rate", self._bus_bit_rate), ("node_id", self._given_id)):
-            key = objects[role]
+            key = objects.get(role)
+            if key is None:  # a device that keeps neither has what it was given
+                continue
             raw = given if bus is None and given is not None else (bus or {}).get(key, factory[key])
+            assert isinstance(raw, int), "bit rate and node-ID are numbers"
+            active[role] = raw
             self._module.set(role, raw)
             self._module.set(f"active_{role}", raw)
-        self.node_id = self._module.role("active_node_id")
+        self._bit_rate, self.node_id = active["bit_rate"], active["node_id"]
 
     def _reset_communication(self, now: float) -> None:
         """Bring the communication objects back, send the boot-up message and become pre-operational."""

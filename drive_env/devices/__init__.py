@@ -168,6 +168,7 @@ class Device(NamedTuple):
     gains: GainSet
     firmware_name: str
     variant_of: str = ""
+    about: str = ""  # what a reader of its page must know besides its data
 
     @property
     def firmware(self) -> Firmware:
@@ -377,6 +378,7 @@ def _device(
         gains=gains,
         firmware_name=checked_firmware(data["firmware"]),
         variant_of=data.get("variant_of", ""),
+        about=data.get("about", "").strip(),
     )
 
 

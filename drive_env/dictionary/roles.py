@@ -31,6 +31,8 @@ class Role(Enum):
     ENCODER_INITIALISATION = "initialisation of the encoder"
     HALL_POLARITY = "polarity of the hall sensors"
     HALL_DIRECTION = "direction of the hall sensors"
+    LOOP_MODE = "mode of the loop that an encoder closes around a stepper"
+    LOOP_INITIALISED = "whether that loop commutates"
     FIELD_ANGLE = "angle of the field in open loop"
     ELECTRICAL_ANGLE = "electrical angle by the encoder"
     HALL_ANGLE = "electrical angle by the hall sensors"

@@ -84,6 +84,7 @@ UNITS: dict[str, Unit] = {
         Unit("0.1V", "tenths of a volt", lambda c: 0.1),
         Unit("pps", "increments per second", _angle, follows_scale=True),
         Unit("pps^2", "increments per second squared", _angle, follows_scale=True),
+        Unit("pps^3", "increments per second cubed", _angle, follows_scale=True),
         Unit("rpm", "revolutions per minute", lambda c: RPM),
         Unit("rpm/s", "revolutions per minute, per second", lambda c: RPM),
         Unit("1/1000", "thousandths", lambda c: 1e-3),

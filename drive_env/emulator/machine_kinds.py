@@ -7,4 +7,4 @@ from drive_env.emulator.servo_machine import SERVO
 from drive_env.emulator.stepper_machine import STEPPER
 
 # By the name of the firmware's folder.
-MACHINE_KINDS: dict[str, MachineKind] = {"servo": SERVO, "stepper": STEPPER}
+MACHINE_KINDS: dict[str, MachineKind] = {"servo": SERVO, "stepper": STEPPER, "stepper_loop": STEPPER}

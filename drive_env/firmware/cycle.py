@@ -303,6 +303,8 @@ def reset_shared_state(drive, lane):
     drive.velocity_demand[lane] = 0.0
     drive.torque_demand[lane] = 0.0
     drive.ramp_wait_left[lane] = 0.0
+    drive.acceleration_demand[lane] = 0.0
+    drive.acceleration_before[lane] = 0.0
     drive.cause_flags[lane] = 0
 
 

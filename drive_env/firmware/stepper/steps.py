@@ -74,15 +74,21 @@ def count_steps(drive, h):
 
 
 @inlined
+def table_values(drive, lane, position):
+    """Return sine and cosine of the table's entry at a position [rad]."""
+    entry = np.floor(position * drive.steps_per_rad[lane] + 0.5)
+    entry -= drive.table_length[lane] * np.floor(entry / drive.table_length[lane])
+    angle = (entry + 0.5) * drive.rad_per_entry[lane]
+    full = (np.floor(angle * (1.0 / HALF_PI)) + 0.5) * HALF_PI
+    return sine_cosine(full if drive.in_full_steps[lane] > 0.5 else angle)
+
+
+@inlined
 def make_steps(drive, dt):
     """Step for one tick of dt [s]: writes step_position, and the table's values sin_ref and cos_ref."""
     for lane in range(LANES):
         position = drive.step_position[lane] + drive.step_rate[lane] * dt
         drive.step_position[lane] = position
-        entry = np.floor(position * drive.steps_per_rad[lane] + 0.5)
-        entry -= drive.table_length[lane] * np.floor(entry / drive.table_length[lane])
-        angle = (entry + 0.5) * drive.rad_per_entry[lane]
-        full = (np.floor(angle * (1.0 / HALF_PI)) + 0.5) * HALF_PI
-        s, c = sine_cosine(full if drive.in_full_steps[lane] > 0.5 else angle)
+        s, c = table_values(drive, lane, position)
         drive.sin_ref[lane] = s
         drive.cos_ref[lane] = c

@@ -162,6 +162,9 @@ def generate_demand(drive, lane, dt):
     if drive.mode[lane] != drive.mode_display[lane]:
         change_mode(drive, lane)
     mode = drive.mode_display[lane]
+    # Whatever moves the demand without bows leaves no acceleration behind for a ramp that has them.
+    drive.acceleration_before[lane] = drive.acceleration_demand[lane]
+    drive.acceleration_demand[lane] = 0.0
     if drive.drive_function[lane] == 0.0:
         drive.position_demand[lane] = drive.theta_meas[lane]
         drive.velocity_demand[lane] = 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drive_env import cia402
-from drive_env.firmware.common import fsa, profiles, six_point
+from drive_env.firmware.common import fsa, profiles, s_ramp, six_point
 from drive_env.firmware.common.limits import ROUNDING, corrected_maximum, corrected_minimum
 from mechanics.compiled import stage
 
@@ -57,7 +57,9 @@ def generate(drive, lane, ramp, dt):
     if up > 0.0 and v_max > 0.0:
         # Factory values of 6081h and 6083h are 0: then there is no speed to move with, and the axis stays.
         down = drive.deceleration[lane] if drive.deceleration[lane] > 0.0 else up
-        if six_point.is_set(drive, lane):
+        if s_ramp.is_set(drive, lane):
+            s_ramp.advance(drive, lane, target, v_max, up, down, dt)
+        elif six_point.is_set(drive, lane):
             six_point.advance(drive, lane, target, v_max, up, down, dt)
         else:
             x, v = profiles.trapezoid(x, v, target, v_max, up, down, dt)

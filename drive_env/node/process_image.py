@@ -1,0 +1,195 @@
+"""Process data as one packed image in each direction, and the objects that say what is in it (ETG.1000.6, 5.6.7.4).
+
+Sync manager 2 carries what the master sends (outputs), sync manager 3 what the drive answers (inputs). 1C12h and 1C13h
+name the mapping objects that each carries, and those the objects, one behind the other without gaps. An image is not
+bound to the 8 bytes of a frame on CAN. It is changed from the outside in: no assignment (1C12h:00 = 0), no entries
+(1600h:00 = 0), entries, their number, the assignment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from drive_env.dictionary.aborts import (
+    SUB_INDEX_ZERO_IN_USE,
+    UNSUPPORTED_ACCESS,
+    VALUE_RANGE,
+    WRONG_STATE,
+    ObjectAccessError,
+)
+from drive_env.dictionary.access import check_allowed, check_limits
+from drive_env.dictionary.entries import Entry
+from drive_env.emulator.emulated_drives import EmulatedDrives
+from drive_env.node import mapping
+from drive_env.node.axis import Axis, ObjectPort
+from drive_env.node.node_dictionary import NodeDictionary
+from drive_env.node.process_data import MappedObjects
+
+SYNC_MANAGER_TYPES = 0x1C00
+OUTPUTS, INPUTS = 0x1C12, 0x1C13  # what sync managers 2 and 3 carry
+ASSIGNMENTS = {OUTPUTS: range(0x1600, 0x1800), INPUTS: range(0x1A00, 0x1C00)}  # and the mappings that each can
+
+
+class ProcessImage:
+    """The process image of a device with sync managers, in front of the axes of an emulated one.
+
+    Args:
+        drives: The emulated drives.
+        first_axis: Number of the device's first axis among the drives'.
+        may_change: Tells whether the image may be changed now; a node of EtherCAT allows it in pre-operational alone.
+
+    Raises:
+        ValueError: For a device without sync managers, or axes that the drives do not have.
+
+    Attributes:
+        dictionary: All objects by index and sub-index; the image's among them.
+        commands: Objects whose write commands something: none.
+    """
+
+    def __init__(
+        self, drives: EmulatedDrives, first_axis: int = 0, may_change: Callable[[], bool] = lambda: True
+    ) -> None:
+        device, objects = drives.device, drives.inside.objects
+        entries = objects.entries
+        missing = [index for index in ASSIGNMENTS if not entries.has(index)]
+        if missing:
+            raise ValueError(
+                f"{device.name} has no process image: its dictionary lacks {missing[0]:04X}h; its process data are PDOs"
+            )
+        if not 0 <= first_axis <= drives.num_axes - device.num_axes:
+            raise ValueError(
+                f"the image of {device.name} carries {device.num_axes} axes from first_axis={first_axis} on, and there "
+                f"are {drives.num_axes}: take a load, or a number of machines, with {device.num_axes} axes"
+            )
+        self.commands: dict[tuple[int, int], Callable[[int], None]] = {}
+        self._may_change = may_change
+        self._allowed = device.allowed_values
+        carried = {direction: [i for i in indices if entries.has(i)] for direction, indices in ASSIGNMENTS.items()}
+        # Of CANopen's PDOs, which the device may have too, each has a communication parameter 200h below its mapping.
+        self._mappings = {
+            index: direction
+            for direction, indices in carried.items()
+            for index in indices
+            if not entries.has(index - 0x200)
+        }
+        owned = {SYNC_MANAGER_TYPES, *ASSIGNMENTS, *self._mappings}
+        self._factory = {(entry.index, entry.sub): _number(entry) for entry in entries if entry.index in owned}
+        self._values = dict(self._factory)
+        axes = [Axis(objects, first_axis + k) for k in range(device.num_axes)]
+        self.dictionary = NodeDictionary(device, entries, self, axes)
+        self._configure()
+
+    # --- the image --------------------------------------------------------------------------------------------------
+    @property
+    def output_size(self) -> int:
+        """Length of what the master sends [bytes]."""
+        return self._images[OUTPUTS].size
+
+    @property
+    def input_size(self) -> int:
+        """Length of what the drive answers [bytes]."""
+        return self._images[INPUTS].size
+
+    def write_outputs(self, data: bytes) -> bool:
+        """Let what the master sent take effect, all of it or, where an object does not take its value, nothing.
+
+        Returns:
+            Whether it took effect.
+
+        Raises:
+            ValueError: For data of another length than the image; a sync manager passes none on.
+        """
+        image = self._images[OUTPUTS]
+        if len(data) != image.size:
+            raise ValueError(f"outputs have {image.size} bytes as they are mapped, not {len(data)}")
+        return image.write(data)
+
+    def read_inputs(self) -> bytes:
+        """Return what the drive answers, as it is now."""
+        return self._images[INPUTS].pack()
+
+    def restart(self) -> None:
+        """Bring the factory's image back, as a device does that is switched on."""
+        self._values.update(self._factory)
+        self._configure()
+
+    # --- the objects ------------------------------------------------------------------------------------------------
+    def owns(self, entry: Entry) -> bool:
+        """Return whether an object is one of the image's."""
+        return (entry.index, entry.sub) in self._values
+
+    def port(self, entry: Entry) -> ObjectPort:
+        """Return the way to one of them."""
+        key = (entry.index, entry.sub)
+
+        def write(raw: int) -> None:
+            self._values[key] = raw
+            self._configure()
+
+        return ObjectPort(entry, lambda: self._values[key], partial(self._check, entry), write)
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+    def _configure(self) -> None:
+        """Take over what the objects say."""
+        self._images = {direction: self._image(direction) for direction in ASSIGNMENTS}
+
+    def _image(self, direction: int) -> MappedObjects:
+        mapped = [
+            mapping.parse(self._values[index, sub])
+            for index in self._assigned(direction)
+            for sub in range(1, self._values[index, 0] + 1)
+        ]
+        return MappedObjects([self.dictionary.port(index, sub) for index, sub, _ in mapped])
+
+    def _assigned(self, direction: int) -> list[int]:
+        return [self._values[direction, sub] for sub in range(1, self._values[direction, 0] + 1)]
+
+    def _check(self, entry: Entry, raw: int) -> None:
+        check_limits(entry, raw)
+        allowed = self._allowed.get((entry.index, entry.sub))
+        if allowed is not None:
+            check_allowed(entry, np.array([raw]), allowed)
+        if not self._may_change():
+            raise ObjectAccessError(WRONG_STATE, f"{entry.label} can only be written in pre-operational")
+        if entry.index in ASSIGNMENTS:
+            self._check_assignment(entry, raw)
+        elif entry.index in self._mappings:
+            self._check_mapping(entry, raw)
+
+    def _check_assignment(self, entry: Entry, raw: int) -> None:
+        direction = entry.index
+        self._check_sub_index(entry)
+        for index in [self._values[direction, sub] for sub in range(1, raw + 1)] if entry.sub == 0 else [raw]:
+            if self._mappings.get(index) != direction:
+                known = ", ".join(f"{one:04X}h" for one, way in self._mappings.items() if way == direction)
+                raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {index:04X}h; there is {known}")
+
+    def _check_mapping(self, entry: Entry, raw: int) -> None:
+        direction = self._mappings[entry.index]
+        if entry.index in self._assigned(direction):
+            raise ObjectAccessError(
+                UNSUPPORTED_ACCESS, f"{entry.label} is in use; set {direction:04X}h:00 to 0 before changing its mapping"
+            )
+        self._check_sub_index(entry)
+        transmit = direction == INPUTS
+        subs = range(1, raw + 1) if entry.sub == 0 else ()
+        for mapped in [self._values[entry.index, sub] for sub in subs] or ([raw] if entry.sub and raw else []):
+            mapping.check_mappable(entry, mapped, transmit, self._find)
+
+    def _check_sub_index(self, entry: Entry) -> None:
+        count = self._values[entry.index, 0]
+        if entry.sub != 0 and count != 0:
+            raise ObjectAccessError(
+                SUB_INDEX_ZERO_IN_USE, f"{entry.label} is one of {count} in use; set sub-index 0 to 0 before"
+            )
+
+    def _find(self, index: int, sub: int) -> Entry:
+        return self.dictionary.entries.find((index, sub))
+
+
+def _number(entry: Entry) -> int:
+    assert isinstance(entry.default, int), "objects of the image are numbers"
+    return entry.default
