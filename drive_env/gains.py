@@ -256,13 +256,8 @@ _CHIP = {
 }
 
 
-def has_linear_model(device: Device) -> bool:
-    """Return whether the loops of a device are those of the linear model: it has every gain of the cascade, once."""
-    return not _lacks(device)
-
-
 def check_linear_model(device: Device) -> None:
-    """Raise ValueError unless a device's loops are those of the linear model, saying what it lacks."""
+    """Raise ValueError unless a device's loops are those of the linear model: every gain of the cascade, once."""
     if lacks := _lacks(device):
         raise ValueError(
             f"{device.name}: this drive has no linear model of its loops: {lacks}; drive-tune sweep and optimise need "

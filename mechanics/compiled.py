@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import re
@@ -13,7 +14,8 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 import numba
-from numba import config, njit
+from numba import config, njit, types
+from numba.core import event
 
 from mechanics.kernel_files import KernelCache
 
@@ -32,6 +34,33 @@ _IMPORT = re.compile(r"^(?:from ([\w.]+) import (\([^)]*\)|.*)|import (.*))$", r
 UNCOUNTED: dict[str, Any] = {"_nrt": False}
 # What kernels alone call needs no way in from Python or C: compiling those took a tenth of the whole.
 UNWRAPPED: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+class _CollectorWaits(event.Listener):  # type: ignore[misc]  # Numba has no types
+    """Has Python's cyclic garbage collector wait while Numba compiles.
+
+    A compilation makes millions of objects that live until its end: to look through them again and again took a sixth
+    of the whole. Numba compiles in one thread at a time.
+    """
+
+    def __init__(self) -> None:
+        self._nested, self._was_on = 0, False
+
+    def on_start(self, event: event.Event) -> None:
+        """Switch it off at the outermost function."""
+        if self._nested == 0:
+            self._was_on = gc.isenabled()
+            gc.disable()
+        self._nested += 1
+
+    def on_end(self, event: event.Event) -> None:
+        """Switch it on again, whatever ended the compilation."""
+        self._nested -= 1
+        if self._nested == 0 and self._was_on:
+            gc.enable()
+
+
+event.register("numba:compile", _CollectorWaits())
 
 
 def user_cache_folder() -> Path:
@@ -120,7 +149,18 @@ def cached(*, allocates: bool = True, source: str | None = None) -> Callable[[Fu
 
 def stage(function: Function) -> Function:
     """Compile a function that kernels call, and they alone: Python would crash. It cannot make arrays."""
-    return njit(**OPTIONS, **UNCOUNTED, **UNWRAPPED)(function)  # type: ignore[no-any-return]
+    kernel: Any = njit(**OPTIONS, **UNCOUNTED, **UNWRAPPED)(function)
+    specialised = kernel.get_call_template
+
+    # Numba would compile it once more for each number that a caller has written out: the automaton's transitions seven
+    # times. The optimiser sees the number all the same, where it puts the function in its caller's place.
+    def of_any_number(args: Any, kws: Any) -> Any:
+        return specialised(
+            tuple(types.unliteral(one) for one in args), {name: types.unliteral(one) for name, one in kws.items()}
+        )
+
+    kernel.get_call_template = of_any_number
+    return kernel  # type: ignore[no-any-return]
 
 
 def inlined(function: Function) -> Function:

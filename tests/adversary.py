@@ -22,7 +22,9 @@ from __future__ import annotations
 import argparse
 import logging
 import multiprocessing
+import os
 import random
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -542,6 +544,18 @@ def attack_machines(numbers: Iterable[int], seed: int = 0) -> Tally:
     return tally
 
 
+def end_with_parent() -> None:
+    """Have a worker process end when the program that started it does, however that ended: its queue is long."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "only workers have a parent"
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", type=int, default=100_000, help="how many")
@@ -556,7 +570,7 @@ def main() -> None:
     tally, begin = Tally(), time.perf_counter()
     columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TextColumn("{task.fields[bad]} wrong"))
     with (
-        ProcessPoolExecutor(given.processes, multiprocessing.get_context("spawn")) as pool,
+        ProcessPoolExecutor(given.processes, multiprocessing.get_context("spawn"), initializer=end_with_parent) as pool,
         Progress(*columns, TimeRemainingColumn()) as progress,
     ):
         task = progress.add_task("episodes", total=given.episodes, bad=0)

@@ -122,7 +122,27 @@ def sample(files: Sequence[str], count: int, seed: int) -> list[Mutant]:
         for mutant in mutants_of(file):
             by_line.setdefault((file, mutant.line), []).append(mutant)
     lines = chance.sample(sorted(by_line), min(count, len(by_line)))
-    return [chance.choice(by_line[line]) for line in lines]
+    chosen = (chance.sample(by_line[line], len(by_line[line])) for line in lines)
+    return [found for some in chosen if (found := next(filter(_is_python, some), None)) is not None]
+
+
+def _is_python(mutant: Mutant) -> bool:
+    """Return whether a change leaves a file that can be read: where it does not, every test would notice."""
+    try:
+        ast.parse(_changed((REPOSITORY / mutant.file).read_text(encoding="utf-8"), mutant))
+    except SyntaxError:
+        return False
+    return True
+
+
+def _changed(source: str, mutant: Mutant) -> str:
+    """Return a file's text with a change."""
+    from cosmic_ray.mutating import mutate_code
+    from cosmic_ray.plugins import get_operator
+
+    changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
+    assert changed is not None and changed != source, mutant
+    return str(changed)
 
 
 class Copy:
@@ -153,13 +173,9 @@ class Copy:
 
     def try_(self, mutant: Mutant, tests: Sequence[str]) -> Outcome:
         """Return whether tests notice a change; the file is as it was afterwards."""
-        from cosmic_ray.mutating import mutate_code
-        from cosmic_ray.plugins import get_operator
-
         path = self.folder / mutant.file
         source = path.read_text(encoding="utf-8")
-        changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
-        assert changed is not None and changed != source, mutant
+        changed = _changed(source, mutant)
         before, after = next((a, b) for a, b in zip(source.splitlines(), changed.splitlines(), strict=False) if a != b)
         began = time.monotonic()
         path.write_text(changed, encoding="utf-8")

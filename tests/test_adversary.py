@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import multiprocessing
+import os
 import random
+import subprocess
+import sys
+import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,6 +27,7 @@ from adversary import (
     build_bench,
     judge,
     kind_of,
+    main,
     quiet,
     run_episode,
     runs,
@@ -32,6 +39,7 @@ from drive_env.cia402 import State
 from drive_env.cores import usable_cores
 
 SAMPLE, MANY = 40, 600
+PATIENCE = 60.0  # s
 ON, OFF = 4, 1  # of the automaton
 
 
@@ -51,6 +59,56 @@ def test_the_envelope_withstands_many():
             tally.merge(part)
     assert tally.text() == ""
     assert tally.episodes == MANY
+
+
+WORKER = """
+import multiprocessing, time
+from concurrent.futures import ProcessPoolExecutor
+import adversary
+
+def note(k):
+    open(f"{multiprocessing.current_process().pid}.worker", "w").close()
+    time.sleep(600)
+
+if __name__ == "__main__":
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=adversary.end_with_parent) as pool:
+        list(pool.map(note, range(100)))
+"""
+
+
+def test_workers_end_with_the_program_that_started_them(tmp_path):
+    """Killed, it can tell them nothing; they had gone on to the end of their queue."""
+    (tmp_path / "many.py").write_text(WORKER)
+    program = subprocess.Popen(
+        [sys.executable, "many.py"], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    )
+    try:
+        wait_until(lambda: list(tmp_path.glob("*.worker")))
+        worker = int(next(tmp_path.glob("*.worker")).stem)
+        assert is_running(worker)
+    finally:
+        program.terminate()
+        program.wait(PATIENCE)
+    wait_until(lambda: not is_running(worker))
+
+
+def test_its_own_workers_do_so():
+    assert "initializer=end_with_parent" in inspect.getsource(main)
+
+
+def wait_until(condition):
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "nothing came of it"
+        time.sleep(0.05)
+
+
+def is_running(process):
+    try:
+        os.kill(process, 0)
+        return "\nState:\tZ" not in Path(f"/proc/{process}/status").read_text()
+    except (ProcessLookupError, FileNotFoundError):
+        return False
 
 
 # --- the adversary is one -------------------------------------------------------------------------------------------

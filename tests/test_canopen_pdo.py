@@ -116,6 +116,19 @@ def test_a_new_set_point_finds_the_target_of_its_frame(wire):
     assert abs(wire.value(0x6064) - 20_000) < 200  # within a degree: the factory preset is soft
 
 
+def test_the_mode_of_a_frame_takes_effect_before_the_controlword_that_stands_in_front_of_it(wire):
+    for index, raw in ((0x6081, 300_000), (0x6083, 3_000_000), (0x6084, 3_000_000), (0x607A, 20_000)):
+        configure(wire, index, 0, raw, 4)
+    wire.play("""
+        rx 305  06 00 03              # pv
+        rx 305  07 00 03
+        rx 305  0F 00 03
+        rx 305  1F 00 01              # pp, and its new set-point
+    """)
+    wire.wait(300)
+    assert abs(wire.value(0x6064) - 20_000) < 200
+
+
 def test_a_repeated_mode_is_ignored_in_an_rpdo_and_refused_by_sdo(wire):
     wire.play("""
         rx 305  06 00 03

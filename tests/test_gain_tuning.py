@@ -248,6 +248,8 @@ def test_a_trial_that_shakes_is_stopped_within_50_ms_and_the_drive_goes_on_with_
         tried = trials.run(wild, rule, move, np.zeros(2, np.int64), np.ones(2, np.int64), np.ones(2, bool))
         assert tried.aborted[:, 0].tolist()[:2] == [False, False]
         assert tried.aborted[:, 1].all()
+        followed = np.abs(tried.error).sum(axis=0) * 0.001  # the integral of the first phase's error, a sample per ms
+        assert tried.following[0] == pytest.approx(followed) and (followed > 0.002).all()
         assert looks[0] == wild[1, P]
         assert set(looks[50:]) == {rule[1, P]}  # a look is a millisecond
         assert [int(drives.read(name)[1]) for name in GAIN_OBJECTS] == rule[1].tolist()

@@ -29,7 +29,7 @@ from drive_env.dictionary.units import UNITS, Context
 from drive_env.envs.gain_scheduling import GainScheduling
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.envs.tracking import Tracking
-from drive_env.gains import gain_factors, has_linear_model, rule_gains
+from drive_env.gains import check_linear_model, gain_factors, rule_gains
 from drive_env.motors import find_motor
 from tuning.auto.one_button import auto
 from tuning.certificate.certificate import si_gains
@@ -194,7 +194,8 @@ def test_a_trained_tuner_names_the_gain_that_a_drive_lacks():
 
 def test_what_needs_a_linear_model_says_that_it_has_none(tmp_path):
     device, motor = find_device(INVENTED), find_motor("qbl4208")
-    assert not has_linear_model(device)
+    with pytest.raises(ValueError, match="this drive has no linear model of its loops"):
+        check_linear_model(device)
     with emulated(INVENTED, "inertia") as target:
         for needs_it in (
             lambda: auto(target, tmp_path / "before.toml"),

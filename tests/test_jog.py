@@ -36,7 +36,7 @@ def is_off(drives):
     return drives.read(0x6041)[0] & 0x4F == 0x40
 
 
-@pytest.mark.parametrize("words", [("2000 rpm", "--by", "-50 rev"), ("--for", "2", "--", "-2000 rpm")])
+@pytest.mark.parametrize("words", [("2000 rpm", "--by", "-50 rev"), ("-2000 rpm", "--for", "2")])
 def test_a_limit_switch_ends_it_and_is_named(jog, words):
     run, drives = jog
     found = run(*words)
@@ -60,5 +60,30 @@ def test_an_axis_that_does_not_move_is_told(jog):
     assert slow.exit_code == 0, slow.output
     found = run("300 rpm", "--for", "0.2")
     assert found.exit_code == 1, found.output
-    assert "the axis hardly moved, and the drive reports no cause: check for a closed brake" in found.stderr
+    assert "the axis hardly moved, and the drive reports no cause. The speed was 327680 pps (300 rpm)" in found.stderr
+    assert "Else check for a closed brake, a blocked load" in found.stderr
     assert "Limits(" not in found.output and is_off(drives)
+
+
+def test_a_speed_without_a_unit_is_told_in_rpm_where_the_axis_hardly_moved(jog):
+    run, drives = jog
+    before = drives.read(0x6064)[0]
+    found = run("30", "--for", "0.1")
+    assert abs(drives.read(0x6064)[0] - before) < 16
+    assert found.exit_code == 1, found.output
+    assert "The speed was 30 pps (0.0274658 rpm); if 30 rpm are meant, write '30 rpm'. Else check" in found.stderr
+
+
+@pytest.mark.parametrize(
+    ("speed", "text"),
+    [("300", "300 pps (0.274658 rpm); if 300 rpm are meant, write '300 rpm'"), ("300 pps", "300 pps (0.274658 rpm)")],
+)
+def test_a_speed_in_words(speed, text):
+    from drive_env.commands.jog import _speed_in_words
+    from drive_env.devices import find_device
+
+    entry = find_device("tmcm1636").new_dictionary().find(0x60FF)
+    assert _speed_in_words(speed, 300, entry, 65536.0) == text
+    assert _speed_in_words("300", 300, entry, None) == "300 pps; if 300 rpm are meant, write '300 rpm'"
+    rpm = find_device("tmcm1636_fw109").new_dictionary().find(0x60FF)
+    assert _speed_in_words("300", 300, rpm, 65536.0) == "300 rpm"

@@ -1,6 +1,7 @@
 """The cache of compiled kernels: whatever its files hold, a program runs, and says in one line what it rebuilds."""
 
 import errno
+import gc
 import logging
 import os
 import shutil
@@ -10,6 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba import njit
+from numba.core.errors import TypingError
+from numba.extending import overload
 
 from drive_env import EmulatedDrives
 from drive_env.emulator import cyclic_control, prepared_record
@@ -18,7 +22,7 @@ from drive_env.envs import bus_delays, tracking_cycle
 from drive_env.firmware.servo import stages
 from drive_env.firmware.servo.stages import FIRMWARE
 from mechanics import kernel_files
-from mechanics.compiled import source_hash, sources, user_cache_folder
+from mechanics.compiled import source_hash, sources, stage, user_cache_folder
 from mechanics.kernel_files import KernelFiles
 
 ROOT = Path(kernel_files.__file__).parent.parent
@@ -223,3 +227,42 @@ def test_kernels_of_a_copy_of_the_sources_are_those_of_the_original(cache, tmp_p
         env={**os.environ, "DRIVE_ENV_CACHE": str(cache), "PYTHONPATH": str(tmp_path / "copy")},
     )  # fmt: skip
     assert (found.stdout, found.stderr) == ("compiled 0 kept 1\n", "")
+
+
+def test_a_stage_is_compiled_once_whatever_numbers_its_callers_have_written_out():
+    @stage
+    def add(values, number):
+        values[0] += number
+
+    @njit
+    def kernel(values, number):
+        add(values, 1)
+        add(values, 20)
+        add(values, number)
+
+    values = np.zeros(1)
+    kernel(values, 300)
+    assert values[0] == 321.0
+    assert len(add.signatures) == 1
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_collector_waits_while_something_is_compiled_and_is_as_it_was_then(enabled):
+    seen = []
+
+    def unknown(_):
+        raise AssertionError("compiled code alone calls it")
+
+    @overload(unknown)
+    def _look(_):  # the compiler asks, in the middle of its work, and is told of no such function
+        seen.append(gc.isenabled())
+
+    before = gc.isenabled()
+    (gc.enable if enabled else gc.disable)()
+    try:
+        with pytest.raises(TypingError):
+            njit(lambda x: unknown(x))(1.0)
+        assert gc.isenabled() is enabled
+    finally:
+        (gc.enable if before else gc.disable)()
+    assert seen and not any(seen)

@@ -40,6 +40,19 @@ def test_a_sample_is_the_same_for_a_seed_and_has_a_line_once():
     assert len({(mutant.file, mutant.line) for mutant in found}) == 20
 
 
+def test_a_change_that_python_cannot_read_is_none(monkeypatch):
+    """The `*` of arguments by name looks like a product to Cosmic Ray."""
+    pytest.importorskip("cosmic_ray", reason="install the extra 'mutation'")
+    file = "drive_env/safety/oscillation.py"
+    source = (mutation.REPOSITORY / file).read_text(encoding="utf-8")
+    everything = list(mutation.mutants_of(file))
+    readable = [mutant for mutant in everything if mutation._is_python(mutant)]
+    assert 0 < len(readable) < len(everything)
+    for mutant in readable:
+        compile(mutation._changed(source, mutant), file, "exec")
+    assert set(mutation.sample([file], 1000, 0)) <= set(readable)
+
+
 @pytest.mark.slow
 def test_a_sample_of_changes_is_noticed():
     pytest.importorskip("cosmic_ray", reason="install the extra 'mutation'")

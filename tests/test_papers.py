@@ -29,6 +29,16 @@ def test_every_file_that_a_paper_names_exists(paper):
     assert missing == []
 
 
+def test_what_the_walks_through_the_house_pass_is_in_the_files_that_they_name():
+    walk = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    found = re.findall(r"`([\w/]+\.py)`\s+`([\w.]+)`", walk)
+    assert len(found) > 15
+    for file, name in found:
+        text = next(p for p in (ROOT / file, ROOT / "drive_env" / file) if p.is_file()).read_text(encoding="utf-8")
+        for part in name.split("."):
+            assert re.search(rf"^\s*(?:class|def|async def) {part}\b|^{part}\b.*=", text, re.MULTILINE), (file, name)
+
+
 def test_the_map_is_two_pages():
     assert len((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").splitlines()) <= 110
 

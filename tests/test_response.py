@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drive_env.trials.response import current_metrics, disturbance_metrics, oscillation, step_metrics
+from drive_env.trials.response import _reversals, current_metrics, disturbance_metrics, oscillation, step_metrics
 
 DT = 1e-3
 TAU = 0.02
@@ -338,6 +338,13 @@ def test_saturation_counts_both_signs_and_the_edge():
     i = [0.0, 7.5, -7.5, 7.0, -10.0, 11.0, 2.0, 0.0]
     assert current_metrics(i, i_max=10.0, tol=0.25).saturation_share == 4 / 8
     assert current_metrics(i, i_max=10.0).saturation_share == 2 / 8
+
+
+# --- reversals ----------------------------------------------------------------------------------------------------
+def test_a_turn_counts_in_either_direction_and_the_first_move_is_none():
+    zigzag = np.array([0.0, 1.0, 0.2, 1.0, 0.1, 0.9])
+    columns = np.stack([zigzag, -zigzag, np.linspace(0, 1, 6), 0.4 * zigzag], axis=-1)
+    assert _reversals(columns, np.full(4, 0.5)).tolist() == [4, 4, 0, 0]
 
 
 # --- oscillation --------------------------------------------------------------------------------------------------

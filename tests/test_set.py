@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from scripted_drive import ScriptedBus, ScriptedDrive
 from typer.testing import CliRunner
@@ -163,6 +165,94 @@ def test_a_watchdog_stays_where_its_statusword_cannot_be_read(drive):
     drive.silent.add((0x6041, 0))
     assert put("1016:1", 0, "--yes", "--timeout", 0.05)[0] == REFUSED
     assert "w1016" not in requests(drive)
+
+
+def enable_at_the_write(drive, monkeypatch, index, then=ENABLED):
+    """Have another master enable the axis when an object is written: after every look, before every answer."""
+    plain = drive.set
+
+    def write(one, value, sub=0):
+        plain(one, value, sub)
+        if one == index and then is not None:
+            plain(0x6041, then)
+
+    monkeypatch.setattr(drive, "set", write)
+
+
+@pytest.mark.parametrize("name", ["1016:1", "100C", "1029:1"])
+@pytest.mark.parametrize("state", [ENABLED, QUICK_STOP])
+def test_a_watchdog_of_an_axis_that_is_enabled_meanwhile_is_as_it_was(drive, monkeypatch, name, state):
+    key = int(name[:4], 16), int(name[5:] or 0)
+    drive.values[key] = (1, {"1016": 4, "100C": 2}.get(name[:4], 1))
+    enable_at_the_write(drive, monkeypatch, key[0], state)
+    code, out, error = put(name, 0, "--yes")
+    assert (code, out, drive.get(*key)) == (REFUSED, "", 1)
+    assert f"node 1 ({state:04X}h) was enabled by another program while {name[:4]}h:0" in error
+    assert ": 1 was written back, as it was before. Stop the axis with drive-env set 6040 2" in error
+    asked = [one.replace(name[:4], "....") for one in requests(drive) if one[1:] in {"6041", name[:4]}]
+    assert asked[-5:] == ["r6041", "r....", "w....", "r6041", "w...."]
+
+
+def test_so_is_that_of_an_axis_that_does_not_tell_any_more(drive, monkeypatch):
+    drive.values[0x1016, 1] = (0x7F0064, 4)
+    plain = drive.set
+    monkeypatch.setattr(drive, "set", lambda *written: (plain(*written), drive.silent.add((0x6041, 0))))
+    code, _, error = put("1016:1", 0, "--timeout", 0.05)
+    assert (code, drive.get(0x1016, 1)) == (REFUSED, 0x7F0064)
+    assert "an axis whose statusword could not be read" in error
+
+
+def test_a_second_master_enables_between_look_and_write(monkeypatch):
+    """The whole emulated bus in lockstep: its enabling words arrive right before the write."""
+    from fault_injection import ANSWER, ObservedWorld, WorldBus
+
+    from drive_env import EmulatedDrives
+    from drive_env.canopen.frames import Frame
+
+    with EmulatedDrives(num_threads=1) as drives:
+        world = ObservedWorld(drives, lockstep=True)
+        written = []
+
+        def another_master(request):
+            with world.lock:
+                world.receive(Frame(0x601, bytes.fromhex(request)), "another master")
+                world.cycle()
+
+        class Between(WorldBus):
+            def send(self, msg, timeout=None):
+                if msg.arbitration_id == 0x601 and msg.data[:4] == bytes.fromhex("23 16 10 01"):
+                    if not written:
+                        for word in ("06", "07", "0F"):
+                            another_master(f"2B 40 60 00 {word} 00 00 00")
+                    written.append(int.from_bytes(msg.data[4:], "little"))
+                super().send(msg, timeout)
+
+        bus = Between(world)
+        another_master("23 16 10 01 64 00 7F 00")  # what it has set for itself
+        monkeypatch.setattr("drive_env.master.can_drives.open_bus", lambda *_, **__: bus)
+        code, out, error = put("1016:1", 0, "--timeout", ANSWER)
+        assert (code, out, world.truth.is_on()[0]) == (REFUSED, "", True), error
+        assert re.match(r"drive-env: node 1 \(\w{4}h\) was enabled by another program while 1016h:01", error)
+        assert written == [0, 0x7F0064]
+
+
+@pytest.mark.parametrize("value", ["-1000", "-500 rpm", "-0.5 rev/s"])
+@pytest.mark.parametrize("order", ["before", "after", "dashes"])
+def test_a_negative_value_is_no_option(drive, value, order):
+    options = ["--node", "1", "--raw"] if value == "-1000" else ["--node", "1"]
+    words = {"before": [*options, "60FF", value], "after": ["60FF", value, *options],
+             "dashes": [*options, "60FF", "--", value]}[order]  # fmt: skip
+    code, out, error = put(*words)
+    raw = {"-1000": -1000, "-500 rpm": -546133, "-0.5 rev/s": -32768}[value]
+    assert (code, drive.get(0x60FF)) == (DONE, raw), error
+    assert out.startswith(f"node 1  60FFh:00 Target velocity = {raw}")
+
+
+def test_what_is_no_number_is_still_an_unknown_option(drive):
+    code, _, error = put("60FF", "-z")
+    assert (code, "No such option: -z" in error) == (USER_ERROR, True)
+    code, _, error = put("60FF", "-1 apples")
+    assert (code, "60FFh:00 Target velocity is not a quantity in 'apples'" in error) == (USER_ERROR, True), error
 
 
 @pytest.mark.parametrize(("kept", "code"), [(1 << 30, DONE), (1 << 31, REFUSED)])

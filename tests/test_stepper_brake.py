@@ -1,4 +1,4 @@
-"""The brake output: its delays and currents (TMCM-3313 manual, 2002h, 200Ah, 200Ch), and a hanging load on its brake."""
+"""The brake output: delays and currents (TMCM-3313 manual, 2002h, 200Ah, 200Ch), and a hanging load on its brake."""
 
 from __future__ import annotations
 
@@ -131,6 +131,20 @@ def test_what_cuts_the_stage_also_cuts_a_current_that_waits_for_the_brake():
         np.testing.assert_array_equal(lane(drives, "stage_on"), 0.0)
 
 
+@pytest.mark.parametrize(("words", "flows"), [((7, 6), True), ((7, 0), False), ((7, 2), False), ((6, 7), True)])
+def test_a_current_that_waits_for_the_brake_survives_orders_and_ends_when_the_energy_is_taken(words, flows):
+    """Shutdown and switch on (6, 3) leave it; disable voltage and quick stop of an axis that is off (10) end it."""
+    with build(parameters=DAMPED) as drives:
+        commission(drives, apply=500)
+        hold(drives)
+        for word in words:
+            drives.write(0x6040, word)
+            drives.advance(0.05)
+        assert lane(drives, "stage_on")[0] == flows
+        drives.advance(0.5)
+        assert lane(drives, "stage_on")[0] == 0.0
+
+
 def test_an_axis_that_turns_is_not_held_when_it_is_shut_down():
     with build(parameters=DAMPED) as drives:
         commission(drives, apply=500)
@@ -160,6 +174,16 @@ def test_enabling_that_is_called_off_never_enables(word, state):
         drives.write(0x6040, 7)
         drives.write(0x6040, 15)
         assert first(watch(drives, 250), 0, ENABLED) == 200
+
+
+def test_an_axis_that_is_not_enabled_in_time_is_not_enabled_later():
+    with build(num_machines=2, parameters=DAMPED) as drives:
+        commission(drives, enable=[300, 0])
+        with pytest.raises(TimeoutError, match=r"axis 0 did not reach operation enabled in 0\.1 s"):
+            motion.enable(drives, mode="pp", timeout=0.1)
+        drives.advance(0.5)
+        assert (drives.read(0x6041) & 0x6F).tolist() == [READY, ENABLED]
+        motion.enable(drives, timeout=0.5)
 
 
 def test_a_fault_on_the_way_to_operation_enabled_ends_it():

@@ -1,4 +1,4 @@
-"""The encoder's index: homing by it (CiA 402, methods 1, 2, 3, 5, 33, 34), and its latch (TMCM-3313 manual, 200Bh, 200Fh).
+"""The encoder's index: homing by it (CiA 402, methods 1, 2, 3, 5, 33, 34), its latch (TMCM-3313 manual, 200Fh).
 
 The disc's index begins at a true angle of the rotor and is one count wide, so home is known in closed form: where the
 steps were when the rotor came to that angle.
@@ -147,6 +147,27 @@ def test_the_latch_takes_both_positions_at_the_next_index_and_disarms(speed):
         assert steps == pytest.approx(7_680, abs=20 if speed < 10_000 else 300)  # the rotor lags, and is seen lagging
         turn(drives, 0)
         assert latched(drives) == [armed, steps, encoder]  # not armed
+
+
+def test_both_positions_are_latched_as_they_were_at_the_same_moment():
+    """At an even speed the rotor lags by a constant angle, also at the index, wherever in its window of 200 us.
+
+    In a window the steps go on by 20; the encoder resolves 1.28.
+    """
+    with build(num_machines=4, parameters=DAMPED) as drives:
+        drives.machine.set("motor.index_angle", np.array([1_000.5, 1_004.5, 1_009.5, 1_013.5]) * COUNT)
+        motion.enable(drives, mode="pv")
+        drives.write(0x6083, 10**6)
+        drives.write(0x60FF, 100_000)
+        drives.advance(1.5)
+        drives.write((0x200F, 1), 1)
+        lags = []
+        for _ in range(600):
+            drives.advance(0.001)
+            lags.append((lane(drives, "step_position") - lane(drives, "theta_m")) * TURN / (2.0 * math.pi))
+        assert drives.read((0x200F, 1)).tolist() == [0] * 4
+        latched_lag = drives.read((0x200F, 2)) - drives.read((0x200F, 3))
+        np.testing.assert_allclose(latched_lag, np.mean(lags, axis=0), rtol=0, atol=3)
 
 
 @pytest.mark.parametrize(("polarity", "inverted"), [(0, 0), (1, 1), (0, 1), (1, 0)])

@@ -230,7 +230,7 @@ def test_a_move_ends_at_its_microstep(resolution):
         size = 2**resolution
         entry = math.floor(target * size / 256.0 + 0.5)
         assert 50.0 * lane(drives, "theta_m")[0] == pytest.approx((entry + 0.5) * math.pi / 2.0 / size, abs=1e-3)
-        assert drives.read(0x210B)[0] == pytest.approx(target * size / 256.0, abs=1)
+        assert drives.read((0x210B, 3))[0] == pytest.approx(target * size / 256.0, abs=1)
 
 
 def test_there_and_back_again_is_where_it_began():
@@ -242,7 +242,17 @@ def test_there_and_back_again_is_where_it_began():
         drives.advance(0.3)
         assert lane(drives, "theta_m")[0] == pytest.approx(before, abs=1e-6)
         assert lane(drives, "step_position")[0] == pytest.approx(0.0, abs=1e-9)
-        assert drives.read(0x210B)[0] == pytest.approx(12_345 + 90_122 + 77_780 + 3, abs=4)
+        assert drives.read((0x210B, 3))[0] == pytest.approx(12_345 + 90_122 + 77_780 + 3, abs=4)
+
+
+def test_the_step_counter_is_one_of_64_bits_whose_halves_can_be_set():
+    with build(parameters=SMOOTH) as drives:
+        drives.write((0x210B, 1), 2**32 - 1_000)
+        drives.write((0x210B, 2), 7)
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, -3_000)
+        drives.advance(0.01)
+        assert [int(drives.read((0x210B, sub))[0]) for sub in (1, 2, 3)] == [2_000, 8, 8 * 2**32 + 2_000]
 
 
 def test_the_rotor_follows_set_points_of_csp_and_csv():

@@ -159,7 +159,7 @@ def test_the_command_writes_a_stepper(tmp_path):
     assert done.exit_code == 0, done.output
     assert "holding torque 1 N*m, detent torque 0.05 N*m" in done.output
     assert "24 V carry the rated current up to " in done.output
-    assert "drives that turn it: tmcm6212\n" in done.output
+    assert "drives that turn it: tmcm3313, tmcm6212\n" in done.output
     assert load_motor(path).rated_torque == 1.0
 
 

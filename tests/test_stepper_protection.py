@@ -64,6 +64,77 @@ def test_a_short_circuit_in_the_stage_is_an_overcurrent_unless_it_is_not_watched
         np.testing.assert_array_equal(lane(drives, "fault") > 0, [True, drives.read(0x2102)[1] & UV > 0])
 
 
+@pytest.mark.parametrize(("phase", "code", "flag"), [(0, 0x2312, 0x01), (1, 0x2311, 0x02)])
+def test_a_short_to_ground_is_seen_by_its_bridge(phase, code, flag):
+    with build(parameters=DAMPED) as drives:
+        hold(drives)
+        drives.machine.fault("stage_short", phase=phase, conductance=2.0)
+        drives.advance(0.002)
+        assert told(drives) == [(code, 0)]
+        assert drives.read(0x2102)[0] == flag
+        assert lane(drives, "stage_on")[0] == 0.0
+        drives.write(0x6040, 0x00)
+        drives.write(0x6040, 0x80)
+        drives.advance(0.01)
+        assert drives.read(0x2102)[0] == 0  # a bridge that is off carries nothing
+        motion.enable(drives, mode="pp", timeout=0.01)
+        drives.advance(0.01)
+        assert told(drives)[-1] == (code, 0)
+
+
+def test_a_short_to_ground_that_is_not_watched_drains_the_link_and_burns_the_stage():
+    """Its bridge is on for the share u/U of the time: the link loses G |u|, the stage gains R G^2 U |u|."""
+    with build(num_machines=3, parameters=DAMPED | {"stage.thermal_time": 0.5}) as drives:
+        drives.write(0x20A1, 1)
+        hold(drives)
+        for machine, conductance in ((1, 0.8), (2, 6.0)):
+            drives.machine.fault("stage_short", phase=0, conductance=conductance, where=np.arange(3) == machine)
+        drives.advance(0.02)
+        u, u_dc = abs(lane(drives, "u_a")), lane(drives, "u_dc")
+        assert u[1] > 0.5
+        drawn = lane(drives, "drain") - lane(drives, "drain")[0]
+        np.testing.assert_allclose(drawn, np.array([0.0, 0.8, 6.0]) * u, rtol=0.05)
+        sags = (u_dc[0] - u_dc) / drives.machine.parameters["stage.supply_resistance"]
+        np.testing.assert_allclose(sags, drawn, rtol=0.1, atol=0.01)
+        drives.advance(3.0)
+        rise = drives.machine.temperatures[1] - drives.machine.temperatures[1][0]
+        loss = drives.machine.parameters["stage.on_resistance"] * 0.64 * lane(drives, "u_dc") * abs(lane(drives, "u_a"))
+        heat = drives.machine.parameters["stage.thermal_resistance"]
+        assert rise[1] == pytest.approx((loss * heat)[1], rel=0.05)
+        assert {m.axis for m in drives.emergencies() if m.code == 0x4310} == {2}
+        assert drives.read(0x6041)[2] & 0x4F == FAULT
+
+
+@pytest.mark.parametrize(("setting", "needed"), [(0, 3.2e-6), (1, 1.6e-6), (2, 1.2e-6), (3, 0.8e-6)])
+def test_a_bridge_sees_a_short_only_if_it_is_on_for_long_enough(setting, needed):
+    """20A2h (TMC262 data sheet, TS2G). A high supply makes a bridge short on."""
+    with build(num_machines=8, parameters=DAMPED) as drives:
+        drives.write(0x20A2, setting)
+        drives.write(0x2096, [0, 0, 1, 1, 2, 3, 4, 5])  # the hysteresis, and so the time that a bridge is on
+        drives.write(0x2092, [0, 1, 0, 1, 1, 1, 2, 2])
+        drives.machine.supply = 58.0
+        hold(drives)
+        on_time = lane(drives, "on_time")
+        drives.machine.fault("stage_short", phase=1, conductance=2.0)
+        drives.advance(0.005)
+        seen = np.zeros(8, bool)
+        seen[[m.axis for m in drives.emergencies() if m.code == 0x2311]] = True
+        np.testing.assert_array_equal(seen, on_time > needed)
+
+
+def test_a_short_is_at_a_bridge_that_there_is():
+    with build() as drives, pytest.raises(ValueError, match=r"phase=2 must lie in -1\.\.\.1"):
+        drives.machine.fault("stage_short", phase=2)
+    with (
+        EmulatedDrives(load="inertia", num_threads=1) as drives,
+        pytest.raises(
+            ValueError,
+            match="fault stage_short: phase=0 must be -1 to -1 of a tmcm1636; -1 is a short across the DC link",
+        ),
+    ):
+        drives.machine.fault("stage_short", phase=0)
+
+
 def test_too_much_amplitude_of_the_voltage_pwm_is_an_overcurrent():
     """24 V over 0.5 ohm: nothing but the winding limits the current of voltage PWM."""
     with build("qsh4218_47", parameters=SMOOTH) as drives:

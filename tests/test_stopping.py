@@ -97,6 +97,8 @@ def swing(share, lasting):
         (down(RAMP, to=0.1 * SPEED), RAMP, "it does not slow down by its ramp", 0.24, 0.28),
         # Slower and slower, always fast enough to stand within a second, and never at rest.
         (lambda t: 0.1 * SPEED + 0.9 * SPEED * math.exp(-t), RAMP / 20.0, "it is still turning after 2 s", 2.0, 2.05),
+        # As slowly as a ramp says that would take minutes.
+        (down(RAMP / 10_000.0), RAMP / 10_000.0, "it does not slow down by its ramp", 0.04, 0.1),
         # Past rest and back.
         (swing(0.12, 0.2), RAMP, "", 0.3, 0.4),
         (swing(-0.4, 0.2), RAMP, "it does not slow down by its ramp", 0.1, 0.25),  # on again, not back

@@ -186,7 +186,8 @@ def notes(device: Device, entry: Entry, by_place: dict[tuple[int, int], object])
     if place in device.write_states:
         found.append(f"written in {device.write_states[place].replace('_', ' ').lower()} only")
     if place in device.unsupported:
-        found.append("refused where the service behind it is not there")
+        reason = device.unsupported[place]
+        found.append(f"always refused: {reason}" if reason else "refused where the service behind it is not there")
     return "; ".join(found)
 
 

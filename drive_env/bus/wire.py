@@ -235,6 +235,14 @@ class Wire:
             return frame._replace(data=data.to_bytes(len(frame.data), "big")), "received"
         return frame, "received"
 
+    def error_counter(self, sender: Hashable) -> int:
+        """Return the error counter of a sender's controller."""
+        ending = self._on_wire
+        if ending is not None and ending.sender == sender and ending.outcome == "bus off":
+            return BUS_OFF_LIMIT  # the frame that is the last one has not ended yet
+        controller = self._senders.get(sender)
+        return 0 if controller is None else controller.error_counter
+
     def _count_error(self, controller: _Sender, end: float) -> Outcome:
         self.statistics.errors += 1
         controller.error_counter += ERROR_STEP

@@ -122,6 +122,8 @@ class World:
 
             self.attach(node_id, make)
             self._sync_objects.append(nodes[-1].dictionary.port(*SYNC_OBJECT))
+            axes = slice(k * per_node, (k + 1) * per_node)
+            drives.machine.connect_lamps(axes, self._lamps_of(nodes[-1], node_id))
         self.drives += [drives] if spare is None else [drives, spare]
         self._answering += nodes
         return nodes
@@ -233,6 +235,9 @@ class World:
         """End the drives."""
         for drives in self.drives:
             drives.close()
+
+    def _lamps_of(self, node: Node, node_id: int) -> Callable[[], tuple[str, str]]:
+        return lambda: node.leds(self.wire.error_counter(("node", node_id)))
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _next_answer(self) -> float:

@@ -20,6 +20,7 @@ from drive_env.canopen.communication import ModuleObjects, known_bit_rate, signe
 from drive_env.canopen.emergency import EPSILON, EmergencyProducer
 from drive_env.canopen.error_control import HeartbeatConsumer, HeartbeatProducer, NodeGuarding, consumers
 from drive_env.canopen.frames import Frame
+from drive_env.canopen.leds import Leds, leds_of
 from drive_env.canopen.nmt import Command, NmtState
 from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, HARDWARE_ERROR, VALUE_RANGE, ObjectAccessError
@@ -254,6 +255,11 @@ class Node:
     @saves_lose_power.setter
     def saves_lose_power(self, value: bool) -> None:
         self._store.loses_power = value
+
+    def leds(self, error_counter: int = 0) -> Leds:
+        """Return what its lamps show; `error_counter` is its controller's."""
+        boots = self.state is NmtState.INITIALISING
+        return leds_of(self.state, not self._is_online and not boots, self._conditions, error_counter)
 
     # --- conditions of the CAN controller -------------------------------------------------------------------------
     def bus_off(self, now: float) -> None:

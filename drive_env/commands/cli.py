@@ -23,6 +23,7 @@ from drive_env.commands.render import render
 from drive_env.commands.scan import scan
 from drive_env.commands.scope import scope
 from drive_env.commands.serve import serve
+from drive_env.commands.signed_values import SignedValues
 
 app = typer.Typer(
     name="drive-env",
@@ -49,7 +50,7 @@ PANELS = {
 app.add_typer(motor_app, name="motor", rich_help_panel="This installation")
 for panel, commands in PANELS.items():
     for name, function in commands:
-        app.command(name, rich_help_panel=panel)(function)
+        app.command(name, cls=SignedValues, rich_help_panel=panel)(function)
 
 
 @app.callback()

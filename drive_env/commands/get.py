@@ -87,10 +87,10 @@ def set_object(
 ) -> None:
     """Write an object over SDO, read it back and show its value.
 
-    Put -- before a negative value: drive-env set 60FF -- -1000. If an axis is enabled it asks first. A controlword that
-    enables is refused, since nothing would monitor the motor; one that stops (0, 2, 6, 7) is always sent, after a quick
-    stop to rest where it takes the voltage away (0, 6). What an enabled axis stops by when its master dies (1016h,
-    100Ch, 100Dh, 1029h, 6007h) is not changed.
+    If an axis is enabled it asks first. A controlword that enables is refused, since nothing would monitor the motor;
+    one that stops (0, 2, 6, 7) is always sent, after a quick stop to rest where it takes the voltage away (0, 6). What
+    an enabled axis stops by when its master dies (1016h, 100Ch, 100Dh, 1029h, 6007h) is not changed; if another program
+    enables an axis meanwhile, the value of before is written back.
     """
     from drive_env.master import quantities
     from drive_env.master.can.error_control import is_of_a_watchdog
@@ -122,7 +122,7 @@ def set_object(
             _ask_where_live(drives, f"{entry.label} = {value}", yes)
         elif cia402.cuts_voltage(wanted[0]):
             _bring_to_rest(drives, entry)
-        drives.write((entry.index, entry.sub), wanted if drives.description.is_number(entry) else value)
+        _write(drives, entry, wanted if drives.description.is_number(entry) else value)
         rows = []
         readable = entry.access != "wo"
         found = drives.read((entry.index, entry.sub)) if readable else wanted
@@ -226,6 +226,39 @@ def _keep_watchdog(drives: BusDrives, entry: Entry) -> None:
             "whoever set it: it was not changed, and --yes does not change that. Switch the axis off first, in the "
             "program that enabled it or with drive-env set 6040 2"
         )
+
+
+def _write(drives: BusDrives, entry: Entry, value: Any) -> None:
+    """Write an object; one of a watchdog is written back where another program has enabled an axis meanwhile.
+
+    Between our look at the statusword and our write another master may enable, and nothing on the bus keeps it from
+    that. So we look again, and an axis that does not answer counts as enabled.
+
+    Raises:
+        RuntimeError: If an axis was enabled meanwhile.
+    """
+    from drive_env.dictionary.aborts import ObjectAccessError
+    from drive_env.master.can.error_control import is_of_a_watchdog
+    from drive_env.master.errors import BusError
+
+    key = entry.index, entry.sub
+    if not is_of_a_watchdog(entry.index):
+        drives.write(key, value)
+        return
+    before = [int(one) for one in drives.read(key)]  # last before the write: it may be another program's by now
+    drives.write(key, value)
+    try:
+        who = _live(drives)
+    except (BusError, ObjectAccessError) as error:
+        who = f"an axis whose statusword could not be read ({error})"
+    if not who:
+        return
+    drives.write(key, before)
+    raise RuntimeError(
+        f"{who} was enabled by another program while {entry.label} was written, which is part of what stops it when "
+        f"its master dies: {', '.join(map(str, before))} was written back, as it was before. Stop the axis with "
+        "drive-env set 6040 2 where nothing monitors its master"
+    )
 
 
 def _ask_where_live(drives: BusDrives, what: str, yes: bool) -> None:

@@ -32,7 +32,7 @@ from drive_env.commands.options import (
 from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
 
 if TYPE_CHECKING:
-    from drive_env.dictionary.entries import ObjectDictionary
+    from drive_env.dictionary.entries import Entry, ObjectDictionary
     from drive_env.master.bus_drives import BusDrives
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
@@ -69,8 +69,7 @@ def jog(
     """Enable an axis, turn it for a while or by a distance, and switch it off again.
 
     The safety envelope is on: Ctrl-C, an exceeded limit and the end of this process all cause a quick stop. A negative
-        speed turns the other way: drive-env jog -- '-100 rpm'. Exit code 1 if the movement was stopped, or the axis did
-            not move.
+        speed turns the other way. Exit code 1 if the movement was stopped, or the axis did not move.
     """
     with errors_as_exit_codes():
         from drive_env import motion
@@ -106,7 +105,8 @@ def jog(
             emergencies = [message._asdict() for message in drives.emergencies()]
             if files is not None and trace is not None:
                 _write(files, trace, known, scale)
-        stopped = _verdict(moved, movement.way, reasons, emergencies)
+        meant = _speed_in_words(speed, movement.velocity, known.find(cia402.TARGET_VELOCITY), scale)
+        stopped = _verdict(moved, movement.way, reasons, emergencies, meant)
         if json:
             print_json({"moved": moved, "start": start, "emergencies": emergencies, "stopped": stopped})
         else:
@@ -185,8 +185,18 @@ def _what_stops(reasons: list[str]) -> Iterator[None]:
         reasons.append(str(error).partition(";")[0])
 
 
-def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dict[str, Any]]) -> str:
-    """Return why a movement failed; "" if it did not."""
+def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: float | None) -> str:
+    """Return what a speed is, and how rpm are written where it was a bare number."""
+    from drive_env.master import quantities
+
+    text = quantities.show(velocity, entry, scale)
+    if quantities.is_quantity(speed) or text.endswith(" rpm"):
+        return text
+    return f"{text}; if {speed} rpm are meant, write '{speed} rpm'"
+
+
+def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dict[str, Any]], meant: str) -> str:
+    """Return why a movement failed; "" if it did not. `meant` is the speed that was asked for, in words."""
     share = moved / asked
     told = [_told(message) for message in emergencies if message["code"]]
     if told and (reasons or share < ENOUGH):
@@ -198,8 +208,8 @@ def _verdict(moved: int, asked: float, reasons: list[str], emergencies: list[dic
         return "; ".join(reasons)
     if share < LEAST:
         return (
-            "the axis hardly moved, and the drive reports no cause: check for a closed brake, a blocked load, a low "
-            "current limit (--max-current) or a small profile acceleration (6083h)"
+            f"the axis hardly moved, and the drive reports no cause. The speed was {meant}. Else check for a closed "
+            "brake, a blocked load, a low current limit (--max-current) or a small profile acceleration (6083h)"
         )
     return ""
 

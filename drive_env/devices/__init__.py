@@ -156,7 +156,7 @@ class Device(NamedTuple):
     standstill: float
     write_states: dict[tuple[int, int], str]
     allowed_values: dict[tuple[int, int], tuple[int, ...]]
-    unsupported: frozenset[tuple[int, int]]
+    unsupported: dict[tuple[int, int], str]
     refuses_same_mode: bool
     emergencies: dict[str, EmergencyCode]
     stage: dict[str, StageParameter]
@@ -366,7 +366,7 @@ def _device(
         standstill=data["motion"]["standstill"],
         write_states={parse_key(text): state for text, state in data["states"].items()},
         allowed_values=allowed_values(data),
-        unsupported=frozenset(parse_key(text) for text in data["unsupported"]["objects"]),
+        unsupported=_unsupported(data["unsupported"]),
         refuses_same_mode=data["quirks"]["refuses_same_mode"],
         emergencies={name: _emergency(row) for name, row in data["emergencies"].items()},
         stage={n: StageParameter(**row) for n, row in data["stage"].items()},
@@ -397,6 +397,12 @@ def allowed_values(data: Mapping[str, Any]) -> dict[tuple[int, int], tuple[int, 
     if data["quirks"]["strict_transmission_types"]:
         rows |= data["strict_transmission_types"]
     return {parse_key(text): tuple(value for item in items for value in _values(item)) for text, items in rows.items()}
+
+
+def _unsupported(data: Mapping[str, Any]) -> dict[tuple[int, int], str]:
+    """Return the objects whose write is refused, each with the reason; "" where a node has the service."""
+    reasons = {parse_key(text): reason for text, reason in data.get("reasons", {}).items()}
+    return {**dict.fromkeys(map(parse_key, data["objects"]), ""), **reasons}
 
 
 def _emergency(row: Mapping[str, Any]) -> EmergencyCode:

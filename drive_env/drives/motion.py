@@ -62,8 +62,14 @@ def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> No
 def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = None, timeout: float = 1.0) -> None:
     """Take drives to operation enabled, a fault being reset first; `mode` is selected before.
 
+    Args:
+        drives: The drives.
+        mode: Abbreviation of a mode; None leaves it.
+        where: Axes; all by default.
+        timeout: Longest wait for each state [s]; a drive that waits for its brake needs its delays, and more.
+
     Raises:
-        TimeoutError: If a state is not reached within `timeout` [s].
+        TimeoutError: If a state is not reached in time. An axis that is late is not left on its way there.
     """
     status = drives.read(cia402.STATUSWORD)
     axes = np.ones(drives.num_axes, bool) if where is None else where
@@ -85,7 +91,13 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
         (cia402.ENABLE_OPERATION, cia402.OPERATION_ENABLED, "operation enabled"),
     ):
         drives.write(cia402.CONTROLWORD, word, where=not_enabled)
-        wait_for(drives, state, timeout, name, not_enabled)
+        try:
+            wait_for(drives, state, timeout, name, not_enabled)
+        except TimeoutError:
+            # A drive that waits for its brake would enable later, when nobody expects it any more.
+            late = not_enabled & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+            drives.write(cia402.CONTROLWORD, cia402.SHUTDOWN, where=late)
+            raise
 
 
 def disable(drives: BasicDrives, where: Mask | None = None, timeout: float = 1.0) -> None:

@@ -353,9 +353,11 @@ class LiveDictionary:
 
 # --- what the device allows, the same for a set of axes and for the one axis of a node --------------------------------
 def check_supported(device: Device, entry: Entry) -> None:
-    """Raise 08000020h for an object whose write would need a service that is not there."""
-    if (entry.index, entry.sub) in device.unsupported:
-        raise ObjectAccessError(CANNOT_BE_STORED, f"{entry.label} has no service behind it in this emulator")
+    """Raise 08000020h for an object whose write would need a service that is not there, with the reason."""
+    reason = device.unsupported.get((entry.index, entry.sub))
+    if reason is not None:
+        without = f"{entry.label} has no service behind it in this emulator"
+        raise ObjectAccessError(CANNOT_BE_STORED, f"{without}: {reason}" if reason else without)
 
 
 def allowed_values(device: Device, entry: Entry) -> tuple[int, ...] | None:

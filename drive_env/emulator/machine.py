@@ -5,7 +5,7 @@ A task may use it to make a world, never to act; `drives.machine` is None on a r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 INPUTS_SHIFT = 16  # general inputs and outputs are bits 16 to 23 of their objects
+AFTER_POWER_ON = ("blinking", "off")  # of the run lamp and the error lamp
 _BRAKES = ("open", "closed", "with_stage", "output")  # numbers of firmware/common/brake.py
 
 
@@ -45,6 +46,7 @@ class Machines:
     def __init__(self, drives: EmulatedDrives) -> None:
         self._drives = drives
         self._rest: RecordSnapshot | None = None  # state of a machine at rest
+        self._lamps: list[tuple[slice, Callable[[], tuple[str, str]]]] = []  # of nodes: their axes, what they show
 
     @property
     def drives(self) -> EmulatedDrives:
@@ -141,7 +143,8 @@ class Machines:
         """Holding brake of each axis: "open", "closed", "with_stage" or "output"; set likewise.
 
         With the stage it is closed while that is off. At the drive's output a spring closes it, and the output's
-        current opens it, each after its time (`motor.brake_closes_in`, `motor.brake_opens_in`). Its torque is twice the motor's rated torque: what holding brakes of this size are built for.
+        current opens it, each after its time (`motor.brake_closes_in`, `motor.brake_opens_in`). Its torque is twice
+        the motor's rated torque: what holding brakes of this size are built for.
         """
         return np.array([_BRAKES[int(mode)] for mode in self._axis_field("brake_mode")])
 
@@ -255,6 +258,24 @@ class Machines:
         entries = self._drives._objects.entries
         first = entries.find(Role.ANALOG_INPUTS)
         return [(entry.index, entry.sub) for entry in entries if entry.index == first.index and entry.sub >= first.sub]
+
+    @property
+    def leds(self) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
+        """What the run lamp and the error lamp of each axis' node show, by name, each of shape (num_axes,).
+
+        "off", "on", "blinking", "single flash" or "double flash" (CiA 303-3; their times are in canopen/leds.py).
+        Drives on no bus show what they do after power-on: pre-operational, without an error.
+        """
+        shown = np.array([AFTER_POWER_ON] * self._drives.num_axes).T
+        for axes, lamps in self._lamps:
+            shown = shown.astype(object)
+            shown[0, axes], shown[1, axes] = lamps()
+        run, error = shown.astype(str)
+        return run, error
+
+    def connect_lamps(self, axes: slice, lamps: Callable[[], tuple[str, str]]) -> None:
+        """Let the lamps of axes show what a node's do: run and error, by name."""
+        self._lamps.append((axes, lamps))
 
     @property
     def temperatures(self) -> tuple[Floats, Floats]:

@@ -133,7 +133,8 @@ def draw_parameters(
 _SIGNED = ("offset", "error", "phase", "ambient", "index_angle")
 _MAY_VANISH = (
     "cogging_torque", "detent_torque", "saturation", "coulomb", "viscous", "broken", "open_a", "open_b",
-    "short_conductance", "index_inverted", "brake_opens_in", "brake_closes_in", "noise", "dead_time", "resistance", "supply_sinks",
+    "short_conductance", "short_a", "short_b", "index_inverted", "brake_opens_in", "brake_closes_in", "noise",
+    "dead_time", "resistance", "supply_sinks",
 )  # fmt: skip
 
 

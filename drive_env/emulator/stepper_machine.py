@@ -49,6 +49,8 @@ _FIELDS = {
     "stage.thermal_resistance": "stage_thermal_resistance",
     "stage.thermal_time": "stage_thermal_time",
     "stage.short_conductance": "short_conductance",
+    "stage.short_a": "short_a",
+    "stage.short_b": "short_b",
 }
 _AT_TEMPERATURE = {"motor.R_s": "R_s", "motor.psi_m": "psi_m"}
 _ENCODER_DIRECTION = "motor.encoder_direction"
@@ -103,6 +105,8 @@ def wiring_parameters(motor: Motor) -> list[MachineParameter]:
     return [
         MachineParameter(_ENCODER_DIRECTION, "1", wired, 0.0, 1.0, wired),
         MachineParameter("motor.index_angle", "rad", 0.0, 0.0, 2.0 * np.pi, 0.0),
+        MachineParameter("stage.short_a", "S", 0.0, 0.0, 0.0, 0.0),
+        MachineParameter("stage.short_b", "S", 0.0, 0.0, 0.0, 0.0),
         MachineParameter("motor.index_inverted", "1", 0.0, 0.0, 0.0, 0.0),
         # Usual for brakes of some newton metres that a spring closes.
         MachineParameter("motor.brake_opens_in", "s", 0.04, 0.02, 0.08, 0.04),

@@ -49,6 +49,10 @@ def _phase(number: int) -> Callable[[Floats, Given, float], Floats]:
     return lambda sound, given, rated: np.ones_like(sound) if given["phase"] == number else sound
 
 
+def _shorted(number: int) -> Callable[[Floats, Given, float], Floats]:
+    return lambda sound, given, rated: sound + given["conductance"] if given["phase"] == number else sound
+
+
 def _left(sound: Floats, given: Given, rated: float) -> Floats:
     return sound * given["left"]
 
@@ -73,7 +77,9 @@ CHANGES: dict[str, tuple[Change, ...]] = {
     "open_phase": tuple(_record(f"open_{letter}", _phase(number)) for number, letter in enumerate("abc")),
     "demagnetised": (_record("psi_nominal", lambda sound, given, rated: sound * (1.0 - given["share"])),),
     "winding_short": tuple(_record(name, _left) for name in ("R_nominal", "L_d", "L_q", "L_s")),
-    "stage_short": (_record("short_conductance", lambda sound, given, rated: sound + given["conductance"]),),
+    "stage_short": tuple(
+        _record(name, _shorted(number)) for number, name in enumerate(("short_conductance", "short_a", "short_b"), -1)
+    ),
     "supply_dip": (_record("supply_voltage", lambda sound, given, rated: np.minimum(sound, given["voltage"])),),
     "supply_surge": (_record("supply_voltage", lambda sound, given, rated: np.maximum(sound, given["voltage"])),),
     "enable_lost": (_record("enable_input", _vanished),),

@@ -122,6 +122,11 @@ class MachineFaults:
         if row.name == "open_phase" and given["phase"] >= len(changes):
             phase = f"{given['phase']:g}"
             raise ValueError(f"fault open_phase: phase={phase} must be 0 to {len(changes) - 1} of this motor")
+        if row.name == "stage_short" and given["phase"] >= len(changes) - 1:
+            raise ValueError(
+                f"fault stage_short: phase={given['phase']:g} must be -1 to {len(changes) - 2} of a "
+                f"{drives.device.name}; -1 is a short across the DC link"
+            )
         delay, length = cycles_of(order, row, drives.inside.cycles)
         condition = Condition.parse(order.when)
         axes = np.repeat(machines, self._axes_per_machine)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 
 from drive_env.faults.table import FaultRow
 
-QUANTITIES = {"position": "rad", "speed": "rad/s"}
 NO_CONDITION, ENABLED = "", "enabled"
 _COMPARISON = re.compile(r"\s*(position|speed)\s*([<>])\s*(\S+)\s*")
 _WORDS = ("at", "when", "duration", "node")

@@ -64,7 +64,8 @@ class NodeDictionary:
         roles = self._device.canopen.objects
         if (entry.index, entry.sub) in (roles.get("bit_rate"), roles.get("node_id")):
             return "bus"
-        is_command = (entry.index, entry.sub) in self._module.commands
+        key = (entry.index, entry.sub)
+        is_command = key in self._module.commands or key in self._device.unsupported
         if entry.access != "rw" or entry.bits is None or entry.pdo_mappable or is_command:
             return None
         if 0x1000 <= entry.index <= 0x1FFF:

@@ -35,7 +35,7 @@ FILM_LENGTH = 8.0  # s, about what one watches
 PACES = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 HEADER, FOOTER, EDGE = 34, 26, 14  # pixels of a frame of NORMAL size; others are scaled
 NORMAL = (960, 540)
-BACKGROUND, INK, SOFT_INK, PALE = (255, 255, 255), (25, 25, 25), (95, 95, 95), (226, 229, 233)
+INK, SOFT_INK, PALE = (25, 25, 25), (95, 95, 95), (226, 229, 233)
 VIEWER_FRAME = 1.0 / 60.0  # s
 
 

@@ -37,6 +37,7 @@ from drive_env.safety.objects import (
     TARGET_VELOCITY,
     TORQUE_OFFSET,
     UNRAMPED_MODES,
+    VELOCITY,
     VELOCITY_OFFSET,
 )
 from drive_env.safety.rotor import scale_objects
@@ -325,6 +326,23 @@ class Commands:
             self._refuse_mode(slow & np.isin(now, UNRAMPED_MODES).any(axis=0), bounds.braking)
         for row in np.unique(now, axis=0):
             self._check_speeds(axes, row, RUNNING_SPEEDS, bounds.velocity, played)
+
+    def check_turning(self, axes: Mask) -> None:
+        """Raise SafetyError for axes that turn, though nobody drives them, faster than they may be once enabled.
+
+        What coasts or is pulled has a speed that no set-point tells, and a quick stop's ramp may be too slow for it.
+        """
+        if not axes.any():
+            return
+        bounds = self._limits.bounds()
+        speed = np.abs(read_own(self._drives, VELOCITY, 0))
+        wrong = axes & ((speed > bounds.velocity) | (np.abs(self._axes.speed) > bounds.speed))
+        for axis in np.flatnonzero(wrong).tolist():
+            raise SafetyError(
+                f"axis {axis}: it turns though it is off, {speed[axis]} by 606Ch, beyond the limit "
+                f"{int(bounds.velocity[axis])}; it was not enabled. Wait until it is slower, or raise "
+                f"{self._velocity_origin(axis)}"
+            )
 
     def _check_resolution(self, axes: Mask) -> None:
         """Raise SafetyError for axes whose positions are too coarse for their travel to be watched."""

@@ -231,6 +231,7 @@ class Envelope:
         if words is not None and enables.any():
             self._commands.check_modes(enables, played=played)
             self._commands.check_played_starts(words, played)
+            self._commands.check_turning(enables & ~self._axes.live)
             self._prove_watchdogs(enables)
             self._axes.assume(enables)
         self._checked_stop = self._stops.current
@@ -429,6 +430,7 @@ class Envelope:
             self._arm()
             self._commands.check_start(words, where)
             self._commands.check_modes(enables)
+            self._commands.check_turning(enables & ~self._axes.live)
             self._prove_watchdogs(enables)
             self._axes.assume(enables)
         if np.any(cuts := where & self._stops.cuts(words)):

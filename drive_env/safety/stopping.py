@@ -145,8 +145,9 @@ class AxisStop:
     def _slows_down(self, now: float, sample: Sample) -> bool:
         """Return whether the speed is where the ramp has it, swings past rest, or will be 0 within LONGEST."""
         elapsed = max(now - self._begun - GRACE, 0.0)
-        # Of a ramp that is not known only how fast the speed falls tells anything.
-        expected = self._first - SHARE * self._deceleration * elapsed if self._deceleration > 0.0 else 0.0
+        # Of a ramp that is not known, or too slow for this speed, only how fast the speed falls tells anything.
+        is_ramp = 0.0 < self._first <= RAMP_TIMEOUT * self._deceleration
+        expected = self._first - SHARE * self._deceleration * elapsed if is_ramp else 0.0
         if self._check is None:
             self._check = sample
         if sample.speed * self._way < 0.0 and self._swung is None:

@@ -1,6 +1,6 @@
 """Commissioning of a TMCM-3313 for a motor, from the motor's data alone; a preset that is written goes before it.
 
-The loop stays open: 606Ah = 0 and 2020h = 1 (or 2, 3), written once the axis is enabled, close it with what stands here.
+The loop stays open: 606Ah = 0 and 2020h = 1 (or 2, 3), written once the axis is enabled, close it with what is here.
 """
 
 from __future__ import annotations

@@ -58,15 +58,34 @@ def overcurrent_high_side(drive, lane, told):
 
 
 @stage
+def detection_time(setting):
+    """Return how long a bridge must be on to see a short to ground [s] (TMC262 data sheet, TS2G)."""
+    slow = 3.2e-6 if setting < 0.5 else 1.6e-6
+    fast = 1.2e-6 if setting < 2.5 else 0.8e-6
+    return slow if setting < 1.5 else fast
+
+
+@stage
+def carries_too_much(drive, lane, peak, conductance):
+    """Return whether a bridge with a short to ground of that conductance [S], or without, has too large a current.
+
+    A short carries its current while the bridge is on; a bridge that is on for less than the detection time misses it.
+    """
+    sees = drive.stage_on[lane] > 0.0 and drive.on_time[lane] > detection_time(drive.short_detection[lane])
+    carried = peak + (drive.u_dc[lane] * conductance if sees else 0.0)
+    return drive.short_protection_off[lane] == 0.0 and carried > drive.overcurrent[lane]
+
+
+@stage
 def overcurrent_a(drive, lane, told):
-    """Return whether phase A had too large a current."""
-    return drive.short_protection_off[lane] == 0.0 and drive.peak_a[lane] > drive.overcurrent[lane]
+    """Return whether bridge A had too large a current."""
+    return carries_too_much(drive, lane, drive.peak_a[lane], drive.short_a[lane])
 
 
 @stage
 def overcurrent_b(drive, lane, told):
-    """Return whether phase B had too large a current."""
-    return drive.short_protection_off[lane] == 0.0 and drive.peak_b[lane] > drive.overcurrent[lane]
+    """Return whether bridge B had too large a current."""
+    return carries_too_much(drive, lane, drive.peak_b[lane], drive.short_b[lane])
 
 
 @stage

@@ -21,6 +21,7 @@ from mechanics.compiled import inlined
 
 HYSTERESIS_UNITS = 512.0  # of the largest current (TMC5160 data sheet, HEND)
 PWM_STEPS = 255.0
+PWM_CLOCKS = 1024.0  # of a period of the voltage PWM (TMC5130 data sheet, pwm_freq 0)
 FINEST = 256.0  # microsteps of the table per full step, by which the driver measures time
 SMALLEST_SLOPE = 1.0  # A/s; a supply that the back-EMF has used up makes no current
 TWO_PI = 6.283185307179586
@@ -109,7 +110,7 @@ def constant_off_cycle(rise, lost, off, blank, dropped, fast_decay):
 def find_ripple(drive):
     """Find what the chopper's cycle does to the mean current in this window.
 
-    Writes ripple, chopper_frequency, in_spread_cycle, current_shift, current_gain and lowest_share.
+    Writes ripple, chopper_frequency, in_spread_cycle, on_time, current_shift, current_gain and lowest_share.
     """
     for lane in range(LANES):
         clock = 1.0 / drive.chopper_clock[lane]
@@ -139,10 +140,24 @@ def find_ripple(drive):
         drive.ripple[lane] = (steady if is_constant else spread) * chops
         drive.in_spread_cycle[lane] = 0.0 if is_constant else 1.0
         drive.chopper_frequency[lane] = chops / (steady_time if is_constant else spread_time)
+        held = drive.pwm_scale[lane] * (PWM_CLOCKS / PWM_STEPS) * clock
+        drive.on_time[lane] = held if drive.in_pwm[lane] > 0.5 else (steady if is_constant else spread) / rise
         # A spread cycle's losses are small where the current is; those of the other do distort the zero crossing.
         drive.current_shift[lane] = end - below if is_constant else 0.0
         drive.current_gain[lane] = 1.0 if is_constant else 1.0 + above / drive.amplitude[lane]
         drive.lowest_share[lane] = (blank - fast_decay) / (blank + fast_decay + off) if is_constant else -1.0
+
+
+@inlined
+def drain_shorts(drive):
+    """Find what is taken from the DC link in this window beside the winding's power: writes drain.
+
+    A short to ground carries current while the bridge's upper transistor is on, for the share of time that the phase's
+    voltage is of the supply's.
+    """
+    for lane in range(LANES):
+        shorts = drive.short_a[lane] * abs(drive.u_a[lane]) + drive.short_b[lane] * abs(drive.u_b[lane])
+        drive.drain[lane] = drive.idle_current[lane] + drive.stage_on[lane] * shorts
 
 
 @inlined

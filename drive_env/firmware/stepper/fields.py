@@ -31,6 +31,7 @@ PARAMETERS = (
     ),
     Field("off_time", "f8", "", "2097h: 0 bridges off, else slow decay of 12 + 32 n clocks", 5.0),
     Field("short_protection_off", "f8", "", "20A1h: 1: short circuits cut nothing"),
+    Field("short_detection", "f8", "", "20A2h: 0...3; how long a bridge must be on to see a short to ground"),
     Field("pwm_threshold", "f8", "rad/s", "20B0h: speed below which voltage PWM drives; 0: never"),
     Field("pwm_gradient", "f8", "", "20B1h: 0...255; PWM amplitude by speed; 0: no voltage PWM"),
     Field("pwm_amplitude", "f8", "", "20B2h: 0...255; PWM amplitude at standstill"),
@@ -55,6 +56,8 @@ PARAMETERS = (
     Field("detent_torque", "f8", "N*m", "amplitude, four periods in each electrical one"),
     Field("index_angle", "f8", "rad", "of the rotor, at which the encoder's index begins; it is one count wide"),
     Field("index_inverted", "f8", "", "1: N and its complement are exchanged"),
+    Field("short_a", "f8", "S", "short to ground at the output of bridge A"),
+    Field("short_b", "f8", "S", "the same of bridge B"),
     Field("open_a", "f8", "", "1: the cable of phase A is broken"),
     Field("open_b", "f8", "", "1: the cable of phase B is broken"),
 )
@@ -66,7 +69,9 @@ STATE = (
     # --- steps ----------------------------------------------------------------------------------------------------
     Field("step_position", "f8", "rad", "what the steps have moved since power-on"),
     Field("step_rate", "f8", "rad/s", "speed of the steps in this period"),
-    Field("steps_done", "f8", "", "210Bh: microsteps made so far, whatever their direction"),
+    Field("steps_done", "f8", "", "210Bh:03: microsteps made so far, whatever their direction"),
+    Field("steps_low", "f8", "", "210Bh:01: their lower 32 bits"),
+    Field("steps_high", "f8", "", "210Bh:02: their upper 32 bits"),
     Field("steps_per_rad", "f8", "1/rad", "microsteps per rad of the drive's belief"),
     Field("table_length", "f8", "", "microsteps of an electrical period", 1024.0),
     Field("rad_per_entry", "f8", "rad", "electrical angle of a microstep"),
@@ -86,6 +91,8 @@ STATE = (
     Field("ripple", "f8", "A", "of the phase currents, peak to peak"),
     Field("chopper_frequency", "f8", "Hz", ""),
     Field("in_spread_cycle", "f8", "1", "1: the chopper, if it works, makes spread cycles"),
+    Field("on_time", "f8", "s", "for which a bridge is on in a cycle"),
+    Field("drain", "f8", "A", "that logic and shorts to ground take from the DC link in this window"),
     # --- load by StallGuard2 --------------------------------------------------------------------------------------
     Field("load_value", "f8", "", "2101h: 0...1023, lower with load"),
     Field("load_is_fresh", "f8", "1", "1: the reading was taken in this window"),

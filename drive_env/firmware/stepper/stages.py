@@ -10,7 +10,7 @@ from drive_env.firmware.common.warming import warmed
 from drive_env.firmware.cycle import FirmwareStages, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper import causes, fields
-from drive_env.firmware.stepper.chopper import choose_drive, find_ripple
+from drive_env.firmware.stepper.chopper import choose_drive, drain_shorts, find_ripple
 from drive_env.firmware.stepper.current_scale import scale_current
 from drive_env.firmware.stepper.sensors import derive_encoder, measure_motion
 from drive_env.firmware.stepper.stall_guard import (
@@ -77,6 +77,7 @@ def prepare_chopper(drive, rates):
     refresh_winding(drive, rates.tick, rates.window)
     choose_drive(drive)
     find_ripple(drive)
+    drain_shorts(drive)
 
 
 @stage
@@ -86,7 +87,14 @@ def warm(drive, rates):
         square = drive.i_a[lane] * drive.i_a[lane] + drive.i_b[lane] * drive.i_b[lane]
         square += drive.ripple[lane] * drive.ripple[lane] * (1.0 / 6.0)
         square = square if square < LARGEST_SQUARE else 0.0  # a frozen lane's currents may be no numbers
-        warmed(drive, lane, drive.R_s[lane] * square, drive.on_resistance[lane] * square, rates.period)
+        # What a short to ground carries warms the stage alone, while its bridge is on.
+        u_dc = drive.u_dc[lane]
+        shorts = drive.short_a[lane] * drive.short_a[lane] * abs(drive.u_a[lane])
+        shorts += drive.short_b[lane] * drive.short_b[lane] * abs(drive.u_b[lane])
+        shorted = drive.stage_on[lane] * u_dc * shorts
+        shorted = shorted if shorted < LARGEST_SQUARE else 0.0
+        in_stage = drive.on_resistance[lane] * (square + shorted)
+        warmed(drive, lane, drive.R_s[lane] * square, in_stage, rates.period)
 
 
 @stage
@@ -133,6 +141,8 @@ def power_on(drive, lane):
     drive.step_position[lane] = 0.0
     drive.step_rate[lane] = 0.0
     drive.steps_done[lane] = 0.0
+    drive.steps_low[lane] = 0.0
+    drive.steps_high[lane] = 0.0
     drive.in_full_steps[lane] = 0.0
     drive.standstill_time[lane] = 0.0
     drive.velocity_before[lane] = 0.0

@@ -15,6 +15,7 @@ from mechanics.compiled import inlined
 
 HALF_PI = 1.5707963267948966
 SMALLEST_WAY = 1e-6  # microsteps
+HALF = 4294967296.0  # 2^32: of a counter of 64 bits
 
 
 @inlined
@@ -39,7 +40,11 @@ def plan_steps(drive, dt):
         way = 0.0 if abs(way) * drive.steps_per_rad[lane] < SMALLEST_WAY else way
         rate = way / dt
         drive.step_rate[lane] = rate
-        drive.steps_done[lane] += abs(way) * drive.steps_per_rad[lane]
+        counted = drive.steps_low[lane] + abs(way) * drive.steps_per_rad[lane]
+        carry = 1.0 if counted >= HALF else 0.0
+        drive.steps_low[lane] = counted - carry * HALF
+        drive.steps_high[lane] += carry
+        drive.steps_done[lane] = drive.steps_high[lane] * HALF + drive.steps_low[lane]
         threshold = drive.fullstep_threshold[lane]
         fast = threshold > 0.0 and abs(rate) > threshold
         drive.in_full_steps[lane] = drive.high_speed_fullstep[lane] if fast else 0.0

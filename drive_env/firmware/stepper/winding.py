@@ -134,7 +134,7 @@ def move_rotor(drive, dt, progress):
     """
     for lane in range(LANES):
         u_dc = drive.u_dc[lane]
-        drained = drive.idle_current[lane] + drive.bridge_power[lane] / u_dc
+        drained = drive.drain[lane] + drive.bridge_power[lane] / u_dc
         drive.u_dc[lane] = link_voltage(
             u_dc - drive.link_step[lane] * drained,
             drive.link_decay[lane],

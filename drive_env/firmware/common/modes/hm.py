@@ -40,7 +40,8 @@ def _ends_at_index(method):
 
 @stage
 def _looks_for_index_alone(method):
-    return method == INDEX_LEFT or method == INDEX_RIGHT
+    """Return whether a method looks for the next index, wherever it is."""
+    return method in (INDEX_LEFT, INDEX_RIGHT)
 
 
 @stage

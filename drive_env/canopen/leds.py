@@ -1,0 +1,64 @@
+"""The two lamps of a node: run, which is green, and error, which is red (CiA 303-3).
+
+Devices do not show what is not in the table: "flickering" (LSS, automatic bit rate), "triple flash" (SYNC error).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Hashable
+from typing import NamedTuple
+
+from drive_env.canopen.nmt import NmtState
+
+# Seconds of light and darkness in turn, beginning with light; without any it is on or off for good.
+PATTERNS: dict[str, tuple[float, ...]] = {
+    "off": (),
+    "on": (),
+    "blinking": (0.2, 0.2),
+    "single flash": (0.2, 1.0),
+    "double flash": (0.2, 0.2, 0.2, 1.0),
+}
+RUN = {
+    NmtState.INITIALISING: "off",
+    NmtState.PRE_OPERATIONAL: "blinking",
+    NmtState.STOPPED: "single flash",
+    NmtState.OPERATIONAL: "on",
+}
+WARNING_LIMIT = 96  # of the controller's error counter (ISO 11898-1)
+
+
+class Leds(NamedTuple):
+    """Patterns of both lamps, by name."""
+
+    run: str
+    error: str
+
+
+def leds_of(state: NmtState, is_bus_off: bool, conditions: Collection[Hashable], error_counter: int) -> Leds:
+    """Return what the lamps of a node show; of several errors the gravest.
+
+    Args:
+        state: NMT state.
+        is_bus_off: Whether its controller has left the bus.
+        conditions: Errors that last: "guarding", ("heartbeat", node), others do not count.
+        error_counter: Of its controller.
+    """
+    watched = any(key == "guarding" or (isinstance(key, tuple) and key[0] == "heartbeat") for key in conditions)
+    if is_bus_off:
+        return Leds(RUN[state], "on")
+    if watched:
+        return Leds(RUN[state], "double flash")
+    return Leds(RUN[state], "single flash" if error_counter >= WARNING_LIMIT else "off")
+
+
+def is_lit(pattern: str, time: float) -> bool:
+    """Return whether a lamp with that pattern is lit at a time [s] since the pattern began."""
+    parts = PATTERNS[pattern]
+    if not parts:
+        return pattern == "on"
+    left = time % sum(parts)
+    for k, part in enumerate(parts):
+        if left < part:
+            return k % 2 == 0
+        left -= part
+    return False
