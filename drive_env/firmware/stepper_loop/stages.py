@@ -50,6 +50,9 @@ def take_over(drive, rates):
         seed_steps(drive, rates.period)
 
 
+# Right after the encoder is read, whatever else looks at the motion in a window.
+_READ = stepper.STAGES.window.index(stepper.read_motion) + 1
+
 STAGES = replace(
     stepper.STAGES,
     name="stepper_loop",
@@ -58,7 +61,7 @@ STAGES = replace(
     switch=(*stepper.STAGES.switch, initialise.choose_loop),
     tell=(*stepper.STAGES.tell, ask_torque, tell_torque_mode),
     end_period=(take_over, *stepper.STAGES.end_period),
-    window=(stepper.watch_load, stepper.read_motion, regulate, stepper.prepare_chopper),
+    window=(*stepper.STAGES.window[:_READ], regulate, *stepper.STAGES.window[_READ:]),
     tick=(run_tick,),
     power_on=(*stepper.STAGES.power_on, initialise.power_on),
     halt=(*stepper.STAGES.halt, initialise.halt),
