@@ -301,9 +301,6 @@ ELSEWHERE = {
 } | {
     key: f"its figures: {test}.py"
     for test, found in {
-        "test_stepper_cool_step": [(index, 0) for index in (*range(0x2098, 0x209E), 0x20A5)],
-        "test_stepper_stall_guard": [(0x209E, 0), (0x20A4, 0)],
-        "test_stepper_dc_step": [(0x20B3, 0), (0x20B4, 0), (0x20B5, 0)],
         "test_stepper_brake": [(0x2002, 1), (0x2002, 2), (0x200A, 0), (0x200C, 1), (0x200C, 2)],
         "test_stepper_index": [(0x200B, 1), (0x200B, 2), (0x200B, 3), (0x200F, 1)],
         "test_stepper_protection": [(0x20A2, 0)],

@@ -168,7 +168,7 @@ class Distributions:
         return _shipped_set(str(source))
 
     def of_machine(self, parameters: Collection[str]) -> Distributions:
-        """Return the set without the laws of parameters that a machine does not have, as those of another motor."""
+        """Return the set without parameters that a machine does not have, as those of another motor."""
         laws = {name: law for name, law in self.laws.items() if name in parameters or name in BESIDE}
         return Distributions(laws, self.curriculum, self.faults)
 

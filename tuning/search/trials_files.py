@@ -94,7 +94,7 @@ def save(
 
 
 def titles(device: str) -> dict[str, str]:
-    """Return what each objective is told as, of a device."""
+    """Return the title of each objective, for a device."""
     return OPEN_LOOP_TITLES if find_device(device).gains.is_open_loop else TITLES
 
 
