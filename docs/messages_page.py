@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-DEVICE = HERE.parent / "drive_env" / "devices" / "tmcm1636" / "device.toml"
+DEVICES = HERE.parent / "drive_env" / "devices"
 INTRODUCTION = """# When it says …
 
 Messages that programs, drives and certificates show, by topic, with cause and remedy. A value is written as `…`. Search
@@ -36,10 +36,16 @@ def load() -> dict[str, Any]:
     return tomllib.loads((HERE / "messages.toml").read_text(encoding="utf-8"))
 
 
+def emergencies() -> dict[str, dict[str, Any]]:
+    """Return what each device tells: its emergencies by name. Variants tell what their device does."""
+    files = sorted(DEVICES.glob("*/device.toml"))
+    tables = {file.parent.name: tomllib.loads(file.read_text(encoding="utf-8")) for file in files}
+    return {name: table["emergencies"] for name, table in tables.items() if "emergencies" in table}
+
+
 def page() -> str:
     """Return the page."""
     data = load()
-    emergencies = tomllib.loads(DEVICE.read_text(encoding="utf-8"))["emergencies"]
     parts = [INTRODUCTION]
     for topic in data["topic"]:
         parts.append(f"## {topic['title']}\n")
@@ -47,7 +53,7 @@ def page() -> str:
             parts.append(f"{topic['text']}\n")
         rows = topic["message"]
         if "emcy" in rows[0]:
-            parts.append(_emergency_table(rows, emergencies))
+            parts.append(_emergency_table(rows, emergencies()))
         else:
             parts += [_message(row) for row in rows]
     parts.append(FAMILIES + "\n".join(f"**{one['title']}.** {one['reason']}\n" for one in data["family"]))
@@ -59,15 +65,17 @@ def _message(row: dict[str, Any]) -> str:
     return f"{said}\n\n- *From:* {row['from']}\n- *Cause:* {row['cause']}\n- *Remedy:* {row['remedy']}\n"
 
 
-def _emergency_table(rows: list[dict[str, str]], emergencies: dict[str, Any]) -> str:
-    lines = ["| code | what | cause | remedy |", "| --- | --- | --- | --- |"]
+def _emergency_table(rows: list[dict[str, str]], told: dict[str, dict[str, Any]]) -> str:
+    lines = ["| code | what | drives | cause | remedy |", "| --- | --- | --- | --- | --- |"]
     for row in rows:
         if "same" in row:
             continue
         names = [row["emcy"], *(other["emcy"] for other in rows if other.get("same") == row["emcy"])]
-        codes = dict.fromkeys(f"{emergencies[name]['code']:04X}h" for name in names)
+        codes = {f"{table[name]['code']:04X}h": None for name in names for table in told.values() if name in table}
         called = ", ".join(name.replace("_", " ") for name in names)
-        lines.append(f"| {', '.join(codes)} | {called} | {row['cause']} | {row['remedy']} |")
+        those = [device for device, table in told.items() if any(name in table for name in names)]
+        drives = "all" if len(those) == len(told) else ", ".join(those)
+        lines.append(f"| {', '.join(codes)} | {called} | {drives} | {row['cause']} | {row['remedy']} |")
     return "\n".join(lines) + "\n"
 
 

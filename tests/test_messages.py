@@ -176,9 +176,27 @@ def test_every_verdict_and_every_stop_has_a_row_or_a_family():
     assert without_a_row(said()) == []
 
 
-def test_every_emergency_has_a_row():
+def test_every_emergency_of_every_device_has_a_row():
     rows = {row["emcy"] for row in ROWS if "emcy" in row}
-    assert rows == set(tomllib.loads(PAGE.DEVICE.read_text(encoding="utf-8"))["emergencies"])
+    told = PAGE.emergencies()
+    assert {"tmcm1636", "tmcm6212", "tmcm3313"} <= told.keys()
+    assert rows == {name for table in told.values() for name in table}
+
+
+def test_an_emergency_says_which_drives_send_it_and_with_which_codes():
+    page = (ROOT / "docs" / "messages.md").read_text(encoding="utf-8")
+    rows = {cells[1]: cells for line in page.splitlines() if len(cells := line.strip("| ").split(" | ")) == 5}
+    assert rows["stall"][0] == "3230h"  # TMCM-3313 manual, table 380
+    assert rows["stall"][2] == "tmcm3313, tmcm6212"
+    assert rows["hall error"][2] == "tmcm1636"  # a stepper has no halls
+    assert rows["open load a, open load b"][::2][:2] == ["1000h", "all"]
+    assert rows["following error"][::2][:2] == ["8611h", "all"]
+    assert rows["overcurrent high side, overcurrent bridge a, overcurrent bridge b"][0] == "2310h, 2312h, 2311h"
+
+
+def test_one_emergency_has_one_code_on_every_device():
+    codes = {(name, row["code"]) for table in PAGE.emergencies().values() for name, row in table.items()}
+    assert len(codes) == len(dict(codes))
 
 
 def test_every_abort_code_has_a_row():
