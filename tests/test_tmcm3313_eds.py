@@ -8,11 +8,13 @@ Entries that the manual does not print are an extension for CAN, and their objec
 from __future__ import annotations
 
 import configparser
+import importlib
 import re
 from pathlib import Path
 
 import pytest
 
+from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary
 
 EDS = Path(__file__).parents[1] / "drive_env" / "devices" / "tmcm3313" / "tmcm3313.eds"
@@ -351,3 +353,23 @@ def test_the_file_is_ascii_and_lists_its_objects():
         if "SubNumber" in eds[f"{index:04X}"]:
             subs = [name for name in eds.sections() if name.startswith(f"{index:04X}sub")]
             assert int(eds[f"{index:04X}"]["SubNumber"], 16) == len(subs)
+
+
+# What a binding counts in, and how the EDS writes it; `jog '60 rpm'` and monitors turn it into units.
+WRITTEN = {
+    **{unit: unit for unit in ("pps", "pps^2", "inc", "ms", "10ms", "mA", "512 clocks")},
+    **dict.fromkeys(("counter", "position window", "position limit"), "inc"),
+}
+
+
+@pytest.mark.parametrize("name", ["tmcm3313", "tmcm6212"])
+def test_the_eds_says_in_what_an_object_counts_on_every_axis(name):
+    device = find_device(name)
+    entries = {(entry.index, entry.sub): entry for entry in device.new_dictionary()}
+    bindings = importlib.import_module(f"drive_env.devices.{name}.bindings").BINDINGS
+    counted = [one for one in bindings if one.unit in WRITTEN]
+    assert len(counted) > 30
+    for one in counted:
+        step = 0x200 if one.index < 0x2200 else 0x800
+        for axis in range(device.num_axes):
+            assert entries[one.index + step * axis, one.sub].unit == WRITTEN[one.unit], f"{one.index:04X}h:{one.sub}"

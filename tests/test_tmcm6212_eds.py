@@ -8,6 +8,8 @@ of the chip's registers. Where either is silent stands -.
 from __future__ import annotations
 
 import configparser
+import csv
+import re
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,8 @@ import pytest
 from drive_env.dictionary.entries import ObjectDictionary
 
 EDS = Path(__file__).parents[1] / "drive_env" / "devices" / "tmcm6212" / "tmcm6212.eds"
+DECISIONS = Path(__file__).parents[1] / "docs" / "decisions" / "stepper.md"
+FACT_TABLE = Path(__file__).parents[1] / "research" / "stepper_drives" / "tmcm6212.csv"
 NODE, AXES = 5, 6
 BITS = {
     "U8": (8, False),
@@ -272,8 +276,32 @@ ROWS = """
 67FF:0 U32 ro 0 0x00040192 -
 """
 
+# What the maker's EDS has and ours has not: entry, type, access. docs/decisions/stepper.md has the reasons.
+ABSENT = """
+3009:0 U8 rw
+300B:0 U32 ro
+300C:0 U8 const
+300C:1 U32 ro
+300C:2 U32 ro
+300C:3 U32 ro
+300C:4 U32 ro
+300C:5 U32 ro
+300C:6 U32 ro
+300E:5 U32 ro
+300E:6 U32 ro
+300E:7 U32 ro
+300E:8 U32 ro
+300F:0 I32 rw
+"""
+FACTS = 257  # entries of axis 0 in the maker's EDS
+
 TABLE = {
     tuple(int(part, 16) for part in row.split()[0].split(":")): row.split()[1:] for row in ROWS.strip().splitlines()
+}
+
+
+LACKING = {
+    tuple(int(part, 16) for part in row.split()[0].split(":")): row.split()[1:] for row in ABSENT.strip().splitlines()
 }
 
 
@@ -324,6 +352,29 @@ def test_an_entry_is_as_its_maker_has_it_on_every_axis(dictionary, key):
 def test_there_is_nothing_else(dictionary):
     expected = {(of_axis(index, axis), sub) for index, sub in TABLE for axis in range(AXES)}
     assert {(entry.index, entry.sub) for entry in dictionary} == expected
+
+
+def test_what_the_maker_has_is_there_or_absent_for_a_reason(dictionary):
+    assert len(TABLE) + len(LACKING) == FACTS and not TABLE.keys() & LACKING.keys()
+    assert not {(entry.index, entry.sub) for entry in dictionary} & LACKING.keys()
+    told = {}
+    for line in DECISIONS.read_text(encoding="utf-8").partition("## What the TMCM-6212 lacks")[2].splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if found := re.fullmatch(r"([0-9A-F]{4})h(?::(\d\d) to (\d\d))?", cells[0]):
+            assert len(cells[3]) > 30  # a reason
+            first, last = int(found[2] or 0), int(found[3] or 0)
+            told |= {(int(found[1], 16), sub): cells[1].split(", ") for sub in range(first, last + 1)}
+    assert told.keys() == LACKING.keys()
+    for key, kind in LACKING.items():
+        assert " ".join(kind) in told[key]
+
+
+def test_what_was_read_from_the_manuals_is_there_or_absent():
+    """The table of the objects of axis 0; it has one row for all PDO sets."""
+    with FACT_TABLE.open(encoding="utf-8", newline="") as file:
+        read = {(int(row["index"][:4], 16), int(row["sub"][:2], 16)) for row in csv.DictReader(file)}
+    whole = TABLE.keys() | LACKING.keys()
+    assert read == {(index, sub) for index, sub in whole if not 0x1400 <= index < 0x1C00 or index & 0x3F == 0}
 
 
 def test_the_numbers_of_pdos_are_the_manuals(dictionary):

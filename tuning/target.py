@@ -131,7 +131,7 @@ class Target:
 def emulated(
     device: str = "tmcm1636",
     load: str | Path | Load = "two_mass",
-    motor: str = "qbl4208",
+    motor: str | None = None,
     *,
     num_machines: int = 1,
     seed: int = 0,
@@ -147,7 +147,7 @@ def emulated(
     Args:
         device: Name of the device.
         load: A load's name, the path of an MJCF, or a `mechanics.Load`.
-        motor: Name of the motor.
+        motor: Name of the motor; the device's usual one by default.
         num_machines: Machines, each with its drives.
         seed: Seed of everything random.
         supply: Supply voltage [V]; the motor's by default. The machines have it, and the tuner knows it.
@@ -197,7 +197,7 @@ def emulated(
 
 def on_bus(
     device: str = "tmcm1636",
-    motor: str = "qbl4208",
+    motor: str | None = None,
     *,
     interface: str | None = None,
     channel: str | None = None,
@@ -216,7 +216,7 @@ def on_bus(
 
     Args:
         device: Name of the device.
-        motor: Name of the motor that every node turns.
+        motor: Name of the motor that every node turns; the device's usual one by default.
         interface: As python-can names it; from DRIVE_ENV_INTERFACE if not given.
         channel: The channel; from DRIVE_ENV_CHANNEL if not given.
         nodes: Node-IDs.
@@ -232,10 +232,11 @@ def on_bus(
     """
     if axes not in AXES:
         raise ValueError(f"--axes {axes} must be one of {', '.join(AXES)}")
+    from drive_env.devices import find_device
     from drive_env.master.open_drives import open_drives
     from drive_env.motors import find_motor
 
-    row = find_motor(motor)
+    row = find_motor(find_device(device).default_motor if motor is None else motor)
     numbers = tuple(nodes)
     drives = open_drives(device, interface=interface, channel=channel, nodes=numbers, **options)
     try:

@@ -48,7 +48,7 @@ def tune(
         bool, typer.Option("--lockstep", help="For emulated drives served with --lockstep: time passes by SYNC.")
     ] = (False),
     device: DeviceName = "tmcm1636",
-    motor: MotorName = "qbl4208",
+    motor: MotorName = None,
     load: Annotated[str, typer.Option(help="Load of the emulated drive, where no --interface is given.")] = "two_mass",
     seed: Annotated[
         int | None,
@@ -131,7 +131,7 @@ def _check_gains(policy: Any, device: str) -> None:
 
 @contextmanager
 def _emulated_node(
-    device: str, motor: str, load: str, seed: int | None, supply: float | None, travel: str | None
+    device: str, motor: str | None, load: str, seed: int | None, supply: float | None, travel: str | None
 ) -> Iterator[Target]:
     """Serve an emulated drive on a hub of its own and reach it over that."""
     from drive_env import EmulatedDrives

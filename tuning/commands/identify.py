@@ -54,6 +54,8 @@ def identify(
         if out is not None:
             check_free(out, "choose another --out")
             check_writable(out)
+        drive.check()
+        drive.check_linear_model()
         file = way_back(drive, "identify", None if out is None else out.with_suffix(""))
         from drive_env.whole_file import write_whole
         from tuning.identify.identification import identify as run

@@ -198,7 +198,7 @@ def _on_bus(drive: DriveOptions, settings: Settings, folder: Path, json: bool) -
 
 def _named(drive: DriveOptions) -> dict[str, Any]:
     """Return what settings.toml tells of any drive."""
-    return {name: getattr(drive, name) for name in ("device", "motor", "supply", "travel")}
+    return {"device": drive.device, "motor": drive.motor_name, "supply": drive.supply, "travel": drive.travel}
 
 
 def _search_machine(

@@ -37,9 +37,11 @@ if TYPE_CHECKING:
 
 APART = "apart"  # of `tuning.target.AXES`
 MotorName = Annotated[
-    str,
+    str | None,
     typer.Option(
-        "--motor", help="Motor: a name of the catalogue, or the path of a TOML file; its data sheet values are used."
+        "--motor",
+        help="Motor: a name of the catalogue, or the path of a TOML file; its data sheet values are used.",
+        show_default="the device's usual one",
     ),
 ]
 LoadName = Annotated[
@@ -107,7 +109,7 @@ class DriveOptions:
     bus: Bus = False
     device: DeviceName = "tmcm1636"
     eds: ForeignEds = None
-    motor: MotorName = "qbl4208"
+    motor: MotorName = None
     load: LoadName = "two_mass"
     seed: Seed = 0
     interface: Interface = None
@@ -120,6 +122,13 @@ class DriveOptions:
     axes: Axes = APART
     yes: Yes = False
 
+    @property
+    def motor_name(self) -> str:
+        """The motor: the device's usual one, if none was named."""
+        from drive_env.devices import find_device
+
+        return find_device(self.device).default_motor if self.motor is None else self.motor
+
     def check(self) -> None:
         """Raise ValueError for a number that cannot be, or a drive of which too little is known."""
         check_seed(self.seed)
@@ -130,12 +139,19 @@ class DriveOptions:
                 "--device FOLDER (the page on file formats, section Device, has the list)"
             )
 
+    def check_linear_model(self) -> None:
+        """Raise ValueError for a drive whose loops are not those of the linear model, before anybody is asked."""
+        from drive_env.devices import find_device
+        from drive_env.gains import check_linear_model
+
+        check_linear_model(find_device(self.device))
+
     def machine(self) -> dict[str, Any]:
         """Return what `tuning.target.emulated` takes of these options; raises as `open_target` does."""
         self.check()
         check_no_bus(self.nodes, self.bitrate, self.lockstep, self.axes)
-        named = {name: getattr(self, name) for name in ("device", "load", "motor", "seed", "supply")}
-        return named | {"travel": None if self.travel is None else parse_travels(self.travel)}
+        named = {name: getattr(self, name) for name in ("device", "load", "seed", "supply")}
+        return named | {"motor": self.motor_name, "travel": None if self.travel is None else parse_travels(self.travel)}
 
     def open(self) -> Target:
         """Return the drives, once the user lets a motor of a bus turn; raises as `open_target` does."""
@@ -274,7 +290,7 @@ def open_target(drive: DriveOptions) -> Target:
         options |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE}
     return on_bus(
         drive.device,
-        drive.motor,
+        drive.motor_name,
         interface=drive.interface,
         channel=drive.channel,
         nodes=drive.nodes or (1,),

@@ -70,6 +70,8 @@ def response(
             raise ValueError(
                 "--trace is for emulated drives, up to 1000 Hz; leave out --high and --bus, or leave out --trace"
             )
+        drive.check()
+        drive.check_linear_model()
         file = way_back(drive, "response", out)
         with drive.open() as target, unchanged(target, file), progress_bar("shaking") as show:
             measured = measure(target, loop, signal=Signal(signal, low, high, resolution), traced=trace, progress=show)

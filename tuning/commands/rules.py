@@ -76,6 +76,8 @@ def rules(
             raise ValueError("--store stores what --apply writes; add --apply RULE, or leave it out")
         if snapshot is not None and not (apply or drive.bus):
             raise ValueError("--snapshot is the file for the state before --apply; add --apply RULE, or leave it out")
+        drive.check()
+        drive.check_linear_model()
         file = run_folder("rules") / "before.toml" if snapshot is None else snapshot
         if drive.bus:
             check_place(file)  # written before the motor turns; of emulated drives, before their gains change
