@@ -49,6 +49,7 @@ def test_objects_of_an_axis(bus):
         (("get", "2403", "--axis", 1), "2403h:00 Maximum current axis 2 is an object of axis 2, not of --axis 1"),
         (("get", "2003", "--axis", 6), "--axis 6: a tmcm6212 has 6 axes, from 0"),
         (("jog", "1 rev/s", "--axis", 6), "--axis 6: a tmcm6212 has 6 axes, from 0"),
+        (("jog", "1 rev/s", "--max-current", "1 A"), "--max-current: tmcm6212 has no current limit in amperes"),
     ):
         found = run(*words)
         assert found.exit_code == 2 and says in found.stderr

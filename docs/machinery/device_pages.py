@@ -51,11 +51,13 @@ def page(device: Device) -> str:
 
 def facts(device: Device) -> str:
     """Return the device's figures."""
-    peak = "peak of a phase" if "stepper" in motor_kinds(device.firmware_name) else "peak i_q"
+    is_stepper = "stepper" in motor_kinds(device.firmware_name)
+    peak = "peak of a phase" if is_stepper else "peak i_q"
+    fast, slow = ("windings", "steps and choppers") if is_stepper else ("current loop", "velocity and position loop")
     rows = [
         ("axes", device.num_axes, ""),
-        ("current loop", f"{device.current_rate:g}", "Hz"),
-        ("velocity and position loop", f"{device.velocity_rate:g}", "Hz"),
+        (fast, f"{device.current_rate:g}", "Hz"),
+        (slow, f"{device.velocity_rate:g}", "Hz"),
         ("supervision, modes and profiles", f"{device.supervision_rate:g}", "Hz"),
         ("communication cycle", f"{1e3 / device.communication_rate:g}", "ms"),
         ("supply voltage", f"{device.undervoltage:g} to {device.overvoltage:g}", "V"),
@@ -91,13 +93,14 @@ def gains(device: Device) -> str:
 def roles(device: Device) -> str:
     """Return which object plays which part."""
     dictionary = device.new_dictionary()
+    first = next(iter(device.roles))
     rows = [
         (f"`Role.{role.name}`", role.value, key(*place), dictionary.find(place).name)
         for role, place in device.roles.items()
     ]
     return (
         "## Roles\n\nObjects that programs ask for by the part that they play, whatever a drive's index is: "
-        "`drives.read(Role.CURRENT_LIMIT)`.\n\n" + table(("role", "part", "object", "name"), rows)
+        f"`drives.read(Role.{first.name})`.\n\n" + table(("role", "part", "object", "name"), rows)
     )
 
 

@@ -35,6 +35,7 @@ from drive_env.commands.scope import DEFAULT, draw, new_files, write_table
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry, ObjectDictionary
     from drive_env.master.bus_drives import BusDrives
+    from drive_env.master.description import Description
 
 Node = Annotated[int, typer.Option("--node", "-n", help="Node-ID.")]
 AxisNumber = Annotated[int, typer.Option("--axis", help="Axis of a node with several, from 0.")]
@@ -84,6 +85,8 @@ def jog(
         known = description.dictionary
         if not 0 <= axis < description.num_axes:
             raise ValueError(f"--axis {axis}: a {description.name} has {description.num_axes} axes, from 0")
+        if max_current is not None:
+            _check_has_current_limit(description)
         current = None if max_current is None else quantities.parse(max_current, known.find(cia402.TORQUE_ACTUAL), None)
         if current is not None and current <= 0:
             raise ValueError(f"--max-current {max_current} must be above 0 A; leave it out for the drive's own limit")
@@ -124,6 +127,20 @@ def jog(
                 print("nothing was recorded" if trace is None else f"recorded in {files[0]} and {files[1]}")
         if stopped:
             fail(stopped, REFUSED)
+
+
+def _check_has_current_limit(description: Description) -> None:
+    """Raise ValueError for a known drive without a current limit in amperes: nothing would be limited."""
+    from drive_env.dictionary.roles import Role
+
+    device = description.device
+    if device is not None and Role.CURRENT_LIMIT not in device.roles:
+        name = next((row for row in device.gains.rows if row.name == "run_current"), None)
+        own = "" if name is None else f" (drive-env set {name.key[0]:04X} ..., shares of the drive's full current)"
+        raise ValueError(
+            f"--max-current: {description.name} has no current limit in amperes that could be set for the movement; "
+            f"leave it out, and set the drive's own current{own}"
+        )
 
 
 class _OneAxis:

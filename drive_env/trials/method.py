@@ -119,7 +119,7 @@ class OpenLoop(NamedTuple):
 
     @property
     def measures_current(self) -> bool:
-        """It does not: drives of steppers have no 6077h."""
+        """It does not: there is no 6077h, or it is the size of the current that is set, whatever the load."""
         return False
 
     @property

@@ -351,7 +351,7 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
     lines += sorted({note for note in found.notes if note})
     if find_device(device).gains.is_open_loop:
         lines.append(
-            "J has no load step and no ripple of the current here: the drive measures no current (no 6077h). E_d/E_0 "
+            "J has no load step and no ripple of the current here: a stepper in open loop tells no torque. E_d/E_0 "
             "follows from the standby current, effort from the settings; settling, load angle, vibration and lost "
             "steps are the encoder's."
         )

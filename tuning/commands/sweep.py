@@ -171,7 +171,7 @@ def _print_result(result: Any, folder: Path) -> None:
         lines.append("No point is usable: choose other ranges; heatmap.png and results.csv show all points.")
     if result.response.lag is not None:
         lines.append(
-            "This drive measures no current (no 6077h): there is no ripple and no peak current; effort is the square "
+            "A stepper in open loop tells no torque: there is no ripple and no peak current; effort is the square "
             "of the run current that is set, load angle and lost steps are by the encoder."
         )
     lines += [f"{name} has no effect in this experiment." for name in result.without_effect()]

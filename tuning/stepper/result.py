@@ -86,7 +86,7 @@ class StepperResult:
             "drive seconds": round(self.drive_seconds, 3),
             "stored": self.kept,
             "load and obstacle tried": self.proved_with_load,
-            "not measured": "current, load step: the drive has no 6077h; frequency response, margins: open loop",
+            "not measured": "current, load step: a stepper in open loop tells no torque; frequency response, margins: open loop",
             "axes": [
                 {
                     "axis": k,
