@@ -6,7 +6,6 @@ import ast
 import fnmatch
 import importlib.util
 import re
-import tomllib
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple

@@ -260,12 +260,23 @@ def run(*arguments):
 
 def test_auto_finds_by_the_gain_set_what_a_device_is(stepper, tmp_path):
     out = tmp_path / "found"
-    result = run("auto", "--device", stepper, "--motor", NAME, "--load", "inertia", "--out", out)
+    result = run("auto", "--device", stepper, "--load", "inertia", "--out", out)
     assert result.exit_code == 0, result.output
     assert "axis 0: accepted" in result.output and "not measured: current and load step" in result.output
     written = json.loads((out / "stepper-certificate.json").read_text(encoding="utf-8"))
     assert written["axes"][0]["verdict"] == "accepted" and written["load and obstacle tried"]
+    assert written["motor"] == NAME, "the device's usual one"
     assert (out / "before.toml").is_file()
+    assert run("verify", out / "stepper-certificate.json").exit_code == 0
+    written["axes"][0]["figures"]["run current [A]"] += 0.1
+    (out / "stepper-certificate.json").write_text(json.dumps(written), encoding="utf-8")
+    changed = run("verify", out / "stepper-certificate.json")
+    assert changed.exit_code == 1 and "was changed since it was written" in changed.output
+
+
+def test_a_stepper_of_more_volts_than_its_device_is_tuned_at_those_of_the_device():
+    with emulated("tmcm6212", "arm", "qsh8618_96") as target:
+        assert target.motor.voltage == 48.0 and target.supply.tolist() == [35.0]
 
 
 def test_auto_says_what_a_drive_lacks_before_anything_moves(tmp_path):

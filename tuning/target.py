@@ -180,7 +180,7 @@ def emulated(
     narrow_low, narrow_high = _ways(FREE if travel is None else travel, drives.load.num_axes)
     low = np.tile(np.maximum(own.low, narrow_low), num_machines)
     high = np.tile(np.minimum(own.high, narrow_high), num_machines)
-    volts = drives.motor.voltage if supply is None else supply
+    volts = drives.device.supply_of(drives.motor) if supply is None else supply
     limits = _limits(drives.motor, drives.num_axes, volts, speed, current)
     return Target(
         drives,
@@ -242,7 +242,7 @@ def on_bus(
     try:
         low, high = _ways(travel, drives.num_axes)
         assert drives.device is not None, "a device of a name is known"
-        volts = row.voltage if supply is None else supply
+        volts = drives.device.supply_of(row) if supply is None else supply
         limits = _limits(row, drives.num_axes, volts, speed, current)
         bus = _address(interface, channel, numbers, options)
         machine = f"{bus.get('channel', 'a bus')}, node {', '.join(map(str, numbers))}"

@@ -21,7 +21,12 @@ LEAST = 16  # machines that a fit needs
 def check_model(
     log: Annotated[Path, typer.Argument(help="Log of a move from rest, as `scope` writes it (CSV).")],
     device: DeviceName = "tmcm1636",
-    motor: Annotated[str, typer.Option(help="Motor: a name of the catalogue, or the path of a TOML file.")] = "qbl4208",
+    motor: Annotated[
+        str | None,
+        typer.Option(
+            help="Motor: a name of the catalogue, or the path of a TOML file.", show_default="the device's usual one"
+        ),
+    ] = None,
     load: Annotated[str, typer.Option(help="Load: a name, or the path of an MJCF file.")] = "two_mass",
     settings: Annotated[
         Path | None, typer.Option(help="Parameters of the real drive, as `backup` writes them (TOML).")

@@ -304,7 +304,8 @@ class GainTuning(VectorEnvironment):
         planned = plan_move(self.motor, self._identified.inertia, scaler, self._reach)
         # Environments outside the mask keep theirs: nothing of what it follows from has changed.
         self._move = planned
-        supply = np.full(drives.num_axes, float(self.motor.voltage))
+        volts = self.motor.voltage if drives.device is None else drives.device.supply_of(self.motor)
+        supply = np.full(drives.num_axes, volts)
         rule = self._method.keep(self._method.rule(self._identified, planned, supply), self._safe)
         self._rule = np.where(axes[:, None], rule, self._rule)
         self._best = np.where(axes[:, None], self._rule, self._best)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 FORMAT = 2
+STEPPER_FORMAT = "stepper 1"  # of stepper-certificate.json, which tuning/stepper/result.py writes
 HASH = "sha256"
 
 Floats = NDArray[np.float64]

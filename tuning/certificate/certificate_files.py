@@ -13,7 +13,7 @@ import numpy as np
 
 from drive_env.whole_file import content_hash, files_to_be
 from mechanics.untrusted import parse_json, read_text
-from tuning.certificate.certificate import FORMAT, HASH, Certificate, CertificateError, Floats
+from tuning.certificate.certificate import FORMAT, HASH, STEPPER_FORMAT, Certificate, CertificateError, Floats
 from tuning.certificate.report import html_is_unchanged, to_html
 
 
@@ -41,7 +41,7 @@ def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
     Raises:
         CertificateError: If the file is not a certificate.
     """
-    data = _read(Path(path))
+    data = _read(Path(path), FORMAT)
     stated = data.pop(HASH)
     unchanged = content_hash(data) == stated
     data.pop("format")
@@ -52,26 +52,26 @@ def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
 
 
 def is_unchanged(path: str | Path) -> bool:
-    """Return whether a certificate.json, or a report.html, is as it was written.
+    """Return whether a certificate.json, a stepper-certificate.json or a report.html is as it was written.
 
     Raises:
-        CertificateError: If the file is neither.
+        CertificateError: If the file is none of them.
     """
     where = Path(path)
     if where.suffix == ".html":
         return html_is_unchanged(_text(where))
-    data = _read(where)
+    data = _read(where, FORMAT, STEPPER_FORMAT)
     return bool(content_hash({k: v for k, v in data.items() if k != HASH}) == data[HASH])
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path, *formats: int | str) -> dict[str, Any]:
     try:
         data = parse_json(_text(path))
     except CertificateError:
         raise
     except ValueError as error:
         raise CertificateError(f"{path} is not a certificate: {error}; give a certificate.json of drive-tune") from None
-    if not isinstance(data, dict) or HASH not in data or data.get("format") != FORMAT:
+    if not isinstance(data, dict) or HASH not in data or data.get("format") not in formats:
         raise CertificateError(f"{path} is not a certificate of format {FORMAT}; give a certificate.json of drive-tune")
     return data
 

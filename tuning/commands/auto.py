@@ -125,7 +125,10 @@ def _report_stepper(target: Target, result: StepperResult, folder: Path, json: b
         lines.append(f"axis {k}: {axis.verdict}")
         lines += [f"axis {k}: {name}: {'not measured' if v is None else f'{v:g}'}" for name, v in axis.figures.items()]
         lines += [f"axis {k}: reservation: {reservation}" for reservation in axis.reservations]
-    lines.append("not measured: current and load step (a stepper in open loop tells no torque), frequency response and margins (open loop)")
+    lines.append(
+        "not measured: current and load step (a stepper in open loop tells no torque), frequency response and margins "
+        "(open loop)"
+    )
     kept = "; the settings are stored in the drive" if result.kept else ""
     lines.append(f"{result.drive_seconds:.1f} s of drive time{kept}")
     lines.append(f"written to {folder}: before.toml, {CERTIFICATE}")

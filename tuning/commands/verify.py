@@ -11,7 +11,9 @@ from tuning.commands.options import REFUSED, errors_as_exit_codes, fail
 
 
 def verify(
-    file: Annotated[Path, typer.Argument(help="certificate.json or report.html of a tuning.")],
+    file: Annotated[
+        Path, typer.Argument(help="certificate.json, stepper-certificate.json or report.html of a tuning.")
+    ],
 ) -> None:
     """Check whether a certificate or its report was changed since it was written; exit code 1 if it was.
 

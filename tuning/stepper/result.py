@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.certificate.certificate import verdict
+from tuning.certificate.certificate import HASH, STEPPER_FORMAT, verdict
 from tuning.runs.provenance import versions
 
 CERTIFICATE = "stepper-certificate.json"
@@ -86,7 +86,8 @@ class StepperResult:
             "drive seconds": round(self.drive_seconds, 3),
             "stored": self.kept,
             "load and obstacle tried": self.proved_with_load,
-            "not measured": "current, load step: a stepper in open loop tells no torque; frequency response, margins: open loop",
+            "not measured": "current, load step: a stepper in open loop tells no torque; frequency response, margins: "
+            "open loop",
             "axes": [
                 {
                     "axis": k,
@@ -110,11 +111,12 @@ def figure(value: float, digits: int = 5) -> float | None:
 
 @contextmanager
 def certificate_file(result: StepperResult, folder: Path) -> Iterator[Path]:
-    """Write the certificate, complete or not at all; it is removed if the block fails."""
-    from drive_env.whole_file import write_whole
+    """Write the certificate with a hash over its content, complete or not at all; removed if the block fails."""
+    from drive_env.whole_file import content_hash, write_whole
 
     path = folder / CERTIFICATE
-    write_whole(path, json.dumps(result.as_dict(), indent=1) + "\n")
+    content = {"format": STEPPER_FORMAT} | result.as_dict()
+    write_whole(path, json.dumps(content | {HASH: content_hash(content)}, indent=1) + "\n")
     try:
         yield path
     except BaseException:
