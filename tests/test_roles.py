@@ -27,7 +27,7 @@ def test_every_role_of_a_device_is_an_object_that_it_has(name):
 
 @pytest.mark.parametrize("name", device_names())
 def test_what_the_record_has_as_a_position_a_speed_a_time_or_a_current_has_its_unit_in_the_eds(name):
-    """A master knows the units from there: commands take `300 rpm`, and the envelope counts speeds and ramps in them."""
+    """A master knows units from there: commands take `300 rpm`, and the envelope counts speeds and ramps in them."""
     device = find_device(name)
     dictionary = device.new_dictionary()
     plain = {"counter": "inc", "position window": "inc", "position limit": "inc"}
