@@ -119,7 +119,7 @@ class OpenLoop(NamedTuple):
 
     @property
     def measures_current(self) -> bool:
-        """It does not: drives of steppers have no 6077h."""
+        """It does not: in open loop no drive tells a torque current."""
         return False
 
     @property

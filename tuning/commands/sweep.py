@@ -170,9 +170,13 @@ def _print_result(result: Any, folder: Path) -> None:
     elif not usable:
         lines.append("No point is usable: choose other ranges; heatmap.png and results.csv show all points.")
     if result.response.lag is not None:
+        from drive_env.devices import find_device
+        from drive_env.trials.open_loop import unmeasured
+
         lines.append(
-            "This drive measures no current (no 6077h): there is no ripple and no peak current; effort is the square "
-            "of the run current that is set, load angle and lost steps are by the encoder."
+            f"No torque current is measured ({unmeasured(find_device(result.experiment.device))}): there is no ripple "
+            "and no peak current; effort is the square of the run current that is set, load angle and lost steps are "
+            "by the encoder."
         )
     lines += [f"{name} has no effect in this experiment." for name in result.without_effect()]
     if result.simulated > 0.0:

@@ -1,0 +1,126 @@
+"""Tuning of the TMCM-3313: its currents and load detection in open loop, and the gains of its closed loop."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from drive_env import cia402, motion
+from drive_env.devices import find_device
+from drive_env.dictionary.roles import Role
+from drive_env.envs.gain_tuning import GainTuning
+from drive_env.motors import MOTORS
+from drive_env.phase_current import rated_setting
+from drive_env.trials.open_loop import unmeasured
+from tuning.commands.cli import app
+from tuning.search.optimise import Settings, optimise
+from tuning.search.trial_bench import TrialBench
+from tuning.target import emulated
+
+NAME = "qsh4218_51"
+MOTOR = MOTORS[NAME]
+DEVICE = find_device("tmcm3313")
+
+
+def call(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "200"})
+
+
+# --- open loop --------------------------------------------------------------------------------------------------------
+def test_its_load_detection_is_that_of_the_tmcm6212_row_by_row():
+    """Sections 4.2.45 to 4.2.51 of its manual; the objects are shared."""
+    rows = [row for row in DEVICE.gains.rows if row.loop in ("load detection", "CoolStep")]
+    assert rows == [row for row in find_device("tmcm6212").gains.rows if row.loop in ("load detection", "CoolStep")]
+    dictionary = DEVICE.new_dictionary()
+    for row in rows:
+        entry = dictionary.find(row.key)
+        assert (entry.low, entry.high) == (row.lowest, row.highest)
+
+
+def test_a_sweep_of_two_currents_has_a_point_for_each_pair(tmp_path):
+    shown = call("sweep", "--device", "tmcm3313", "--load", "inertia", "--show-config").output
+    grid = shown[shown.index("[[sweep]]") : shown.index("[excitation]")]
+    pair = "".join(
+        f'[[sweep]]\nobject = "{name}"\nlow = 63\nhigh = 95\ncount = 2\nspacing = "lin"\n\n'
+        for name in ("run_current", "standby_current")
+    )
+    config = tmp_path / "two.toml"
+    config.write_text(shown.replace(grid, pair), encoding="utf-8")
+    result = call("sweep", "--config", config, "--device", "tmcm3313", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    lines = (tmp_path / "out" / "results.csv").read_text(encoding="utf-8").splitlines()
+    assert lines[0].startswith("2003h:00,2004h:00,")
+    assert [line.split(",")[:2] for line in lines[1:]] == [["63", "63"], ["63", "95"], ["95", "63"], ["95", "95"]]
+    assert "in open loop 6077h is the size of the current" in result.output
+    assert unmeasured(find_device("tmcm6212")) == "no 6077h"
+
+
+def test_optimise_finds_currents_of_three_axes_again_to_the_digit():
+    settings = Settings(trials=4, seed=3)
+    found = []
+    for _ in range(2):
+        with emulated("tmcm3313", "portal", NAME, num_threads=1) as target:
+            found.append(optimise(target, settings, anew=True))
+    one, other = found
+    assert [row.cost for row in one.rows] == [row.cost for row in other.rows]
+    assert len({row.cost for row in one.rows}) > 1, "the currents are told apart"
+    assert one.gains.shape == (3, DEVICE.gains.count)
+    assert np.all(one.gains[:, :2] <= rated_setting(DEVICE, MOTOR))
+    assert one.cost[0] <= one.rows[0].cost, "the first is the rule"
+    assert np.array_equal(one.gains[:, 2:], one.rule[:, 2:]), "what is no current is left as it was"
+
+
+def test_an_episode_of_gain_tuning():
+    env = GainTuning(device="tmcm3313", motor=NAME, load="inertia", trials=3, num_threads=1)
+    try:
+        observation, info = env.reset(seed=1)
+        first, rule, ended, costs = info["robust_cost"].copy(), info["gains"].copy(), False, []
+        while not ended:
+            observation, _, terminated, truncated, info = env.step(np.array([[-0.2, 0.2]]))
+            assert not terminated.any() and env.observation_space.contains(observation)
+            costs.append(float(info["trial_robust_cost"][0]))
+            ended = bool(truncated[0])
+        assert len(costs) == 3 and abs(costs[0] / first[0] - 1.0) > 0.02, "the currents change the score"
+        tried = info["trial_gains"][0, 0] - rule[0, 0]
+        assert tried[0] < 0 < tried[1] and not tried[2:].any(), "what is no current stays"
+    finally:
+        env.close()
+
+
+def test_auto_commissions_and_certifies_its_load_detection(tmp_path):
+    result = call("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    axis = json.loads((tmp_path / "out" / "stepper-certificate.json").read_text(encoding="utf-8"))["axes"][0]
+    assert axis["verdict"] == "accepted" and axis["figures"]["teeth lost at an obstacle"] == 0
+    assert axis["after"]["coolstep_lower"] > 0
+    assert axis["figures"]["current saved by CoolStep, by the load angle [%]"] > 5
+
+
+def test_trials_of_currents_open_a_closed_loop_and_give_it_back():
+    """With it closed the difference of demand and encoder is a following error, and no load angle."""
+    with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:
+        drives = target.drives
+        drives.write(cia402.SENSOR_SELECTION, 0)
+        motion.enable(drives, mode="pp")
+        drives.write(Role.LOOP_MODE, 1)
+        drives.advance(3.2)
+        assert drives.read(Role.LOOP_INITIALISED).all()
+        motion.disable(drives)
+        bench = TrialBench(target)
+        bench.identify()
+        assert not drives.read(Role.LOOP_INITIALISED).any() and not drives.read(Role.LOOP_MODE).any()
+        bench.leave(bench.rule)
+        assert np.all(drives.read(Role.LOOP_MODE) == 1)
+
+
+@pytest.mark.parametrize("name", ["correction_velocity_p", "stall_threshold"])
+def test_what_trials_do_not_show_is_refused_before_anything_moves(name):
+    with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:
+        with pytest.raises(ValueError, match=rf"{name}: .* drive-tune sweep"):
+            optimise(target, Settings(trials=1, gains=(name,)))
+        assert not cia402.matches(target.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED).any()
+    with pytest.raises(ValueError, match=name):
+        GainTuning(device="tmcm3313", motor=NAME, load="inertia", gains=(name,))
