@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,9 @@ from drive_env.motors import MOTORS
 from drive_env.phase_current import rated_setting
 from drive_env.trials.open_loop import unmeasured
 from tuning.commands.cli import app
+from tuning.runs.experiment import SweptObject, load_experiment
+from tuning.runs.metrics import MoveRecording, figures, tracking
+from tuning.runs.sweep import run
 from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import TrialBench
 from tuning.target import emulated
@@ -116,7 +120,7 @@ def test_trials_of_currents_open_a_closed_loop_and_give_it_back():
         assert np.all(drives.read(Role.LOOP_MODE) == 1)
 
 
-@pytest.mark.parametrize("name", ["correction_velocity_p", "stall_threshold"])
+@pytest.mark.parametrize("name", ["correction_velocity_p", "correction_velocity_limit", "stall_threshold"])
 def test_what_trials_do_not_show_is_refused_before_anything_moves(name):
     with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:
         with pytest.raises(ValueError, match=rf"{name}: .* drive-tune sweep"):
@@ -124,3 +128,71 @@ def test_what_trials_do_not_show_is_refused_before_anything_moves(name):
         assert not cia402.matches(target.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED).any()
     with pytest.raises(ValueError, match=name):
         GainTuning(device="tmcm3313", motor=NAME, load="inertia", gains=(name,))
+
+
+# --- closed loop ------------------------------------------------------------------------------------------------------
+def closed_experiment(*swept, **excitation):
+    shipped = load_experiment(closed_loop=True)
+    return replace(shipped, sweep=swept, excitation=replace(shipped.excitation, **excitation))
+
+
+def test_gains_of_the_closed_loop_are_told_apart_where_the_motor_is_overloaded(tmp_path):
+    """A ramp that is too steep: with more P, and with more I, the axis is behind for less time."""
+    result = run(
+        closed_experiment(
+            SweptObject("correction_velocity_p", 1000, 10000, 2, "lin"),
+            SweptObject("202C:00", 20, 400, 2, "lin"),
+        ),
+        num_threads=1,
+    )  # fmt: skip
+    assert result.objects == ("202Bh:00", "202Ch:00") and not result.columns["fault"].any()
+    behind = result.columns["behind [s]"].reshape(2, 2)
+    assert behind[1, 0] < 0.8 * behind[0, 0] and behind[0, 1] < 0.8 * behind[0, 0]
+    assert result.best(1)[0]["202Bh:00"] == 10000
+    assert np.all(result.columns["following [full steps]"] > 2.0), "in open loop the steps would be lost"
+    assert np.all(result.columns["rms_current [A]"] < MOTOR.rated_current)
+    folder = result.save(tmp_path / "closed")
+    again = run(load_experiment(folder / "settings.toml"), num_threads=1)
+    assert np.array_equal(again.score, result.score)
+
+
+def test_tracking_in_closed_loop_is_its_formula():
+    """480 rpm are 1600 full steps/s; 40 of them behind in the step, 8 under load, a ripple of 0.1 A of 1 A."""
+    t = np.arange(0.0, 0.4, 0.001)
+    n = len(t)
+    recording = MoveRecording(
+        t, np.where(t < 0.02, 0.0, 480.0), np.full((n, 1), 480.0), 0.05 * (-1.0) ** np.arange(n)[:, None],
+        np.array([1.0]), 0.02, 0.2, np.where(t < 0.2, 40.0, 8.0)[:, None], None, np.array([200.0]),
+    )  # fmt: skip
+    found = figures(recording)
+    score = tracking(found, {"step": 1.0, "disturbance": 2.0, "ripple": 0.005})
+    step = (180 * 40.0 + 8.0) / 181  # the step's window has the first sample under load, too
+    assert score[0] == pytest.approx(step / 1600.0 + 2.0 * 8.0 / 1600.0 + 0.005 * 0.1)
+
+
+def test_within_the_motors_torque_no_gain_of_the_closed_loop_does_anything():
+    """Why trials, whose moves stay within it, refuse them."""
+    swept = (SweptObject("correction_velocity_p", 300, 30000, 2, "lin"),)
+    result = run(closed_experiment(*swept, acceleration_rpm_per_s=3000.0, velocity_rpm=120.0), num_threads=1)
+    assert result.columns["following [full steps]"].max() < 1.0
+    assert len(set(result.score)) == 1 and result.without_effect() == ["202Bh:00"]
+
+
+def test_an_axis_whose_loop_does_not_close_counts_as_one_in_fault(monkeypatch):
+    """Here the time is too short for the rotor to swing in."""
+    monkeypatch.setattr("tuning.runs.sweep.CLOSING_TIME", 0.1)
+    result = run(closed_experiment(SweptObject("correction_velocity_p", 3000, 3000, 1, "lin")), num_threads=1)
+    assert result.columns["fault"].all() and not result.usable.any()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--device", "tmcm6212"), "tmcm6212 has no loop to close"),
+        (("--device", "tmcm1636"), "tmcm1636 has no loop to close"),
+        (("--config", "my.toml"), "leave it out with --config"),
+    ],
+)
+def test_a_loop_that_cannot_be_closed_is_refused_with_the_reason(arguments, said, tmp_path):
+    result = call("sweep", "--closed-loop", *arguments, "--out", tmp_path / "out")
+    assert result.exit_code != 0 and said in result.output and "Traceback" not in result.output

@@ -197,6 +197,12 @@ def check_tried(device: Device, names: tuple[str, ...]) -> None:
             "tell apart; name gains of its gains.toml"
         )
     device.gains.columns(names)
+    closed = [row.name for row in device.gains.closed_rows if row.name in names]
+    if closed:
+        raise ValueError(
+            f"{', '.join(closed)}: the move of a trial stays within the motor's torque, where the corrections of a "
+            "closed loop do nothing; drive-tune sweep --closed-loop varies them in a ramp that overloads the motor"
+        )
     if device.gains.is_open_loop and (others := [name for name in names if name not in device.gains.outer]):
         raise ValueError(
             f"{', '.join(others)}: a trial of an open-loop stepper shows what the phase currents do, "
