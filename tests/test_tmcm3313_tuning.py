@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from drive_env import cia402, motion
+from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
+from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.motors import MOTORS
 from drive_env.phase_current import rated_setting
 from drive_env.trials.open_loop import unmeasured
+from drive_env.trials.positioning import plan_move, start, write_profile
 from tuning.commands.cli import app
 from tuning.runs.experiment import SweptObject, load_experiment
 from tuning.runs.metrics import MoveRecording, figures, tracking
-from tuning.runs.sweep import run
+from tuning.runs.sweep import _close_loop, run
 from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import TrialBench
 from tuning.target import emulated
@@ -170,12 +173,32 @@ def test_tracking_in_closed_loop_is_its_formula():
     assert score[0] == pytest.approx(step / 1600.0 + 2.0 * 8.0 / 1600.0 + 0.005 * 0.1)
 
 
-def test_within_the_motors_torque_no_gain_of_the_closed_loop_does_anything():
-    """Why trials, whose moves stay within it, refuse them."""
+def test_a_ramp_within_the_motors_torque_shows_no_gain_of_the_closed_loop():
     swept = (SweptObject("correction_velocity_p", 300, 30000, 2, "lin"),)
     result = run(closed_experiment(*swept, acceleration_rpm_per_s=3000.0, velocity_rpm=120.0), num_threads=1)
     assert result.columns["following [full steps]"].max() < 1.0
     assert len(set(result.score)) == 1 and result.without_effect() == ["202Bh:00"]
+
+
+@pytest.mark.parametrize(("rotors", "acts"), [(5, False), (30, False), (100, True)])
+def test_why_trials_refuse_gains_of_the_closed_loop(rotors, acts):
+    """In the move of a trial, closed, they do nothing at the rated current where the motor is not overloaded."""
+    values = [300, 3000, 30000]
+    heavy = {"load.inertia": rotors * MOTOR.inertia}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MisfitWarning)
+        drives = EmulatedDrives("tmcm3313", "inertia", NAME, num_machines=3, identical=True, parameters=heavy)
+    with drives:
+        drives.write(cia402.SENSOR_SELECTION, 0)
+        motion.enable(drives, mode="pp")
+        assert not _close_loop(drives).any()
+        scale = drives.read(Role.POSITION_SCALE)
+        move = plan_move(MOTOR, np.full(3, (rotors + 1) * MOTOR.inertia), scale, np.full(3, 20.0))
+        write_profile(drives, move)
+        drives.write(DEVICE.gains.keys[DEVICE.gains.names.index("correction_velocity_p")], values)
+        start(drives, drives.read(cia402.POSITION_ACTUAL) + move.distance)
+        trace = drives.record([cia402.POSITION_ACTUAL], 0.25)[cia402.POSITION_ACTUAL]
+    assert bool(np.any(trace != trace[:, :1])) is acts
 
 
 def test_an_axis_whose_loop_does_not_close_counts_as_one_in_fault(monkeypatch):

@@ -200,8 +200,9 @@ def check_tried(device: Device, names: tuple[str, ...]) -> None:
     closed = [row.name for row in device.gains.closed_rows if row.name in names]
     if closed:
         raise ValueError(
-            f"{', '.join(closed)}: the move of a trial stays within the motor's torque, where the corrections of a "
-            "closed loop do nothing; drive-tune sweep --closed-loop varies them in a ramp that overloads the motor"
+            f"{', '.join(closed)}: trials have the loop open, and closed it would do no more: their moves ask for "
+            "0.4 of the rated torque, and corrections begin where the load angle is at its limit; drive-tune sweep "
+            "--closed-loop varies them in a ramp that overloads the motor"
         )
     if device.gains.is_open_loop and (others := [name for name in names if name not in device.gains.outer]):
         raise ValueError(
