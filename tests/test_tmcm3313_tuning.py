@@ -123,13 +123,20 @@ def test_trials_of_currents_open_a_closed_loop_and_give_it_back():
         assert np.all(drives.read(Role.LOOP_MODE) == 1)
 
 
-@pytest.mark.parametrize("name", ["correction_velocity_p", "correction_velocity_limit", "stall_threshold"])
-def test_what_trials_do_not_show_is_refused_before_anything_moves(name):
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("correction_velocity_p", "sweep --closed-loop"),
+        ("correction_velocity_limit", "sweep --closed-loop"),
+        ("stall_threshold", "drive-tune auto"),
+    ],
+)
+def test_what_trials_do_not_show_is_refused_before_anything_moves(name, remedy):
     with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:
-        with pytest.raises(ValueError, match=rf"{name}: .* drive-tune sweep"):
+        with pytest.raises(ValueError, match=rf"{name}: .*{remedy}"):
             optimise(target, Settings(trials=1, gains=(name,)))
         assert not cia402.matches(target.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED).any()
-    with pytest.raises(ValueError, match=name):
+    with pytest.raises(ValueError, match=rf"{name}: .*{remedy}"):
         GainTuning(device="tmcm3313", motor=NAME, load="inertia", gains=(name,))
 
 
