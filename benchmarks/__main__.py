@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -27,7 +28,9 @@ from rich.table import Table
 
 from benchmarks import bus, environments, gain_tuning, sweeps, training
 from drive_env import EmulatedDrives, motion
+from drive_env.devices import device_names, find_device
 from drive_env.emulator.emulated_drives import MOST_MACHINES
+from drive_env.emulator.inertia_check import MisfitWarning
 from mechanics.loads import LOADS
 
 SIZES = (1, 8, 64, 1024, 16384)
@@ -35,6 +38,8 @@ LOAD = "two_mass"
 OBSERVED = ("Position actual value", "Velocity actual value", "Torque actual value")
 SPEED_PPS = 1_000_000
 SLOW_PPS = 200_000  # no load comes to its end stops
+DEVICE_SPEED = "180 rpm"  # that every device's usual motor reaches in open loop, too
+ARM = "robot"  # six joints
 PER_LOAD = ("drive alone", "packed mj_step alone", "bound", "emulator", "share of bound", "x real time")
 
 
@@ -48,8 +53,10 @@ def best_time(function: Callable[[], Any], repetitions: int = 5) -> float:
     return min(times)
 
 
-def running_drives(machines: int, threads: int, load: str = LOAD, speed: int = SPEED_PPS) -> EmulatedDrives:
-    drives = EmulatedDrives(load=load, num_machines=machines, num_threads=threads)
+def running_drives(
+    machines: int, threads: int, load: str = LOAD, speed: int | str = SPEED_PPS, device: str = "tmcm1636"
+) -> EmulatedDrives:
+    drives = EmulatedDrives(device, load, num_machines=machines, num_threads=threads)
     motion.enable(drives, mode="pv")
     drives.write("Target velocity", speed)
     drives.advance(0.01)
@@ -70,12 +77,46 @@ def ticks() -> dict[str, float]:
     return result
 
 
-def bound(load: str = LOAD, machines: int = 64) -> dict[str, float]:
+def device_ticks() -> dict[str, float]:
+    """Return ns per drive and current tick of each device's firmware, eight live lanes, in turn."""
+    cycles, runs = 2000, {}
+    for name in device_names():
+        if find_device(name).variant_of:
+            continue
+        drives = running_drives(8, 1, "inertia", DEVICE_SPEED, name)
+        group = drives.inside.groups[0]
+        per_tick = 1e9 / (cycles * group.rates.windows * group.rates.ticks * 8)
+        runs[name] = (
+            per_tick,
+            lambda g=group, d=drives: d.device.firmware.run_drives_alone(d.inside.records, g.rates, cycles),
+        )
+    best = dict.fromkeys(runs, float("inf"))
+    for _ in range(5):
+        for name, (per_tick, run) in runs.items():
+            best[name] = min(best[name], best_time(run, 1) * per_tick)
+    return best | {f"{name} over tmcm1636": best[name] / best["tmcm1636"] for name in best if name != "tmcm1636"}
+
+
+def arms() -> dict[str, dict[str, float]]:
+    """Return what 64 six-joint arms make of one core with the drives of each device that has enough axes for them."""
+    rows = {}
+    for name in device_names():
+        device = find_device(name)
+        if device.variant_of or device.num_axes not in (1, 6):
+            continue
+        row = bound(ARM, 64, DEVICE_SPEED, name)
+        rows[name] = row | {"arm-seconds per second": row["x real time"] / 6}
+    return rows
+
+
+def bound(
+    load: str = LOAD, machines: int = 64, speed: int | str = SLOW_PPS, device: str = "tmcm1636"
+) -> dict[str, float]:
     """Return microseconds per axis and millisecond on one core: the parts alone, the whole, and the ratio.
 
     The parts are measured in turn, so that a slower moment of the machine slows all of them.
     """
-    drives = running_drives(machines, 1, load, SLOW_PPS)
+    drives = running_drives(machines, 1, load, speed, device)
     groups, cycles, run_alone = drives.inside.groups, 40, drives.device.firmware.run_drives_alone
     moving = [(group.load.data.qpos.copy(), group.load.data.qvel.copy()) for group in groups]
 
@@ -194,13 +235,18 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="leave out the largest size and the cold compile")
     options = parser.parse_args()
     console = Console()
+    warnings.simplefilter("ignore", MisfitWarning)  # a load may be heavy for a motor: it is the time that counts
     sizes = SIZES[:-1] if options.quick else SIZES
     with Progress(console=console, transient=True) as progress:
-        parts = "firmware, bound, loads, bus, environments, training, sweeps, construction, start-up"
+        parts = "firmware, bound, devices, arms, loads, bus, environments, training, sweeps, construction, start-up"
         task = progress.add_task(parts, total=parts.count(",") + len(LOADS))
         result: dict[str, Any] = {"ns per drive and tick": ticks()}
         progress.advance(task)
         result["us per axis and ms, 64 machines, 1 thread"] = bound()
+        progress.advance(task)
+        result["ns per drive and tick, by device, 8 lanes"] = device_ticks()
+        progress.advance(task)
+        result["64 arms of six axes, 1 thread"] = arms()
         progress.advance(task)
         result["per load"] = {}
         for load in LOADS:
@@ -223,6 +269,7 @@ def main() -> None:
     for name in (
         "ns per drive and tick",
         "us per axis and ms, 64 machines, 1 thread",
+        "ns per drive and tick, by device, 8 lanes",
         "bus",
         "environments",
         "training",
@@ -232,6 +279,12 @@ def main() -> None:
     ):
         if name in result:
             print_table(console, name, ("what", "figure"), list(result[name].items()))
+    print_table(
+        console,
+        "64 arms of six axes, 1 thread: us per axis and ms",
+        ("device", *PER_LOAD, "arm-seconds per second"),
+        [(name, *row.values()) for name, row in result["64 arms of six axes, 1 thread"].items()],
+    )
     print_table(
         console,
         "per load: us per axis and ms, 64 machines, 1 thread, 5 physics steps per ms",

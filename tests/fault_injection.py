@@ -65,15 +65,16 @@ class Truth:
     """What rotors, stages and automata of a set of emulated drives did, one row per communication cycle.
 
     theta, omega: Rotor angle and speed [rad, rad/s], shape (cycles, num_axes).
-    current: Magnitude of the motor current [A]; fsa: state of the automaton; alike.
+    current: Magnitude of the motor current, of a stepper's vector [A]; fsa: state of the automaton; alike.
     load: Position of the part of the load that meets end stops [rad or m]; alike.
     """
 
-    _FIELDS = ("theta_m", "omega_m", "i_q", "i_d", "fsa", "load_position")
-
     def __init__(self, drives):
         self.num_axes = drives.num_axes
-        self._views = [drives.inside.records[name] for name in self._FIELDS]
+        records = drives.inside.records
+        self._currents = ("i_q", "i_d") if "i_q" in records.dtype.names else ("i_a", "i_b")
+        self._fields = ("theta_m", "omega_m", *self._currents, "fsa", "load_position")
+        self._views = [records[name] for name in self._fields]
         self._rows = [np.empty((4096, *view.shape), view.dtype) for view in self._views]
         self.cycles = 0
         self.sample()
@@ -87,7 +88,7 @@ class Truth:
         self.cycles = k + 1
 
     def _get(self, name, since=0):
-        rows = self._rows[self._FIELDS.index(name)][since : self.cycles]
+        rows = self._rows[self._fields.index(name)][since : self.cycles]
         return rows.reshape(len(rows), -1, LANES).reshape(len(rows), -1)[:, : self.num_axes]
 
     def theta(self, since=0):
@@ -97,7 +98,7 @@ class Truth:
         return self._get("omega_m", since)
 
     def current(self, since=0):
-        return np.hypot(self._get("i_q", since), self._get("i_d", since))
+        return np.hypot(*(self._get(name, since) for name in self._currents))
 
     def fsa(self, since=0):
         return self._get("fsa", since)
@@ -452,7 +453,7 @@ def run_lockstep(drives, session, fault=None, interrupts=(), limits=LIMITS):
     bus = FaultyBus(inner, fault, meets if interrupts else None)
     ended = opened = None
     try:
-        with CanDrives(bus=bus, pace="lockstep", timeout=ANSWER, safety=limits) as opened:
+        with CanDrives(drives.device.name, bus=bus, pace="lockstep", timeout=ANSWER, safety=limits) as opened:
             session(opened)
     except EXPECTED as error:
         ended = error

@@ -220,7 +220,7 @@ def test_gains_that_were_stopped_are_no_answer(tmp_path):
 
 def test_where_every_trial_was_stopped_the_drive_has_what_it_had(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "drive_env.envs.gain_tuning.rule_gains", lambda *_, **__: np.array([[4021, 1573, 32767, 9, 32767]])
+        "drive_env.trials.method.rule_gains", lambda *_, **__: np.array([[4021, 1573, 32767, 9, 32767]])
     )
     with emulated("tmcm1636", "inertia", "qbl4208") as target:
         before, set_before = gains(target), settings(target)

@@ -219,7 +219,7 @@ def test_sweep_runs_the_open_loop_experiment_says_what_is_not_measured_and_repea
     first, again = tmp_path / "first", tmp_path / "again"
     result = run("sweep", "--device", stepper, "--out", first)
     assert result.exit_code == 0, result.output
-    assert "A stepper in open loop tells no torque" in result.output
+    assert "No torque current is measured (no 6077h)" in result.output
     with (first / "results.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert not {"peak_current [A]", "rms_current [A]", "ripple [A]"} & set(rows[0])

@@ -25,6 +25,17 @@ def test_every_role_of_a_device_is_an_object_that_it_has(name):
         assert dictionary.has(role)
 
 
+@pytest.mark.parametrize("name", device_names())
+def test_what_the_record_has_as_a_position_a_speed_a_time_or_a_current_has_its_unit_in_the_eds(name):
+    """A master knows units from there: commands take `300 rpm`, and the envelope counts speeds and ramps in them."""
+    device = find_device(name)
+    dictionary = device.new_dictionary()
+    plain = {"counter": "inc", "position window": "inc", "position limit": "inc"}
+    for key, row in device.bindings.items():
+        if row.unit in ("pps", "pps^2", "pps^3", "rpm", "inc", "ms", "10ms", "mA", *plain):
+            assert dictionary.find(key).unit == plain.get(row.unit, row.unit), dictionary.find(key).label
+
+
 def test_every_row_of_a_table_of_roles_is_a_role():
     for path in FOLDER.glob("*/roles.toml"):
         assert set(tomllib.loads(path.read_text(encoding="utf-8"))) <= {role.name.lower() for role in Role}

@@ -36,6 +36,13 @@ class Gain(NamedTuple):
     steps: int = 0
 
 
+class ClosedLoop(NamedTuple):
+    """A loop that an open-loop stepper's drive may close: the loop of its gains, and its mode (`Role.LOOP_MODE`)."""
+
+    loop: str
+    mode: int
+
+
 RUN, STANDBY = ("current", "amplitude"), ("current", "standby amplitude")  # of a stepper's phases: loop and part
 
 
@@ -45,10 +52,12 @@ class GainSet:
 
     cascade: Structure of the loops that they are gains of, one of those of `drive_env/gains.py`, from which their
     rule comes; "" for loops that nothing is known of.
+    closed_loop: What a stepper's drive may close; None for nothing.
     """
 
     rows: tuple[Gain, ...]
     cascade: str = ""
+    closed_loop: ClosedLoop | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -89,6 +98,12 @@ class GainSet:
     def is_open_loop(self) -> bool:
         """Whether the motor follows the current's amplitude and no loop is closed around it: a stepper's."""
         return self.column(*RUN) is not None and not self.columns_of("velocity", "position")
+
+    @property
+    def closed_rows(self) -> tuple[Gain, ...]:
+        """Those that act only where the drive has closed its loop."""
+        closed = self.closed_loop
+        return tuple(row for row in self.rows if closed is not None and row.loop == closed.loop)
 
     @property
     def lowest(self) -> Integers:
@@ -178,4 +193,7 @@ def load_gain_set(path: Path) -> GainSet:
                 row.get("steps", 0),
             )
         )
-    return GainSet(tuple(rows), data.get("cascade", ""))
+    closed = data.get("closed_loop")
+    return GainSet(
+        tuple(rows), data.get("cascade", ""), None if closed is None else ClosedLoop(closed["loop"], closed["mode"])
+    )

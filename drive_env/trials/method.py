@@ -119,7 +119,7 @@ class OpenLoop(NamedTuple):
 
     @property
     def measures_current(self) -> bool:
-        """It does not: there is no 6077h, or it is the size of the current that is set, whatever the load."""
+        """It does not: in open loop no drive tells a torque current."""
         return False
 
     @property
@@ -197,6 +197,13 @@ def check_tried(device: Device, names: tuple[str, ...]) -> None:
             "tell apart; name gains of its gains.toml"
         )
     device.gains.columns(names)
+    closed = [row.name for row in device.gains.closed_rows if row.name in names]
+    if closed:
+        raise ValueError(
+            f"{', '.join(closed)}: trials have the loop open, and closed it would do no more: their moves ask for "
+            "0.4 of the rated torque, and corrections begin where the load angle is at its limit; drive-tune sweep "
+            "--closed-loop varies them in a ramp that overloads the motor"
+        )
     if device.gains.is_open_loop and (others := [name for name in names if name not in device.gains.outer]):
         raise ValueError(
             f"{', '.join(others)}: a trial of an open-loop stepper shows what the phase currents do, "

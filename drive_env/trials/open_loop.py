@@ -1,9 +1,10 @@
 """One trial of the currents of an open-loop stepper: a move, the reversal, and the current probe.
 
-No loop is closed, and drives of steppers measure no torque current (6077h). What a master sees is the encoder against
-the step counter: their difference is the load angle, which is the torque over the holding torque, and jumps by four
-full steps where the motor falls out of step. Inertia and friction are identified from it, and settling, load angle,
-vibration and lost steps are seen by it. What the currents cost is known from their settings.
+No loop is closed, and no torque current is measured: 6077h, where there is one, is the size of the current. What a
+master sees is the encoder against the step counter: their difference is the load angle, which is the torque over the
+holding torque, and jumps by four full steps where the motor falls out of step. Inertia and friction are identified from
+it, and settling, load angle, vibration and lost steps are seen by it. What the currents cost is known from their
+settings.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ LOST = 2.0  # full steps between field and rotor: beyond the unstable balance, f
 TOOTH = 4.0  # full steps: what a rotor falls behind
 BAND_STEPS = 0.05  # of a full step, in which an axis has settled at least: dry friction holds it off the field's angle
 ENCODER, NO_WINDOW = 0, 0  # of 606Ah and 6065h
+OPEN = 0  # of `Role.LOOP_MODE`
 STILL = 20  # samples at rest by which demand and encoder are compared
 REST, LONGEST_ROLL = 0.25, 100  # full steps in that time, of a rotor at rest; times that it is waited for
 LEAST_WAY = 0.25  # of a move that an encoder must show
@@ -130,6 +132,13 @@ class OpenLoopTrial(NamedTuple):
         return open_loop_cost(self.terms._replace(disturbance=disturbance, tripped=self.aborted))
 
 
+def unmeasured(device: Device) -> str:
+    """Return why an open loop has no torque current to score, for people."""
+    if (cia402.TORQUE_ACTUAL, 0) in device.bindings:
+        return "in open loop 6077h is the size of the current that is set"
+    return "no 6077h"
+
+
 def encoder_age(device: Device) -> float:
     """Return how old an encoder's count is when it is read [s]: it is taken once in each period of the motion loops."""
     return 1.0 / device.velocity_rate
@@ -167,15 +176,17 @@ def with_run_current(device: Device, gains: Integers, factor: float | Floats) ->
 class OpenLoopTrials(Trials):
     """Runs trials on open-loop steppers, as `Trials` does on servo drives; the axes of a machine are stopped together.
 
-    606Ah is set to the encoder while the drives are disabled, and 6065h watches no longer, with which no axis that has
-    lost steps could be enabled again; `sensor` and `window` are what they were. Positions are the encoder's;
-    what has been lost in steps is made up for in the targets that the step counter gets.
+    606Ah is set to the encoder while the drives are disabled, a loop that is closed is opened, and 6065h watches no
+    longer, with which no axis that has lost steps could be enabled again; `sensor`, `loop` and `window` are what
+    they were. Positions are the encoder's; what has been lost in steps is made up for in the targets that the step
+    counter gets.
     """
 
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:
         super().__init__(drives, motor, axes, t_0)
         self.sensor: Integers | None = None
         self.window: Integers | None = None
+        self.loop: Integers | None = None
         self._zero: Floats | None = None
         self._fell = False  # steps were lost, and the rotor may still be on its way to the next tooth
 
@@ -185,6 +196,7 @@ class OpenLoopTrials(Trials):
         now = drives.read(cia402.SENSOR_SELECTION)
         if self.sensor is None:
             self.sensor, self.window = now, drives.read(cia402.FOLLOWING_WINDOW)
+            self._open_loop()
             if np.any(self.window != NO_WINDOW):
                 drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
         blind = where & (now != ENCODER)
@@ -200,8 +212,18 @@ class OpenLoopTrials(Trials):
         self._drives.write(cia402.SENSOR_SELECTION, ENCODER, where=where)
         super().power_up(where)
 
+    def _open_loop(self) -> None:
+        """Open the loops that drives have closed: with one closed the load angle says something else."""
+        drives = self._drives
+        if Role.LOOP_MODE in device_of(drives).roles:
+            self.loop = drives.read(Role.LOOP_MODE)
+            if np.any(closed := self.loop != OPEN):
+                drives.write(Role.LOOP_MODE, OPEN, where=closed)
+
     def leave(self) -> None:
-        """Give 606Ah back what it was; the axes must be disabled."""
+        """Give 606Ah and the loop's mode back what they were; the axes must be disabled."""
+        if self.loop is not None and np.any(opened := self._drives.read(Role.LOOP_MODE) != self.loop):
+            self._drives.write(Role.LOOP_MODE, self.loop, where=opened)
         if self.sensor is not None and self.window is not None:
             if np.any(drifted := self._drives.read(cia402.FOLLOWING_WINDOW) != self.window):
                 self._drives.write(cia402.FOLLOWING_WINDOW, self.window, where=drifted)

@@ -104,6 +104,7 @@ def _stepper(target: Target, folder: Path, store: bool, json: bool) -> None:
 
 
 def _report_stepper(target: Target, result: StepperResult, folder: Path, json: bool) -> None:
+    from drive_env.trials.open_loop import unmeasured
     from tuning.stepper.result import CERTIFICATE
 
     files = {"snapshot": str(result.file), "certificate": str(folder / CERTIFICATE)}
@@ -126,8 +127,7 @@ def _report_stepper(target: Target, result: StepperResult, folder: Path, json: b
         lines += [f"axis {k}: {name}: {'not measured' if v is None else f'{v:g}'}" for name, v in axis.figures.items()]
         lines += [f"axis {k}: reservation: {reservation}" for reservation in axis.reservations]
     lines.append(
-        "not measured: current and load step (a stepper in open loop tells no torque), frequency response and margins "
-        "(open loop)"
+        f"not measured: current and load step ({unmeasured(target.device)}), frequency response and margins (open loop)"
     )
     kept = "; the settings are stored in the drive" if result.kept else ""
     lines.append(f"{result.drive_seconds:.1f} s of drive time{kept}")

@@ -350,10 +350,12 @@ def _print(found: Any, settings: Any, folder: Path, before: Path | None, where: 
             lines.append(f"{which} {row.number} was stopped: the drive reported {row.cause}")
     lines += sorted({note for note in found.notes if note})
     if find_device(device).gains.is_open_loop:
+        from drive_env.trials.open_loop import unmeasured
+
         lines.append(
-            "J has no load step and no ripple of the current here: a stepper in open loop tells no torque. E_d/E_0 "
-            "follows from the standby current, effort from the settings; settling, load angle, vibration and lost "
-            "steps are the encoder's."
+            "J has no load step and no ripple of the current here: no torque current is measured "
+            f"({unmeasured(find_device(device))}). E_d/E_0 follows from the standby current, effort from the settings; "
+            "settling, load angle, vibration and lost steps are the encoder's."
         )
     if before is None and len(searches) > 1 and np.isfinite(found.cost).any():
         lines.append(f"search {int(np.nanargmin(found.cost))} found the best gains")

@@ -25,7 +25,7 @@ from tuning.commands.options import (
 
 BEST_ROWS = 10
 TABLE_FIGURES = (
-    "settling [s]", "overshoot [%]", "dip [rpm]", "ripple [A]", "load_angle [full steps]", "effort [%]",
+    "settling [s]", "overshoot [%]", "dip [rpm]", "ripple [A]", "behind [s]", "load_angle [full steps]", "effort [%]",
 )  # fmt: skip
 
 
@@ -38,6 +38,9 @@ def sweep(
     out: Annotated[
         Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-sweep")
     ] = None,
+    closed_loop: Annotated[
+        bool, typer.Option("--closed-loop", help="Of a stepper: close its loop, and sweep the loop's gains.")
+    ] = False,
     show_config: Annotated[bool, typer.Option("--show-config", help="Print the experiment and stop.")] = False,
     workers: Workers = None,
     cluster: Cluster = None,
@@ -52,8 +55,15 @@ def sweep(
     sweep --config settings.toml` repeats the run to the last digit. A stopped run continues with --out and --resume,
     with identical results.
     """
-    overrides = {"device": device, "motor": motor, "load": load, "seed": seed}
+    overrides: dict[str, Any] = {"device": device, "motor": motor, "load": load, "seed": seed}
     with errors_as_exit_codes():
+        if closed_loop and config is not None:
+            raise ValueError(
+                "--closed-loop chooses the experiment that ships; leave it out with --config: the loop is closed "
+                "wherever a gain of it is swept"
+            )
+        if closed_loop:
+            overrides["closed_loop"] = True
         if list_names:
             _list_names()
         elif show_config:
@@ -157,7 +167,7 @@ def _print_result(result: Any, folder: Path) -> None:
         f"{int(result.columns[flag].sum())} {word}"
         for flag, word in (
             ("oscillates", "oscillate"),
-            ("fault", "end in fault" if result.response.lag is None else "end in fault or lose steps"),
+            ("fault", "end in fault" if not result.response.is_open_loop else "end in fault or lose steps"),
             ("diverged", "diverge"),
         )
     )
@@ -169,10 +179,14 @@ def _print_result(result: Any, folder: Path) -> None:
         )
     elif not usable:
         lines.append("No point is usable: choose other ranges; heatmap.png and results.csv show all points.")
-    if result.response.lag is not None:
+    if result.response.is_open_loop:
+        from drive_env.devices import find_device
+        from drive_env.trials.open_loop import unmeasured
+
         lines.append(
-            "A stepper in open loop tells no torque: there is no ripple and no peak current; effort is the square "
-            "of the run current that is set, load angle and lost steps are by the encoder."
+            f"No torque current is measured ({unmeasured(find_device(result.experiment.device))}): there is no ripple "
+            "and no peak current; effort is the square of the run current that is set, load angle and lost steps are "
+            "by the encoder."
         )
     lines += [f"{name} has no effect in this experiment." for name in result.without_effect()]
     if result.simulated > 0.0:
@@ -215,7 +229,14 @@ def _list_names() -> None:
     from drive_env.motors import MOTORS
     from mechanics.loads import LOADS
     from tuning.runs.experiment import gain_objects
-    from tuning.runs.metrics import METRICS, OPEN_LOOP_METRICS, OPEN_LOOP_TRACKING, TRACKING
+    from tuning.runs.metrics import (
+        CLOSED_LOOP_METRICS,
+        CLOSED_LOOP_TRACKING,
+        METRICS,
+        OPEN_LOOP_METRICS,
+        OPEN_LOOP_TRACKING,
+        TRACKING,
+    )
 
     devices = [find_device(name) for name in device_names()]
     gains: dict[tuple[str, str], list[str]] = {}  # by object and what it is: devices that have it
@@ -238,6 +259,12 @@ def _list_names() -> None:
             "metrics of open-loop steppers": {f"{TRACKING.name} [{TRACKING.unit}]": OPEN_LOOP_TRACKING.meaning}
             | {
                 f"{row.name} [{row.unit}]": row.meaning for row in OPEN_LOOP_METRICS.values() if row.name not in METRICS
+            },
+            "metrics of steppers in closed loop": {f"{TRACKING.name} [{TRACKING.unit}]": CLOSED_LOOP_TRACKING.meaning}
+            | {
+                f"{row.name} [{row.unit}]": row.meaning
+                for row in CLOSED_LOOP_METRICS.values()
+                if row.name not in METRICS
             },
         }
     )

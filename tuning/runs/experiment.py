@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.devices import Device, find_device
+from drive_env.devices.gain_set import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.dictionary.position_scale import position_scale
@@ -24,12 +25,13 @@ from drive_env.gains import gain_factors
 from drive_env.motors import find_motor
 from mechanics.loads import find_load
 from mechanics.untrusted import read_toml
-from tuning.runs.metrics import OPEN_LOOP_TRACKING, TRACKING, combined_of, metric_names
+from tuning.runs.metrics import TRACKING, closes_loop, combined_of, metric_names
 from tuning.toml_tables import ExperimentError as ExperimentError
 from tuning.toml_tables import as_table, as_value, check_keys, kind_of, read_table, toml, toml_lines
 
 DEFAULT = Path(__file__).parent / "sweep.toml"
 OPEN_LOOP = Path(__file__).parent / "open_loop_sweep.toml"  # of drives without loops
+CLOSED_LOOP = Path(__file__).parent / "closed_loop_sweep.toml"  # of those that may close one
 MAX_POINTS = 262_144
 MAX_DURATION = 60.0  # s
 MIN_SAMPLES = 20  # in each of the two windows; fewer say nothing about ringing
@@ -137,19 +139,30 @@ class Resolved(NamedTuple):
     velocity: int  # as 60FFh counts it
     acceleration: int  # as 6083h does
 
+    @property
+    def swept(self) -> tuple[Key, ...]:
+        """The swept objects."""
+        return tuple((entry.index, entry.sub) for entry in self.entries)
 
-def load_experiment(config: str | Path | None = None, **overrides: Any) -> Experiment:
+    @property
+    def closes_loop(self) -> bool:
+        """Whether the drives close their loop: some of the swept gains act in it alone."""
+        return closes_loop(self.device, self.swept)
+
+
+def load_experiment(config: str | Path | None = None, *, closed_loop: bool = False, **overrides: Any) -> Experiment:
     """Return the experiment of a TOML file, by default the one that ships, checked.
 
     Args:
         config: The file.
+        closed_loop: Without a file take the one that ships for steppers whose loop is closed.
         overrides: device, motor, load or seed in place of the file's; None keeps the file's. The experiment that ships
             sweeps the same gains of any device, over the same range in its units.
 
     Raises:
         ExperimentError: With the key, its value, the limit and the remedy.
     """
-    path = shipped_experiment(overrides.get("device")) if config is None else Path(config)
+    path = shipped_experiment(overrides.get("device"), closed_loop=closed_loop) if config is None else Path(config)
     try:
         data = read_toml(path)
     except (OSError, UnicodeDecodeError) as error:
@@ -167,18 +180,25 @@ def load_experiment(config: str | Path | None = None, **overrides: Any) -> Exper
     return experiment
 
 
-def shipped_experiment(device: str | None) -> Path:
+def shipped_experiment(device: str | None, *, closed_loop: bool = False) -> Path:
     """Return the experiment that ships for a device, None for the default one.
 
     Raises:
-        ExperimentError: For a device that is none.
+        ExperimentError: For a device that is none, or that closes no loop where one is wanted.
     """
     if device is None:
-        return DEFAULT
+        return CLOSED_LOOP if closed_loop else DEFAULT
     try:
-        return OPEN_LOOP if find_device(device).gains.is_open_loop else DEFAULT
+        known = find_device(device).gains
     except ValueError as error:
         raise ExperimentError(str(error)) from None
+    if closed_loop and not known.closed_rows:
+        raise ExperimentError(
+            f"{device} has no loop to close: its gains.toml has no [closed_loop]; leave --closed-loop out"
+        )
+    if closed_loop:
+        return CLOSED_LOOP
+    return OPEN_LOOP if known.is_open_loop else DEFAULT
 
 
 def resolve(experiment: Experiment) -> Resolved:
@@ -198,7 +218,7 @@ def resolve(experiment: Experiment) -> Resolved:
     dictionary = device.new_dictionary()
     entries = tuple(_swept_entry(device, dictionary, k, swept) for k, swept in enumerate(experiment.sweep, 1))
     _check_grid(experiment, entries)
-    _check_metric(experiment.metric, device)
+    _check_metric(experiment.metric, device, [(entry.index, entry.sub) for entry in entries])
     _check_times(experiment.excitation, 1.0 / device.communication_rate)
     scaler = _position_scale(device, dictionary, preset)
     velocity = experiment.excitation.raw_velocity(dictionary.find(TARGET_VELOCITY), scaler)
@@ -319,10 +339,10 @@ def _check_grid(experiment: Experiment, entries: tuple[Entry, ...]) -> None:
         raise ExperimentError(f"the grid has {product} = {points} points; the limit is {MAX_POINTS}: lower a count")
 
 
-def _check_metric(metric: MetricChoice, device: Device) -> None:
-    if metric.name not in (known := metric_names(device)):
+def _check_metric(metric: MetricChoice, device: Device, swept: list[Key]) -> None:
+    if metric.name not in (known := metric_names(device, swept)):
         raise ExperimentError(f"metric: name = {metric.name!r} is unknown; there are {', '.join(known)}")
-    wanted = combined_of(device).weights if metric.name == TRACKING.name else {}
+    wanted = combined_of(device, swept).weights if metric.name == TRACKING.name else {}
     if set(metric.weights) != set(wanted):
         needed = f"the weights {', '.join(wanted)}" if wanted else "no weights"
         raise ExperimentError(
@@ -377,11 +397,15 @@ def _raw(in_rpm: float | None, in_pps: float | None, entry: Entry, position_scal
     return round(value * per_increment_of(entry.unit, position_scaler))
 
 
-def _is_open_loop(device: object) -> bool:
+def _default_weights(name: str, sweep: tuple[SweptObject, ...]) -> Mapping[str, float]:
+    """Return the weights of the combined metric; those of a servo drive where names are wrong, which `resolve` says."""
     try:
-        return find_device(str(device)).gains.is_open_loop
-    except ValueError:  # `resolve` says it
-        return False
+        device = find_device(name)
+        dictionary = device.new_dictionary()
+        entries = [_swept_entry(device, dictionary, k, swept) for k, swept in enumerate(sweep, 1)]
+    except (ValueError, ExperimentError):
+        return TRACKING.weights
+    return combined_of(device, [(entry.index, entry.sub) for entry in entries]).weights
 
 
 # --- the TOML ---------------------------------------------------------------------------------------------------------
@@ -402,8 +426,8 @@ def _parse(data: Mapping[str, Any]) -> Experiment:
     check_keys("metric", metric, ["name", "weights"], optional={"weights"})
     given = as_table("metric: weights", metric.get("weights", {}))
     name = as_value("metric: name", metric["name"], "str")
-    own = OPEN_LOOP_TRACKING if _is_open_loop(data["device"]) else TRACKING
-    combined = dict(own.weights) if name == TRACKING.name and not given else {}
+    own = _default_weights(str(data["device"]), sweep)
+    combined = dict(own) if name == TRACKING.name and not given else {}
     weights = combined | {key: as_value(f"metric: weight {key}", value, "float") for key, value in given.items()}
     versions = as_table("versions", data.get("versions", {}))
     return Experiment(

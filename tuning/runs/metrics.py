@@ -6,7 +6,7 @@ settles) is nan.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from drive_env.trials import response
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
+    from drive_env.devices.gain_set import Key
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -37,10 +38,17 @@ class MoveRecording(NamedTuple):
     current_limit: Floats  # A, shape (p,)
     t_step: float  # s
     t_load: float  # s
-    # Of an open loop, whose drive measures no current (the two above are nan): demand less encoder [full steps], shape
-    # (n, p), and the mean square of the run current that is set over the motor's rated one, shape (p,).
+    # Of a stepper: demand less encoder [full steps], shape (n, p). In open loop, where no torque current is measured
+    # (the two above are nan), the mean square of the run current that is set over the motor's rated one, shape (p,);
+    # in closed loop the full steps of a revolution, shape (p,).
     lag: Floats | None = None
     effort: Floats | None = None
+    full_steps: Floats | None = None
+
+    @property
+    def is_open_loop(self) -> bool:
+        """Whether no torque current is measured."""
+        return self.effort is not None
 
     def point(self, k: int) -> MoveRecording:
         """Return the recording of point k alone."""
@@ -50,6 +58,7 @@ class MoveRecording(NamedTuple):
             current_limit=self.current_limit[[k]],
             lag=None if self.lag is None else self.lag[:, [k]].copy(),
             effort=None if self.effort is None else self.effort[[k]],
+            full_steps=None if self.full_steps is None else self.full_steps[[k]],
         )
 
 
@@ -84,7 +93,7 @@ def figures(recording: MoveRecording) -> Figures:
         step=response.step_metrics(t, speed, reference, t_step=recording.t_step, t_end=recording.t_load, initial=0.0),
         disturbance=response.disturbance_metrics(t, speed, reference, t_load=recording.t_load, band=RECOVERY_BAND),
         current=None
-        if recording.lag is not None
+        if recording.is_open_loop
         else response.current_metrics(recording.current[first:], i_max=recording.current_limit),
         step_error=error[first : load + 1],
         load_error=error[load:],
@@ -94,7 +103,7 @@ def figures(recording: MoveRecording) -> Figures:
 def oscillates(found: Figures) -> Mask:
     """Return which points ring without decaying, in the velocity or in the current, shape (p,)."""
     recording = found.recording
-    if recording.lag is not None:  # there is no current to swing
+    if recording.is_open_loop:  # there is no current to swing
         return np.asarray(found.step.oscillating)
     window = slice(_index(recording.t, recording.t_step), _index(recording.t, recording.t_load) + 1)
     ringing, _ = response.oscillation(
@@ -125,9 +134,16 @@ def tracking(found: Figures, weights: Mapping[str, float]) -> Floats:
     IAE_load the same from there to the end, i_ripple the metric `ripple` and i_max the drive's current limit. The first
     two are seconds of full error; the weight of the third [s] is what a ripple of the whole current limit would cost:
     with 0.2 s, one percent of it is worth 2 ms. In open loop the third term is
-    effort * (i/i_rated)^2 of the run current.
+    effort * (i/i_rated)^2 of the run current. In closed loop the first two are the means of |demand - encoder| in the
+    same times over the height: by how many seconds the axis is behind.
     """
     height = abs(float(found.recording.reference_rpm[-1]))
+    if found.recording.full_steps is not None:
+        return (
+            weights["step"] * _behind(found, slice(None, len(found.step_error)))
+            + weights["disturbance"] * _behind(found, slice(len(found.step_error) - 1, None))
+            + weights["ripple"] * ripple(found) / found.recording.current_limit
+        )
     if found.recording.effort is not None:
         return (
             weights["step"] * _iae(found) / height
@@ -143,7 +159,9 @@ def tracking(found: Figures, weights: Mapping[str, float]) -> Floats:
 
 def score(name: str, weights: Mapping[str, float], found: Figures) -> Floats:
     """Return the metric that ranks, plain or combined, shape (p,)."""
-    return tracking(found, weights) if name == TRACKING.name else (METRICS | OPEN_LOOP_METRICS)[name].function(found)
+    if name == TRACKING.name:
+        return tracking(found, weights)
+    return (METRICS | OPEN_LOOP_METRICS | CLOSED_LOOP_METRICS)[name].function(found)
 
 
 def _iae(found: Figures) -> Floats:
@@ -156,6 +174,14 @@ def _itae(found: Figures) -> Floats:
 
 def _disturbance_iae(found: Figures) -> Floats:
     return response.iae(found.recording.t[: len(found.load_error)], found.load_error)
+
+
+def _behind(found: Figures, window: slice) -> Floats:
+    """Return the mean of |demand - encoder| over the height of the step [s], in samples from the step on."""
+    recording = found.recording
+    assert recording.full_steps is not None, "a closed loop has a scale of full steps"
+    height = abs(float(recording.reference_rpm[-1])) / 60.0 * recording.full_steps
+    return np.asarray(np.abs(_lag(found)[window]).mean(axis=0) / height)
 
 
 def _peak_current(found: Figures) -> Floats:
@@ -209,9 +235,21 @@ OPEN_LOOP_METRICS: dict[str, Metric] = {
 }  # fmt: skip
 
 
+# Of a stepper whose loop is closed: 6077h is its torque current, and the load angle a following error.
+CLOSED_LOOP_METRICS: dict[str, Metric] = METRICS | {
+    row.name: row
+    for row in (
+        Metric("following", "full steps", "largest |demand - encoder| from the step on",
+               lambda f: np.abs(_lag(f)).max(axis=0)),
+        Metric("behind", "s", "mean |demand - encoder| from the step on over the step's speed",
+               lambda f: _behind(f, slice(None))),
+    )
+}  # fmt: skip
+
+
 def _lag(found: Figures) -> Floats:
     recording = found.recording
-    assert recording.lag is not None, "an open loop has a load angle"
+    assert recording.lag is not None, "a stepper's demand and encoder are recorded"
     return recording.lag[_index(recording.t, recording.t_step) :]
 
 
@@ -238,21 +276,37 @@ OPEN_LOOP_TRACKING = TRACKING._replace(
 )
 
 
-def metrics_of(device: Device) -> dict[str, Metric]:
-    """Return the metrics that a device's drives can show."""
+CLOSED_LOOP_TRACKING = TRACKING._replace(
+    meaning="of a stepper in closed loop: mean |demand - encoder| over the step's speed, in step and disturbance, plus "
+    "the ripple of the torque current over the run current; weighted",
+    weights={"step": 1.0, "disturbance": 1.0, "ripple": 0.005},
+)
+
+
+def closes_loop(device: Device, swept: Collection[Key]) -> bool:
+    """Return whether a sweep of objects has gains among them that act in a closed loop alone."""
+    return any(row.key in swept for row in device.gains.closed_rows)
+
+
+def metrics_of(device: Device, swept: Collection[Key] = ()) -> dict[str, Metric]:
+    """Return the metrics that a device's drives can show in a sweep of objects."""
+    if closes_loop(device, swept):
+        return CLOSED_LOOP_METRICS
     return OPEN_LOOP_METRICS if device.gains.is_open_loop else METRICS
 
 
-def combined_of(device: Device) -> Combined:
-    """Return the combined metric of a device."""
+def combined_of(device: Device, swept: Collection[Key] = ()) -> Combined:
+    """Return the combined metric of a sweep of objects of a device."""
+    if closes_loop(device, swept):
+        return CLOSED_LOOP_TRACKING
     return OPEN_LOOP_TRACKING if device.gains.is_open_loop else TRACKING
 
 
 def unit_of(name: str) -> str:
     """Return the unit of a metric, plain or combined."""
-    return TRACKING.unit if name == TRACKING.name else (METRICS | OPEN_LOOP_METRICS)[name].unit
+    return TRACKING.unit if name == TRACKING.name else (METRICS | OPEN_LOOP_METRICS | CLOSED_LOOP_METRICS)[name].unit
 
 
-def metric_names(device: Device) -> list[str]:
-    """Return the names of all metrics of a device, the combined one first."""
-    return [TRACKING.name, *metrics_of(device)]
+def metric_names(device: Device, swept: Collection[Key] = ()) -> list[str]:
+    """Return the names of all metrics of a sweep of objects of a device, the combined one first."""
+    return [TRACKING.name, *metrics_of(device, swept)]

@@ -61,7 +61,7 @@ def best_response(result: SweepResult) -> Figure:
     speed.legend(loc="lower right")
     if recording.lag is not None:
         current.plot(t, recording.lag[:, 0], color="#d55e00", linewidth=1.2)
-        current.set_ylabel("load angle [full steps]")
+        current.set_ylabel(f"{'load angle' if recording.is_open_loop else 'following error'} [full steps]")
     else:
         _draw_current(current, t, recording)
     torque = np.where(recording.t >= recording.t_load - 1e-9, excitation.load_torque, 0.0)
@@ -181,7 +181,7 @@ def _legend(axes: Axes, result: SweepResult) -> None:
         handles.append(Line2D([], [], **BEST, label="best"))
     flagged = int((~result.usable).sum())
     if flagged:
-        steps = ", steps lost" if result.response.lag is not None else ""
+        steps = ", steps lost" if result.response.is_open_loop else ""
         text = f"oscillating, in fault{steps} or diverged ({flagged} points)"
         handles.append(Patch(facecolor=UNUSABLE, edgecolor="0.6", label=text))
     missing = int((result.usable & ~np.isfinite(result.score)).sum())

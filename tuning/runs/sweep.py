@@ -18,13 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env import EmulatedDrives, cia402, motion
-from drive_env.devices import Device, find_device
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.speeds import per_increment_of
 from drive_env.drives.trace import Trace
 from drive_env.phase_current import run_and_standby
-from drive_env.trials.open_loop import ENCODER, LOST, TOOTH
+from drive_env.trials.open_loop import ENCODER, LOST, NO_WINDOW, TOOTH
 from drive_env.trials.positioning import wrapped
 from mechanics.loads import find_load
 from mechanics.model import COPIES_PER_MODEL
@@ -37,6 +36,7 @@ from tuning.runs.shard_log import Arrays, ShardLog
 
 FLAGS = ("diverged", "oscillates", "fault")
 PIECE = 0.02  # s of simulation between two reports of progress
+CLOSING_TIME = 0.6  # s, in which the encoder of a standing rotor is aligned
 MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
 MAX_MACHINES = 1024  # of a shard: small enough for little to be lost when a run is killed
 SHARDS_PER_WORKER = 4  # at least, where there are points enough: for the last to end soon after the first
@@ -210,7 +210,7 @@ def run(
     wall = time.perf_counter() - started
     simulated = experiment.excitation.duration * sum(part.last - part.first for part in left)
     in_order = [found[first] for first in sorted(found)]
-    names = _column_names(resolved.device)
+    names = _column_names(resolved)
     columns = {name: np.concatenate([arrays[name] for arrays in in_order]) for name in names}
     return _ranked(experiment, resolved, columns, _best(in_order, experiment), simulated, wall)
 
@@ -263,11 +263,14 @@ _RECORDED = ("t", "reference_rpm", "speed_rpm", "current", "current_limit")
 
 
 def _recorded(experiment: Experiment) -> tuple[str, ...]:
-    return (*_RECORDED, "lag", "effort") if find_device(experiment.device).gains.is_open_loop else _RECORDED
+    resolved = resolve(experiment)
+    if resolved.closes_loop:
+        return (*_RECORDED, "lag", "full_steps")
+    return (*_RECORDED, "lag", "effort") if resolved.device.gains.is_open_loop else _RECORDED
 
 
-def _column_names(device: Device) -> list[str]:
-    return ["score", *metrics.metrics_of(device), *FLAGS]
+def _column_names(resolved: Resolved) -> list[str]:
+    return ["score", *metrics.metrics_of(resolved.device, resolved.swept), *FLAGS]
 
 
 def _best(found: list[Arrays], experiment: Experiment) -> MoveRecording:
@@ -282,12 +285,14 @@ def _compile(experiment: Experiment) -> None:
     """Compile the kernels, or load them, here and now: from a thread, Ctrl-C would have to wait for the compiler."""
     with _machines(experiment, 1, 1) as drives:
         motion.enable(drives, mode="pv")
-        drives.record(_signals(drives.device), 0.001)
+        drives.record(_signals(resolve(experiment)), 0.001)
 
 
-def _signals(device: Device) -> list[ObjectName]:
+def _signals(resolved: Resolved) -> list[ObjectName]:
     """Return what is recorded: velocity and current, or what an open loop has in place of a measured current."""
-    if device.gains.is_open_loop:
+    if resolved.closes_loop:
+        return [cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL]
+    if resolved.device.gains.is_open_loop:
         return [cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL]
     return [cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL]
 
@@ -313,10 +318,13 @@ def _record(
 ) -> tuple[MoveRecording, NDArray[np.bool_]]:
     """Return the recording of every point, and which ended in fault."""
     excitation, is_open_loop = experiment.excitation, resolved.device.gains.is_open_loop
+    unclosed = np.zeros(drives.num_axes, bool)
     if is_open_loop:
         drives.write(cia402.SENSOR_SELECTION, ENCODER)
     # Enabled with the preset's gains, which are stable, so that the point's gains meet every axis in the same state.
     motion.enable(drives, mode="pv")
+    if resolved.closes_loop:
+        unclosed = _close_loop(drives)
     drives.write((cia402.PROFILE_ACCELERATION, 0), resolved.acceleration)
     for column, entry in enumerate(resolved.entries):
         drives.write((entry.index, entry.sub), np.repeat(points[:, column], drives.num_axes // len(points)))
@@ -328,14 +336,14 @@ def _record(
         if start == excitation.load_time:
             drives.machine.load_torque = excitation.load_torque
         period = excitation.sampling_period
-        traces.append(drives.record(_signals(resolved.device), round((end - start) / period) * period, period=period))
+        traces.append(drives.record(_signals(resolved), round((end - start) / period) * period, period=period))
         report(end / excitation.duration)
     t = np.arange(sum(map(len, traces)), dtype=np.float64) * excitation.sampling_period
     velocity_unit = resolved.device.bindings[cia402.VELOCITY_ACTUAL, 0].unit
     rpm = 60.0 / resolved.position_scaler / per_increment_of(velocity_unit, resolved.position_scaler)
     ramp = np.clip((t - excitation.velocity_time) * resolved.acceleration, 0.0, abs(resolved.velocity))
     if is_open_loop:
-        signals = _open_loop_signals(drives, traces, period)
+        signals = _stepper_signals(drives, traces, period, resolved.closes_loop)
     else:
         signals = {
             "speed_rpm": np.concatenate([trace[cia402.VELOCITY_ACTUAL] for trace in traces]) * rpm,
@@ -349,16 +357,33 @@ def _record(
         t_load=excitation.load_time,
         **signals,
     )
-    tripped = cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
+    tripped = unclosed | cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
     for message in drives.emergencies():
         tripped[message.axis] = True  # a limit of travel too: what follows it says nothing of the gains
-    if recording.lag is not None:  # steps were lost
+    if recording.lag is not None and recording.is_open_loop:  # steps were lost
         tripped |= (np.abs(recording.lag) > LOST).any(axis=0)
     return recording, tripped
 
 
-def _open_loop_signals(drives: EmulatedDrives, traces: list[Trace], period: float) -> dict[str, NDArray[np.float64]]:
-    """Return speed by the encoder, load angle and effort of the points, and nan for a current that nothing measures.
+def _close_loop(drives: EmulatedDrives) -> NDArray[np.bool_]:
+    """Close the loops of enabled axes with the preset's gains; return of which axes they stay open.
+
+    The following error window is off: an axis that is overloaded falls behind, and shows by what it catches up with.
+    """
+    closed = drives.device.gains.closed_loop
+    assert closed is not None, "a gain of a closed loop is swept"
+    drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW)
+    drives.write(Role.LOOP_MODE, closed.mode)
+    drives.advance(CLOSING_TIME)
+    return np.asarray(drives.read(Role.LOOP_INITIALISED) == 0)
+
+
+def _stepper_signals(
+    drives: EmulatedDrives, traces: list[Trace], period: float, closes_loop: bool
+) -> dict[str, NDArray[np.float64]]:
+    """Return speed by the encoder, lag and effort of the points, and nan for a current that nothing measures.
+
+    In closed loop the torque current is measured, and its limit is the run current.
 
     606Ch of these drives is the speed of the steps, whatever the rotor does.
     """
@@ -369,6 +394,14 @@ def _open_loop_signals(drives: EmulatedDrives, traces: list[Trace], period: floa
     full_step = scale / (TOOTH * drives.motor.n_p)
     run, _ = run_and_standby(drives.device, drives.device.gains.read(drives))
     way = wrapped(actual - actual[0])
+    if closes_loop:
+        return {
+            "speed_rpm": np.gradient(way, period, axis=0) * 60.0 / scale,
+            "current": np.concatenate([trace[cia402.TORQUE_ACTUAL] for trace in traces]) * 1e-3,
+            "current_limit": np.asarray(run),
+            "lag": wrapped(demand - actual) / full_step,
+            "full_steps": np.full(drives.num_axes, TOOTH * drives.motor.n_p),
+        }
     return {
         "speed_rpm": np.gradient(way, period, axis=0) * 60.0 / scale,
         "current": np.full(demand.shape, np.nan),
@@ -397,7 +430,8 @@ def _evaluate(experiment: Experiment, recording: MoveRecording) -> dict[str, NDA
     found = metrics.figures(recording)
     choice = experiment.metric
     columns: dict[str, NDArray[Any]] = {"score": metrics.score(choice.name, choice.weights, found)}
-    for row in metrics.metrics_of(find_device(experiment.device)).values():
+    resolved = resolve(experiment)
+    for row in metrics.metrics_of(resolved.device, resolved.swept).values():
         columns[row.name] = np.asarray(row.function(found), np.float64)
     columns["diverged"] = np.asarray(~np.isfinite(recording.speed_rpm).all(axis=0))
     columns["oscillates"] = metrics.oscillates(found)
@@ -427,7 +461,7 @@ def _ranked(
     columns: dict[str, NDArray[Any]] = {name: points[:, k] for k, name in enumerate(objects)}
     columns["rank"] = rank
     columns[f"score [{metrics.unit_of(experiment.metric.name)}]"] = score
-    for row in metrics.metrics_of(resolved.device).values():
+    for row in metrics.metrics_of(resolved.device, resolved.swept).values():
         columns[f"{row.name} [{row.unit}]"] = found[row.name]
     for flag in FLAGS:
         columns[flag] = found[flag]

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drive_env.devices import find_device
+from drive_env.trials.open_loop import unmeasured
 from tuning.certificate.certificate import HASH, STEPPER_FORMAT, verdict
 from tuning.runs.provenance import versions
 
@@ -86,7 +88,7 @@ class StepperResult:
             "drive seconds": round(self.drive_seconds, 3),
             "stored": self.kept,
             "load and obstacle tried": self.proved_with_load,
-            "not measured": "current, load step: a stepper in open loop tells no torque; frequency response, margins: "
+            "not measured": f"current, load step: {unmeasured(find_device(self.device))}; frequency response, margins: "
             "open loop",
             "axes": [
                 {

@@ -1,0 +1,228 @@
+"""Tuning of the TMCM-3313: its currents and load detection in open loop, and the gains of its closed loop."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from drive_env import EmulatedDrives, cia402, motion
+from drive_env.devices import find_device
+from drive_env.dictionary.roles import Role
+from drive_env.emulator.inertia_check import MisfitWarning
+from drive_env.envs.gain_tuning import GainTuning
+from drive_env.motors import MOTORS
+from drive_env.phase_current import rated_setting
+from drive_env.trials.open_loop import unmeasured
+from drive_env.trials.positioning import plan_move, start, write_profile
+from tuning.commands.cli import app
+from tuning.runs.experiment import SweptObject, load_experiment
+from tuning.runs.metrics import MoveRecording, figures, tracking
+from tuning.runs.sweep import _close_loop, run
+from tuning.search.optimise import Settings, optimise
+from tuning.search.trial_bench import TrialBench
+from tuning.target import emulated
+
+NAME = "qsh4218_51"
+MOTOR = MOTORS[NAME]
+DEVICE = find_device("tmcm3313")
+
+
+def call(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "200"})
+
+
+# --- open loop --------------------------------------------------------------------------------------------------------
+def test_its_load_detection_is_that_of_the_tmcm6212_row_by_row():
+    """Sections 4.2.45 to 4.2.51 of its manual; the objects are shared."""
+    rows = [row for row in DEVICE.gains.rows if row.loop in ("load detection", "CoolStep")]
+    assert rows == [row for row in find_device("tmcm6212").gains.rows if row.loop in ("load detection", "CoolStep")]
+    dictionary = DEVICE.new_dictionary()
+    for row in rows:
+        entry = dictionary.find(row.key)
+        assert (entry.low, entry.high) == (row.lowest, row.highest)
+
+
+def test_a_sweep_of_two_currents_has_a_point_for_each_pair(tmp_path):
+    shown = call("sweep", "--device", "tmcm3313", "--load", "inertia", "--show-config").output
+    grid = shown[shown.index("[[sweep]]") : shown.index("[excitation]")]
+    pair = "".join(
+        f'[[sweep]]\nobject = "{name}"\nlow = 63\nhigh = 95\ncount = 2\nspacing = "lin"\n\n'
+        for name in ("run_current", "standby_current")
+    )
+    config = tmp_path / "two.toml"
+    config.write_text(shown.replace(grid, pair), encoding="utf-8")
+    result = call("sweep", "--config", config, "--device", "tmcm3313", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    lines = (tmp_path / "out" / "results.csv").read_text(encoding="utf-8").splitlines()
+    assert lines[0].startswith("2003h:00,2004h:00,")
+    assert [line.split(",")[:2] for line in lines[1:]] == [["63", "63"], ["63", "95"], ["95", "63"], ["95", "95"]]
+    assert "in open loop 6077h is the size of the current" in result.output
+    assert unmeasured(find_device("tmcm6212")) == "no 6077h"
+
+
+def test_optimise_finds_currents_of_three_axes_again_to_the_digit():
+    settings = Settings(trials=4, seed=3)
+    found = []
+    for _ in range(2):
+        with emulated("tmcm3313", "portal", NAME, num_threads=1) as target:
+            found.append(optimise(target, settings, anew=True))
+    one, other = found
+    assert [row.cost for row in one.rows] == [row.cost for row in other.rows]
+    assert len({row.cost for row in one.rows}) > 1, "the currents are told apart"
+    assert one.gains.shape == (3, DEVICE.gains.count)
+    assert np.all(one.gains[:, :2] <= rated_setting(DEVICE, MOTOR))
+    assert one.cost[0] <= one.rows[0].cost, "the first is the rule"
+    assert np.array_equal(one.gains[:, 2:], one.rule[:, 2:]), "what is no current is left as it was"
+
+
+def test_an_episode_of_gain_tuning():
+    env = GainTuning(device="tmcm3313", motor=NAME, load="inertia", trials=3, num_threads=1)
+    try:
+        observation, info = env.reset(seed=1)
+        first, rule, ended, costs = info["robust_cost"].copy(), info["gains"].copy(), False, []
+        while not ended:
+            observation, _, terminated, truncated, info = env.step(np.array([[-0.2, 0.2]]))
+            assert not terminated.any() and env.observation_space.contains(observation)
+            costs.append(float(info["trial_robust_cost"][0]))
+            ended = bool(truncated[0])
+        assert len(costs) == 3 and abs(costs[0] / first[0] - 1.0) > 0.02, "the currents change the score"
+        tried = info["trial_gains"][0, 0] - rule[0, 0]
+        assert tried[0] < 0 < tried[1] and not tried[2:].any(), "what is no current stays"
+    finally:
+        env.close()
+
+
+def test_auto_commissions_and_certifies_its_load_detection(tmp_path):
+    result = call("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    axis = json.loads((tmp_path / "out" / "stepper-certificate.json").read_text(encoding="utf-8"))["axes"][0]
+    assert axis["verdict"] == "accepted" and axis["figures"]["teeth lost at an obstacle"] == 0
+    assert axis["after"]["coolstep_lower"] > 0
+    assert axis["figures"]["current saved by CoolStep, by the load angle [%]"] > 5
+
+
+def test_trials_of_currents_open_a_closed_loop_and_give_it_back():
+    """With it closed the difference of demand and encoder is a following error, and no load angle."""
+    with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:
+        drives = target.drives
+        drives.write(cia402.SENSOR_SELECTION, 0)
+        motion.enable(drives, mode="pp")
+        drives.write(Role.LOOP_MODE, 1)
+        drives.advance(3.2)
+        assert drives.read(Role.LOOP_INITIALISED).all()
+        motion.disable(drives)
+        bench = TrialBench(target)
+        bench.identify()
+        assert not drives.read(Role.LOOP_INITIALISED).any() and not drives.read(Role.LOOP_MODE).any()
+        bench.leave(bench.rule)
+        assert np.all(drives.read(Role.LOOP_MODE) == 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("correction_velocity_p", "sweep --closed-loop"),
+        ("correction_velocity_limit", "sweep --closed-loop"),
+        ("stall_threshold", "drive-tune auto"),
+    ],
+)
+def test_what_trials_do_not_show_is_refused_before_anything_moves(name, remedy):
+    with emulated("tmcm3313", "inertia", NAME, num_threads=1) as target:
+        with pytest.raises(ValueError, match=rf"{name}: .*{remedy}"):
+            optimise(target, Settings(trials=1, gains=(name,)))
+        assert not cia402.matches(target.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED).any()
+    with pytest.raises(ValueError, match=rf"{name}: .*{remedy}"):
+        GainTuning(device="tmcm3313", motor=NAME, load="inertia", gains=(name,))
+
+
+# --- closed loop ------------------------------------------------------------------------------------------------------
+def closed_experiment(*swept, **excitation):
+    shipped = load_experiment(closed_loop=True)
+    return replace(shipped, sweep=swept, excitation=replace(shipped.excitation, **excitation))
+
+
+def test_gains_of_the_closed_loop_are_told_apart_where_the_motor_is_overloaded(tmp_path):
+    """A ramp that is too steep: with more P, and with more I, the axis is behind for less time."""
+    result = run(
+        closed_experiment(
+            SweptObject("correction_velocity_p", 1000, 10000, 2, "lin"),
+            SweptObject("202C:00", 20, 400, 2, "lin"),
+        ),
+        num_threads=1,
+    )  # fmt: skip
+    assert result.objects == ("202Bh:00", "202Ch:00") and not result.columns["fault"].any()
+    behind = result.columns["behind [s]"].reshape(2, 2)
+    assert behind[1, 0] < 0.8 * behind[0, 0] and behind[0, 1] < 0.8 * behind[0, 0]
+    assert result.best(1)[0]["202Bh:00"] == 10000
+    assert np.all(result.columns["following [full steps]"] > 2.0), "in open loop the steps would be lost"
+    assert np.all(result.columns["rms_current [A]"] < MOTOR.rated_current)
+    folder = result.save(tmp_path / "closed")
+    again = run(load_experiment(folder / "settings.toml"), num_threads=1)
+    assert np.array_equal(again.score, result.score)
+
+
+def test_tracking_in_closed_loop_is_its_formula():
+    """480 rpm are 1600 full steps/s; 40 of them behind in the step, 8 under load, a ripple of 0.1 A of 1 A."""
+    t = np.arange(0.0, 0.4, 0.001)
+    n = len(t)
+    recording = MoveRecording(
+        t, np.where(t < 0.02, 0.0, 480.0), np.full((n, 1), 480.0), 0.05 * (-1.0) ** np.arange(n)[:, None],
+        np.array([1.0]), 0.02, 0.2, np.where(t < 0.2, 40.0, 8.0)[:, None], None, np.array([200.0]),
+    )  # fmt: skip
+    found = figures(recording)
+    score = tracking(found, {"step": 1.0, "disturbance": 2.0, "ripple": 0.005})
+    step = (180 * 40.0 + 8.0) / 181  # the step's window has the first sample under load, too
+    assert score[0] == pytest.approx(step / 1600.0 + 2.0 * 8.0 / 1600.0 + 0.005 * 0.1)
+
+
+def test_a_ramp_within_the_motors_torque_shows_no_gain_of_the_closed_loop():
+    swept = (SweptObject("correction_velocity_p", 300, 30000, 2, "lin"),)
+    result = run(closed_experiment(*swept, acceleration_rpm_per_s=3000.0, velocity_rpm=120.0), num_threads=1)
+    assert result.columns["following [full steps]"].max() < 1.0
+    assert len(set(result.score)) == 1 and result.without_effect() == ["202Bh:00"]
+
+
+@pytest.mark.parametrize(("rotors", "acts"), [(5, False), (30, False), (100, True)])
+def test_why_trials_refuse_gains_of_the_closed_loop(rotors, acts):
+    """In the move of a trial, closed, they do nothing at the rated current where the motor is not overloaded."""
+    values = [300, 3000, 30000]
+    heavy = {"load.inertia": rotors * MOTOR.inertia}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MisfitWarning)
+        drives = EmulatedDrives("tmcm3313", "inertia", NAME, num_machines=3, identical=True, parameters=heavy)
+    with drives:
+        drives.write(cia402.SENSOR_SELECTION, 0)
+        motion.enable(drives, mode="pp")
+        assert not _close_loop(drives).any()
+        scale = drives.read(Role.POSITION_SCALE)
+        move = plan_move(MOTOR, np.full(3, (rotors + 1) * MOTOR.inertia), scale, np.full(3, 20.0))
+        write_profile(drives, move)
+        drives.write(DEVICE.gains.keys[DEVICE.gains.names.index("correction_velocity_p")], values)
+        start(drives, drives.read(cia402.POSITION_ACTUAL) + move.distance)
+        trace = drives.record([cia402.POSITION_ACTUAL], 0.25)[cia402.POSITION_ACTUAL]
+    assert bool(np.any(trace != trace[:, :1])) is acts
+
+
+def test_an_axis_whose_loop_does_not_close_counts_as_one_in_fault(monkeypatch):
+    """Here the time is too short for the rotor to swing in."""
+    monkeypatch.setattr("tuning.runs.sweep.CLOSING_TIME", 0.1)
+    result = run(closed_experiment(SweptObject("correction_velocity_p", 3000, 3000, 1, "lin")), num_threads=1)
+    assert result.columns["fault"].all() and not result.usable.any()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--device", "tmcm6212"), "tmcm6212 has no loop to close"),
+        (("--device", "tmcm1636"), "tmcm1636 has no loop to close"),
+        (("--config", "my.toml"), "leave it out with --config"),
+    ],
+)
+def test_a_loop_that_cannot_be_closed_is_refused_with_the_reason(arguments, said, tmp_path):
+    result = call("sweep", "--closed-loop", *arguments, "--out", tmp_path / "out")
+    assert result.exit_code != 0 and said in result.output and "Traceback" not in result.output

@@ -1,0 +1,107 @@
+"""A fault at frame k of a session with a node of six axes: all rotors end at rest, disabled, inside their travel.
+
+As tests/test_fault_injection.py has it for one servo axis, with a sample of the frames; the verdict is the emulator's
+inside alone.
+"""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+from fault_injection import (
+    RADIANS,
+    Fault,
+    eds_read_once,
+    no_interrupt_left,
+    no_longer_than,
+    problems,
+    run_lockstep,
+    sample,
+    stop_by_ramp,
+    worst_of,
+)
+
+from drive_env import EmulatedDrives, Limits, cia402, motion
+
+AXES = 6
+TURN = 200 * 256  # microsteps
+LIMITS = Limits(position=(-3 * TURN, 3 * TURN), velocity=6 * TURN)
+TRAVEL = tuple(3 * sign * 2.0 * np.pi / RADIANS for sign in (-1, 1))  # as `problems` counts
+KINDS = ("lose", "double", "delay", "interrupt", "three interrupts")
+
+
+@pytest.fixture(scope="module")
+def emulated():
+    with eds_read_once(), EmulatedDrives("tmcm6212", "inertia", num_machines=AXES, num_threads=1) as drives:
+        yield drives
+
+
+@pytest.fixture(autouse=True)
+def no_test_hangs():
+    with no_longer_than(600.0):
+        yield
+
+
+def speeds(drives):
+    """Every axis at a speed of its own, then the other way, and a stop by ramp."""
+    for name in ("Profile acceleration", "Profile deceleration"):
+        drives.write(name, 60 * TURN)
+    motion.enable(drives, mode="pv")
+    each = np.arange(1, AXES + 1) * TURN // 2
+    drives.write(cia402.TARGET_VELOCITY, each)
+    drives.advance(0.03)
+    drives.write(cia402.TARGET_VELOCITY, -each)
+    drives.advance(0.02)
+    stop_by_ramp(drives)
+
+
+def paths(drives):
+    """Six paths, played in one call, and the stop left to the end of the program."""
+    motion.enable(drives, mode="csp")
+    path = TURN // 32 * (1.0 - np.cos(np.linspace(0.0, 2.0 * np.pi, 60)))
+    rows = np.rint(path[:, None] * np.linspace(-1.0, 1.0, AXES)).astype(int)
+    drives.record([cia402.POSITION_ACTUAL], 0.06, play={cia402.TARGET_POSITION: rows})
+
+
+def some_are_off(drives):
+    """Two of the axes turn; one of them is switched off while the other goes on, for ever."""
+    where = np.arange(AXES) < 2
+    motion.enable(drives, mode="pv", where=where)
+    drives.write(cia402.TARGET_VELOCITY, 2 * TURN, where=where)
+    drives.advance(0.05)
+    motion.disable(drives, where=np.arange(AXES) == 0)
+    drives.advance(0.05)
+
+
+SESSIONS = {session.__name__: session for session in (speeds, paths, some_are_off)}
+
+
+def run_with(emulated, session, kind, frame):
+    """Run a session with a fault at a frame; return what is wrong, as texts."""
+    if "interrupt" in kind:
+        pressed = (frame,) if kind == "interrupt" else (frame, frame + 1, frame + 2)
+        with no_interrupt_left():
+            truth, *_ = run_lockstep(emulated, session, interrupts=pressed, limits=LIMITS)
+    else:
+        truth, *_ = run_lockstep(emulated, session, Fault(kind, frame), limits=LIMITS)
+    return problems(truth, travel=TRAVEL)
+
+
+@pytest.mark.parametrize("name", SESSIONS)
+def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
+    truth, frames, ended = run_lockstep(emulated, SESSIONS[name], limits=LIMITS)
+    assert ended is None
+    assert problems(truth, travel=TRAVEL) == []
+    assert frames > 100
+    assert np.ptp(truth.theta(), axis=0)[: 2 if name == "some_are_off" else AXES].min() > 0.01 * 2 * np.pi
+
+
+@pytest.mark.parametrize("count", [1, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", SESSIONS)
+def test_a_fault_at_a_frame_leaves_no_axis_running(emulated, name, kind, count):
+    _, frames, _ = run_lockstep(emulated, SESSIONS[name], limits=LIMITS)
+    chosen = sample(random.Random(f"{name} {kind} {count}"), frames, count)
+    assert worst_of([(f"{kind} {k}", run_with(emulated, SESSIONS[name], kind, k)) for k in chosen]) == ""
