@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 import tomllib
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,7 +112,15 @@ def _silent(source: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     for node in ast.walk(ast.parse(source)):
         found += [getattr(node, name) for name in ("annotation", "returns") if getattr(node, name, None) is not None]
         found += getattr(node, "decorator_list", [])
-    return [((e.lineno, e.col_offset), (e.end_lineno or e.lineno, e.end_col_offset or 0)) for e in found]
+    ranges = [((e.lineno, e.col_offset), (e.end_lineno or e.lineno, e.end_col_offset or 0)) for e in found]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef) and node.args.kwonlyargs:
+            # The `*` before arguments that go by name is no operator.
+            before = [*node.args.args, *node.args.defaults]
+            begin = max(((e.end_lineno or 0, e.end_col_offset or 0) for e in before), default=(node.lineno, 0))
+            first = node.args.kwonlyargs[0]
+            ranges.append((begin, (first.lineno, first.col_offset)))
+    return ranges
 
 
 def sample(files: Sequence[str], count: int, seed: int) -> list[Mutant]:
@@ -127,11 +136,16 @@ def sample(files: Sequence[str], count: int, seed: int) -> list[Mutant]:
 
 
 def _is_python(mutant: Mutant) -> bool:
-    """Return whether a change leaves a file that can be read: where it does not, every test would notice."""
-    try:
-        ast.parse(_changed((REPOSITORY / mutant.file).read_text(encoding="utf-8"), mutant))
-    except SyntaxError:
-        return False
+    """Return whether a change leaves a file that can be read, without a warning.
+
+    Where it cannot be read every test would notice; `is` for `==` beside a literal is the same, and Python warns of it.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SyntaxWarning)
+        try:
+            compile(_changed((REPOSITORY / mutant.file).read_text(encoding="utf-8"), mutant), mutant.file, "exec")
+        except (SyntaxError, SyntaxWarning):
+            return False
     return True
 
 
