@@ -1,4 +1,4 @@
-"""The watch over the drives, rule by rule: how old a sample may be, what is stopped, and how long a stop is waited for."""
+"""The watch over the drives: how old a sample may be, what is stopped, and how long a stop is waited for."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_in_lockstep_a_stop_without_end_is_given_up_after_five_thousand_cycles(c
 
 def test_a_lockstep_that_takes_long_is_no_stop_without_end(clock):
     """Time waits there: what a cycle takes of the computer's says nothing."""
-    watch, done = watch_of(time_waits=True)
+    watch, _ = watch_of(time_waits=True)
     stop_of(watch, over_after=30)
     watch._pass_cycle = lambda: setattr(clock, "now", clock.now + 10.0)
     watch.await_stop()
@@ -237,7 +237,7 @@ def test_three_syncs_in_a_row_without_samples_stop_once_and_have_the_node_starte
 
 
 def test_a_node_that_restarts_is_told_of_once_by_its_number(clock):
-    watch, done = watch_of(3, nodes=(4, 5, 9))
+    watch, _ = watch_of(3, nodes=(4, 5, 9))
     watch.note_restart(2)
     watch.note_restart(0)
     with pytest.raises(SafetyError, match="node 4, 9 has restarted by itself"):
