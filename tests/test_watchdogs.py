@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import signal
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,8 @@ import pytest
 
 from drive_env import Limits, SafetyError, cia402
 from drive_env.master.errors import BusError
+from drive_env.safety import signals
+from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import POSITION_HIGH
 from drive_env.safety.limits import NO_LIMIT
 from drive_env.safety.watchdogs import Watchdogs
@@ -218,3 +221,39 @@ def test_without_a_silence_no_watchdog_is_set(caplog):
     watchdogs.check()
     assert log == ["end"] and axes.is_armed
     assert "no drive stops by itself when this process dies" in caplog.text
+
+
+# --- axes of nodes ------------------------------------------------------------------------------------------------
+def test_axes_of_nodes_are_counted_through_and_taken_for_off_by_themselves():
+    drives = SimpleNamespace(
+        num_axes=6, time_waits=True, description=SimpleNamespace(num_axes=2, has=lambda key: False, dictionary=None)
+    )
+    axes = Axes(drives)
+    assert np.flatnonzero(axes.of_nodes([0, 2])).tolist() == [0, 1, 4, 5]
+    assert not axes.of_nodes([]).any()
+    axes.assume(axes.everywhere)
+    axes.take_for_off(axes.of_nodes([1]))
+    for known in (axes.live, axes.assumed, axes.in_flight, axes.may_turn):
+        assert np.flatnonzero(known).tolist() == [0, 1, 4, 5]
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_that_is_ignored_stays_so_and_the_others_are_guarded(name):
+    """The program was started to outlive its terminal, or Ctrl-C of it."""
+    numbers = {one: getattr(signal, one) for one in signals.NAMES if hasattr(signal, one)}
+    before = {number: signal.getsignal(number) for number in numbers.values()}
+    one = SimpleNamespace()
+    try:
+        for number in numbers.values():
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(numbers[name], signal.SIG_IGN)
+        signals.guard(one)
+        found = {other: signal.getsignal(number) for other, number in numbers.items()}
+        assert {other for other, handler in found.items() if handler is signals._handle} == numbers.keys() - {name}
+        signals.release(one)
+        assert signal.getsignal(numbers[name]) is signal.SIG_IGN
+        assert all(signal.getsignal(n) is signal.SIG_DFL for other, n in numbers.items() if other != name)
+    finally:
+        signals.release(one)
+        for number, handler in before.items():
+            signal.signal(number, handler)
