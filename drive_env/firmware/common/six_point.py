@@ -8,7 +8,7 @@ r"""The six-point ramp: a trapezoid that begins and ends with a jump, and has ot
     ____________________________ time   ramp_wait passes before the next motion
 
 As the motion controllers of Trinamic have it (TMC5130 data sheet, "ramp generator"): velocity_1 = 0 leaves one ramp for
-each way, start_velocity and end_velocity are jumped to and from, and after a stop the axis waits. Where the device has a
+each way, start_velocity and end_velocity are jumped to and from, and after a stop the axis waits. Where there is a
 stop_deceleration (TMCM-3313 manual, section 4.2.15) the end velocity is where that ramp takes over. It is exact within
 a period: the times at which one ramp goes over into the next are found, not sampled.
 """
