@@ -315,18 +315,21 @@ class Tracking(VectorEnvironment):
         bound = high.astype(np.float32)
         return Box(-bound, bound, dtype=np.float32), Box(-1.0, 1.0, (axes,), np.float32)
 
+    def _new_machines(self) -> RandomMachines | None:
+        """Return the emulated machines, as they are drawn; None on a bus, whose drives must tell what is observed."""
+        distributions, machine = self.config.distributions, self.drives.machine
+        if machine is not None:
+            return RandomMachines(machine.drives, Distributions.load(distributions or {"parameters": {}}))
+        if distributions is not None:
+            raise ValueError("distributions are of emulated machines; leave them out on a bus")
+        if self._is_stepper and (self.drives.read(cia402.SENSOR_SELECTION) == ENCODER_OFF).any():
+            raise ValueError("606Ah = -1: no encoder tells where these steppers are; write 606Ah = 0 if they have one")
+        return None
+
     def _prepare(self, sensor: Callable[[], ArrayLike] | None) -> None:
         config, drives, n = self.config, self.drives, self.num_envs
         machine = drives.machine
-        self._machines = None
-        if machine is not None:
-            self._machines = RandomMachines(
-                machine.drives, Distributions.load(config.distributions or {"parameters": {}})
-            )
-        elif config.distributions is not None:
-            raise ValueError("distributions are of emulated machines; leave them out on a bus")
-        elif self._is_stepper and (drives.read(cia402.SENSOR_SELECTION) == ENCODER_OFF).any():
-            raise ValueError("606Ah = -1: no encoder tells where these steppers are; write 606Ah = 0 if they have one")
+        self._machines = self._new_machines()
         self._sensor = sensor
         if self._has_sensor and sensor is None:
             if machine is None:
