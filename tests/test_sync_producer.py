@@ -22,10 +22,10 @@ def drives():
 
 @pytest.fixture
 def wire(drives):
-    """Node 5 without the TPDOs that go with SYNC from the factory on."""
+    """Node 5 without the TPDOs that are on from the factory."""
     drives.machine.reset()
     made = Wire(drives)
-    for index in (0x1802, 0x1803):
+    for index in (0x1800, 0x1801, 0x1802, 0x1803):
         assert made.download(index, 1, 0xC000_0385, 4) == 0
     return made
 
@@ -128,7 +128,7 @@ def test_its_own_sync_is_one_to_the_producer(wire):
         rx 205  06 00                     # it waits
     """)
     assert wire.value(0x6041) & 0x6F == 0x40
-    wire.play("wait 1 ms\ntx 080\ntx 185  50 02")
+    wire.play("wait 1 ms\ntx 080\ntx 185  31 02")
     assert wire.value(0x6041) & 0x6F == 0x21
 
 
