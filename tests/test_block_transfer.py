@@ -150,7 +150,7 @@ def test_segments_behind_an_abort_are_no_requests(wire):
     wire.play("rx 605  C2 01 2F 00 FF 0F 00 00\ntx 585  A4 01 2F 00 7F 00 00 00")
     for number in range(1, 0x2F):
         assert wire.receive(0x605, f"{number:02X} 60 60 00 03 00 00 00") == []
-    wire.node._sdo._block._room = 0x2E * 7  # the memory is full
+    wire.node._sdo.block._room = 0x2E * 7  # the memory is full
     wire.play("""
         rx 605  2F 60 60 00 03 00 00 00
         tx 585  80 01 2F 00 05 00 04 05

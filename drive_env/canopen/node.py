@@ -594,7 +594,8 @@ class Node:
                 self._transmit(frame)
             else:
                 self._answer(frame, now)
-        self._send_segments(now)
+        if self._sdo.block is not None:
+            self._send_segments(now)
         if self._leaves_for_bootloader:
             # The boot loader does not speak CANopen, and under it no firmware drives the motor: until power-on.
             self._is_online = False

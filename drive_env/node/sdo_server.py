@@ -58,6 +58,9 @@ class SdoServer:
         timeout: Time [s] after which an open transfer is given up.
         block_size: Segments that it takes at a time in a block transfer; 0: it has none.
         longest_text: Bytes of a string or domain that can be written; 0: none can.
+
+    Attributes:
+        block: The block transfer that is open, if there is one.
     """
 
     def __init__(
@@ -68,7 +71,7 @@ class SdoServer:
         self._block_size = block_size
         self._longest_text = longest_text
         self._open: Transfer | None = None
-        self._block: BlockDownload | BlockUpload | None = None
+        self.block: BlockDownload | BlockUpload | None = None
         self._block_port: ObjectPort | None = None  # of a block download
         self._block_size_said: int | None = None
         self._last = 0.0  # of a block transfer [s]
@@ -79,10 +82,10 @@ class SdoServer:
         if len(data) != 8:
             return None
         specifier = data[0] >> 5
-        if self._block is not None:
-            if data[0] != ABORTED and self._is_of_block(self._block, data):
-                return self._go_on(self._block, data, now)
-            self._block = None
+        if self.block is not None:
+            if data[0] != ABORTED and self._is_of_block(self.block, data):
+                return self._go_on(self.block, data, now)
+            self.block = None
         elif self._leftover and self._is_leftover(data):
             return None
         if specifier == ABORT:
@@ -113,19 +116,19 @@ class SdoServer:
 
     def next_segment(self, now: float) -> bytes | None:
         """Return the next segment of a block upload, to be sent at `now` [s]; None where there is none to send."""
-        if not isinstance(self._block, BlockUpload):
+        if not isinstance(self.block, BlockUpload):
             return None
-        segment = self._block.next_segment()
+        segment = self.block.next_segment()
         if segment is not None:
             self._last = now
         return segment
 
     def expire(self, now: float) -> bytes | None:
         """Return the abort of a transfer whose client has been silent for too long, None as long as there is none."""
-        if self._block is not None:
+        if self.block is not None:
             if now - self._last < self._timeout - EPSILON:
                 return None
-            block, self._block = self._block, None
+            block, self.block = self.block, None
             return _abort(block.multiplexor, PROTOCOL_TIMED_OUT)
         if self._open is None or now - self._open.last < self._timeout - EPSILON:
             return None
@@ -134,7 +137,7 @@ class SdoServer:
 
     def close(self) -> None:
         """Forget an open transfer."""
-        self._open = self._block = None
+        self._open = self.block = None
         self._leftover = 0
 
     # --- inside: upload is what the client reads ------------------------------------------------------------------
@@ -204,14 +207,14 @@ class SdoServer:
             if entry.bits is None or self._block_size_said is not None:
                 self._check_length(entry, self._block_size_said or 0)
             self._block_port = port
-            self._block = BlockDownload(data, self._block_size, self._room(entry))
-            return self._block.initiated()
+            self.block = BlockDownload(data, self._block_size, self._room(entry))
+            return self.block.initiated()
         check_readable(entry)
         content = encode(entry, port.read())
         upload = BlockUpload(data, content)
         if 0 < data[5] >= len(content):  # the protocol switch threshold: the client asks for the other protocol then
             return self._begin_upload(entry, data[1:4], content, now)
-        self._block = upload
+        self.block = upload
         return upload.initiated()
 
     @staticmethod
@@ -224,7 +227,7 @@ class SdoServer:
         try:
             if isinstance(block, BlockUpload):
                 if block.is_confirmed(data):
-                    self._block = None
+                    self.block = None
                     return None
                 return block.request(data)
             answer = block.request(data)
@@ -236,9 +239,9 @@ class SdoServer:
             _store(port, answer.data)
         except ObjectAccessError as error:
             self._leftover = block.position
-            self._block = None
+            self.block = None
             return _abort(block.multiplexor, error.abort_code)
-        self._block = None
+        self.block = None
         return block.ended()
 
     def _is_leftover(self, data: bytes) -> bool:
