@@ -9,6 +9,7 @@ from typing import Protocol
 
 from drive_env.bus.wire import Transmission, Wire
 from drive_env.canopen.frames import IDENTIFIER, SYNC, Frame
+from drive_env.canopen.lss import UNCONFIGURED
 from drive_env.canopen.node import Node
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.node.axis import ObjectPort
@@ -57,7 +58,7 @@ class World:
     says, and frames take the time that the wire says.
 
     Attributes:
-        nodes: Node identifier -> node.
+        nodes: Node identifier -> node; those that begin without one have numbers from 128 on here.
         drives: All emulated drives, each a set with its nodes.
         listeners: Called with each frame that everybody received, also its own sender.
         before_cycle: Called as a communication cycle begins; they may send by the wire.
@@ -92,7 +93,7 @@ class World:
 
         Args:
             drives: The drives; machines of several one-axis devices have as many nodes as axes.
-            node_ids: Identifiers 1 to 127 in the order of the axes.
+            node_ids: Identifiers 1 to 127 in the order of the axes; 255, of devices with LSS, for a node without one.
             store: Folder of the nodes' stored values; without one they live as long as the world.
 
         Raises:
@@ -109,21 +110,26 @@ class World:
         left_over = needed * per_node - drives.num_axes
         spare = _without_motors(drives, left_over) if left_over else None
         nodes: list[Node] = []
-        for k, node_id in enumerate(node_ids):
+        for k, given in enumerate(node_ids):
+            is_new = given == UNCONFIGURED and drives.device.canopen.services.lss
+            node_id = max([MAX_NODE_ID, *self.nodes]) + 1 if is_new else given
             path = None if store is None else store / f"node-{node_id}-{Path(drives.device.name).stem}.json"
 
-            def make(send: Callable[[Frame], None], k: int = k, path: Path | None = path) -> Node:
+            def make(
+                send: Callable[[Frame], None], k: int = k, path: Path | None = path, node_id: int = node_id
+            ) -> Node:
                 bit_rate = round(self.wire.bit_rate)
                 real = not self.lockstep  # docs/decisions/bus.md has why nothing takes time in lockstep
                 node = Node(
                     node_ids[k], drives, k * per_node, send=send, store=path, bit_rate=bit_rate, takes_time=real,
-                    spare=spare if k == needed - 1 else None,
+                    spare=spare if k == needed - 1 else None, serial=node_id,
+                    has_room=lambda: self.wire.waiting(("node", node_id)) < self._room_of(node_id) // 2,
                 )  # fmt: skip
                 nodes.append(node)
                 return node
 
             self._room[node_id] = TRANSMIT_BUFFER * per_node
-            self.attach(node_id, make)
+            (self._attach if is_new else self.attach)(node_id, make)
             self._sync_objects.append(nodes[-1].dictionary.port(*SYNC_OBJECT))
             axes = slice(k * per_node, (k + 1) * per_node)
             drives.machine.connect_lamps(axes, self._lamps_of(nodes[-1], node_id))
@@ -137,6 +143,9 @@ class World:
             raise ValueError(f"node {node_id} is out of range; identifiers are 1 to {MAX_NODE_ID}")
         if node_id in self.nodes:
             raise ValueError(f"node {node_id} is on the bus already; give each its own identifier, 1 to {MAX_NODE_ID}")
+        self._attach(node_id, make)
+
+    def _attach(self, node_id: int, make: Callable[[Callable[[Frame], None]], BusNode]) -> None:
         self.nodes[node_id] = make(lambda frame: self._send(node_id, frame))
 
     def power_on(self) -> None:
@@ -268,9 +277,16 @@ class World:
         return any(frame.can_id == int(port.read()) & IDENTIFIER for port in self._sync_objects)
 
     def _settle(self) -> None:
-        """Carry frames until none is ready at this time."""
-        while (ended := self.wire.take(self.time)) is not None:
-            self._pass_on(ended)
+        """Carry frames until none is ready at this time, and no segment of a block upload either."""
+        while True:
+            while (ended := self.wire.take(self.time)) is not None:
+                self._pass_on(ended)
+            if self._next_answer() > self.time:
+                return
+            for node in self._answering:
+                node.answer(self.time)
+            if self.wire.next_event() > self.time:  # none could send any
+                return
 
     def _pass_on(self, ended: Transmission | None) -> None:
         if ended is None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from drive_env.canopen import frames
 from drive_env.devices import Device
+from drive_env.devices.services import NodeQuirks, Services
 from drive_env.dictionary.aborts import INCOMPATIBLE_PARAMETER, VALUE_RANGE, WRONG_STATE, ObjectAccessError
 from drive_env.dictionary.access import check_allowed, check_limits
 from drive_env.dictionary.entries import EdsText, Entry, ObjectDictionary
@@ -24,16 +25,23 @@ from drive_env.node.axis import ObjectPort
 Key = tuple[int, int]
 
 SYNC_ID = 0x1005
+SYNC_PERIOD = 0x1006
+SYNC_WINDOW = 0x1007
 ERROR_HISTORY = 0x1003
 ERROR_REGISTER = 0x1001
 GUARD_TIME = 0x100C
 LIFE_TIME_FACTOR = 0x100D
 STORE = 0x1010
 RESTORE = 0x1011
+TIME_ID = 0x1012
+TIME_STAMP = 0x1013
 EMERGENCY_ID = 0x1014
 EMERGENCY_INHIBIT = 0x1015
 CONSUMER_HEARTBEAT = 0x1016
 PRODUCER_HEARTBEAT = 0x1017
+IDENTITY = 0x1018
+SYNC_OVERFLOW = 0x1019
+STORE_EDS = 0x1021
 ERROR_BEHAVIOUR = 0x1029
 RPDO = range(0x1400, 0x1600)
 RPDO_MAPPING = range(0x1600, 0x1800)
@@ -41,6 +49,7 @@ TPDO = range(0x1800, 0x1A00)
 TPDO_MAPPING = range(0x1A00, 0x1C00)
 PDO = range(0x1400, 0x1C00)
 TO_MAPPING = 0x200  # from a PDO's communication parameter to its mapping
+CYCLE_US = 1000  # a node does what it does by itself once in a communication cycle
 
 
 @cache
@@ -65,7 +74,7 @@ class ModuleObjects:
         factory = _factory(entries.path, 1)
         self._values: dict[Key, int | str] = {key: factory[key] for key in self._own}
         # Objects whose value comes from a service, and those whose write is a command that stores no value.
-        self.readers: dict[Key, Callable[[], int]] = {}
+        self.readers: dict[Key, Callable[[], int | str]] = {}
         self.commands: dict[Key, Callable[[int], None]] = {}
 
     def owns(self, entry: Entry) -> bool:
@@ -118,11 +127,25 @@ class ModuleObjects:
             if check is not None:
                 check(self, entry, raw)
 
+        if entry.bits is None:
+            return ObjectPort(entry, read, checked, write, "", lambda text: values.update({key: text}))
         return ObjectPort(entry, read, checked, write)
+
+    @property
+    def services(self) -> Services:
+        """Parts of the node that the device has."""
+        return self._device.canopen.services
+
+    @property
+    def quirks(self) -> NodeQuirks:
+        """Where the device differs from the standard."""
+        return self._device.canopen.quirks
 
     def _fixed(self, entry: Entry) -> int:
         """Return the bits that are set whatever is written: bit 30 of a PDO's COB-ID, where the factory's has it."""
-        return self.factory_value(entry) & frames.NO_REMOTE if is_pdo_id(entry) else 0
+        if not is_pdo_id(entry) or (entry.index in RPDO and self.quirks.rpdo_bit_30 == "store"):
+            return 0
+        return self.factory_value(entry) & frames.NO_REMOTE
 
     def factory_value(self, entry: Entry) -> int:
         """Return the factory's number of an object, with node 1's COB-IDs."""
@@ -159,7 +182,7 @@ def _check_bits(entry: Entry, raw: int, allowed: int) -> None:
         )
 
 
-def _check_identifier(objects: ModuleObjects, entry: Entry, raw: int) -> None:
+def _check_identifier(objects: ModuleObjects, entry: Entry, raw: int, *, changes_while_on: bool = False) -> None:
     """Check an object of which bit 31 switches the service off (CiA 301: 1014h, 1400h, 1800h)."""
     # First what is never possible: a master that set bit 31 and tried again would be refused then.
     if raw & frames.INVALID == 0 and frames.is_restricted(raw & frames.IDENTIFIER):
@@ -167,19 +190,57 @@ def _check_identifier(objects: ModuleObjects, entry: Entry, raw: int) -> None:
             VALUE_RANGE, f"{entry.label} cannot be {raw & frames.IDENTIFIER:03X}h, which CiA 301 reserves"
         )
     before = objects.value(entry.index, entry.sub)
-    if (before | raw) & frames.INVALID == 0 and (before ^ raw) & frames.IDENTIFIER:
+    if not changes_while_on and (before | raw) & frames.INVALID == 0 and (before ^ raw) & frames.IDENTIFIER:
         raise ObjectAccessError(
             WRONG_STATE, f"{entry.label} is in use with {before & frames.IDENTIFIER:03X}h; set its bit 31 before"
         )
 
 
 def _check_sync_id(objects: ModuleObjects, entry: Entry, raw: int) -> None:
-    # Bit 30 would make the device produce SYNC, at a period that it has no object for (1006h).
+    # Bit 30 makes the device produce SYNC, at the period of 1006h, where it can.
     # Bit 31 says nothing by CiA 301; it is taken where the factory's value has it.
-    _check_bits(entry, raw, frames.IDENTIFIER | objects.factory_value(entry) & frames.INVALID)
-    identifier = raw & frames.IDENTIFIER
-    if frames.is_restricted(identifier):
-        raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {identifier:03X}h, which CiA 301 reserves")
+    produce = frames.PRODUCE if objects.services.sync_producer else 0
+    _check_bits(entry, raw, frames.IDENTIFIER | produce | objects.factory_value(entry) & frames.INVALID)
+    _check_unrestricted(entry, raw)
+    _check_off(objects, entry, raw, frames.PRODUCE)
+
+
+def _check_sync_period(objects: ModuleObjects, entry: Entry, raw: int) -> None:
+    if objects.services.sync_producer and raw % CYCLE_US:
+        raise ObjectAccessError(
+            VALUE_RANGE, f"{entry.label} cannot be {raw} us; SYNC is produced every whole number of {CYCLE_US} us"
+        )
+
+
+def _check_sync_overflow(objects: ModuleObjects, entry: Entry, raw: int) -> None:
+    if raw == 1 or raw > 240:
+        raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {raw}; it is 0, or 2 to 240")
+    if objects.value(SYNC_PERIOD) != 0:
+        raise ObjectAccessError(WRONG_STATE, f"{entry.label} cannot change while 1006h is not 0")
+
+
+def _check_time_id(objects: ModuleObjects, entry: Entry, raw: int) -> None:
+    produce = frames.PRODUCE if objects.services.time_producer else 0
+    _check_bits(entry, raw, frames.CONSUME_TIME | produce | frames.IDENTIFIER)
+    _check_unrestricted(entry, raw)
+    _check_off(objects, entry, raw, frames.CONSUME_TIME | frames.PRODUCE)
+
+
+def _check_unrestricted(entry: Entry, raw: int) -> None:
+    if frames.is_restricted(raw & frames.IDENTIFIER):
+        raise ObjectAccessError(
+            VALUE_RANGE, f"{entry.label} cannot be {raw & frames.IDENTIFIER:03X}h, which CiA 301 reserves"
+        )
+
+
+def _check_off(objects: ModuleObjects, entry: Entry, raw: int, bits: int) -> None:
+    """Raise 08000022h for another identifier while the service is on, and stays so."""
+    before = objects.value(entry.index, entry.sub)
+    if before & bits and raw & bits and (before ^ raw) & frames.IDENTIFIER:
+        named = " and ".join(str(bit) for bit in (30, 31) if bits >> bit & 1)
+        raise ObjectAccessError(
+            WRONG_STATE, f"{entry.label} is in use with {before & frames.IDENTIFIER:03X}h; clear bit {named} before"
+        )
 
 
 def _check_emergency_id(objects: ModuleObjects, entry: Entry, raw: int) -> None:
@@ -202,8 +263,15 @@ def _check_pdo(objects: ModuleObjects, entry: Entry, raw: int) -> None:
     if entry.sub == 1:
         # Bit 30 reads 1; writing 0 is accepted, since many masters do.
         _check_bits(entry, raw, frames.INVALID | frames.NO_REMOTE | frames.IDENTIFIER)
-        _check_identifier(objects, entry, raw)
-    elif entry.sub == 3 and objects.value(entry.index, 1) & frames.INVALID == 0:
+        refuses = entry.index in RPDO and objects.quirks.rpdo_bit_30 == "refuse"
+        if refuses and (raw ^ objects.factory_value(entry)) & frames.NO_REMOTE:
+            raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {raw:08X}h: bit 30 cannot change")
+        _check_identifier(objects, entry, raw, changes_while_on=objects.quirks.pdo_changes_while_on)
+    elif (
+        entry.sub == 3
+        and not objects.quirks.pdo_changes_while_on
+        and objects.value(entry.index, 1) & frames.INVALID == 0
+    ):
         # CiA 301: the inhibit time shall not be changed while the PDO exists.
         raise ObjectAccessError(WRONG_STATE, f"{entry.label} is in use; set bit 31 of the PDO's COB-ID before")
 
@@ -221,6 +289,9 @@ def _check_mapping(objects: ModuleObjects, entry: Entry, raw: int) -> None:
 
 _RULES: tuple[tuple[range, Rule], ...] = (
     (range(SYNC_ID, SYNC_ID + 1), _check_sync_id),
+    (range(SYNC_PERIOD, SYNC_PERIOD + 1), _check_sync_period),
+    (range(SYNC_OVERFLOW, SYNC_OVERFLOW + 1), _check_sync_overflow),
+    (range(TIME_ID, TIME_ID + 1), _check_time_id),
     (range(EMERGENCY_ID, EMERGENCY_ID + 1), _check_emergency_id),
     (range(CONSUMER_HEARTBEAT, CONSUMER_HEARTBEAT + 1), _check_consumer),
     (RPDO, _check_pdo),

@@ -48,7 +48,9 @@ RESTRICTED = (
 
 # Bits of an object that holds an identifier.
 INVALID = 1 << 31  # EMCY, PDO: 1 switches the object off
-NO_REMOTE = 1 << 30  # PDO: 1 refuses remote frames; SYNC: 1 makes the device produce it
+NO_REMOTE = 1 << 30  # PDO: 1 refuses remote frames
+PRODUCE = 1 << 30  # SYNC, TIME: 1 makes the device produce it
+CONSUME_TIME = 1 << 31
 EXTENDED = 1 << 29
 IDENTIFIER = 0x7FF
 

@@ -1,6 +1,7 @@
 """The two lamps of a node: run, which is green, and error, which is red (CiA 303-3).
 
-Devices do not show what is not in the table: "flickering" (LSS, automatic bit rate), "triple flash" (SYNC error).
+Devices do not show what is not in the table: "triple flash" (SYNC error). While LSS configures a node, or waits to,
+both lamps flicker.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from drive_env.canopen.nmt import NmtState
 PATTERNS: dict[str, tuple[float, ...]] = {
     "off": (),
     "on": (),
+    "flickering": (0.05, 0.05),
     "blinking": (0.2, 0.2),
     "single flash": (0.2, 1.0),
     "double flash": (0.2, 0.2, 0.2, 1.0),
@@ -34,7 +36,9 @@ class Leds(NamedTuple):
     error: str
 
 
-def leds_of(state: NmtState, is_bus_off: bool, conditions: Collection[Hashable], error_counter: int) -> Leds:
+def leds_of(
+    state: NmtState, is_bus_off: bool, conditions: Collection[Hashable], error_counter: int, is_lss: bool = False
+) -> Leds:
     """Return what the lamps of a node show; of several errors the gravest.
 
     Args:
@@ -42,7 +46,10 @@ def leds_of(state: NmtState, is_bus_off: bool, conditions: Collection[Hashable],
         is_bus_off: Whether its controller has left the bus.
         conditions: Errors that last: "guarding", ("heartbeat", node), others do not count.
         error_counter: Of its controller.
+        is_lss: Whether it has no node-ID, or LSS configures it.
     """
+    if is_lss and not is_bus_off:
+        return Leds("flickering", "flickering")
     watched = any(key == "guarding" or (isinstance(key, tuple) and key[0] == "heartbeat") for key in conditions)
     if is_bus_off:
         return Leds(RUN[state], "on")

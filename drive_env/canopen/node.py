@@ -15,20 +15,23 @@ from pathlib import Path
 
 import numpy as np
 
-from drive_env.canopen import communication, frames, nmt
+from drive_env.canopen import communication, frames, lss, nmt, time_of_day
 from drive_env.canopen.communication import ModuleObjects, known_bit_rate, signed_command
 from drive_env.canopen.emergency import EPSILON, EmergencyProducer
 from drive_env.canopen.error_control import HeartbeatConsumer, HeartbeatProducer, NodeGuarding, consumers
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.leds import Leds, leds_of
+from drive_env.canopen.lss import UNCONFIGURED, Identity, LssSlave
 from drive_env.canopen.nmt import Command, NmtState
 from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
+from drive_env.canopen.sync import SyncProducer, SyncWindow
+from drive_env.canopen.time_of_day import Clock, TimeProducer
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, HARDWARE_ERROR, VALUE_RANGE, ObjectAccessError
 from drive_env.dictionary.access import check_limits
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.firmware.common.protection import CUT, STOP
 from drive_env.node.axis import Axis, QueuedEmergency
-from drive_env.node.error_history import CONDITIONS, ErrorCondition, ErrorHistory
+from drive_env.node.error_history import CONDITIONS, OPTIONAL_CONDITIONS, ErrorCondition, ErrorHistory
 from drive_env.node.node_dictionary import NodeDictionary
 from drive_env.node.sdo_server import SdoServer
 from drive_env.node.store import PowerLostError, Section, Store
@@ -37,6 +40,9 @@ logger = logging.getLogger(__name__)
 
 COMMUNICATION_ERROR, APPLICATION_ERROR = 1, 2  # sub-indices of 1029h
 FAULT_RESET = 0  # row of the firmware's causes
+SEGMENT_BITS = 135  # of a frame of eight bytes with its stuff bits
+# Section of the store, and its keys, of what LSS has stored; there is no object of index 0.
+LSS_SECTION, LSS_NODE_ID, LSS_BIT_RATE = "lss", (0, 1), (0, 2)
 
 
 class Node:
@@ -45,7 +51,8 @@ class Node:
     It is off until `power_on`.
 
     Args:
-        node_id: Number on the bus, 1...127; one that the store holds replaces it.
+        node_id: Number on the bus, 1...127; one that the store holds replaces it. 255 of a device with LSS: it has
+            none, and waits for one.
         drives: The emulated drives.
         first_axis: Number of the device's first axis among the drives'.
         send: Takes every frame that the node sends.
@@ -55,6 +62,8 @@ class Node:
         takes_time: Its firmware takes no more frames in a cycle than it can, the next wait in its receive buffer; from
             an NMT reset to the boot-up message it needs the device's time, deaf and mute, and so does an SDO answer.
         spare: Drives of the node's last axes, those that `drives` have none for.
+        has_room: Whether the controller's buffer takes another segment of a block upload.
+        serial: Serial number of a device whose data say where it stands; by default the node-ID.
 
     Raises:
         ValueError: For a number that no node can have, axes that the drives do not have, a bit rate that the device
@@ -79,10 +88,22 @@ class Node:
         bit_rate: int | None = None,
         takes_time: bool = False,
         spare: EmulatedDrives | None = None,
+        has_room: Callable[[], bool] = lambda: True,
+        serial: int | None = None,
     ) -> None:
         device = drives.device
-        if not 1 <= node_id <= 127:
-            raise ValueError(f"node {node_id} is impossible: CANopen has nodes 1 to 127")
+        services = device.canopen.services
+        if not (1 <= node_id <= 127 or (node_id == UNCONFIGURED and services.lss)):
+            none = "" if services.lss else f"; {device.name} has no LSS, so it needs one"
+            raise ValueError(
+                f"node {node_id} is impossible: CANopen has nodes 1 to 127" + (none if node_id == UNCONFIGURED else "")
+            )
+        self._serial = node_id if serial is None else serial
+        self._has_room = has_room
+        self._pending_node_id: int | None = None  # that LSS has configured since power-on
+        self._pending_bit_rate: int | None = None  # kbit/s
+        self._activated_bit_rate: int | None = None
+        self._clock = Clock()
         self._bus_bit_rate = None if bit_rate is None else known_bit_rate(device, bit_rate)
         self.node_id = self._given_id = node_id
         self.state = NmtState.INITIALISING
@@ -103,7 +124,7 @@ class Node:
         self._check_store(store)
         self._prepare_restart()
         self._restore_bus()
-        self._module.restore(self.node_id, {})
+        self._module.restore(self._factory_id, {})
 
         self._make_services(sorted({entry.index for entry in entries}))
         self._handlers: dict[int, tuple[Callable[[bytes, float], None], ...]] = {}
@@ -112,9 +133,11 @@ class Node:
         self._boot_time = device.canopen.boot_time if takes_time else 0.0
         self._boots_at: float | None = None  # while it boots
         self._boot: Callable[[float], None] = self._reset_communication
-        self._answers: deque[tuple[float, Frame]] = deque()  # of SDO, and when they are ready [s]
+        self._answers: deque[tuple[float, Frame]] = deque()  # of SDO and LSS, and when they are ready [s]
+        self._segment_at = math.inf  # when the next segment of a block upload may go [s]
         self._work = 0.0  # s that the present request takes
-        self._received: deque[Frame] = deque()
+        self._received: deque[tuple[Frame, float]] = deque()  # and when they came [s]
+        self._came = 0.0  # when the frame under way came [s]
         self._has_lost = False  # frames, since its receive buffer was last half empty
 
     def _take_axes(self, drives: EmulatedDrives, first_axis: int, spare: EmulatedDrives | None) -> None:
@@ -136,7 +159,14 @@ class Node:
     def _make_services(self, indices: Sequence[int]) -> None:
         """Make SDO server, emergencies, error control and the PDOs of the dictionary's indices."""
         device = self._device
-        self._sdo = SdoServer(self.dictionary.port, device.canopen.sdo_timeout)
+        services = device.canopen.services
+        self._sdo = SdoServer(
+            self.dictionary.port, device.canopen.sdo_timeout, services.block_size, services.longest_text
+        )
+        self._lss = LssSlave(self) if services.lss else None
+        self._sync_producer = SyncProducer()
+        self._window = SyncWindow()
+        self._time_producer = TimeProducer(services.time_period)
         self._emergency = EmergencyProducer(self._transmit, device.num_axes)
         self._told_last = 0  # axis of the last emergency
         self._module_told: dict[int, float] = {}  # row of a cause that is the module's -> when it was told
@@ -160,6 +190,8 @@ class Node:
         """Switch the device on, or off and on: stored values, boot-up, pre-operational."""
         self._now = now
         self._boots_at = None
+        self._pending_node_id = self._pending_bit_rate = self._activated_bit_rate = None
+        self._clock.power_on(now)
         self._reset_application(now)
 
     def receive(self, frame: Frame, now: float) -> None:
@@ -169,27 +201,51 @@ class Node:
             return
         if self._frames_left > 0 and not self._received:
             self._frames_left -= 1
+            self._came = now
             self._take(frame, now)
         elif len(self._received) < self._device.canopen.receive_buffer:
-            self._received.append(frame)
+            self._received.append((frame, now))
         elif not self._has_lost:
             self._has_lost = True
             self.overrun(now, "receive")
 
     @property
     def next_answer(self) -> float:
-        """When its next SDO answer is ready [s]; infinite while none is under way."""
-        return self._answers[0][0] if self._answers else math.inf
+        """When its next SDO answer, or segment of one, is ready [s]; infinite while none is under way."""
+        return min(self._answers[0][0], self._segment_at) if self._answers else self._segment_at
 
     def answer(self, now: float) -> None:
         """Send the SDO answers that are ready at `now` [s]."""
         self._now = now
         while self._answers and self._answers[0][0] <= now + EPSILON:
             self._transmit(self._answers.popleft()[1])
+        if self._segment_at <= now + EPSILON:
+            self._send_segments(now)
+
+    def _send_segments(self, now: float) -> None:
+        """Send what the bus takes of a block upload: a controller's buffer is filled no further than half."""
+        while self._has_room():
+            segment = self._sdo.next_segment(now)
+            if segment is None:
+                self._segment_at = math.inf
+                return
+            self._transmit(Frame(frames.SDO_RESPONSE + self.node_id, segment))
+            if self._takes_time:
+                break
+        self._segment_at = now + self._segment_time
+
+    @property
+    def _segment_time(self) -> float:
+        """Time from a segment to the next [s]: neither its firmware nor its bus is faster."""
+        if not self._takes_time:
+            return 0.0
+        return max(self._device.canopen.sdo_time, SEGMENT_BITS / (1e3 * (self._bit_rate or 1000)))
 
     def _accepts(self, frame: Frame) -> bool:
         """Return whether a frame passes the controller's filters."""
-        return frame.can_id == frames.ERROR_CONTROL + self.node_id if frame.rtr else frame.can_id in self._handlers
+        if frame.rtr:
+            return frame.can_id == frames.ERROR_CONTROL + self.node_id and self.node_id != UNCONFIGURED
+        return frame.can_id in self._handlers
 
     def _take(self, frame: Frame, now: float) -> None:
         if frame.rtr:  # the device supports remote frames for guarding alone
@@ -215,7 +271,8 @@ class Node:
         self._frames_left = self._frames_per_cycle
         while self._received and self._frames_left > 0:
             self._frames_left -= 1
-            self._take(self._received.popleft(), now)
+            frame, self._came = self._received.popleft()
+            self._take(frame, now)
         if len(self._received) < self._device.canopen.receive_buffer // 2:
             self._has_lost = False
         for consumer in self._consumers:
@@ -223,6 +280,20 @@ class Node:
                 self._lose("heartbeat", consumer.node_id, now)
         if self._guarding.is_lost(now):
             self._lose("guarding", 0, now)
+        self._produce(now)
+
+    def _produce(self, now: float) -> None:
+        """Send SYNC and TIME where this node makes them and they are due; its own SYNC is one to it, too."""
+        if not nmt.SERVICES[self.state].sdo:  # they live where SDO lives, and error control has its own times
+            return
+        if self._time_producer.is_due(now):
+            raw = self._module.value(communication.TIME_ID)
+            self._transmit(Frame(raw & frames.IDENTIFIER, time_of_day.encode(*self._clock.milliseconds(now))))
+        data = self._sync_producer.take(now)
+        if data is not None:
+            self._transmit(Frame(self._module.value(communication.SYNC_ID) & frames.IDENTIFIER, data))
+            self._came = now
+            self._on_sync(data, now)
 
     def after_cycle(self, now: float) -> None:
         """Do what is due after it: emergencies, event-driven PDOs, timers, heartbeat; the cycle ended at `now` [s]."""
@@ -260,7 +331,13 @@ class Node:
     def leds(self, error_counter: int = 0) -> Leds:
         """Return what its lamps show; `error_counter` is its controller's."""
         boots = self.state is NmtState.INITIALISING
-        return leds_of(self.state, not self._is_online and not boots, self._conditions, error_counter)
+        is_lss = self.node_id == UNCONFIGURED or (self._lss is not None and self._lss.is_configuring)
+        return leds_of(self.state, not self._is_online and not boots, self._conditions, error_counter, is_lss)
+
+    @property
+    def clock(self) -> Clock:
+        """Its clock, which TIME sets."""
+        return self._clock
 
     # --- conditions of the CAN controller -------------------------------------------------------------------------
     def bus_off(self, now: float) -> None:
@@ -270,7 +347,7 @@ class Node:
             return
         self._is_online = False
         self._received.clear()
-        self._answers.clear()
+        self._clear_answers()
         for axis in self._axes:
             axis.trip()
         self._react(COMMUNICATION_ERROR)
@@ -278,7 +355,7 @@ class Node:
     def bus_on(self, now: float) -> None:
         """Let the controller recover from bus-off; the node tells it as soon as its NMT state allows."""
         self._now = now
-        if self._is_online or self.state is NmtState.INITIALISING:
+        if self._is_online or self._boots_at is not None or self.state is NmtState.INITIALISING:
             return
         self._is_online = True
         self._raise("bus_off_recovered", now)
@@ -297,13 +374,7 @@ class Node:
     def _reset_application(self, now: float) -> None:
         """Start the module anew: bit rate and node ID that were stored, the axes' stored values, then communication."""
         self._restore_bus()
-        self._is_online = self._bus_bit_rate in (None, self.bit_rate)
-        if not self._is_online:
-            logger.warning(
-                "node %d has %d kbit/s stored and is off the bus, which has %d kbit/s; give the bus the node's bit "
-                "rate, or the node another store",
-                self.node_id, self.bit_rate, self._bus_bit_rate,
-            )  # fmt: skip
+        self._take_bit_rate("stored")
         self._restart_axes()
         self._reset_communication(now)
 
@@ -311,32 +382,80 @@ class Node:
         """Restore the stored values of the axes and start their firmware anew; the motors are off."""
         for objects, mask in self._sets:
             objects.restart(mask)
+        for axis in self._axes:
+            axis.forget_texts()
+
+    def _take_bit_rate(self, origin: str) -> None:
+        """Be on the bus if its bit rate is the node's."""
+        self._is_online = self._bus_bit_rate in (None, self.bit_rate)
+        if not self._is_online:
+            logger.warning(
+                "node %d has %d kbit/s %s and is off the bus, which has %d kbit/s; give the bus the node's bit "
+                "rate, or the node another store",
+                self.node_id, self.bit_rate, origin, self._bus_bit_rate,
+            )  # fmt: skip
 
     def _restore_bus(self) -> None:
         """Let bit rate and node ID that were stored become the active ones; never stored, they are the given ones."""
         objects, bus = self._device.canopen.objects, self._store.sections.get("bus")
-        factory = self._module.factory(self._given_id)
+        by_lss = self._store.sections.get(LSS_SECTION, {})  # stored later than "bus", which forgets it
+        factory = self._module.factory(self._factory_id)
         active = {"bit_rate": self._bus_bit_rate or 0, "node_id": self._given_id}
-        for role, given in (("bit_rate", self._bus_bit_rate), ("node_id", self._given_id)):
+        for role, given, lss_key in (
+            ("bit_rate", self._bus_bit_rate, LSS_BIT_RATE),
+            ("node_id", self._given_id, LSS_NODE_ID),
+        ):
             key = objects.get(role)
             if key is None:  # a device that keeps neither has what it was given
+                active[role] = by_lss.get(lss_key, active[role])
                 continue
             raw = given if bus is None and given is not None else (bus or {}).get(key, factory[key])
             assert isinstance(raw, int), "bit rate and node-ID are numbers"
-            active[role] = raw
+            active[role] = raw = by_lss.get(lss_key, raw)
             self._module.set(role, raw)
             self._module.set(f"active_{role}", raw)
         self._bit_rate, self.node_id = active["bit_rate"], active["node_id"]
+        if self._activated_bit_rate is not None:
+            self._bit_rate = self._activated_bit_rate
+        self._take_pending_node_id()
+
+    @property
+    def _factory_id(self) -> int:
+        """Node-ID of the factory's COB-IDs; of a node that has none it is of no account."""
+        return 1 if self._given_id == UNCONFIGURED else self._given_id
+
+    def _take_pending_node_id(self) -> bool:
+        """Let a node-ID that LSS has configured be the node's; return whether it was another one."""
+        before = self.node_id
+        if self._pending_node_id is not None:
+            self.node_id = self._pending_node_id
+            if "active_node_id" in self._device.canopen.objects:
+                self._module.set("active_node_id", self.node_id)
+        return self.node_id != before
 
     def _reset_communication(self, now: float) -> None:
-        """Bring the communication objects back, send the boot-up message and become pre-operational."""
+        """Bring the communication objects back, send the boot-up message and become pre-operational.
+
+        A node without a node-ID does not: it waits for LSS to give it one.
+        """
         self.state = NmtState.INITIALISING
+        if self._take_pending_node_id():
+            # Whoever commanded it, and watched it, knows it no more by its new number.
+            for axis in self._axes:
+                axis.trip()
         self._leaves_for_bootloader = False
         self._received.clear()
         self._close_sdo()
         self._emergency.clear()
         self._conditions.clear()
         self._guarding.reset()
+        self._window.forget()
+        self._sync_producer.restart()
+        if self._lss is not None:
+            self._lss.reset()
+        if self.node_id == UNCONFIGURED:
+            self._wait_for_node_id()
+            return
         self._module.restore(self.node_id, self._store.sections.get("communication", {}))
         for pdo in self._pdos.values():
             pdo.configure()
@@ -345,11 +464,22 @@ class Node:
             communication.CONSUMER_HEARTBEAT,
             communication.GUARD_TIME,
             communication.PRODUCER_HEARTBEAT,
+            communication.SYNC_ID,
+            communication.TIME_ID,
         ):
             self._configure(index)
         self._transmit(Frame(frames.ERROR_CONTROL + self.node_id, bytes((NmtState.INITIALISING,))))
         self._heartbeat.postpone(now)
         self.state = NmtState.PRE_OPERATIONAL
+
+    def _wait_for_node_id(self) -> None:
+        """Listen to LSS alone, and produce nothing."""
+        self._heartbeat.configure(0.0)
+        self._guarding.configure(0.0)
+        self._sync_producer.configure(0.0, 0)
+        self._time_producer.configure(False)
+        self._consumers = []
+        self._handlers = {lss.REQUEST: (self._on_lss,)}
 
     def _configure(self, index: int) -> None:
         """Let the service behind a communication object take over what was written."""
@@ -365,6 +495,16 @@ class Node:
         elif index in (communication.GUARD_TIME, communication.LIFE_TIME_FACTOR):
             life = module.value(communication.GUARD_TIME) * 1e-3 * module.value(communication.LIFE_TIME_FACTOR)
             self._guarding.configure(life)
+        elif index in (communication.SYNC_ID, communication.SYNC_PERIOD, communication.SYNC_OVERFLOW):
+            produces = module.services.sync_producer and module.value(communication.SYNC_ID) & frames.PRODUCE
+            period = module.value(communication.SYNC_PERIOD) * 1e-6 if produces else 0.0
+            self._sync_producer.configure(period, module.value(communication.SYNC_OVERFLOW))
+            self._window.configure(module.value(communication.SYNC_WINDOW) * 1e-6)
+        elif index == communication.SYNC_WINDOW:
+            self._window.configure(module.value(index) * 1e-6)
+        elif index == communication.TIME_ID:
+            produces = module.services.time_producer and module.value(index) & frames.PRODUCE
+            self._time_producer.configure(bool(produces))
         elif index in communication.PDO:
             is_mapping = index in communication.RPDO_MAPPING or index in communication.TPDO_MAPPING
             self._pdos[index - communication.TO_MAPPING if is_mapping else index].configure()
@@ -376,7 +516,12 @@ class Node:
             frames.NMT: [self._on_nmt],
             frames.SDO_REQUEST + self.node_id: [self._on_sdo],
         }
-        table.setdefault(self._module.value(communication.SYNC_ID) & frames.IDENTIFIER, []).append(self._on_sync)
+        if self._lss is not None:
+            table[lss.REQUEST] = [self._on_lss]
+        sync_id, time_id = self._module.value(communication.SYNC_ID), self._module.value(communication.TIME_ID)
+        table.setdefault(sync_id & frames.IDENTIFIER, []).append(self._on_sync)
+        if time_id & frames.CONSUME_TIME:
+            table.setdefault(time_id & frames.IDENTIFIER, []).append(self._on_time)
         for consumer in self._consumers:
             handler = partial(self._on_heartbeat, consumer)
             table.setdefault(frames.ERROR_CONTROL + consumer.node_id, []).append(handler)
@@ -413,13 +558,16 @@ class Node:
         self.state = NmtState.INITIALISING
         self._is_online = False
         self._received.clear()
-        self._answers.clear()
+        self._clear_answers()
         self._boots_at, self._boot = now + self._boot_time, boot
 
     def _enter(self, state: NmtState, *, is_commanded: bool = False) -> None:
         if state is self.state:
             return
+        if self.state is NmtState.STOPPED:
+            self._sync_producer.restart()
         self.state = state
+        self._window.forget()
         for received in self._rpdos:
             received.forget()
         if state is NmtState.OPERATIONAL:
@@ -443,36 +591,80 @@ class Node:
             return
         if answer is not None:
             frame = Frame(frames.SDO_RESPONSE + self.node_id, answer)
-            if self._takes_time and not self._leaves_for_bootloader:
-                begins = max(now, self._answers[-1][0]) if self._answers else now  # one request after the other
-                self._answers.append((begins + self._work, frame))
-            else:
+            if self._leaves_for_bootloader:
                 self._transmit(frame)
+            else:
+                self._answer(frame, now)
+        if self._sdo.block is not None:
+            self._send_segments(now)
         if self._leaves_for_bootloader:
             # The boot loader does not speak CANopen, and under it no firmware drives the motor: until power-on.
             self._is_online = False
             self.state = NmtState.INITIALISING
             self._restart_axes()
 
+    def _answer(self, frame: Frame, now: float) -> None:
+        """Send an answer, now or after the time that it takes."""
+        if not self._takes_time:
+            self._transmit(frame)
+            return
+        begins = max(now, self._answers[-1][0]) if self._answers else now  # one request after the other
+        self._answers.append((begins + self._work, frame))
+
     def _close_sdo(self) -> None:
         """Forget an open transfer, and the answers that are under way."""
         self._sdo.close()
+        self._clear_answers()
+
+    def _clear_answers(self) -> None:
         self._answers.clear()
+        self._segment_at = math.inf
+
+    def _on_lss(self, data: bytes, now: float) -> None:
+        assert self._lss is not None, "nobody else is called"
+        self._work = self._device.canopen.sdo_time
+        try:
+            answer = self._lss.request(data)
+        except PowerLostError:
+            self.power_on(now)
+            return
+        if answer is not None:
+            self._answer(Frame(lss.RESPONSE, answer), now)
+
+    def _on_time(self, data: bytes, now: float) -> None:
+        time = time_of_day.decode(data)
+        if time is not None and nmt.SERVICES[self.state].sdo:
+            self._clock.set(*time, self._came)
 
     def _on_sync(self, data: bytes, now: float) -> None:
-        # CiA 301: without or with a counter. This device's table of emergencies has none for another length (8240h).
+        # CiA 301: without or with a counter. Whoever has no 1019h takes both.
         if len(data) > 1 or not nmt.SERVICES[self.state].pdo:
             return
+        if self._module.has(communication.SYNC_OVERFLOW):
+            counts = self._module.value(communication.SYNC_OVERFLOW) != 0
+            if len(data) != counts:
+                self._tell_if_known("sync_length", now)
+                return
+            self._conditions.pop("sync_length", None)
+        self._window.open(self._came)
         for received in self._sync_rpdos:
             self._judge(received, received.latch(), now)
+        if self._window.is_over(now):  # so late was it looked at
+            return
+        counter = data[0] if data else None
         for sent in self._sync_tpdos:
-            sample = sent.on_sync()
+            sample = sent.on_sync(counter)
             if sample is not None and sent.can_id is not None:
                 self._transmit(Frame(sent.can_id, sample))
 
     def _on_rpdo(self, pdo: ReceivePdo, data: bytes, now: float) -> None:
-        if nmt.SERVICES[self.state].pdo:
-            self._judge(pdo, pdo.receive(data), now)
+        if not nmt.SERVICES[self.state].pdo:
+            return
+        if pdo.is_synchronous and self._window.is_over(self._came):
+            self._tell_if_known("sync_window_missed", now)
+            return
+        self._conditions.pop("sync_window_missed", None)
+        self._judge(pdo, pdo.receive(data), now)
 
     def _on_heartbeat(self, consumer: HeartbeatConsumer, data: bytes, now: float) -> None:
         if len(data) == 1:
@@ -493,7 +685,7 @@ class Node:
 
     def _raise(self, name: str, now: float, key: Hashable = None) -> None:
         """Tell of a condition of the bus, unless it is known already."""
-        condition = CONDITIONS[name]
+        condition = CONDITIONS.get(name) or OPTIONAL_CONDITIONS[name]
         key = name if key is None else key
         if self._conditions.get(key) is condition:
             return
@@ -504,6 +696,11 @@ class Node:
         self._emergency.push(emergency, self._error_register() | condition.error_register)
         self._history.add(emergency.code)
         self._flush(now)
+
+    def _tell_if_known(self, name: str, now: float) -> None:
+        """Tell of a condition that a device's table of emergencies may lack, since the standard leaves it open."""
+        if name in self._device.emergencies:
+            self._raise(name, now)
 
     def _tell_of(self, axis: Axis, queued: QueuedEmergency, now: float) -> None:
         """Pass an axis' emergency on, with the error register of its moment, and react to a fault."""
@@ -575,14 +772,21 @@ class Node:
         serial = canopen.objects.get("serial_number")
         if serial is not None:
             for objects, mask in self._sets:
-                objects.engrave(serial, self._given_id, mask)
+                objects.engrave(serial, self._serial, mask)
             module.readers[serial] = lambda: int(self._objects.read(serial)[self.first_axis])
+        module.readers[communication.STORE_EDS, 0] = self._eds_text
+        module.readers[communication.TIME_STAMP, 0] = lambda: self._clock.microseconds(self._now)
+        module.commands[communication.TIME_STAMP, 0] = lambda raw: self._clock.set_microseconds(raw, self._came)
         subs = module.subs(communication.ERROR_HISTORY)
         self._history = ErrorHistory(len(subs))
         if subs:
             for sub in (0, *subs):
                 module.readers[communication.ERROR_HISTORY, sub] = partial(self._history.read, sub)
             module.commands[communication.ERROR_HISTORY, 0] = self._history.write
+
+    def _eds_text(self) -> str:
+        """Return what 1021h holds, each byte a character: the EDS as it is, which 1022h says is not compressed."""
+        return self._device.eds.read_text(encoding="utf-8").encode().decode("latin-1")
 
     def _leave_for_bootloader(self) -> None:
         self._leaves_for_bootloader = True
@@ -606,6 +810,8 @@ class Node:
         self._commit({name: {} for name in names})
 
     def _commit(self, changed: dict[str, Section]) -> None:
+        if "bus" in changed and LSS_SECTION in self._store.sections:
+            changed[LSS_SECTION] = {}  # what is stored last counts
         self._work = self._device.canopen.store_time
         try:
             self._store.save(changed)
@@ -625,9 +831,93 @@ class Node:
             served.store(stored)
 
     def _check_store(self, path: Path | None) -> None:
-        for section in self._store.sections.values():
+        for name, section in self._store.sections.items():
             for (index, sub), raw in section.items():
                 try:
+                    if name == LSS_SECTION:
+                        self._check_lss((index, sub), raw)
+                        continue
                     check_limits(self._module.find(index, sub), raw)
                 except ObjectAccessError as error:
                     raise ValueError(f"{path} does not fit {self._device.name}: {error}; delete it") from error
+
+    def _check_lss(self, key: tuple[int, int], raw: int) -> None:
+        services = self._device.canopen.services
+        known = {LSS_NODE_ID: (*range(1, 128), UNCONFIGURED), LSS_BIT_RATE: services.lss_bit_rates}
+        if not services.lss or raw not in known.get(key, ()):
+            raise ObjectAccessError(VALUE_RANGE, f"LSS has stored nothing like {key[0]:04X}:{key[1]} = {raw}")
+
+    # --- what LSS asks for (drive_env/canopen/lss.py) -----------------------------------------------------------------
+    def identity(self) -> Identity:
+        """Return vendor, product, revision and serial number, 0 for what the device lacks."""
+        has = self._module.subs(communication.IDENTITY)
+        port = self.dictionary.port
+        parts = [port(communication.IDENTITY, sub).read() if sub in has else 0 for sub in (1, 2, 3, 4)]
+        return Identity(*(part if isinstance(part, int) else 0 for part in parts))
+
+    def active_node_id(self) -> int:
+        """Return its node-ID, 255 for none."""
+        return self.node_id
+
+    def pending_node_id(self) -> int:
+        """Return the node-ID that it has after the next reset."""
+        return self.node_id if self._pending_node_id is None else self._pending_node_id
+
+    def configure_node_id(self, node_id: int) -> None:
+        """Note the node-ID of after the next reset."""
+        self._pending_node_id = node_id
+
+    def configure_bit_rate(self, bit_rate: int) -> bool:
+        """Note a bit rate [kbit/s], if the device has it."""
+        try:
+            known_bit_rate(self._device, 1000 * bit_rate)
+        except ValueError:
+            return False
+        if bit_rate not in self._device.canopen.services.lss_bit_rates:
+            return False
+        self._pending_bit_rate = bit_rate
+        return True
+
+    def activate_bit_rate(self, delay: float) -> None:
+        """Stop the axes and fall silent; have the pending bit rate after `delay` [s], and speak after as long again."""
+        if self._pending_bit_rate is None:
+            return
+        for axis in self._axes:  # nobody can stop them over a bus whose nodes change their bit rate
+            axis.trip()
+        self._is_online = False
+        self._received.clear()
+        self._close_sdo()
+        self._activated_bit_rate = self._pending_bit_rate
+        if self._takes_time:  # in lockstep nothing does
+            self._boots_at, self._boot = self._now + 2.0 * delay, self._change_bit_rate
+        else:
+            self._change_bit_rate(self._now)
+
+    def _change_bit_rate(self, now: float) -> None:
+        assert self._activated_bit_rate is not None, "it was noted before"
+        self._bit_rate = self._activated_bit_rate
+        if "active_bit_rate" in self._device.canopen.objects:
+            self._module.set("active_bit_rate", self._bit_rate)
+        self._take_bit_rate("by LSS")
+
+    def store(self) -> int:
+        """Store node-ID and bit rate as they are pending."""
+        services = self._device.canopen.services
+        if not services.lss_stores:
+            return lss.STORE_UNSUPPORTED
+        bit_rate = self._pending_bit_rate or self._bit_rate
+        section = {LSS_NODE_ID: self.pending_node_id()}
+        if bit_rate in services.lss_bit_rates:
+            section[LSS_BIT_RATE] = bit_rate
+        self._work = self._device.canopen.store_time
+        try:
+            self._store.save({LSS_SECTION: section})
+        except OSError as error:
+            logger.warning("node %d cannot store what LSS has configured: %s", self.node_id, error)
+            return lss.STORE_FAILED
+        return lss.OK
+
+    def leave_configuration(self) -> None:
+        """Boot, if the node had no node-ID and now has one."""
+        if self.node_id == UNCONFIGURED and self.pending_node_id() != UNCONFIGURED:
+            self._restart(self._reset_communication, self._now)

@@ -105,6 +105,7 @@ class TransmitPdo(Pdo):
         super().configure()
         self._inhibit = self._objects.value(self.index, 3) * self._inhibit_unit
         self._period = self._objects.value(self.index, 5) * self._event_unit
+        self._start_value = self._objects.value(self.index, 6)
         self.start()
         if self.can_id is not None and self.can_id == before[0]:
             self._sent_at = before[1]  # the inhibit time of a PDO that stays on runs on
@@ -115,15 +116,25 @@ class TransmitPdo(Pdo):
         self._is_due = False
         self._sent_at = None
         self._syncs = 0
+        self._waits_for_start = self._start_value != 0
 
-    def on_sync(self) -> bytes | None:
-        """Return the data to send at this SYNC, None if there is nothing to send."""
+    def on_sync(self, counter: int | None = None) -> bytes | None:
+        """Return the data to send at this SYNC, None if there is nothing to send.
+
+        Args:
+            counter: The count in the SYNC, None of one without; the one with the SYNC start value (1800h:06) is the
+                first.
+        """
         if not self.is_synchronous or not len(self._mapped):
             return None
         if self.transmission_type == 0:
             data = self._mapped.pack()
             changed, self._seen = data != self._seen, data
             return data if changed else None
+        if self._waits_for_start and counter is not None:
+            if counter != self._start_value:
+                return None
+            self._waits_for_start = False
         self._syncs += 1
         if self._syncs < self.transmission_type:
             return None

@@ -13,6 +13,7 @@ from drive_env.commands.fault import fault
 from drive_env.commands.get import get, set_object
 from drive_env.commands.jog import jog
 from drive_env.commands.log import log, replay
+from drive_env.commands.lss import lss_app
 from drive_env.commands.monitor import monitor
 from drive_env.commands.motor import motor_app
 from drive_env.commands.names import list_names
@@ -47,6 +48,7 @@ PANELS = {
     "Frames": (("log", log), ("replay", replay)),
     "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("check-model", check_model)),
 }
+app.add_typer(lss_app, name="lss", rich_help_panel="Drives on a bus")
 app.add_typer(motor_app, name="motor", rich_help_panel="This installation")
 for panel, commands in PANELS.items():
     for name, function in commands:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from drive_env import cia402
 from drive_env.devices.gain_set import GainSet, load_gain_set
 from drive_env.devices.own_folder import BINDINGS, is_own_folder, naming, own_bindings, own_data
+from drive_env.devices.services import NodeQuirks, Services, node_quirks_of, services_of
 from drive_env.devices.variants import (
     check_rates,
     compose_eds,
@@ -97,6 +98,8 @@ class CanopenBehaviour(NamedTuple):
         load_signature: What 1011h wants to be written.
         bootloader_signature: What the bootloader's object wants to be written.
         store_groups: Sub-index of 1010h and 1011h -> sections that it stores and restores.
+        services: Parts of a node that it has beyond what every node has.
+        quirks: Where it differs from the standard.
     """
 
     sdo_timeout: float
@@ -113,6 +116,8 @@ class CanopenBehaviour(NamedTuple):
     load_signature: int
     bootloader_signature: int
     store_groups: dict[int, tuple[str, ...]]
+    services: Services = Services()
+    quirks: NodeQuirks = NodeQuirks()
 
 
 class MasterHints(NamedTuple):
@@ -447,6 +452,8 @@ def _canopen(data: dict[str, Any]) -> CanopenBehaviour:
         load_signature=data["load_signature"],
         bootloader_signature=data["bootloader_signature"],
         store_groups={int(sub): tuple(sections) for sub, sections in data["store_groups"].items()},
+        services=services_of(data),
+        quirks=node_quirks_of(data),
     )
 
 

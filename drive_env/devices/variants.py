@@ -4,7 +4,8 @@ A variant's `device.toml` names the device that it is a variant of (`variant_of`
 the same keys as there, and two tables. `[groups]` has records and arrays, `[objects]` entries, "index:sub" with what
 differs of the device's EDS; an entry that the device lacks has all of it:
 
-    name, type (u8 ... i32), access, default, low, high, unit, mappable   as the EDS has them; limits may be left out
+    name, access, default, low, high, unit, mappable   as the EDS has them; limits may be left out
+    type      u8 ... u32, i8 ... i32, text, bytes, domain
     field     field of the drive record that it is, in `unit`; without one a value that is stored
 """
 
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from drive_env import cia402
+from drive_env.devices.services import OPTIONAL_EMERGENCIES
 from drive_env.dictionary import units
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
@@ -30,7 +32,10 @@ from mechanics.untrusted import read_bytes
 Key = tuple[int, int]
 
 # Data types of CiA 301, table 44; codes of object types of CiA 306.
-TYPES = {"i8": 0x02, "i16": 0x03, "i32": 0x04, "u8": 0x05, "u16": 0x06, "u32": 0x07}
+TYPES = {
+    "i8": 0x02, "i16": 0x03, "i32": 0x04, "u8": 0x05, "u16": 0x06, "u32": 0x07,
+    "text": 0x09, "bytes": 0x0A, "domain": 0x0F,
+}  # fmt: skip
 VARIABLE, GROUPS = "0x7", {"array": "0x8", "record": "0x9"}
 # Keys of a row, and those of the EDS.
 _KEYS = {"name": "ParameterName", "access": "AccessType", "default": "DefaultValue", "low": "LowLimit",
@@ -76,11 +81,12 @@ def own_variant(path: Path, devices: Mapping[str, Mapping[str, Any]]) -> dict[st
         bases = [name for name, data in devices.items() if "variant_of" not in data]
         raise ValueError(f"{path}: variant_of is {of!r}; it names the device that differs a little: {', '.join(bases)}")
     base = devices[of]
+    base = _with_optional_rows(base)
     for table, value in own.items():
         if table in ("name", "title", "variant_of", "objects", "groups"):
             continue
         _check_like(f"{path}: {table}", value, base.get(table), base)
-    whole = merged(base, own)
+    whole = merged(devices[of], own)
     supply, current = whole["supply"], whole["current"]
     if not supply["undervoltage"] < supply["overvoltage"]:
         raise ValueError(
@@ -110,6 +116,14 @@ def _check_currents(path: Path, current: Mapping[str, float], base: Mapping[str,
     if sorted(values := [current[name] for name in names]) != values:
         told = [f"{name} = {value:g} A" for name, value in zip(names, values, strict=True)]
         raise ValueError(f"{path}: current.{told[0]}, {told[1]} and {told[2]} must come in this order: {meanings}")
+
+
+def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a device's data with the rows that it lacks and a variant may have, each as one of its kind is."""
+    emergencies, canopen = base["emergencies"], base["canopen"]
+    more = dict.fromkeys(OPTIONAL_EMERGENCIES, emergencies["fault_reset"])
+    objects = {"serial_number": "1018:4", **canopen["objects"]}
+    return {**base, "emergencies": {**more, **emergencies}, "canopen": {**canopen, "objects": objects}}
 
 
 def check_rates(rates: Mapping[str, float]) -> None:

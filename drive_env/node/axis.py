@@ -31,7 +31,8 @@ from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
 class ObjectPort(NamedTuple):
     """The way to one object: what it is, its value, the check of a new value, the write of a checked one.
 
-    `event` names what a write sets off, as in a binding.
+    `event` names what a write sets off, as in a binding. `write_text` takes a text or a domain, each byte of which is a
+    character; None where it cannot be written.
     """
 
     entry: Entry
@@ -39,6 +40,7 @@ class ObjectPort(NamedTuple):
     check: Callable[[int], None]
     write: Callable[[int], None]
     event: str = ""
+    write_text: Callable[[str], None] | None = None
 
 
 class QueuedEmergency(NamedTuple):
@@ -75,6 +77,7 @@ class Axis:
         self._scaler = self._place("position_scaler")[1]
         self._error_register = self._place("error_register")[1]
         self._ports: dict[tuple[int, int], ObjectPort] = {}
+        self._texts: dict[tuple[int, int], str] = {}  # that were written, until the firmware starts anew
 
     @property
     def state(self) -> int:
@@ -106,6 +109,10 @@ class Axis:
         """Set what a restart restores; the values are those of objects that exist, within their range."""
         self._objects.store(self.number, values)
 
+    def forget_texts(self) -> None:
+        """Bring texts back to the dictionary's, as a restart does."""
+        self._texts.clear()
+
     def trip(self) -> bool:
         """Take the axis from operation enabled into fault because its network is lost; return whether it was there."""
         firmware = self._device.firmware
@@ -120,6 +127,8 @@ class Axis:
     def _make_port(self, entry: Entry) -> ObjectPort:
         code = self._objects.codes.get((entry.index, entry.sub))
         check = self._checker(entry)
+        if entry.bits is None:
+            return self._text_port(entry, check)
         if code is None:
             write = self._scale_writer(entry) or self._unbound_writer(entry)
             return ObjectPort(entry, self._unbound_reader(entry), check, write)
@@ -144,6 +153,14 @@ class Axis:
                 refuse_same_mode(entry, raw)
 
         return check
+
+    def _text_port(self, entry: Entry, check: Callable[[int], None]) -> ObjectPort:
+        key, texts, dictionary = (entry.index, entry.sub), self._texts, self._unbound_reader(entry)
+
+        def read() -> int | str:
+            return texts[key] if key in texts else dictionary()
+
+        return ObjectPort(entry, read, check, self._unbound_writer(entry), "", lambda text: texts.update({key: text}))
 
     def _unbound_reader(self, entry: Entry) -> Callable[[], int | str]:
         objects, number = self._objects, self.number

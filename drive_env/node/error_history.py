@@ -36,6 +36,16 @@ CONDITIONS = {
 }
 
 
+# Of parts that a device may have (drive_env/devices/services.py); whose table of emergencies lacks them is silent.
+OPTIONAL_CONDITIONS = {
+    row.name: row
+    for row in (
+        ErrorCondition("sync_length", GENERIC | COMMUNICATION, True),  # until a good one comes
+        ErrorCondition("sync_window_missed", GENERIC | COMMUNICATION, True),
+    )
+}
+
+
 class ErrorHistory:
     """Object 1003h: the last errors, the newest first; code in the lower word, the axis above.
 

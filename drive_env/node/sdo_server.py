@@ -1,6 +1,7 @@
-"""The SDO server: expedited and segmented transfers (CiA 301, 7.2.4).
+"""The SDO server: expedited, segmented and block transfers (CiA 301, 7.2.4).
 
-A request and the time go in, the response comes out: eight bytes, or None where the protocol has no response.
+A request and the time go in, the response comes out: eight bytes, or None where the protocol has no response. The
+segments of a block upload are fetched one by one, by whoever knows when the bus takes them.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from drive_env.dictionary.aborts import (
+    CANNOT_BE_STORED,
+    OUT_OF_MEMORY,
     PROTOCOL_TIMED_OUT,
     TOGGLE_NOT_ALTERNATED,
     TOO_LONG,
@@ -20,6 +23,7 @@ from drive_env.dictionary.aborts import (
 from drive_env.dictionary.access import check_readable, check_writable
 from drive_env.dictionary.entries import Entry
 from drive_env.node.axis import ObjectPort
+from drive_env.node.block_transfer import HAS_SIZE, BlockDownload, BlockUpload, Received, is_initiate
 
 # Client command specifiers, bits 7...5 of the first byte.
 DOWNLOAD_SEGMENT, INITIATE_DOWNLOAD, INITIATE_UPLOAD, UPLOAD_SEGMENT, ABORT, BLOCK_UPLOAD, BLOCK_DOWNLOAD = range(7)
@@ -52,18 +56,38 @@ class SdoServer:
     Args:
         port: Finds an object by index and sub-index; raises ObjectAccessError.
         timeout: Time [s] after which an open transfer is given up.
+        block_size: Segments that it takes at a time in a block transfer; 0: it has none.
+        longest_text: Bytes of a string or domain that can be written; 0: none can.
+
+    Attributes:
+        block: The block transfer that is open, if there is one.
     """
 
-    def __init__(self, port: Callable[[int, int], ObjectPort], timeout: float) -> None:
+    def __init__(
+        self, port: Callable[[int, int], ObjectPort], timeout: float, block_size: int = 0, longest_text: int = 0
+    ) -> None:
         self._port = port
         self._timeout = timeout
+        self._block_size = block_size
+        self._longest_text = longest_text
         self._open: Transfer | None = None
+        self.block: BlockDownload | BlockUpload | None = None
+        self._block_port: ObjectPort | None = None  # of a block download
+        self._block_size_said: int | None = None
+        self._last = 0.0  # of a block transfer [s]
+        self._leftover = 0  # segment of a sub-block that was aborted: what follows it in turn is no request
 
     def request(self, data: bytes, now: float) -> bytes | None:
         """Return the response to a request that came at `now` [s]; a frame of other than 8 bytes is no request."""
         if len(data) != 8:
             return None
         specifier = data[0] >> 5
+        if self.block is not None:
+            if data[0] != ABORTED and self._is_of_block(self.block, data):
+                return self._go_on(self.block, data, now)
+            self.block = None
+        elif self._leftover and self._is_leftover(data):
+            return None
         if specifier == ABORT:
             self._open = None
             return None
@@ -76,18 +100,36 @@ class SdoServer:
                 return self._upload_segment(data, now)
             if specifier == DOWNLOAD_SEGMENT:
                 return self._download_segment(data, now)
+            if self._block_size and specifier in (BLOCK_UPLOAD, BLOCK_DOWNLOAD) and is_initiate(data):
+                self._open = None
+                return self._initiate_block(data, now)
         except ObjectAccessError as error:
             # Of a segment, which carries no multiplexor, it is the transfer's.
             is_segment = specifier in (DOWNLOAD_SEGMENT, UPLOAD_SEGMENT)
             multiplexor = self._open.multiplexor if is_segment and self._open else bytes(3) if is_segment else data[1:4]
             self._open = None
             return _abort(multiplexor, error.abort_code)
-        # Block transfer, which this server does not have, or a specifier that nobody has.
+        # Block transfer where the server has none, a step of one that is not open, or a specifier that nobody has.
         self._open = None
-        return _abort(data[1:4], UNKNOWN_COMMAND)
+        names_object = self._block_size == 0 or specifier not in (BLOCK_UPLOAD, BLOCK_DOWNLOAD)
+        return _abort(data[1:4] if names_object else bytes(3), UNKNOWN_COMMAND)
+
+    def next_segment(self, now: float) -> bytes | None:
+        """Return the next segment of a block upload, to be sent at `now` [s]; None where there is none to send."""
+        if not isinstance(self.block, BlockUpload):
+            return None
+        segment = self.block.next_segment()
+        if segment is not None:
+            self._last = now
+        return segment
 
     def expire(self, now: float) -> bytes | None:
         """Return the abort of a transfer whose client has been silent for too long, None as long as there is none."""
+        if self.block is not None:
+            if now - self._last < self._timeout - EPSILON:
+                return None
+            block, self.block = self.block, None
+            return _abort(block.multiplexor, PROTOCOL_TIMED_OUT)
         if self._open is None or now - self._open.last < self._timeout - EPSILON:
             return None
         multiplexor, self._open = self._open.multiplexor, None
@@ -95,19 +137,22 @@ class SdoServer:
 
     def close(self) -> None:
         """Forget an open transfer."""
-        self._open = None
+        self._open = self.block = None
+        self._leftover = 0
 
     # --- inside: upload is what the client reads ------------------------------------------------------------------
     def _initiate_upload(self, data: bytes, now: float) -> bytes:
         self._open = None
         port = self._port(data[1] | data[2] << 8, data[3])
         check_readable(port.entry)
-        content = encode(port.entry, port.read())
+        return self._begin_upload(port.entry, data[1:4], encode(port.entry, port.read()), now)
+
+    def _begin_upload(self, entry: Entry, multiplexor: bytes, content: bytes, now: float) -> bytes:
         size = len(content)
         if 1 <= size <= 4:
-            return bytes((EXPEDITED_UPLOAD | (4 - size) << 2,)) + data[1:4] + content + bytes(4 - size)
-        self._open = Transfer(port.entry, data[1:4], bytearray(content), True, now)
-        return bytes((SEGMENTED_UPLOAD,)) + data[1:4] + size.to_bytes(4, "little")
+            return bytes((EXPEDITED_UPLOAD | (4 - size) << 2,)) + multiplexor + content + bytes(4 - size)
+        self._open = Transfer(entry, multiplexor, bytearray(content), True, now)
+        return bytes((SEGMENTED_UPLOAD,)) + multiplexor + size.to_bytes(4, "little")
 
     def _upload_segment(self, data: bytes, now: float) -> bytes:
         transfer = self._transfer(data, now, is_upload=True)
@@ -127,13 +172,13 @@ class SdoServer:
         check_writable(entry)
         is_expedited, has_size = data[0] & 0x02, data[0] & 0x01
         if is_expedited:
-            size = 4 - (data[0] >> 2 & 0x03) if has_size else _size(entry)
-            _check_length(entry, size)
+            size = 4 - (data[0] >> 2 & 0x03) if has_size else _size(entry) or 4
+            self._check_length(entry, size)
             _store(port, data[4 : 4 + size])
         else:
             expected = int.from_bytes(data[4:8], "little") if has_size else None
             if expected is not None:
-                _check_length(entry, expected)
+                self._check_length(entry, expected)
             self._open = Transfer(entry, data[1:4], bytearray(), False, now, port, expected)
         return bytes((DOWNLOAD_CONFIRMED,)) + data[1:4] + bytes(4)
 
@@ -141,15 +186,93 @@ class SdoServer:
         transfer = self._transfer(data, now, is_upload=False)
         assert transfer.port is not None
         transfer.data += data[1 : 8 - (data[0] >> 1 & 0x07)]
-        if len(transfer.data) > _size(transfer.entry):
-            _check_length(transfer.entry, len(transfer.data))
+        if len(transfer.data) > self._room(transfer.entry):
+            self._check_length(transfer.entry, len(transfer.data))
         if data[0] & 0x01:
-            _check_length(transfer.entry, len(transfer.data))
+            self._check_length(transfer.entry, len(transfer.data), transfer.expected)
             _store(transfer.port, bytes(transfer.data))
             self._open = None
         toggle = transfer.toggle
         transfer.toggle ^= TOGGLE
         return bytes((SEGMENT_CONFIRMED | toggle,)) + bytes(7)
+
+    # --- block transfers ------------------------------------------------------------------------------------------
+    def _initiate_block(self, data: bytes, now: float) -> bytes:
+        port = self._port(data[1] | data[2] << 8, data[3])
+        entry = port.entry
+        self._last = now
+        if data[0] >> 5 == BLOCK_DOWNLOAD:
+            check_writable(entry)
+            self._block_size_said = int.from_bytes(data[4:8], "little") if data[0] & HAS_SIZE else None
+            if entry.bits is None or self._block_size_said is not None:
+                self._check_length(entry, self._block_size_said or 0)
+            self._block_port = port
+            self.block = BlockDownload(data, self._block_size, self._room(entry))
+            return self.block.initiated()
+        check_readable(entry)
+        content = encode(entry, port.read())
+        upload = BlockUpload(data, content)
+        if 0 < data[5] >= len(content):  # the protocol switch threshold: the client asks for the other protocol then
+            return self._begin_upload(entry, data[1:4], content, now)
+        self.block = upload
+        return upload.initiated()
+
+    @staticmethod
+    def _is_of_block(block: BlockDownload | BlockUpload, data: bytes) -> bool:
+        """Return whether a request goes on with the open block transfer; any other replaces it."""
+        return block.takes_segments or (data[0] >> 5 == block.specifier and not is_initiate(data))
+
+    def _go_on(self, block: BlockDownload | BlockUpload, data: bytes, now: float) -> bytes | None:
+        self._last = now
+        try:
+            if isinstance(block, BlockUpload):
+                if block.is_confirmed(data):
+                    self.block = None
+                    return None
+                return block.request(data)
+            answer = block.request(data)
+            if not isinstance(answer, Received):
+                return answer
+            port = self._block_port
+            assert port is not None
+            self._check_length(port.entry, len(answer.data), self._block_size_said)
+            _store(port, answer.data)
+        except ObjectAccessError as error:
+            self._leftover = block.position
+            self.block = None
+            return _abort(block.multiplexor, error.abort_code)
+        self.block = None
+        return block.ended()
+
+    def _is_leftover(self, data: bytes) -> bool:
+        """Return whether a frame is a segment that was on its way when its sub-block was aborted.
+
+        Its first byte might be that of a write, and its data name an object.
+        """
+        number = data[0] & 0x7F
+        if number != self._leftover + 1 or data[0] == ABORTED:
+            self._leftover = 0
+            return False
+        self._leftover = 0 if data[0] & 0x80 or number >= self._block_size else number
+        return True
+
+    def _room(self, entry: Entry) -> int:
+        """Return how many bytes an object takes at most."""
+        return self._longest_text if entry.bits is None else _size(entry)
+
+    def _check_length(self, entry: Entry, size: int, expected: int | None = None) -> None:
+        """Raise 0607xxxxh for data of another length [bytes] than the object's, or than the client announced."""
+        if entry.bits is None and self._longest_text:
+            if size > self._longest_text:
+                raise ObjectAccessError(
+                    OUT_OF_MEMORY, f"{entry.label} has room for {self._longest_text} bytes, not {size}"
+                )
+        else:
+            _check_length(entry, size)
+        if expected is not None and size != expected:
+            raise ObjectAccessError(
+                TOO_LONG if size > expected else TOO_SHORT, f"{size} bytes came, {expected} were announced"
+            )
 
     def _transfer(self, data: bytes, now: float, *, is_upload: bool) -> Transfer:
         """Return the open transfer that a segment belongs to, which proves that its client lives."""
@@ -186,6 +309,11 @@ def _check_length(entry: Entry, size: int) -> None:
 
 
 def _store(port: ObjectPort, content: bytes) -> None:
+    if port.entry.bits is None:
+        if port.write_text is None:
+            raise ObjectAccessError(CANNOT_BE_STORED, f"{port.entry.label} is a text that cannot be written")
+        port.write_text(content.decode("latin-1"))  # each byte a character, whatever it means
+        return
     raw = int.from_bytes(content, "little", signed=port.entry.signed)
     port.check(raw)
     port.write(raw)

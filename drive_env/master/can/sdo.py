@@ -1,7 +1,8 @@
 """The SDO client of one node: python-canopen's transfers on our port, with a time-out for each.
 
 What differs from python-canopen's client: the thread that waits also receives; answers that belong to an earlier
-transfer are passed over; a transfer ends when its node boots, which has forgotten it; an abort names its object.
+transfer are passed over; a transfer ends when its node boots, which has forgotten it; an abort names its object; many
+bytes go in blocks (block_transfer.py) where the node's server has them, which the first refusal tells.
 """
 
 from __future__ import annotations
@@ -9,20 +10,26 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import canopen
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
+from canopen.sdo.client import ReadableStream
 from canopen.sdo.client import SdoClient as CanopenClient
 
 from drive_env.canopen.frames import NMT, SDO_REQUEST, SDO_RESPONSE
-from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.aborts import UNKNOWN_COMMAND, UNSUPPORTED_ACCESS, ObjectAccessError
+from drive_env.master.can import block_transfer
+from drive_env.master.can.block_transfer import BLOCK_FROM, NoBlockTransferError
 from drive_env.master.can.port import Port
 from drive_env.master.errors import BusError, NoAnswerError, refused
 
 _ABORT = 0x80
 _INITIATE = (0x40, 0x60)  # upload and download responses that name their object, upper three bits
-_TIMED_OUT = 0x05040000
+_TIMED_OUT, _GENERAL = 0x05040000, 0x08000000
+_NO_BLOCKS = (UNKNOWN_COMMAND, UNSUPPORTED_ACCESS)  # what servers without block transfers answer
+BUSY_TIME = 0.5  # s for which a controller's buffer may be full of segments
 PRE_OPERATIONAL = 0x80  # NMT command (CiA 301, 7.2.8.3.1)
 PATIENT = 4.0  # times as long as usual is waited for what should not be left undone
 
@@ -43,6 +50,8 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._alive = alive
         self._answers: list[bytes] = []
         self._has_booted = False  # since the transfer under way began
+        self._has_blocks = True  # as far as is known
+        self._in_block = False  # every frame is of the block transfer under way
         self._object = (0, 0)
         self._timeout = 0.5
         self._turn = threading.RLock()  # one transfer at a time: the supervisor's thread looks at the drive, too
@@ -103,6 +112,8 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         Raises:
             BusError: If the bus does not take the frame.
         """
+        if self._in_block:  # or a server that takes segments would take it for one
+            self.abort(_GENERAL)
         self.send_request(struct.pack("<BHB", 0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0"))
 
     def forget(self) -> None:
@@ -122,8 +133,8 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._has_booted = False
         try:
             if data is None:
-                return bytes(self.upload(index, sub))
-            self.download(index, sub, data)
+                return self._read(index, sub)
+            self._write(index, sub, data)
             return b""
         except SdoAbortedError as error:
             raise refused(where, what, int(error.code)) from None
@@ -140,10 +151,79 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
                 "(in Python timeouts={index: seconds})"
             ) from None
 
+    def _read(self, index: int, sub: int) -> bytes:
+        """Read in segments what is short, and in blocks what the server says to be long."""
+        with ReadableStream(self, index, sub) as stream:
+            if stream.exp_data is not None or (stream.size or 0) < BLOCK_FROM or not self._has_blocks:
+                return bytes(stream.read())
+        self.abort(_GENERAL)  # of the transfer in segments
+        try:
+            initiated = self._begin_block(block_transfer.upload_request(index, sub), block_transfer.is_upload)
+        except NoBlockTransferError:
+            return self._read(index, sub)
+        with self._all_frames():
+            return block_transfer.read(self, initiated)
+
+    def _write(self, index: int, sub: int, data: bytes) -> None:
+        if len(data) >= BLOCK_FROM and self._has_blocks:
+            request = block_transfer.download_request(index, sub, len(data))
+            try:
+                initiated = self._begin_block(request, block_transfer.is_download)
+            except NoBlockTransferError:
+                pass
+            else:
+                with self._all_frames():
+                    block_transfer.write(self, initiated, data)
+                return
+        self.download(index, sub, data)
+
+    def _begin_block(self, request: bytes, is_begun: Callable[[bytes], bool]) -> bytes:
+        """Return the answer to a request that begins a block transfer.
+
+        Raises:
+            NoBlockTransferError: If the server has none; from now on it is not asked again.
+        """
+        try:
+            with self._all_frames():
+                answer = self.request_response(request)
+        except SdoAbortedError as error:
+            if error.code not in _NO_BLOCKS:
+                raise
+        except SdoCommunicationError:
+            if self._has_booted:
+                raise
+        else:
+            if is_begun(answer):
+                return answer
+            self.abort(UNKNOWN_COMMAND)
+        self._has_blocks = False
+        raise NoBlockTransferError
+
+    @contextmanager
+    def _all_frames(self) -> Iterator[None]:
+        """Take every frame of the server for one of this transfer: segments name no object."""
+        self._in_block = True
+        try:
+            yield
+        finally:
+            self._in_block = False
+
     # --- what python-canopen's transfers call -----------------------------------------------------------------------
     def send_request(self, request: bytes) -> None:
         """Send a request."""
         self._port.send(self.rx_cobid, bytes(request))
+
+    def send_patiently(self, request: bytes) -> None:
+        """Send a frame, and try again for a while: a controller's buffer may be full of those before."""
+        end = time.monotonic() + BUSY_TIME
+        while True:
+            try:
+                self.send_request(request)
+                return
+            except BusError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.001)
 
     def request_response(self, request: bytes) -> bytes:
         """Send a request and return the answer to it."""
@@ -183,6 +263,8 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
     def _is_ours(self, answer: bytes) -> bool:
         if len(answer) != 8:
             return False
+        if self._in_block:
+            return True
         index, sub = struct.unpack_from("<HB", answer, 1)
         if answer[0] == _ABORT:
             return (index, sub) in (self._object, (0, 0))  # some servers abort without naming the object

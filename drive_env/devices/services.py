@@ -1,0 +1,96 @@
+"""Parts of a CANopen node that a device has or lacks, and its quirks: the tables `services` and `quirks` of `canopen`.
+
+A table that is left out, and a key that is left out of it, is a part that the device lacks, or the standard's way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from mechanics.near_names import did_you_mean
+
+LSS_BIT_RATES = (1000, 800, 500, 250, 125, 50, 20, 10)  # kbit/s of CiA 305's table
+# Causes that a device's table of emergencies may have besides: SYNC of another length than 1019h says, and PDOs that
+# came later than 1007h allows.
+OPTIONAL_EMERGENCIES = ("sync_length", "sync_window_missed")
+BIT_30 = ("keep", "refuse", "store")
+
+
+class Services(NamedTuple):
+    """Parts of a node beyond what every node has; what a dictionary's objects ask for, they switch on by themselves.
+
+    1003h, 1007h, 1019h and 1012h with 1013h need no row here: the node has them where its EDS does.
+
+    Attributes:
+        block_size: Segments of a block SDO transfer that the server takes at a time, 1 to 127; 0: it has none.
+        longest_text: Bytes of a string or domain that it takes; 0: only numbers can be written.
+        sync_producer: Bit 30 of 1005h makes it produce SYNC, every 1006h.
+        time_producer: Bit 30 of 1012h makes it produce TIME.
+        time_period: Seconds between two TIME messages that it produces.
+        lss: It is a slave of the layer setting services (CiA 305).
+        lss_bit_rates: Bit rates [kbit/s] that LSS may set.
+        lss_stores: It keeps what LSS has set.
+    """
+
+    block_size: int = 0
+    longest_text: int = 0
+    sync_producer: bool = False
+    time_producer: bool = False
+    time_period: float = 1.0
+    lss: bool = False
+    lss_bit_rates: tuple[int, ...] = LSS_BIT_RATES
+    lss_stores: bool = True
+
+
+class NodeQuirks(NamedTuple):
+    """Where a node differs from the standard.
+
+    Attributes:
+        rpdo_bit_30: What comes of bit 30 in the COB-ID of an RPDO, which CiA 301 does not define there: "keep": what is
+            written is ignored, and it reads as the factory's; "refuse": a value with another bit 30 than the factory's
+            is refused with 06090030h; "store": it reads as it was written.
+        pdo_changes_while_on: A PDO's identifier and inhibit time can be written without setting its bit 31 before.
+    """
+
+    rpdo_bit_30: str = "keep"
+    pdo_changes_while_on: bool = False
+
+
+def services_of(data: Mapping[str, Any]) -> Services:
+    """Return the services of a device's table `canopen`; ValueError for a key or a value that cannot be."""
+    row = _known(data.get("services", {}), Services, "services")
+    found = Services(**{**row, "lss_bit_rates": tuple(row.get("lss_bit_rates", LSS_BIT_RATES))})
+    if not 0 <= found.block_size <= 127:
+        raise ValueError(f"canopen.services.block_size = {found.block_size} must be 1 to 127 segments, or 0 for none")
+    if found.longest_text < 0:
+        raise ValueError(f"canopen.services.longest_text = {found.longest_text} must be a number of bytes, or 0")
+    if not found.time_period > 0.0:
+        raise ValueError(f"canopen.services.time_period = {found.time_period:g} s must be above 0 s")
+    unknown = [rate for rate in found.lss_bit_rates if rate not in LSS_BIT_RATES]
+    if unknown:
+        raise ValueError(
+            f"canopen.services.lss_bit_rates: CiA 305 has no {', '.join(map(str, unknown))} kbit/s; it has "
+            f"{', '.join(map(str, LSS_BIT_RATES))}"
+        )
+    return found
+
+
+def node_quirks_of(data: Mapping[str, Any]) -> NodeQuirks:
+    """Return the quirks of a device's table `canopen`; ValueError for a key or a value that cannot be."""
+    found = NodeQuirks(**_known(data.get("quirks", {}), NodeQuirks, "quirks"))
+    if found.rpdo_bit_30 not in BIT_30:
+        raise ValueError(f"canopen.quirks.rpdo_bit_30 = {found.rpdo_bit_30!r} must be {', '.join(BIT_30)}")
+    return found
+
+
+def _known(row: Mapping[str, Any], kind: Any, table: str) -> dict[str, Any]:
+    """Return a table whose keys are those of a class, its values of their defaults' types."""
+    for key, value in row.items():
+        default = kind._field_defaults.get(key)
+        if default is None:
+            raise ValueError(f"canopen.{table} has no {key!r}{did_you_mean(key, kind._fields)}")
+        number = isinstance(default, float) and type(value) in (int, float)
+        if not number and type(value) is not (list if isinstance(default, tuple) else type(default)):
+            raise ValueError(f"canopen.{table}.{key} = {value!r} must be as {default!r} is")
+    return dict(row)
