@@ -6,13 +6,14 @@ import json
 
 import pytest
 
-from drive_env import EmulatedDrives
+from drive_env import EmulatedDrives, motion
 from drive_env.bus.wire import Wire
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.faults.bus_faults import DISTURBANCES, OF_ONE_NODE, BusFaults
 from drive_env.faults.schedule import Order, parse_order
 from drive_env.faults.table import FAULTS
+from drive_env.firmware.record import get_lanes
 from drive_env.node.store import Store
 
 NODE, MASTER = 5, 0x7F
@@ -24,9 +25,11 @@ FAST = 500_000  # pps: 458 rpm
 class Bus:
     """A world in virtual real time with one node, its faults, and a master that asks by SDO and sends heartbeats."""
 
-    def __init__(self, load="inertia", nodes=(NODE,), store=None, lockstep=False, seed=0, machines=1):
+    def __init__(
+        self, load="inertia", nodes=(NODE,), store=None, lockstep=False, seed=0, machines=1, device="tmcm1636"
+    ):
         self.world = World(lockstep=lockstep, wire=Wire(instant=lockstep, seed=seed))
-        self.drives = EmulatedDrives(load=load, num_machines=machines, num_threads=1)
+        self.drives = EmulatedDrives(device, load=load, num_machines=machines, num_threads=1)
         self.node = self.world.add(self.drives, nodes, store)[0]
         self.faults = BusFaults(self.world)
         self.carried: list[Frame] = []
@@ -355,6 +358,38 @@ def test_an_axis_of_a_machine_with_two_nodes_fails_alone():
         assert bus.drives.machine.supply.tolist() == [24.0, 30.0]
 
 
+@pytest.mark.parametrize("machines", ["inertia", "portal"])
+def test_a_fault_reaches_an_axis_of_a_module_with_several(machines):
+    """Three machines of one axis, or one machine of three: what is asked for of axis 1 is of axis 1 alone."""
+    count = 3 if machines == "inertia" else 1
+    with Bus(device="tmcm3313", load=machines, machines=count) as bus:
+        bus.fault("open_phase phase=1 axis=1")
+        bus.wait(0.002)
+        broken = get_lanes(bus.drives.inside.records, "open_b", 3)
+        assert broken.tolist() == [0, 1, 0]
+        number = bus.fault("supply_dip voltage=12 axis=2 duration=0.5")
+        bus.fault("open_phase phase=0")
+        bus.wait(0.002)
+        supply = bus.drives.machine.supply
+        assert (supply < 13.0).tolist() == [False, False, True]
+        assert get_lanes(bus.drives.inside.records, "open_a", 3).tolist() == [1, 1, 1], "without an axis: all"
+        assert [one.order.axis for one in bus.faults.listing()] == [1, 2, None]
+        bus.faults.clear(number)
+        bus.wait(0.002)
+        assert (bus.drives.machine.supply > 20.0).all()
+
+
+def test_an_axis_of_a_module_is_jammed_and_the_others_turn():
+    with Bus(device="tmcm3313", machines=3) as bus:
+        motion.enable(bus.drives, mode="pv")
+        bus.fault("jam axis=0")
+        bus.wait(0.01)
+        bus.drives.write(0x60FF, 51_200)
+        bus.wait(0.5)
+        turned = bus.drives.machine.rotor_angle
+        assert abs(turned[0]) < 0.05 and (turned[1:] > 1.0).all()
+
+
 def test_conditions_of_bus_faults_look_at_the_axes():
     with Bus() as bus:
         bus.fault("second_master when='speed > 40' at=0.4 duration=0.005 command=2")
@@ -390,6 +425,9 @@ def test_the_same_seed_disturbs_the_same_frames():
     ("bus_loss at=-1", "is not a whole number of communication cycles"),
     ("bus_loss duration=0.0001", "is not a whole number of communication cycles"),
     ("second_master node=5 command=1.5", "command=1.5 must be a whole number"),
+    ("encoder_stuck node=5 axis=1", "fault encoder_stuck: axis=1 must be 0 to 0 of node 5"),
+    ("encoder_stuck node=5 axis=0.5", "axis must be a whole number, not 0.5"),
+    ("node_reset node=5 axis=0", "is a fault of a bus or a node, not of an axis; leave axis out"),
 ])  # fmt: skip
 def test_a_mistake_is_told_and_schedules_nothing(text, message):
     with Bus(nodes=(5, 6), machines=2) as bus:

@@ -373,3 +373,9 @@ def test_each_node_tells_of_its_own_axes():
         assert [str(f) for f in last.take()] == ["08A  41 54 81 00 FF 00 00 00"]
         assert first.value(0x6041) & 0x6F == 0x27
         assert last.value(0x6041) & 0x4F == 0x08
+
+
+@pytest.mark.parametrize("name", sorted(CONDITIONS))
+def test_an_error_of_the_node_shows_its_class_in_1001h_beside_the_generic_bit(name):
+    """CiA 301: bit 0 for any error, bit 4 for communication; bit 5, of the profile, for a PDO not accepted."""
+    assert CONDITIONS[name].error_register == (0x21 if name == "pdo_not_accepted" else 0x11)

@@ -38,3 +38,8 @@ def test_an_interval_adds_its_parts_as_squares():
     found = interval(-2.0, 0.3, 0.2, "A", 1.2)  # 0.3, 0.4 and 1.2
     assert (found.value, found.unit) == (-2.0, "A")
     assert (found.low, found.high) == pytest.approx((-3.3, -0.7))
+
+
+def test_an_interval_without_what_no_repetition_shows_has_two_parts():
+    found = interval(2.0, 0.3, 0.2, "A")  # 0.3 and 0.4
+    assert (found.low, found.high) == pytest.approx((1.5, 2.5))

@@ -83,8 +83,8 @@ def test_a_fault_is_given_to_a_running_server_listed_and_cleared():
             told = json.loads(fault("--status", "--control", control, "--json").stdout)
             assert told == [
                 {
-                    "number": 2, "name": "payload_jump", "node": 1, "at": 100.0, "when": "", "duration": 0.5,
-                    "parameters": {"factor": 2.0}, "active": False,
+                    "number": 2, "name": "payload_jump", "node": 1, "axis": None, "at": 100.0, "when": "",
+                    "duration": 0.5, "parameters": {"factor": 2.0}, "active": False,
                 }
             ]  # fmt: skip
             assert fault("--clear", "all", "--control", control).exit_code == 0
@@ -200,11 +200,12 @@ def test_all_options_reach_the_server(control):
     served, calls = control
     given = fault(
         "babbling_node", "rate=100", "--at", 2, "--when", "speed > 3", "--duration", 0.5, "--node", 3,
-        "--control", served.port,
+        "--axis", 2, "--control", served.port,
     )  # fmt: skip
     assert (given.exit_code, given.stdout) == (0, "1\n")
     (order,) = calls.orders
-    assert (order.name, order.at, order.when, order.duration, order.node) == ("babbling_node", 2.0, "speed > 3", 0.5, 3)
+    assert (order.name, order.at, order.when, order.duration) == ("babbling_node", 2.0, "speed > 3", 0.5)
+    assert (order.node, order.axis) == (3, 2)
     assert order.parameters == {"rate": 100.0}
 
 

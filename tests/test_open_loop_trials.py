@@ -261,8 +261,8 @@ def test_commands_refuse_in_one_line_before_anything_moves(stepper, command, rea
     assert not list(Path(tmp_path).iterdir())
 
 
-def test_tracking_says_that_it_needs_a_measured_torque(stepper):
+def test_tracking_asks_no_stepper_for_a_current():
     from drive_env.envs.tracking import Tracking
 
-    with pytest.raises(ValueError, match=r"no torque actual value \(6077h\) .* take GainTuning"):
-        Tracking(1, device=stepper, motor=NAME, load="inertia")
+    with pytest.raises(ValueError, match=r"mode='cst': .* drives steppers, which are not asked for a current"):
+        Tracking(1, device="tmcm6212", load="inertia", mode="cst")

@@ -8,6 +8,8 @@ import pytest
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
+from drive_env.firmware.record import get_lanes
+from drive_env.motors import MOTORS
 
 RPM = 2.0 * math.pi / 60.0
 STAGE = """
@@ -72,14 +74,33 @@ def test_currents_are_counted_as_its_measuring_range_has_them(files):
     device, base = find_device(files[0]), find_device("tmcm1636")
     assert (device.current_full_scale, base.current_full_scale) == (50.0, 100.0)
     assert device.velocity_rate == base.velocity_rate
-    from drive_env.motors import MOTORS
-
     # The same gain is twice the integer in velocity P, and half of it in current P.
     own, known = (one.preset(MOTORS["re_40"]) for one in (device, base))
     assert own["Velocity Mode Settings.P_Parameter"] == pytest.approx(
         2 * known["Velocity Mode Settings.P_Parameter"], abs=1
     )
     assert own["Torque Mode Settings.Torque_P"] == pytest.approx(known["Torque Mode Settings.Torque_P"] / 2, abs=1)
+
+
+@pytest.mark.parametrize("base", ["tmcm6212", "tmcm3313"])
+def test_a_stepper_stage_of_ones_own_makes_the_current_that_it_has(tmp_path, base):
+    """One of 5.5 A, whose bridges detect a short at 12 A: a motor of 2.8 A rms gets its rated amplitude of 4 A."""
+    path = tmp_path / "stage.toml"
+    path.write_text(
+        f'title = "Stepper stage, 5.5 A"\nvariant_of = "{base}"\n'
+        "[current]\nfull_scale = 5.5\novercurrent = 12.0\nnominal = 5.5\n"
+    )
+    device, motor = find_device(str(path)), MOTORS["qsh5718_76"]
+    with EmulatedDrives(str(path), "inertia", motor, num_machines=device.num_axes, num_threads=1) as drives:
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, 51_200)
+        drives.advance(0.01)
+        assert (drives.read(0x6041) & 0x6F == 0x27).all()
+        run = get_lanes(drives.inside.records, "full_scale_current", device.num_axes)
+        steps = (drives.read(0x2003) + 1) // 8
+    assert run.tolist() == [5.5] * device.num_axes
+    amplitude = 5.5 * steps / 32
+    assert (amplitude <= motor.rated_current).all() and (amplitude > motor.rated_current - 5.5 / 32).all()
 
 
 @pytest.mark.parametrize(
@@ -94,6 +115,11 @@ def test_currents_are_counted_as_its_measuring_range_has_them(files):
         ('variant_of = "tmcm1636"\n[supply]\novervoltage = -5.0', "must be a number above 0"),
         ('variant_of = "tmcm1636"\n[supply]\novervoltage = 5.0', "undervoltage = 8 V must lie below"),
         ('variant_of = "tmcm1636"\n[current]\nnominal = 95.0', "must come in this order"),
+        (
+            'variant_of = "tmcm6212"\n[current]\nfull_scale = 6.0',
+            "current.nominal = 1.5 A, full_scale = 6 A and overcurrent = 3.6 A must come in this order: continuous "
+            "current, largest current, short detection",
+        ),
         ('variant_of = "tmcm1636"\n[rates]\nvelocity = 4000', "each must be a whole multiple of the next"),
         ('variant_of = "tmcm1636"\nsupply = 3', "supply is a table of undervoltage"),
     ],

@@ -1,5 +1,7 @@
 """Replay: an emulated machine plays the real one; what is told of the difference, and what the fit finds, is known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,8 @@ from drive_env import EmulatedDrives, motion
 from drive_env.commands.scope import write_table
 from drive_env.dictionary.entries import Entry
 from drive_env.envs.randomisation import Distributions
-from drive_env.trials.replay import Log, command_of, compare, fit, read_log, replay
+from drive_env.trials import replay as module
+from drive_env.trials.replay import Log, _candidates, command_of, compare, fit, read_log, replay
 
 TURN = 65536  # increments
 TRUTH = {"load.inertia": 2.4e-5, "load.coulomb": 4e-3}
@@ -227,3 +230,41 @@ def test_logs_that_cannot_be_replayed_are_refused(log):
         fit(machines(4), log, "two_mass", ["load.inertia"])
     with pytest.raises(ValueError, match=r"there is no log nowhere\.csv"):
         read_log("nowhere.csv")
+
+
+def rounds_of_a_fit(monkeypatch, count=200, **options):
+    """What a fit tries where the distance is known: how far a machine's share of chance is from the middle."""
+    tried = []
+
+    def candidates(*arguments):
+        tried.append(found := _candidates(*arguments))
+        return found
+
+    monkeypatch.setattr(module, "_candidates", candidates)
+    monkeypatch.setattr(module, "_give", lambda drives, values: np.ones(drives.num_machines, bool))
+    monkeypatch.setattr(
+        module, "_distances", lambda drives, log, settings: np.abs(tried[-1][:, 0] - 0.5) if tried else np.ones(count)
+    )
+    drives = SimpleNamespace(
+        num_machines=count,
+        machine=SimpleNamespace(
+            parameters={"load.inertia": np.full(count, 2e-5)}, set_all=lambda values: None, reset=lambda: None
+        ),
+    )
+    fit(drives, None, "two_mass", ["load.inertia"], **options)
+    return tried
+
+
+def test_a_fit_draws_its_next_round_around_the_best_tenth(monkeypatch):
+    """Of shares spread evenly from 0 to 1 those within 0.05 of the middle, spread by twice their own covariance."""
+    tried = rounds_of_a_fit(monkeypatch)
+    assert len(tried) == 4
+    first, second = np.sort(tried[0][:, 0]), tried[1][:, 0]
+    assert np.abs(first - (np.arange(200) + 0.5) / 200).max() <= 0.5 / 200
+    assert second.mean() == pytest.approx(0.5, abs=0.02)
+    assert second.std() == pytest.approx(np.sqrt(3.0) * 0.1 / np.sqrt(12.0), rel=0.2)
+
+
+def test_a_fit_never_draws_around_fewer_than_four(monkeypatch):
+    second = rounds_of_a_fit(monkeypatch, accept=1e-9, rounds=2)[1][:, 0]
+    assert second.std() == pytest.approx(np.sqrt(3.0) * 4 / 200 / np.sqrt(12.0), rel=0.5)

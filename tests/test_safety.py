@@ -114,6 +114,26 @@ def test_in_pp_the_target_counts_when_the_move_is_started(bus, drive):
             drives.write(0x6040, 0x5F)
 
 
+@pytest.mark.parametrize("word", [0x2F, 0x4F, 0x6F, 0x0F])
+def test_in_pp_what_sets_no_new_set_point_starts_nothing(bus, drive, word):
+    """Bit 4 alone starts a move (CiA 402); 5 and 6 say of one how it would be."""
+    with enabled(bus, Limits(position=(0, 1000)), mode="pp") as drives:
+        drives.write(0x607A, 2000)
+        drives.write(0x6040, word)
+        with pytest.raises(SafetyError, match="would lead to 2000"):
+            drives.write(0x6040, word | 0x10)
+
+
+def test_relative_moves_of_pp_add_up_by_their_starts_alone(bus):
+    """Bit 6 without bit 4, as between two starts, is no start: 100 and 100 more are 200."""
+    with enabled(bus, Limits(position=(-1000, 250)), mode="pp") as drives:
+        drives.write(0x607A, 100)
+        for word in (0x5F, 0x4F, 0x4F, 0x5F, 0x4F):
+            drives.write(0x6040, word)
+        with pytest.raises(SafetyError, match="would lead to 300"):
+            drives.write(0x6040, 0x5F)
+
+
 def test_rows_are_checked_before_the_first_is_sent(bus, drive):
     with enabled(bus, Limits(velocity=100), mode="csv") as drives:
         with pytest.raises(SafetyError, match="60FFh:00 Target velocity = -101"):

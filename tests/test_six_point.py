@@ -9,6 +9,7 @@ import pytest
 from stepper_rig import SMOOTH, build, lane
 
 from drive_env import motion
+from drive_env.firmware.record import set_lanes
 
 DT = 0.001
 INC = 51200.0 / (2.0 * math.pi)  # increments per rad
@@ -24,16 +25,23 @@ RAMPS = {
     "slow ramps alone": RAMP | {"v": 8_000},
     "end above velocity 1": RAMP | {"end": 15_000},
     "slow ramps left 0": RAMP | {"a1": 0, "d1": 0},
+    "a ramp to rest": RAMP | {"stop": 5_000},
+    "a ramp to rest from above velocity 1": RAMP | {"end": 15_000, "stop": 40_000},
+    "a ramp to rest alone": RAMP | {"end": 60_000, "stop": 30_000},
+    "no ramp to rest without an end velocity": RAMP | {"end": 0, "stop": 5_000},
 }
 
 
 def braking(ramp):
     """Return the parts of a braking from the largest speed as (from, to, rate), fastest first."""
-    v, low, end = ramp["v"], ramp["v1"], ramp["end"]
+    v, low, end, stop = ramp["v"], ramp["v1"], ramp["end"], ramp.get("stop", 0)
+    last = [(min(v, end), 0, stop)] if stop and end else []
+    if v <= end:
+        return last
     if low == 0 or end >= low:
-        return [(v, end, ramp["d"])]
+        return [(v, end, ramp["d"]), *last]
     parts = [(v, low, ramp["d"])] if v > low else []
-    return [*parts, (min(v, low), end, ramp["d1"] or ramp["d"])]
+    return [*parts, (min(v, low), end, ramp["d1"] or ramp["d"]), *last]
 
 
 def parts(ramp, distance):
@@ -65,6 +73,9 @@ def path(rows, t):
 def set_ramp(drives, ramps):
     for name, index in NAMES.items():
         drives.write(index, [ramp[name] for ramp in ramps])
+    # 2014h, which the bare drive has not.
+    stops = np.array([ramp.get("stop", 0) / INC for ramp in ramps])
+    set_lanes(drives.inside.records, "stop_deceleration", stops)
 
 
 def states(drives, cycles):
@@ -111,6 +122,33 @@ def test_a_move_too_short_for_its_speed_turns_in_the_middle():
     exact, _ = path([((peak - 1000) / ramp["a"], 1000, ramp["a"]), ((peak - 2000) / ramp["d"], peak, -ramp["d"])],
                     DT * np.arange(1, 801))  # fmt: skip
     assert np.max(np.abs(x[:, 0] - exact)) < 1e-4
+
+
+@pytest.mark.parametrize("stop", [0, 5_000])
+def test_a_short_move_begins_at_rest_where_the_start_velocity_could_not_be_braked(stop):
+    """From 4000 inc/s braking takes 100 increments and more: no overshoot, whichever ramp ends a move of 60."""
+    ramp = RAMP | {"v1": 0, "start": 4_000, "end": 2_000 if stop else 0, "stop": stop}
+    with build(parameters=SMOOTH) as drives:
+        set_ramp(drives, [ramp])
+        motion.enable(drives, mode="pp")
+        motion.start_move(drives, 60)
+        x, u = states(drives, 400)
+    assert x.max() <= 60 + 1e-4 and x[-1, 0] == pytest.approx(60, abs=1e-6)
+    rate = stop or ramp["d"]
+    peak = math.sqrt(60 / (0.5 / ramp["a"] + 0.5 / rate))
+    assert peak - ramp["a"] * DT <= u.max() <= peak + 1e-6
+
+
+@pytest.mark.parametrize("stop", [0, 5_000])
+def test_a_move_that_starts_faster_than_it_ends_comes_to_its_target(stop):
+    ramp = RAMP | {"start": 3_000, "end": 2_000 if stop else 0, "stop": stop}
+    with build(parameters=SMOOTH) as drives:
+        set_ramp(drives, [ramp])
+        motion.enable(drives, mode="pp")
+        motion.start_move(drives, 20_000)
+        x, u = states(drives, 3_000)
+    assert x.max() <= 20_000 + 1e-6 and x[-1, 0] == pytest.approx(20_000, abs=1e-6)
+    assert (u >= 0).all() and u[-1, 0] == 0.0
 
 
 def test_after_a_stop_the_axis_waits():

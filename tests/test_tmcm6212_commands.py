@@ -48,6 +48,8 @@ def test_objects_of_an_axis(bus):
     for words, says in (
         (("get", "2403", "--axis", 1), "2403h:00 Maximum current axis 2 is an object of axis 2, not of --axis 1"),
         (("get", "2003", "--axis", 6), "--axis 6: a tmcm6212 has 6 axes, from 0"),
+        (("monitor", "6064", "--axis", 6, "--duration", 0.1), "--axis 6: a tmcm6212 has 6 axes, from 0"),
+        (("scope", "6064", "--axis", -1, "--out", "there"), "--axis -1: a tmcm6212 has 6 axes, from 0"),
         (("jog", "1 rev/s", "--axis", 6), "--axis 6: a tmcm6212 has 6 axes, from 0"),
         (("jog", "1 rev/s", "--max-current", "1 A"), "--max-current: tmcm6212 has no current limit in amperes"),
     ):
@@ -77,6 +79,20 @@ def test_an_axis_that_is_jogged_to_its_limit_switch_stops_there(bus):
     assert -6.6 < place < -5.7, "turns; at 4 rev/s with 100 rev/s^2 it needs 0.08"
     assert (drives.read(0x6041) & 0x4F == 0x40).all()
     assert (drives.read(0x6064)[:5] == 0).all()
+
+
+def test_one_axis_is_watched(bus, tmp_path):
+    run, drives = bus
+    drives.write(0x2004, np.arange(AXES))
+    found = run("monitor", "2004", "6041", "--axis", 3, "--duration", 0.1, "--json")
+    assert found.exit_code == 0, found.output
+    assert json.loads(found.stdout.splitlines()[0])["2004:00"] == [3]
+    found = run("monitor", "2004", "--axis", 3, "--duration", 0.1)
+    assert "node 1 axis 3" in found.stdout and "axis 2" not in found.stdout
+    found = run("scope", "6064", "6041", "--axis", 4, "--duration", "0.02", "--out", tmp_path / "seen")
+    assert found.exit_code == 0, found.output
+    head, *rows = (tmp_path / "seen.csv").read_text(encoding="utf-8").splitlines()
+    assert head.count("6064h") == 1 and len(rows) == 20 and len(rows[0].split(",")) == 3
 
 
 @pytest.mark.slow

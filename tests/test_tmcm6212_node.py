@@ -280,13 +280,26 @@ def test_an_emergency_names_its_motor(wire, drives, axis):
     """)
 
 
-def test_the_enable_input_belongs_to_the_module(wire, drives):
+def test_the_enable_input_belongs_to_the_module_which_tells_of_it_once(wire, drives):
+    """Table 380 of the TMCM-3313 has FFh in place of the motor; CiA 301 has one emergency for one event."""
     enable(wire, (0, 3))
     drives.machine.enable_input = False
     wire.wait(1)
-    told = {str(frame) for frame in wire.take()}
-    assert told == {"085  41 54 81 00 FF 00 00 00"}
+    assert [str(frame) for frame in wire.take()] == ["085  41 54 81 00 FF 00 00 00"]
     assert states(wire) == [FAULT if axis in (0, 3) else DISABLED for axis in EACH]
+    drives.machine.enable_input = True
+    wire.wait(20)
+    for axis in (0, 3):
+        assert wire.download(0x6040 + PROFILE * axis, 0, 0x80, 2) == 0
+    wire.wait(1)
+    wire.take()
+    enable(wire, (3,))
+    wire.wait(2)
+    assert states(wire)[3] == ENABLED
+    wire.take()
+    drives.machine.enable_input = False
+    wire.wait(1)
+    assert [str(frame) for frame in wire.take()] == ["085  41 54 81 00 FF 00 00 00"], "once more: another event"
 
 
 # --- in real time -----------------------------------------------------------------------------------------------------

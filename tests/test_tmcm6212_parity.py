@@ -114,6 +114,32 @@ def fault(drives):
     yield drives.read(0x6041)
 
 
+def switch(drives, open_it):
+    """The shutdown switch of the module: each axis is told, whether one frame did so or six machines."""
+    motion.enable(drives, mode="pv")
+    drives.write("Target velocity", 1500 * EACH)
+    drives.advance(0.05)
+    open_it()
+    drives.advance(0.1)
+    return [(one.axis, one.code, one.extra) for one in drives.emergencies()]
+
+
+def test_the_shutdown_switch_is_told_of_each_axis():
+    with EmulatedDrives("tmcm6212", **machine("inertia")) as drives:
+        expected = switch(drives, lambda: setattr(drives.machine, "enable_input", False))
+    assert expected == [(axis, 0x5441, (0, 255, 0, 0, 0)) for axis in range(AXES)]
+    world = World(lockstep=True)
+    inside = EmulatedDrives("tmcm6212", **machine("inertia"))
+    world.add(inside, [1])
+    bus = WorldBus(world)
+    try:
+        with CanDrives("tmcm6212", bus=bus, pace="lockstep") as drives:
+            assert switch(drives, lambda: setattr(inside.machine, "enable_input", False)) == expected
+    finally:
+        bus.shutdown()
+        world.close()
+
+
 LOADS = {pp: "robot", six_point: "inertia", pv: "robot", csp: "robot", csv: "robot", homing: "belt", fault: "inertia"}
 SCRIPTS = {script.__name__: script for script in LOADS}
 

@@ -469,3 +469,52 @@ def test_a_configuration_takes_the_loads_own_task():
     assert TrackingConfig(load="cart_pendulum").mode == "csv"
     assert TrackingConfig(load="cart_pendulum", mode="cst").mode == "cst"
     assert TrackingConfig(load="fan").task.joint is None
+
+
+# --- steppers ---------------------------------------------------------------------------------------------------------
+STILL = {"inertia": 1, "belt": 1, "portal": 3}
+
+
+@pytest.mark.parametrize("load", STILL)
+@pytest.mark.parametrize("device", ["tmcm6212", "tmcm3313"])
+@pytest.mark.parametrize(("mode", "action"), [("csp", "offset"), ("csv", "offset"), ("csp", "direct")])
+def test_steppers_follow_and_tell_their_load_by_the_deviation(device, load, mode, action):
+    axes = STILL[load]
+    options = {"device": device, "load": load, "mode": mode, "action": action, "duration": 0.2, "speed": 1.0}
+    with tracking(2, **options) as lanes:
+        assert lanes.config.motor == "qsh4218_51"
+        assert lanes.single_action_space.shape == (axes,)
+        seen, _ = lanes.reset(seed=2)
+        for _ in range(200):
+            seen, reward, terminated, _, info = lanes.step(np.zeros((2, axes), np.float32))
+            if action == "offset":
+                assert not terminated.any(), info
+            if terminated.any():
+                break
+        assert np.isfinite(seen).all() and np.isfinite(reward).all()
+        drives = lanes.drives
+        assert (drives.read(0x606A) == 0).all()
+        if action == "offset":
+            lag = (drives.read(0x6062) - drives.read(0x6064)).reshape(2, axes) / 256.0  # full steps
+            np.testing.assert_allclose(seen[:, 4 : 8 * axes : 8], lag, atol=0.012)  # the sample is a cycle old
+            assert info["reward_terms"]["tracking"].min() > 0.9
+            assert 0.0 < np.abs(lag).max() < 1.0
+
+
+def test_a_stepper_that_loses_its_steps_ends_the_episode():
+    with tracking(2, device="tmcm6212", load="inertia", action="offset", speed=1.0) as lanes:
+        lanes.reset(seed=2)
+        for k in range(200):
+            if k == 20:
+                lanes.drives.machine.load_torque = np.array([0.0, -2.0])
+            _, _, terminated, _, info = lanes.step(np.zeros((2, 1), np.float32))
+            if terminated.any():
+                break
+        assert terminated.tolist() == [False, True]
+        assert info["fault"][1] == "following_error"
+
+
+def test_a_stepper_has_the_modes_and_speeds_that_suit_it():
+    config = TrackingConfig(device="tmcm3313", load="two_mass")
+    assert (config.mode, config.speed, config.motor) == ("csp", 5.0, "qsh4218_51")
+    assert TrackingConfig(load="two_mass").motor == "qbl4208"

@@ -169,6 +169,7 @@ class Node:
         self._time_producer = TimeProducer(services.time_period)
         self._emergency = EmergencyProducer(self._transmit, device.num_axes)
         self._told_last = 0  # axis of the last emergency
+        self._module_told: dict[int, float] = {}  # row of a cause that is the module's -> when it was told
         self._conditions: dict[Hashable, ErrorCondition] = {}
         self._heartbeat = HeartbeatProducer()
         self._guarding = NodeGuarding()
@@ -709,11 +710,23 @@ class Node:
         register = queued.error_register | self._error_register(without=axis)
         self._told_last = self._axes.index(axis)
         emergency = self._device.emergencies[cause.name].of_axis(self._told_last)
-        self._emergency.push(emergency, register)
-        self._history.add(emergency.code, self._told_last)
+        if not self._is_told_of_module(queued.row, now):
+            self._emergency.push(emergency, register)
+            self._history.add(emergency.code, self._told_last)
         if cause.reaction in (CUT, STOP) and queued.row != FAULT_RESET:
             self._flush(now)
             self._react(APPLICATION_ERROR)
+
+    def _is_told_of_module(self, row: int, now: float) -> bool:
+        """Return whether another axis has told of the same thing of the module in this cycle, and note it if not.
+
+        A switch of the whole module is one event for all of its axes, and CiA 301 wants one message for an event.
+        """
+        if not self._device.is_of_module(self._device.firmware.causes[row].name):
+            return False
+        told = self._module_told.get(row) == now
+        self._module_told[row] = now
+        return told
 
     def _react(self, error_class: int) -> None:
         """Do what 1029h says of an error that is detected in operational."""

@@ -32,6 +32,10 @@ def fault(
     node: Annotated[
         int | None, typer.Option("--node", "-n", help="Node that has the fault.", show_default="the only one")
     ] = None,
+    axis: Annotated[
+        int | None,
+        typer.Option("--axis", help="Axis of a node with several that has the fault, from 0.", show_default="all"),
+    ] = None,
     control: Annotated[int, typer.Option(help="Port of serve's --control.")] = CONTROL_PORT,
     table: Annotated[bool, typer.Option("--list", help="Print the table of faults, and stop.")] = False,
     status: Annotated[bool, typer.Option("--status", help="Print the faults that are active or scheduled.")] = False,
@@ -57,7 +61,7 @@ def fault(
         elif clear is not None:
             ask(control, f"clear {clear}")
         else:
-            given = {"at": at, "duration": duration, "node": node}
+            given = {"at": at, "duration": duration, "node": node, "axis": axis}
             words = [
                 str(name),
                 *(numbers or []),
@@ -99,6 +103,7 @@ def _print_status(faults: list[dict[str, Any]], as_json: bool) -> None:
         return
     for one in faults:
         where = "" if one["node"] is None else f" node {one['node']}"
+        where += "" if one["axis"] is None else f" axis {one['axis']}"
         given = "".join(f" {key}={value:g}" for key, value in one["parameters"].items())
         lasts = "permanent" if one["duration"] is None else f"for {one['duration']:g} s"
         state = "active" if one["active"] else "scheduled"

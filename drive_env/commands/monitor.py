@@ -9,6 +9,7 @@ import typer
 
 from drive_env import cia402
 from drive_env.commands.options import (
+    AxisOfNode,
     Bitrate,
     Channel,
     DeviceName,
@@ -17,6 +18,7 @@ from drive_env.commands.options import (
     Json,
     Nodes,
     Timeout,
+    axes_of_nodes,
     axis_name,
     check_time,
     connect,
@@ -41,6 +43,7 @@ def monitor(
     interface: Interface = None,
     channel: Channel = None,
     node: Nodes = None,
+    axis: AxisOfNode = None,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
     bitrate: Bitrate = None,
@@ -62,45 +65,51 @@ def monitor(
         with connect(interface, channel, node, device, eds, **options) as drives:
             known = drives.description.dictionary
             entries = [known.find(object_name(name)) for name in objects or default_objects(known, DEFAULT)]
+            axes = axes_of_nodes(drives, axis)
             end = time.monotonic() + (float("inf") if duration is None else duration)
             try:
                 if json:
-                    _lines(drives, entries, period, end)
+                    _lines(drives, axes, entries, period, end)
                 else:
-                    _table(drives, entries, period, end)
+                    _table(drives, axes, entries, period, end)
             except KeyboardInterrupt:
                 pass  # the usual end
 
 
-def _look(drives: BusDrives, entries: list[Any]) -> dict[Any, Any]:
-    return {entry: drives.read((entry.index, entry.sub)) for entry in entries}
+def _look(drives: BusDrives, axes: list[int], entries: list[Any]) -> dict[Any, Any]:
+    return {entry: [drives.read_axis(entry, axis) for axis in axes] for entry in entries}
 
 
-def _lines(drives: BusDrives, entries: list[Any], period: float, end: float) -> None:
+def _heard(drives: BusDrives, axes: list[int]) -> list[Any]:
+    """Return the emergencies of these axes, of all of a node those that tell none."""
+    return [message for message in drives.emergencies() if message.axis in axes]
+
+
+def _lines(drives: BusDrives, axes: list[int], entries: list[Any], period: float, end: float) -> None:
     start = time.monotonic()
     while True:
-        values = _look(drives, entries)
+        values = _look(drives, axes, entries)
         row: dict[str, Any] = {"t": round(time.monotonic() - start, 3)}
         row |= {f"{e.index:04X}:{e.sub:02X}": list(values[e]) for e in entries}
-        row["emergencies"] = [message._asdict() for message in drives.emergencies()]
+        row["emergencies"] = [message._asdict() for message in _heard(drives, axes)]
         print_json(row)
         if time.monotonic() + period > end:
             return
         time.sleep(period)
 
 
-def _table(drives: BusDrives, entries: list[Any], period: float, end: float) -> None:
+def _table(drives: BusDrives, axes: list[int], entries: list[Any], period: float, end: float) -> None:
     from rich.live import Live
 
     increments = increments_per_revolution(drives)
     emergencies: list[str] = []
     with Live(auto_refresh=False) as live:
         while True:
-            for message in drives.emergencies():
+            for message in _heard(drives, axes):
                 when = time.strftime("%H:%M:%S")
                 emergencies.append(f"{when}  {axis_name(drives, message.axis)}: {message.code:04X}h {message.name}")
             live.update(
-                _draw(drives, entries, _look(drives, entries), increments, emergencies[-5:], live.console.width),
+                _draw(drives, axes, _look(drives, axes, entries), increments, emergencies[-5:], live.console.width),
                 refresh=True,
             )
             if time.monotonic() + period > end:
@@ -110,8 +119,8 @@ def _table(drives: BusDrives, entries: list[Any], period: float, end: float) -> 
 
 def _draw(
     drives: BusDrives,
-    entries: list[Any],
-    values: Any,
+    axes: list[int],
+    values: dict[Any, Any],
     increments: list[float | None],
     emergencies: list[str],
     width: int,
@@ -121,11 +130,11 @@ def _draw(
 
     from drive_env.master.quantities import show
 
-    columns = [Column("object", "text"), *(Column(axis_name(drives, axis), "text") for axis in range(drives.num_axes))]
+    columns = [Column("object", "text"), *(Column(axis_name(drives, axis), "text") for axis in axes)]
     rows = []
-    for entry in entries:
+    for entry, found in values.items():
         cells = []
-        for axis, value in enumerate(values[entry]):
+        for axis, value in zip(axes, found, strict=True):
             if cia402.of_first_axis(entry.index) == cia402.STATUSWORD:
                 state = cia402.state_of(int(value))
                 name = "?" if state is None else state.name.lower().replace("_", " ")

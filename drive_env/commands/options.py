@@ -263,15 +263,22 @@ def axes_of(drives: BusDrives, entry: Entry, axis: int | None) -> list[int]:
     """
     known, key = drives.description, (entry.index, entry.sub)
     count = known.num_axes
-    if axis is not None and not 0 <= axis < count:
-        raise ValueError(f"--axis {axis}: a {known.name} has {count} axes, from 0")
-    parts = list(range(count)) if axis is None else [axis]
+    chosen = axes_of_nodes(drives, axis)
     if (found := known.of_further_axes().get(key)) is not None:
         if axis not in (None, found[1]):
             raise ValueError(f"{entry.label} is an object of axis {found[1]}, not of --axis {axis}; leave --axis out")
-        parts = [found[1]]
-    elif known.key(entry, 1) == key:
-        parts = [0]
+        return [node * count + found[1] for node in range(len(drives.nodes))]
+    if known.key(entry, 1) == key:
+        return [node * count for node in range(len(drives.nodes))]
+    return chosen
+
+
+def axes_of_nodes(drives: BusDrives, axis: int | None) -> list[int]:
+    """Return all axes, or the one that was asked for, of every node; ValueError for one that the nodes do not have."""
+    count = drives.description.num_axes
+    if axis is not None and not 0 <= axis < count:
+        raise ValueError(f"--axis {axis}: a {drives.description.name} has {count} axes, from 0")
+    parts = range(count) if axis is None else [axis]
     return [node * count + part for node in range(len(drives.nodes)) for part in parts]
 
 

@@ -12,6 +12,7 @@ import typer
 from drive_env.commands.options import (
     INTERRUPTED,
     REFUSED,
+    AxisOfNode,
     Bitrate,
     Channel,
     DeviceName,
@@ -20,6 +21,7 @@ from drive_env.commands.options import (
     Json,
     Nodes,
     Timeout,
+    axes_of_nodes,
     axis_name,
     check_free,
     check_writable,
@@ -59,6 +61,7 @@ def scope(
     interface: Interface = None,
     channel: Channel = None,
     node: Nodes = None,
+    axis: AxisOfNode = None,
     device: DeviceName = "tmcm1636",
     eds: Eds = None,
     bitrate: Bitrate = None,
@@ -88,9 +91,11 @@ def scope(
             known = drives.description.dictionary
             entries = [known.find(object_name(name)) for name in objects or default_objects(known, DEFAULT)]
             condition = None if trigger is None else _parse(trigger, known)
-            scales = increments_per_revolution(drives)
-            labels = [axis_name(drives, axis) for axis in range(drives.num_axes)]
-            rows, start, broken = _record(drives, entries, condition, scales, duration, before, wait)
+            axes = axes_of_nodes(drives, axis)
+            every_scale = increments_per_revolution(drives)
+            scales = [every_scale[k] for k in axes]
+            labels = [axis_name(drives, k) for k in axes]
+            rows, start, broken = _record(drives, axes, entries, condition, scales, duration, before, wait)
             _, late, worst = drives.total_timing
         if broken is not None and not len(rows[entries[0]]):
             raise broken
@@ -152,7 +157,7 @@ def _parse(text: str, known: Any) -> Trigger:
 
 
 def _fires(trigger: Trigger, values: Any, scales: list[float | None]) -> Any:
-    """Return in which rows the condition holds on any axis."""
+    """Return in which rows the condition holds on any of the axes."""
     import operator
 
     import numpy as np
@@ -167,10 +172,11 @@ def _fires(trigger: Trigger, values: Any, scales: list[float | None]) -> Any:
 
 
 class _Samples:
-    """Samples of objects at every SYNC: rows of each entry, (n, axes), as long as no other master is at work."""
+    """Samples of objects at every SYNC: rows of each entry, (n, len(axes)), as long as no other master is at work."""
 
-    def __init__(self, drives: BusDrives, entries: list[Any]) -> None:
+    def __init__(self, drives: BusDrives, axes: list[int], entries: list[Any]) -> None:
         self._drives = drives
+        self._axes = axes
         self._entries = list(dict.fromkeys(entries))
         self._others = drives.link.other_masters()
 
@@ -178,7 +184,7 @@ class _Samples:
         """Return no rows."""
         import numpy as np
 
-        return {entry: np.empty((0, self._drives.num_axes), np.int64) for entry in self._entries}
+        return {entry: np.empty((0, len(self._axes)), np.int64) for entry in self._entries}
 
     def record(self, seconds: float) -> dict[Any, Any]:
         """Return the next rows."""
@@ -192,7 +198,7 @@ class _Samples:
             raise
         self._drives.link.drain()
         self._others.check()
-        return {entry: trace[name] for entry, name in zip(self._entries, names, strict=True)}
+        return {entry: trace[name][:, self._axes] for entry, name in zip(self._entries, names, strict=True)}
 
     def complete(self, rows: dict[Any, Any], missing: int) -> tuple[dict[Any, Any], BaseException | None]:
         """Return these rows and as many more, or those that came before Ctrl-C or the loss of the bus, and which."""
@@ -215,6 +221,7 @@ class _Samples:
 
 def _record(
     drives: BusDrives,
+    axes: list[int],
     entries: list[Any],
     trigger: Trigger | None,
     scales: list[float | None],
@@ -225,10 +232,10 @@ def _record(
     """Return rows of each entry, the number of the row at which the trigger fired, and what broke the rest off."""
     count, keep = round(duration / 0.001), round(before / 0.001)
     if trigger is None:
-        samples = _Samples(drives, entries)
+        samples = _Samples(drives, axes, entries)
         rows, broken = samples.complete(samples.none(), count)
         return rows, 0, broken
-    samples = _Samples(drives, [*entries, trigger.entry])
+    samples = _Samples(drives, axes, [*entries, trigger.entry])
     rows, fired = _wait_for(trigger, samples, scales, keep, wait)
     begin, end = max(0, fired - keep), fired + count
     rows, broken = samples.complete(rows, end - len(rows[trigger.entry]))

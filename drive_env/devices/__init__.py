@@ -60,6 +60,11 @@ class EmergencyCode(NamedTuple):
         """Return it with the bytes that an axis of the node sends; one that tells no axis as it is."""
         return EmergencyCode(self.code, tuple(axis if byte == AXIS else byte for byte in self.extra))
 
+    @property
+    def tells_axis(self) -> bool:
+        """Whether a byte tells the number of the axis."""
+        return AXIS in self.extra
+
     def axis_told(self, extra: tuple[int, ...], num_axes: int) -> int | None:
         """Return the axis that received bytes tell, 0 where they tell none; None if they are another emergency's."""
         told = {sent for byte, sent in zip(self.extra, extra, strict=True) if byte == AXIS} or {0}
@@ -220,6 +225,11 @@ class Device(NamedTuple):
             if 0 <= axis < self.num_axes and offset.first + above <= offset.last:
                 return axis, offset.first + above
         return 0, index
+
+    def is_of_module(self, emergency: str) -> bool:
+        """Return whether an emergency is of all axes of a node: it tells none, though others of the device do."""
+        row = self.emergencies.get(emergency)
+        return row is not None and not row.tells_axis and any(one.tells_axis for one in self.emergencies.values())
 
     def is_shared(self, index: int) -> bool:
         """Return whether the axes of a node have an object in common; a drive with one axis shares nothing."""

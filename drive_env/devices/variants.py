@@ -93,12 +93,7 @@ def own_variant(path: Path, devices: Mapping[str, Mapping[str, Any]]) -> dict[st
             f"{path}: supply.undervoltage = {supply['undervoltage']:g} V must lie below supply.overvoltage = "
             f"{supply['overvoltage']:g} V"
         )
-    if not current["nominal"] <= current["overcurrent"] <= current["full_scale"]:
-        raise ValueError(
-            f"{path}: current.nominal = {current['nominal']:g} A, overcurrent = {current['overcurrent']:g} A and "
-            f"full_scale = {current['full_scale']:g} A must come in this order: continuous current, overcurrent "
-            "threshold, measuring range"
-        )
+    _check_currents(path, current, base["current"])
     try:
         check_rates(whole["rates"])
     except ValueError as error:
@@ -112,6 +107,23 @@ def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
     more = dict.fromkeys(OPTIONAL_EMERGENCIES, emergencies["fault_reset"])
     objects = {"serial_number": "1018:4", **canopen["objects"]}
     return {**base, "emergencies": {**more, **emergencies}, "canopen": {**canopen, "objects": objects}}
+
+
+def _check_currents(path: Path, current: Mapping[str, float], base: Mapping[str, float]) -> None:
+    """Raise ValueError for currents [A] that are out of order, by how the base's own follow each other.
+
+    A drive that measures its currents cannot see an overcurrent beyond its range; one whose bridges detect shorts, as
+    drives of steppers do, has its threshold above the largest current that it makes.
+    """
+    measures = base["overcurrent"] <= base["full_scale"]
+    names, meanings = (
+        (("nominal", "overcurrent", "full_scale"), "continuous current, overcurrent threshold, measuring range")
+        if measures
+        else (("nominal", "full_scale", "overcurrent"), "continuous current, largest current, short detection")
+    )
+    if sorted(values := [current[name] for name in names]) != values:
+        told = [f"{name} = {value:g} A" for name, value in zip(names, values, strict=True)]
+        raise ValueError(f"{path}: current.{told[0]}, {told[1]} and {told[2]} must come in this order: {meanings}")
 
 
 def check_rates(rates: Mapping[str, float]) -> None:

@@ -43,7 +43,7 @@ Integers = NDArray[np.int64]
 class GainTuningConfig:
     """Configuration of GainTuning.
 
-    load, device, motor, friction: As `EmulatedDrives` takes them.
+    load, device, motor, friction: As `EmulatedDrives` takes them; without a motor the device's usual one.
     gains: Which gains the action changes, of the device's: those of the TMCM-1636 are torque_p, torque_i, velocity_p,
         velocity_i, position_p. None is those of the velocity and the position loop.
     trials: Of an episode.
@@ -60,7 +60,7 @@ class GainTuningConfig:
 
     load: Any = "two_mass"
     device: str = "tmcm1636"
-    motor: str | Motor = "qbl4208"
+    motor: str | Motor | None = None
     friction: str = "stribeck"
     gains: tuple[str, ...] | None = None
     trials: int = 10
@@ -75,6 +75,8 @@ class GainTuningConfig:
 
     def __post_init__(self) -> None:
         known = find_device(self.device).gains
+        if self.motor is None:
+            object.__setattr__(self, "motor", find_device(self.device).default_motor)
         object.__setattr__(self, "gains", known.outer if self.gains is None else tuple(self.gains))
         for name in self.chosen:
             check_choice("a gain", name, known.names)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,9 @@ OBJECTS = {
     "cst": (cia402.TARGET_TORQUE, cia402.TORQUE_OFFSET),
 }
 SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
+# Of a stepper, which is not asked for a current: how far the rotor is behind its steps tells the torque.
+SAMPLED_OF_STEPPERS = (*SAMPLED[:3], cia402.POSITION_DEMAND)
+ENCODER, ENCODER_OFF = 0, -1  # of 606Ah
 WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "effort": 0.05, "smoothness": 0.05, "trip": 10.0}
 RATES = (500, 1000)
 ACTIONS = ("direct", "offset")
@@ -82,15 +85,21 @@ TASKS = {
     "inverted_pendulum": Task("csv", "hold", 5.0, 25.0, joint=1, fall=0.6),
 }
 OTHER = Task("cst", "moves", 1.0, 10.0)  # of every other load
+STEPPER_SPEED = 5.0  # rev/s of a stepper at most: beyond it torque falls
+
+
+def of_stepper(task: Task) -> Task:
+    """Return a task as a stepper can do it: by position in place of torque, at a speed at which it has torque."""
+    return replace(task, mode="csp" if task.mode == "cst" else task.mode, speed=min(task.speed, STEPPER_SPEED))
 
 
 @dataclass(frozen=True)
 class TrackingConfig:
     """Configuration of Tracking; None takes the load's own (TASKS).
 
-    load, device, motor, friction: As `EmulatedDrives` takes them.
+    load, device, motor, friction: As `EmulatedDrives` takes them; without a motor the device's usual one.
     mode: "csp", "csv" or "cst". None: csv for gantry, cart_pendulum and inverted_pendulum,
-        else cst.
+        else cst, of steppers csp. Steppers have no cst here.
     action: "direct": the action is the target, of a full scale: current limit, 1.25 times speed or amplitude.
         "offset": the target follows the profile, and the action is 60B0h, 60B1h or 60B2h besides, up to `offset` times
         that full scale. The profile of cst is the current that the commissioned inertia needs.
@@ -102,7 +111,7 @@ class TrackingConfig:
     trajectory, amplitude [rev], speed [rev/s]: What is followed, drawn anew in each episode. "hold": the start;
         "moves": to random places within the amplitude, with rests of up to 0.1 s; "sines": three sines of 0.5 to 5 Hz.
         None: hold, 5 rev and 25 rev/s for inverted_pendulum, else moves: two_mass 2 and 20, gantry 3 and 15,
-        cart_pendulum 5 and 15, every other load 1 and 10.
+        cart_pendulum 5 and 15, every other load 1 and 10; of steppers 5 rev/s at most.
     distributions: What else is drawn anew in each episode, as `randomisation.Distributions` takes it; None: noise
         alone, on the machine with its default parameters.
     stage: Of its curriculum, 0...1.
@@ -112,7 +121,7 @@ class TrackingConfig:
 
     load: Any = "two_mass"
     device: str = "tmcm1636"
-    motor: str | Motor = "qbl4208"
+    motor: str | Motor | None = None
     friction: str = "stribeck"
     mode: str | None = None
     action: str = "direct"
@@ -129,6 +138,8 @@ class TrackingConfig:
     num_threads: int | None = None
 
     def __post_init__(self) -> None:
+        if self.motor is None:
+            object.__setattr__(self, "motor", find_device(self.device).default_motor)
         task = self.task
         for name in ("mode", "trajectory", "amplitude", "speed"):
             if getattr(self, name) is None:
@@ -151,7 +162,8 @@ class TrackingConfig:
     @property
     def task(self) -> Task:
         """What the load's row says."""
-        return TASKS.get(self.load, OTHER) if isinstance(self.load, str) else OTHER
+        task = TASKS.get(self.load, OTHER) if isinstance(self.load, str) else OTHER
+        return of_stepper(task) if turns_steppers(find_device(self.device)) else task
 
     @property
     def cycles(self) -> int:
@@ -164,14 +176,22 @@ class TrackingConfig:
         return max(1, round(self.duration * self.rate))
 
 
-def _check_device(device: Device | None) -> None:
-    """Raise ValueError for drives that do not tell what is observed."""
+def turns_steppers(device: Device | None) -> bool:
+    """Return whether drives have a stepper's objects: positions in microsteps, no current limit in amperes."""
+    return device is not None and Role.FULL_STEPS in device.roles and Role.CURRENT_LIMIT not in device.roles
+
+
+def _check_device(device: Device | None, mode: str) -> None:
+    """Raise ValueError for drives that do not tell what is observed, or have no such mode."""
     if device is None or ((cia402.TORQUE_ACTUAL, 0) in device.bindings and Role.CURRENT_LIMIT in device.roles):
         return
-    raise ValueError(
-        f"{device.name} has no torque actual value (6077h) or no current limit, both of which Tracking observes and "
-        "rewards, as drives of steppers; take GainTuning, or a drive that has them"
-    )
+    if not turns_steppers(device):
+        raise ValueError(
+            f"{device.name} has no torque actual value (6077h) or no current limit, both of which Tracking observes "
+            "and rewards; take GainTuning, or a drive that has them"
+        )
+    if mode == "cst":
+        raise ValueError(f"mode='cst': {device.name} drives steppers, which are not asked for a current; take csp, csv")
 
 
 class Tracking(VectorEnvironment):
@@ -219,6 +239,10 @@ class Tracking(VectorEnvironment):
     | smoothness | g(change of the action, 1) | 0.05 |
     | trip | 1 in the step in which a drive tripped or the pole fell | 10, subtracted |
 
+    A stepper is observed by its encoder (606Ah = 0, written where the drives are emulated). Demand less position (6062h
+    - 6064h) stands for its torque actual value, a full step for its current limit: so far behind it gives the most
+    torque that it has; beyond two it loses steps, and 6065h trips.
+
     `terminated`: a drive tripped, its machine left physics, or the pole fell; `truncated`: time ran out.
 
     `info`: "reward_terms"; "parameters" of environments that begin, the true machine, not on a bus; "fault" once an
@@ -249,8 +273,13 @@ class Tracking(VectorEnvironment):
         reward: Reward | None = None,
         **options: Any,
     ) -> None:
+        if drives is not None and drives.device is not None:
+            options = {"device": drives.device.name, **options}
         self.config = configured(TrackingConfig, config, options)
-        _check_device(find_device(self.config.device) if drives is None else drives.device)
+        device = find_device(self.config.device) if drives is None else drives.device
+        _check_device(device, str(self.config.mode))
+        self._is_stepper = turns_steppers(device)
+        self._sampled = SAMPLED_OF_STEPPERS if self._is_stepper else SAMPLED
         self._owned = drives is None
         self.drives = self._new_drives(num_envs) if drives is None else drives
         try:
@@ -286,16 +315,21 @@ class Tracking(VectorEnvironment):
         bound = high.astype(np.float32)
         return Box(-bound, bound, dtype=np.float32), Box(-1.0, 1.0, (axes,), np.float32)
 
+    def _new_machines(self) -> RandomMachines | None:
+        """Return the emulated machines, as they are drawn; None on a bus, whose drives must tell what is observed."""
+        distributions, machine = self.config.distributions, self.drives.machine
+        if machine is not None:
+            return RandomMachines(machine.drives, Distributions.load(distributions or {"parameters": {}}))
+        if distributions is not None:
+            raise ValueError("distributions are of emulated machines; leave them out on a bus")
+        if self._is_stepper and (self.drives.read(cia402.SENSOR_SELECTION) == ENCODER_OFF).any():
+            raise ValueError("606Ah = -1: no encoder tells where these steppers are; write 606Ah = 0 if they have one")
+        return None
+
     def _prepare(self, sensor: Callable[[], ArrayLike] | None) -> None:
         config, drives, n = self.config, self.drives, self.num_envs
         machine = drives.machine
-        self._machines = None
-        if machine is not None:
-            self._machines = RandomMachines(
-                machine.drives, Distributions.load(config.distributions or {"parameters": {}})
-            )
-        elif config.distributions is not None:
-            raise ValueError("distributions are of emulated machines; leave them out on a bus")
+        self._machines = self._new_machines()
         self._sensor = sensor
         if self._has_sensor and sensor is None:
             if machine is None:
@@ -310,7 +344,7 @@ class Tracking(VectorEnvironment):
         scales[:, 0] = config.amplitude * per_turn
         counts = per_turn * per_increment(drives, cia402.VELOCITY_ACTUAL)
         scales[:, 1] = config.speed * counts
-        scales[:, 2] = drives.read(Role.CURRENT_LIMIT)
+        scales[:, 2] = per_turn / drives.read(Role.FULL_STEPS) if self._is_stepper else drives.read(Role.CURRENT_LIMIT)
         full = {"csp": 1.25 * scales[:, 0], "csv": 1.25 * scales[:, 1], "cst": scales[:, 2]}
         scales[:, 3] = full[str(config.mode)] * (1.0 if config.action == "direct" else config.offset)
         self._per_turn = per_turn.reshape(n, -1)[:, 0]
@@ -318,7 +352,7 @@ class Tracking(VectorEnvironment):
         target, offset = OBJECTS[str(config.mode)]
         play = (target,) if config.action == "direct" else (target, offset)
         self._acts_on_position = play[-1] == cia402.TARGET_POSITION
-        self._control = cyclic_control(drives, SAMPLED, play, config.cycles, CYCLE)
+        self._control = cyclic_control(drives, self._sampled, play, config.cycles, CYCLE)
         self._bus = BusDelays(n, 2 * cycle.LONGEST_DELAY)
         self._episodes = own = cycle.Episodes(
             lanes=np.zeros(n, cycle.LANE),
@@ -341,6 +375,7 @@ class Tracking(VectorEnvironment):
             ended=np.zeros((2, n), bool),
             kind=cycle.KINDS[str(config.mode), config.action == "direct"],
             fall=config.task.fall,
+            lags=int(self._is_stepper),
         )
         self._control.hooks = Hooks(cycle.act, cycle.observe, own)
         self._start = np.zeros(drives.num_axes, np.int64)
@@ -353,6 +388,7 @@ class Tracking(VectorEnvironment):
         if config.mode != "cst":
             return np.ones(drives.num_axes)
 
+        assert config.motor is not None
         motor = find_motor(config.motor)
         inertia = cycle.COMMISSIONED_INERTIA * motor.inertia
         return 1e3 * inertia / motor.torque_constant * 2.0 * np.pi / np.repeat(self._per_turn, self._axes)
@@ -365,17 +401,21 @@ class Tracking(VectorEnvironment):
         self._draw_references(mask)  # first, so that they are the same on a bus, where no machine is drawn
         if self._machines is not None:
             self._machines.redraw(self.rngs, mask, self.stage)
+            if self._is_stepper:
+                self.drives.write(cia402.SENSOR_SELECTION, ENCODER, where=axes)
             motion.enable(self.drives, mode=self.config.mode, where=axes)
         else:
             self._return_to_start(axes)
         self.drives.emergencies()
-        samples = np.stack([self.drives.read(name) for name in SAMPLED])
+        samples = np.stack([self.drives.read(name) for name in self._sampled])
         own = self._episodes
         own.origin[axes] = samples[1][axes]
         neutral = samples[1] if self._acts_on_position else np.zeros(len(axes), np.int64)
         own.last[axes] = 0.0
         # What is seen until the first sample comes: the drives at rest, of no cycle yet.
         seen = np.full((self.num_envs, len(SAMPLED) * self._axes + 1), -1.0)
+        if self._is_stepper:
+            samples[3] -= samples[1]
         seen[:, :-1] = samples.T.reshape(self.num_envs, -1)
         self._bus.reset(self._delays(), self.rngs, neutral.reshape(self.num_envs, -1), seen, mask)
         if self._sensor is not None:

@@ -55,7 +55,7 @@ class Episodes(Bundle):
 
     lanes: Lanes  # (n,)
     action: Vector  # -1...1, (axes,)
-    scales: Matrix  # amplitude [inc], speed [606Ch], current limit [mA], full scale of the action [raw], (axes, 4)
+    scales: Matrix  # amplitude [inc], speed [606Ch], torque [what is sampled], full scale of the action, (axes, 4)
     origin: Vector  # position at the episode's start [inc], (axes,)
     actions: Line  # raw values on their way to the drives, one for each of an environment's axes
     observations: Line  # status, position, velocity, torque of each axis on their way, and their cycle's number
@@ -64,7 +64,7 @@ class Episodes(Bundle):
     profile_scale: Vector  # raw units of the target per unit of the reference, (axes,)
     last: Matrix  # last action and the one before, (axes, 2)
     played: NumberCube  # written: with an offset the profile's set-points, then the actions', (1 or 2, cycles, axes)
-    sampled: NumberCube  # statusword, position, velocity, torque, (4, cycles, axes)
+    sampled: NumberCube  # statusword, position, velocity, torque or position demand, (4, cycles, axes)
     angles: Vector  # the pendulums' [rad], (n,)
     weights: Vector  # of TERMS
     observation: Annotated[NDArray[np.float32], types.float32[:, ::1]]  # written, (n, entries)
@@ -72,6 +72,7 @@ class Episodes(Bundle):
     terms: Matrix  # written, (terms, n)
     ended: Annotated[NDArray[np.bool_], types.boolean[:, ::1]]  # written: terminated and truncated, (2, n)
     kind: int  # a row of KINDS
+    lags: int  # 1: the torque is told by how far the axis is behind its demand, as a stepper's is
     fall: float  # angle that ends an episode [rad]
 
 
@@ -122,6 +123,12 @@ def position_error(reference, position, origin):
     return error - 4294967296.0 * np.floor((error + 2147483648.0) / 4294967296.0)
 
 
+@inlined
+def torque(lags, fourth, position):
+    """Return what tells the torque: a torque actual value, or the demand less the position [inc]."""
+    return position_error(fourth, position, 0.0) if lags == 1 else float(fourth)
+
+
 @stage
 def describe(own, k):
     """Write the observation of environment k, from the samples that have come by now."""
@@ -135,13 +142,13 @@ def describe(own, k):
         axis = k * axes + a
         amplitude, speed = scales[axis, 0], scales[axis, 1]
         error = position_error(reference[k, 0, at], held[k, 4 * a + 1], origin[axis])
-        velocity, torque = held[k, 4 * a + 2], held[k, 4 * a + 3]
+        velocity, felt = held[k, 4 * a + 2], held[k, 4 * a + 3]
         row = 8 * a
         observation[k, row] = limited(error / amplitude, AXIS_HIGH[0])
         observation[k, row + 1] = limited((reference[k, 1, at] - velocity) / speed, AXIS_HIGH[1])
         observation[k, row + 2] = limited((reference[k, 0, at] - error) / amplitude, AXIS_HIGH[2])
         observation[k, row + 3] = limited(velocity / speed, AXIS_HIGH[3])
-        observation[k, row + 4] = limited(torque / scales[axis, 2], AXIS_HIGH[4])
+        observation[k, row + 4] = limited(felt / scales[axis, 2], AXIS_HIGH[4])
         observation[k, row + 5] = limited(reference[k, 1, at] / speed, AXIS_HIGH[5])
         observation[k, row + 6] = limited(reference[k, 1, soon] / speed, AXIS_HIGH[6])
         observation[k, row + 7] = last[axis, 0]
@@ -179,8 +186,10 @@ def observe(address, first, count):
         at = min(begun + cycles - 1, length - 1)
         for c in range(cycles):
             for a in range(axes):
-                for sample in range(4):
-                    message[k, 4 * a + sample] = sampled[sample, c, k * axes + a]
+                axis = k * axes + a
+                for sample in range(3):
+                    message[k, 4 * a + sample] = sampled[sample, c, axis]
+                message[k, 4 * a + 3] = torque(own.lags, sampled[3, c, axis], sampled[1, c, axis])
             message[k, 4 * axes] = begun + c
             pass_on(observations, k, message[k, :width], True)
         c = cycles - 1
@@ -190,7 +199,8 @@ def observe(address, first, count):
             error = position_error(reference[k, 0, at], float(position), origin[axis])
             tracking += tolerance(error / scales[axis, 0], TRACKING_MARGIN)
             slow += tolerance((reference[k, 1, at] - velocity) / scales[axis, 1], SPEED_MARGIN)
-            effort += tolerance(sampled[3, c, axis] / scales[axis, 2], EFFORT_MARGIN)
+            felt = torque(own.lags, sampled[3, c, axis], sampled[1, c, axis])
+            effort += tolerance(felt / scales[axis, 2], EFFORT_MARGIN)
             smooth += tolerance(last[axis, 0] - last[axis, 1], SMOOTHNESS_MARGIN)
         fallen = abs(angles[k]) > own.fall
         lane.fallen = 1 if fallen else 0

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drive_env.bus.faults import Faults
 from drive_env.bus.world import CYCLE, World
@@ -85,10 +86,12 @@ class BusFaults:
         """Schedule a fault of the bus, or of a node and its machine; return its number.
 
         Args:
-            order: What is asked for; `node` is needed where there are several and the fault is of one.
+            order: What is asked for; `node` is needed where there are several and the fault is of one, and `axis` may
+                say which axis of it.
 
         Raises:
-            ValueError: For a fault, parameter, time, condition or node that is none, or that this machine cannot have.
+            ValueError: For a fault, parameter, time, condition, node or axis that is none, or that this machine cannot
+                have.
         """
         row = find_fault(order.name)
         given = checked_parameters(row, order.parameters)
@@ -96,11 +99,13 @@ class BusFaults:
         delay, length = cycles_of(order, row, partial(whole_cycles, cycle=CYCLE))
         is_of_wire = row.group == "bus" and row.name not in OF_ONE_NODE
         node = order.node if is_of_wire and order.node is None else self._node_of(order)
+        is_of_machine = not is_of_wire and row.name not in OF_ONE_NODE
+        self._check_axis(order, is_of_machine, node)
         with self._lock:
-            if not is_of_wire and row.name not in OF_ONE_NODE:
+            if is_of_machine:
                 assert node is not None
                 # Refused here if the machine refuses it; the world's own thread gives it to the machine.
-                self._drives_of(node).inside.faults.check(order)
+                self._drives_of(node).inside.faults.check(replace(order, axis=None))
             self._next_number += 1
             fault = _BusFault(self._next_number, order, row, given, condition, node, delay, length)
             self._faults.append(fault)
@@ -186,7 +191,7 @@ class BusFaults:
             return any(bool(axes_that_fulfil(fault.condition, drives).any()) for drives in self._world.drives)
         node = self._emulated(fault.node)
         met = axes_that_fulfil(fault.condition, node.drives)
-        return bool(met[node.first_axis : node.first_axis + node.drives.device.num_axes].any())
+        return bool(met[self._axes_of(fault.node)].any())
 
     def _is_over(self, fault: _BusFault, now: int) -> bool:
         if fault.row.once:
@@ -216,16 +221,36 @@ class BusFaults:
             fault.inner = self._give_to_machine(fault, node)
 
     def _give_to_machine(self, fault: _BusFault, number: int) -> int:
-        """Let the machine of a node have a fault; of sensors, motor and supply it is of the node's own axis."""
+        """Let the machines of a node have a fault: on the axis that is asked for, or on all that they are of.
+
+        Without an axis, faults of sensors, motor and supply are of the node's own axes, those of the load of all that
+        its machines have.
+        """
+        node, order = self._emulated(number), fault.order
+        drives = node.drives
+        chosen = self._axes_of(number)
+        if order.axis is not None:
+            chosen &= np.arange(len(chosen)) == node.first_axis + order.axis
+        machines: NDArray[np.bool_] = np.logical_or.reduce(chosen.reshape(-1, drives.load.num_axes), axis=1)
+        of_axis = order.axis is not None or fault.row.group in ("sensor", "motor", "supply")
+        return drives.inside.faults.add(replace(order, axis=None), machines, chosen if of_axis else None)
+
+    def _axes_of(self, number: int) -> NDArray[np.bool_]:
+        """Return which of the drives' axes are a node's, shape (num_axes,); those without a motor are none of them."""
         node = self._emulated(number)
-        drives, order = node.drives, fault.order
-        machine, axis = divmod(node.first_axis, drives.load.num_axes)
-        where = np.arange(drives.num_machines) == machine
-        of_axis = fault.row.group in ("sensor", "motor", "supply")
-        return drives.machine.fault(
-            order.name, at=order.at, when=order.when, duration=order.duration, where=where,
-            axis=axis if of_axis else None, **order.parameters,
-        )  # fmt: skip
+        axes = np.arange(node.drives.num_axes) - node.first_axis
+        of_node: NDArray[np.bool_] = (axes >= 0) & (axes < node.drives.device.num_axes)
+        return of_node
+
+    def _check_axis(self, order: Order, is_of_machine: bool, node: int | None) -> None:
+        """Raise ValueError for an axis that the node has not, or of a fault that is of none."""
+        if order.axis is None:
+            return
+        if not is_of_machine or node is None:
+            raise ValueError(f"fault {order.name} is a fault of a bus or a node, not of an axis; leave axis out")
+        count = int(self._axes_of(node).sum())
+        if not 0 <= order.axis < count:
+            raise ValueError(f"fault {order.name}: axis={order.axis} must be 0 to {count - 1} of node {node}")
 
     def _go_on(self, fault: _BusFault, now: int) -> None:
         wire, name, given = self._world.wire, fault.row.name, fault.given

@@ -129,6 +129,6 @@ def _number(text: str) -> int:
 def _told(fault: Any) -> dict[str, Any]:
     order = fault.order
     return {
-        "number": fault.number, "name": order.name, "node": fault.node, "at": order.at, "when": order.when,
-        "duration": order.duration, "parameters": order.parameters, "active": fault.is_active,
+        "number": fault.number, "name": order.name, "node": fault.node, "axis": order.axis, "at": order.at,
+        "when": order.when, "duration": order.duration, "parameters": order.parameters, "active": fault.is_active,
     }  # fmt: skip

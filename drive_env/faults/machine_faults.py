@@ -114,8 +114,14 @@ class MachineFaults:
         self._jam = np.zeros(drives.num_axes)
 
     # --- giving, listing, taking back -----------------------------------------------------------------------------
-    def add(self, order: Order, machines: Mask) -> int:
-        """Schedule a fault and return its number; `Machines.fault` says what an order holds."""
+    def add(self, order: Order, machines: Mask, of_node: Mask | None = None) -> int:
+        """Schedule a fault and return its number; `Machines.fault` says what an order holds.
+
+        Args:
+            order: What is asked for.
+            machines: Machines that have the fault, shape (num_machines,).
+            of_node: Axes that have it, of those the order is of, shape (num_axes,); all of them by default.
+        """
         drives, axis = self._drives, order.axis
         row, changes = self.check(order)
         given = checked_parameters(row, order.parameters)
@@ -132,6 +138,8 @@ class MachineFaults:
         axes = np.repeat(machines, self._axes_per_machine)
         if axis is not None:
             axes &= np.arange(drives.num_axes) % self._axes_per_machine == axis
+        if of_node is not None:
+            axes &= of_node
         self._rehearse(changes, given, axes)
         self._next_number += 1
         begins = np.full(drives.num_machines, drives.inside.cycle + delay)

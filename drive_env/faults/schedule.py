@@ -12,7 +12,7 @@ from drive_env.faults.table import FaultRow
 
 NO_CONDITION, ENABLED = "", "enabled"
 _COMPARISON = re.compile(r"\s*(position|speed)\s*([<>])\s*(\S+)\s*")
-_WORDS = ("at", "when", "duration", "node")
+_WORDS = ("at", "when", "duration", "node", "axis")
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ NEVER = 2**62  # a cycle that does not come
 
 @dataclass(frozen=True)
 class Order:
-    """One fault that is asked for, as `machine.fault` takes it; on a bus `node` says whose it is, not `axis`."""
+    """One fault that is asked for, as `machine.fault` takes it; on a bus `axis` is one of its `node`."""
 
     name: str
     at: float = 0.0
@@ -104,8 +104,10 @@ def parse_order(text: str) -> Order:
             numbers[key] = float(value)
         except ValueError:
             raise ValueError(f"fault {text!r}: {key} must be a number, not {value!r}") from None
-    node = numbers.pop("node", None)
-    if node is not None and not node.is_integer():
-        raise ValueError(f"fault {text!r}: node must be a whole number, not {node:g}")
+    places = {key: numbers.pop(key, None) for key in ("node", "axis")}
+    for key, place in places.items():
+        if place is not None and not place.is_integer():
+            raise ValueError(f"fault {text!r}: {key} must be a whole number, not {place:g}")
+    node, axis = (None if place is None else int(place) for place in places.values())
     at, duration = numbers.pop("at", 0.0), numbers.pop("duration", None)
-    return Order(words[0], at, when, duration, None if node is None else int(node), parameters=numbers)
+    return Order(words[0], at, when, duration, node, axis, parameters=numbers)

@@ -201,7 +201,8 @@ class BusDrives:
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis.
 
-        Of a node with several axes that does not tell which one sent an emergency, the first one stands for it.
+        Of a node with several axes that does not tell which one sent an emergency, the first one stands for it; what
+        stops the whole module, and is told once, is told of each of its axes.
         """
         self._enter()
         if self._pace.time_waits:
@@ -210,7 +211,8 @@ class BusDrives:
         for node, code, register, extra in self._link.take_emergencies():
             name, axis = self._description.emergency(code, extra)
             first = self.nodes.index(node) * self._description.num_axes
-            messages.append(EmergencyMessage(first + axis, code, register, extra, name))
+            about = self._description.axes_of_emergency(name, axis)
+            messages += [EmergencyMessage(first + k, code, register, extra, name) for k in about]
         return sorted(messages, key=lambda message: message.axis)
 
     def reset_node(self, where: Mask | None = None) -> None:

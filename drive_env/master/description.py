@@ -5,6 +5,7 @@ A known device brings its own; any other CiA 402 drive is described by its EDS a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ CYCLE = 0.001  # communication cycle where the device says nothing else [s]
 
 # CiA 402-2: the profile objects of the next axis lie 800h above; where a device shifts more, its data say so.
 CIA_402_OFFSETS = (AxisOffset(cia402.PROFILE_AREAS.start, cia402.SINGLE_DEVICE_TYPE, cia402.AXIS_OFFSET),)
+
+NODE_CODES = (range(0x6000, 0x7000), range(0x8000, 0x8300))  # CiA 301, table 26: software, and communication
 
 # Communication emergencies of CiA 301 (table 26 of version 4.2), named where the device's own table has no row.
 EMERGENCY_NAMES = {
@@ -152,6 +155,13 @@ class Description:
     def size(self, entry: Entry) -> int:
         """Return the bytes that an integer object has."""
         return max(1, len(self._types[entry.index, entry.sub]) // 8)
+
+    def axes_of_emergency(self, name: str, axis: int) -> Sequence[int]:
+        """Return the axes of its node that an emergency is about: the one that it tells, or all that it stopped."""
+        if self.device is None or not self.device.is_of_module(name):
+            return (axis,)
+        code = self.device.emergencies[name].code
+        return (axis,) if any(code in group for group in NODE_CODES) else range(self.num_axes)
 
     def emergency(self, code: int, extra: tuple[int, ...]) -> tuple[str, int]:
         """Return the name of an emergency and the axis of its node that sent it.

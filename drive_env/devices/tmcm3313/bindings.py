@@ -27,6 +27,7 @@ BINDINGS = (
     Binding(0x2011, 0, "acceleration_1", "pps^2"),
     Binding(0x2012, 0, "velocity_1", "pps"),
     Binding(0x2013, 0, "deceleration_1", "pps^2"),
+    Binding(0x2014, 0, "stop_deceleration", "pps^2"),
     Binding(0x2015, 0, "jerk_factor"),
     Binding(0x2020, 0, "loop_mode"),
     Binding(0x2021, 0, "position_correction_p"),

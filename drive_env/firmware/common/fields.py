@@ -39,7 +39,8 @@ PARAMETERS = (
     Field("quick_stop_deceleration", "f8", "rad/s^2", "6085h"),
     # Of a six-point ramp; a drive without one leaves them 0.
     Field("start_velocity", "f8", "rad/s", "2010h: jumped to at the beginning of a ramp"),
-    Field("end_velocity", "f8", "rad/s", "6082h: jumped from at its end"),
+    Field("end_velocity", "f8", "rad/s", "6082h: jumped from at its end, or where the ramp of 2014h begins"),
+    Field("stop_deceleration", "f8", "rad/s^2", "2014h: ramp from the end velocity to rest; 0: a jump"),
     Field("velocity_1", "f8", "rad/s", "2012h: below it the ramps of 2011h and 2013h hold; 0: one ramp for all speeds"),
     Field("acceleration_1", "f8", "rad/s^2", "2011h; 0: as above 2012h"),
     Field("deceleration_1", "f8", "rad/s^2", "2013h; 0: as above 2012h"),

@@ -4,12 +4,13 @@ r"""The six-point ramp: a trapezoid that begins and ends with a jump, and has ot
                  /        \             acceleration above velocity_1, deceleration above it
     velocity_1  /          \
                |            |           acceleration_1 below it, deceleration_1 below it
-    start      |            | end
+    start      |            | end       jumped from, or left by stop_deceleration
     ____________________________ time   ramp_wait passes before the next motion
 
 As the motion controllers of Trinamic have it (TMC5130 data sheet, "ramp generator"): velocity_1 = 0 leaves one ramp for
-each way, start_velocity and end_velocity are jumped to and from, and after a stop the axis waits. It is exact within a
-period: the times at which one ramp goes over into the next are found, not sampled.
+each way, start_velocity and end_velocity are jumped to and from, and after a stop the axis waits. Where there is a
+stop_deceleration (TMCM-3313 manual, section 4.2.15) the end velocity is where that ramp takes over. It is exact within
+a period: the times at which one ramp goes over into the next are found, not sampled.
 """
 
 from __future__ import annotations
@@ -38,21 +39,30 @@ def slow_ramp(ramp, above):
 
 
 @stage
+def last_speed(drive, lane):
+    """Return the speed [rad/s] that a ramp jumps from to rest: the end velocity, unless a ramp of its own ends it."""
+    return 0.0 if drive.stop_deceleration[lane] > 0.0 else drive.end_velocity[lane]
+
+
+@stage
 def braking_constants(drive, lane, u, down):
-    """Return D and c of the way u^2 / (2 D) + c that braking takes from a speed u [rad/s] on its side of velocity_1."""
-    low, end = drive.velocity_1[lane], drive.end_velocity[lane]
+    """Return D and c of the way u^2 / (2 D) + c that braking takes from a speed u [rad/s] on its part of the ramp."""
+    low, end, stop = drive.velocity_1[lane], drive.end_velocity[lane], drive.stop_deceleration[lane]
+    if stop > 0.0 and u < end:
+        return stop, 0.0
+    ended = 0.5 * end * end / stop if stop > 0.0 else 0.0
     slow_down = slow_ramp(drive.deceleration_1[lane], down)
     if u < low:
-        return slow_down, -0.5 * end * end / slow_down
+        return slow_down, ended - 0.5 * end * end / slow_down
     if low <= end:
-        return down, -0.5 * end * end / down
-    return down, 0.5 * (low * low - end * end) / slow_down - 0.5 * low * low / down
+        return down, ended - 0.5 * end * end / down
+    return down, ended + 0.5 * (low * low - end * end) / slow_down - 0.5 * low * low / down
 
 
 @stage
 def braking_way(drive, lane, u, down):
-    """Return the way [rad] from a speed u [rad/s], 0 or more, down to the end velocity."""
-    if u <= drive.end_velocity[lane]:
+    """Return the way [rad] from a speed u [rad/s], 0 or more, down to rest or to what is jumped from."""
+    if u <= last_speed(drive, lane):
         return 0.0
     D, c = braking_constants(drive, lane, u, down)
     return 0.5 * u * u / D + c
@@ -60,7 +70,7 @@ def braking_way(drive, lane, u, down):
 
 @stage
 def slow_down(drive, lane, u, floor, down, left):
-    """Return speed, way and time of one part of a braking: to velocity_1 or to a floor below it, in `left` [s] at most.
+    """Return speed, way and time of one part of a braking: to the part's end or a floor in it, in `left` [s] at most.
 
     Args:
         drive: The record.
@@ -70,9 +80,13 @@ def slow_down(drive, lane, u, floor, down, left):
         down: Deceleration above velocity_1 [rad/s^2].
         left: Time that there is [s].
     """
-    low = drive.velocity_1[lane]
-    rate = down if u > low else slow_ramp(drive.deceleration_1[lane], down)
-    end = max(low, floor) if u > low else floor
+    low, stop_from = drive.velocity_1[lane], drive.end_velocity[lane]
+    if drive.stop_deceleration[lane] > 0.0 and u <= stop_from:
+        rate, end = drive.stop_deceleration[lane], floor
+    else:
+        rate = down if u > low else slow_ramp(drive.deceleration_1[lane], down)
+        end = max(low, floor) if u > low else floor
+        end = max(end, stop_from) if drive.stop_deceleration[lane] > 0.0 else end
     t = (u - end) / rate
     if t >= left:
         return u - rate * left, (u - 0.5 * rate * left) * left, left
@@ -100,7 +114,8 @@ def go_on(drive, lane, u, distance, v_max, up, down, left):
     rate = slow_ramp(drive.acceleration_1[lane], up) if u < low else up
     top = min(v_max, low) if u < low else v_max
     if u < end:
-        top = min(top, end)  # below the end velocity nothing is braked
+        top = min(top, end)
+    if u < last_speed(drive, lane):  # from which nothing is braked
         peak = (u * u + 2.0 * rate * distance) ** 0.5
     else:
         D, c = braking_constants(drive, lane, u, down)
@@ -137,8 +152,13 @@ def advance(drive, lane, target, v_max, up, down, dt):
         sign = 1.0 if target - x > 0.0 else -1.0
         distance, u = sign * (target - x), sign * v
         if u == 0.0:
-            u = min(drive.start_velocity[lane], v_max)
-        floor = drive.end_velocity[lane]
+            if distance <= 10.0 * NEAR:
+                x = target
+                continue
+            # A way on which it could not be braked from begins at rest.
+            start = min(drive.start_velocity[lane], v_max)
+            u = start if braking_way(drive, lane, start, down) <= distance else 0.0
+        floor = last_speed(drive, lane)
         brakes = u < 0.0 or distance <= braking_way(drive, lane, u, down) + NEAR
         if brakes and abs(u) <= floor + NEAR:
             # The last speed is jumped from; away from the target the axis turns round.

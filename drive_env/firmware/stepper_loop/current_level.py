@@ -1,7 +1,8 @@
 """The current of a closed loop: by the load angle, or as much as a torque mode asks for; and what of it makes torque.
 
 The scale goes from 2029h without a load angle to 202Ah at 2027h, one step of 255 in 2030h clocks up and 2031h down
-(TMCM-3313 manual, section 1.5.3). It scales the run current; boost and standby are the open loop's.
+(TMCM-3313 manual, section 1.5.3). It scales the run current, as CoolStep has left it; boost and standby are the open
+loop's.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import numpy as np
 
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.record import LANES
+from drive_env.firmware.stepper.current_scale import STEPS
 from drive_env.firmware.stepper_loop.load_angle import FULL_ANGLE, electrical_angle, lead_of_field
 from mechanics.compiled import inlined
 
@@ -34,10 +36,15 @@ def scale_by_load(drive, h):
         scale = wanted if wanted - scale < up else scale + up
         scale = scale if drive.loop_scale[lane] - scale < down else drive.loop_scale[lane] - down
         run = drive.run_amplitude[lane]
+        # CoolStep takes steps of the run current away, whatever the load angle leaves of it: the driver scales both.
+        steps = np.floor(drive.run_current[lane] * (STEPS / SCALES)) + 1.0
+        reduction = drive.cool_reduction[lane]
+        reduction = reduction if reduction < drive.cool_span[lane] else drive.cool_span[lane]
+        run *= 1.0 - reduction / steps
         amplitude = run * (np.floor(scale) + 1.0) / SCALES
         asks = drive.asks_torque[lane] > 0.5
         amplitude = drive.asked_amplitude[lane] if asks else amplitude
-        scale = amplitude / run * (SCALES - 1.0) if asks else scale
+        scale = amplitude / drive.run_amplitude[lane] * (SCALES - 1.0) if asks else scale
         tracks = drive.tracks_rotor[lane] > 0.5
         drive.loop_scale[lane] = scale if tracks else SCALES - 1.0
         drive.amplitude[lane] = amplitude if tracks else drive.amplitude[lane]
