@@ -259,6 +259,22 @@ def test_without_a_load_the_loop_saves_the_copper_loss_of_its_current():
         assert drives.read(0x2033)[0] == 50
 
 
+def test_coolstep_takes_its_steps_of_the_current_that_a_loop_has():
+    """Down to half of 32 steps (2098h = 0) without a load: half the current of a loop that has it constant (2029h)."""
+    with build(recipe=CONSTANT_CURRENT, num_machines=2) as drives:
+        close_loop(drives, operation="pv")
+        drives.write(0x6083, 400_000)
+        drives.write(0x60FF, 2 * MICROSTEPS)
+        drives.advance(1.0)
+        before = np.hypot(lane(drives, "i_a"), lane(drives, "i_b"))
+        for index, value in ((0x2098, 0), (0x2099, 1), (0x209E, 12), (0x20A5, MICROSTEPS)):
+            drives.write(index, value)
+        drives.write(0x209C, [1, 0])
+        drives.advance(1.5)
+        share = np.hypot(lane(drives, "i_a"), lane(drives, "i_b")) / before
+        np.testing.assert_allclose(share, [0.5, 1.0], atol=0.05)
+
+
 @pytest.mark.parametrize(("up", "down"), [(1000, 10_000), (16_000, 32_000)])
 def test_delays_of_the_scale_count_clocks_for_each_step(up, down):
     recipe = RECIPE | {0x2030: up, 0x2031: down, 0x2027: 64}
