@@ -101,17 +101,6 @@ def own_variant(path: Path, devices: Mapping[str, Mapping[str, Any]]) -> dict[st
     return {"title": f"{base['title']}, {path.stem}", "objects": {}, "groups": {}} | own | {"name": str(path)}
 
 
-<<<<<<< HEAD
-def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a device's data with the rows that it lacks and a variant may have, each as one of its kind is."""
-    emergencies, canopen = base["emergencies"], base["canopen"]
-    more = dict.fromkeys(OPTIONAL_EMERGENCIES, emergencies["fault_reset"])
-    objects = {"serial_number": "1018:4", **canopen["objects"]}
-    return {**base, "emergencies": {**more, **emergencies}, "canopen": {**canopen, "objects": objects}}
-
-
-=======
->>>>>>> main
 def _check_currents(path: Path, current: Mapping[str, float], base: Mapping[str, float]) -> None:
     """Raise ValueError for currents [A] that are out of order, by how the base's own follow each other.
 
@@ -127,8 +116,6 @@ def _check_currents(path: Path, current: Mapping[str, float], base: Mapping[str,
     if sorted(values := [current[name] for name in names]) != values:
         told = [f"{name} = {value:g} A" for name, value in zip(names, values, strict=True)]
         raise ValueError(f"{path}: current.{told[0]}, {told[1]} and {told[2]} must come in this order: {meanings}")
-<<<<<<< HEAD
-=======
 
 
 def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
@@ -137,7 +124,6 @@ def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
     more = dict.fromkeys(OPTIONAL_EMERGENCIES, emergencies["fault_reset"])
     objects = {"serial_number": "1018:4", **canopen["objects"]}
     return {**base, "emergencies": {**more, **emergencies}, "canopen": {**canopen, "objects": objects}}
->>>>>>> main
 
 
 def check_rates(rates: Mapping[str, float]) -> None:
