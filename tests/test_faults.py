@@ -507,7 +507,7 @@ def test_a_fault_as_a_line_of_text(text, order):
 @pytest.mark.parametrize(("text", "message"), [
     ("", "must begin with its name"),
     ("at=2", "must begin with its name"),
-    ("jam now", "'now' must be as at=2; keys are at, when, duration, node and parameters"),
+    ("jam now", "'now' must be as at=2; keys are at, when, duration, node, axis and parameters"),
     ("jam at=soon", "at must be a number, not 'soon'"),
     ("jam node=1.5", "node must be a whole number, not 1.5"),
     ("jam when='speed", "No closing quotation"),

@@ -13,14 +13,14 @@ from drive_env import EmulatedDrives
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
-from drive_env.canopen.lss import Identity
+from drive_env.canopen.lss import LssIdentity
 from drive_env.canopen.node import Node
 from drive_env.commands.cli import app
 from drive_env.master.can.lss import LssError, LssMaster, parse_identity, show
 from drive_env.master.can.port import Port
 
 DEVICE = str(Path(__file__).parent / "all_services.toml")
-FIRST = Identity(0x286, 0x664, 0x10009, 128)  # of the first node without a node-ID on a bus
+FIRST = LssIdentity(0x286, 0x664, 0x10009, 128)  # of the first node without a node-ID on a bus
 SECOND = FIRST._replace(serial=129)
 TIMEOUT = 0.1
 

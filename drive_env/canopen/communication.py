@@ -14,7 +14,7 @@ import numpy as np
 
 from drive_env.canopen import frames
 from drive_env.devices import Device
-from drive_env.devices.services import NodeQuirks, Services
+from drive_env.devices.services import NodeQuirks, NodeServices
 from drive_env.dictionary.aborts import INCOMPATIBLE_PARAMETER, VALUE_RANGE, WRONG_STATE, ObjectAccessError
 from drive_env.dictionary.access import check_allowed, check_limits
 from drive_env.dictionary.entries import EdsText, Entry, ObjectDictionary
@@ -132,7 +132,7 @@ class ModuleObjects:
         return ObjectPort(entry, read, checked, write)
 
     @property
-    def services(self) -> Services:
+    def services(self) -> NodeServices:
         """Parts of the node that the device has."""
         return self._device.canopen.services
 

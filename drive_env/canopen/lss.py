@@ -52,7 +52,7 @@ OK, OUT_OF_RANGE, STORE_UNSUPPORTED, STORE_FAILED = 0, 1, 1, 2  # error codes of
 FASTSCAN_BEGINS = 0x80  # "bit checked" that begins a scan
 
 
-class Identity(NamedTuple):
+class LssIdentity(NamedTuple):
     """The LSS address: 1018h, without a 0 for what a device lacks."""
 
     vendor: int
@@ -64,7 +64,7 @@ class Identity(NamedTuple):
 class LssNode(Protocol):
     """What the slave asks of its node."""
 
-    def identity(self) -> Identity:
+    def identity(self) -> LssIdentity:
         """Return its identity."""
 
     def active_node_id(self) -> int:

@@ -21,7 +21,7 @@ from drive_env.canopen.emergency import EPSILON, EmergencyProducer
 from drive_env.canopen.error_control import HeartbeatConsumer, HeartbeatProducer, NodeGuarding, consumers
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.leds import Leds, leds_of
-from drive_env.canopen.lss import UNCONFIGURED, Identity, LssSlave
+from drive_env.canopen.lss import UNCONFIGURED, LssIdentity, LssSlave
 from drive_env.canopen.nmt import Command, NmtState
 from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
 from drive_env.canopen.sync import SyncProducer, SyncWindow
@@ -128,6 +128,11 @@ class Node:
 
         self._make_services(sorted({entry.index for entry in entries}))
         self._handlers: dict[int, tuple[Callable[[bytes, float], None], ...]] = {}
+        self._empty_buffers(takes_time)
+
+    def _empty_buffers(self, takes_time: bool) -> None:
+        """Have no frame received and no answer under way, and know what takes time."""
+        device = self._device
         self._frames_left = self._frames_per_cycle = device.canopen.frames_per_cycle if takes_time else math.inf
         self._takes_time = takes_time
         self._boot_time = device.canopen.boot_time if takes_time else 0.0
@@ -848,12 +853,12 @@ class Node:
             raise ObjectAccessError(VALUE_RANGE, f"LSS has stored nothing like {key[0]:04X}:{key[1]} = {raw}")
 
     # --- what LSS asks for (drive_env/canopen/lss.py) -----------------------------------------------------------------
-    def identity(self) -> Identity:
+    def identity(self) -> LssIdentity:
         """Return vendor, product, revision and serial number, 0 for what the device lacks."""
         has = self._module.subs(communication.IDENTITY)
         port = self.dictionary.port
         parts = [port(communication.IDENTITY, sub).read() if sub in has else 0 for sub in (1, 2, 3, 4)]
-        return Identity(*(part if isinstance(part, int) else 0 for part in parts))
+        return LssIdentity(*(part if isinstance(part, int) else 0 for part in parts))
 
     def active_node_id(self) -> int:
         """Return its node-ID, 255 for none."""

@@ -24,7 +24,7 @@ from drive_env.commands.options import (
 from drive_env.commands.tables import print_lines
 
 if TYPE_CHECKING:
-    from drive_env.canopen.lss import Identity
+    from drive_env.canopen.lss import LssIdentity
     from drive_env.master.can.lss import LssMaster
     from drive_env.master.can.port import Port
 
@@ -222,7 +222,7 @@ def _check_choice(identity: str | None, node: int | None, dry_run: bool) -> None
         raise ValueError("--dry-run asks nobody which node is there; name it with --identity")
 
 
-def _choose(port: Port, master: LssMaster, identity: str | None, node: int | None, timeout: float) -> Identity:
+def _choose(port: Port, master: LssMaster, identity: str | None, node: int | None, timeout: float) -> LssIdentity:
     """Return the identity of the node that is meant; all slaves wait afterwards."""
     from drive_env.master.can.lss import LssError, identity_of, parse_identity, show
 
@@ -241,11 +241,11 @@ def _choose(port: Port, master: LssMaster, identity: str | None, node: int | Non
     return found[0]
 
 
-def _facts(identity: Identity) -> str:
+def _facts(identity: LssIdentity) -> str:
     return "  ".join(f"{name} {number:X}h" for name, number in identity._asdict().items())
 
 
-def _name(identity: Identity, node: int | None) -> str:
+def _name(identity: LssIdentity, node: int | None) -> str:
     from drive_env.master.can.lss import show
 
     return f"node {node}" if node is not None else f"the node {show(identity)}"

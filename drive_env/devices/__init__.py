@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from drive_env import cia402
 from drive_env.devices.gain_set import GainSet, load_gain_set
 from drive_env.devices.own_folder import BINDINGS, is_own_folder, naming, own_bindings, own_data
-from drive_env.devices.services import NodeQuirks, Services, node_quirks_of, services_of
+from drive_env.devices.services import NodeQuirks, NodeServices, node_quirks_of, services_of
 from drive_env.devices.variants import (
     check_rates,
     compose_eds,
@@ -116,7 +116,7 @@ class CanopenBehaviour(NamedTuple):
     load_signature: int
     bootloader_signature: int
     store_groups: dict[int, tuple[str, ...]]
-    services: Services = Services()
+    services: NodeServices = NodeServices()
     quirks: NodeQuirks = NodeQuirks()
 
 

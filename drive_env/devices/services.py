@@ -17,7 +17,7 @@ OPTIONAL_EMERGENCIES = ("sync_length", "sync_window_missed")
 BIT_30 = ("keep", "refuse", "store")
 
 
-class Services(NamedTuple):
+class NodeServices(NamedTuple):
     """Parts of a node beyond what every node has; what a dictionary's objects ask for, they switch on by themselves.
 
     1003h, 1007h, 1019h and 1012h with 1013h need no row here: the node has them where its EDS does.
@@ -57,10 +57,10 @@ class NodeQuirks(NamedTuple):
     pdo_changes_while_on: bool = False
 
 
-def services_of(data: Mapping[str, Any]) -> Services:
+def services_of(data: Mapping[str, Any]) -> NodeServices:
     """Return the services of a device's table `canopen`; ValueError for a key or a value that cannot be."""
-    row = _known(data.get("services", {}), Services, "services")
-    found = Services(**{**row, "lss_bit_rates": tuple(row.get("lss_bit_rates", LSS_BIT_RATES))})
+    row = _known(data.get("services", {}), NodeServices, "services")
+    found = NodeServices(**{**row, "lss_bit_rates": tuple(row.get("lss_bit_rates", LSS_BIT_RATES))})
     if not 0 <= found.block_size <= 127:
         raise ValueError(f"canopen.services.block_size = {found.block_size} must be 1 to 127 segments, or 0 for none")
     if found.longest_text < 0:

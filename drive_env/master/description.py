@@ -25,7 +25,8 @@ CYCLE = 0.001  # communication cycle where the device says nothing else [s]
 # CiA 402-2: the profile objects of the next axis lie 800h above; where a device shifts more, its data say so.
 CIA_402_OFFSETS = (AxisOffset(cia402.PROFILE_AREAS.start, cia402.SINGLE_DEVICE_TYPE, cia402.AXIS_OFFSET),)
 
-NODE_CODES = (range(0x6000, 0x7000), range(0x8000, 0x8300))  # CiA 301, table 26: software, and communication
+# Upper bytes of emergency codes that are of the node (CiA 301, table 26): software, and communication.
+NODE_CODES = (range(0x60, 0x70), range(0x80, 0x83))
 
 # Communication emergencies of CiA 301 (table 26 of version 4.2), named where the device's own table has no row.
 EMERGENCY_NAMES = {
@@ -161,7 +162,7 @@ class Description:
         if self.device is None or not self.device.is_of_module(name):
             return (axis,)
         code = self.device.emergencies[name].code
-        return (axis,) if any(code in group for group in NODE_CODES) else range(self.num_axes)
+        return (axis,) if any(code >> 8 in group for group in NODE_CODES) else range(self.num_axes)
 
     def emergency(self, code: int, extra: tuple[int, ...]) -> tuple[str, int]:
         """Return the name of an emergency and the axis of its node that sent it.

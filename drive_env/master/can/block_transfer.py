@@ -37,7 +37,7 @@ class NoBlockTransferError(Exception):
     """The server has no block transfer: nothing has begun."""
 
 
-class Channel(Protocol):
+class SdoChannel(Protocol):
     """What a transfer needs of its client; errors are python-canopen's."""
 
     def send_request(self, request: bytes) -> None:
@@ -53,7 +53,7 @@ class Channel(Protocol):
         """End the transfer."""
 
 
-def read(channel: Channel, initiated: bytes) -> bytes:
+def read(channel: SdoChannel, initiated: bytes) -> bytes:
     """Return the data of an upload whose initiate request was answered.
 
     Args:
@@ -82,7 +82,7 @@ def read(channel: Channel, initiated: bytes) -> bytes:
     return found
 
 
-def _receive_block(channel: Channel, content: bytearray) -> tuple[int, bool]:
+def _receive_block(channel: SdoChannel, content: bytearray) -> tuple[int, bool]:
     """Return how many segments of a sub-block came in order, and whether the last of all is among them."""
     in_order = 0
     while True:
@@ -121,7 +121,7 @@ def is_download(answer: bytes) -> bool:
     return answer[0] & _COMMAND == DOWNLOAD_RESPONSE | INITIATE
 
 
-def write(channel: Channel, initiated: bytes, content: bytes) -> None:
+def write(channel: SdoChannel, initiated: bytes, content: bytes) -> None:
     """Send the data of a download whose initiate request was answered.
 
     Args:
@@ -151,7 +151,7 @@ def write(channel: Channel, initiated: bytes, content: bytes) -> None:
     _expect(channel, DOWNLOAD_RESPONSE | END)
 
 
-def _expect(channel: Channel, first: int) -> bytes:
+def _expect(channel: SdoChannel, first: int) -> bytes:
     answer = channel.read_response()
     if answer[0] & _COMMAND != first:
         channel.abort(_WRONG_COMMAND)

@@ -13,7 +13,7 @@ from drive_env.canopen.lss import (
     REQUEST,
     RESPONSE,
     WAITING,
-    Identity,
+    LssIdentity,
     Service,
 )
 from drive_env.dictionary.aborts import ObjectAccessError
@@ -54,7 +54,7 @@ class LssMaster:
         """Switch all slaves into configuration, or let all wait."""
         self._send(Service.SWITCH_GLOBAL, bytes((CONFIGURATION if configuration else WAITING,)))
 
-    def select(self, identity: Identity) -> None:
+    def select(self, identity: LssIdentity) -> None:
         """Switch the slave with an identity into configuration.
 
         Raises:
@@ -68,7 +68,7 @@ class LssMaster:
                 "node that has a node-ID"
             )
 
-    def scan(self) -> Iterator[Identity]:
+    def scan(self) -> Iterator[LssIdentity]:
         """Find the slaves that have no node-ID, one by one; each is in configuration until `switch_all`."""
         for _ in range(MOST_NODES):
             found = self.fastscan()
@@ -76,7 +76,7 @@ class LssMaster:
                 return
             yield found
 
-    def fastscan(self) -> Identity | None:
+    def fastscan(self) -> LssIdentity | None:
         """Find one slave without a node-ID, bit by bit, and switch it into configuration; None if there is none.
 
         Raises:
@@ -96,21 +96,21 @@ class LssMaster:
                     "--timeout"
                 )
             numbers.append(number)
-        return Identity(*numbers)
+        return LssIdentity(*numbers)
 
     def _step(self, number: int, bit: int, part: int, following: int) -> bool:
         data = number.to_bytes(4, "little") + bytes((bit, part, following))
         return self._ask(Service.FASTSCAN, data, Service.IDENTIFIED, echo=ECHO) is not None
 
     # --- what the slave in configuration is asked, and told ---------------------------------------------------------
-    def identity(self) -> Identity:
+    def identity(self) -> LssIdentity:
         """Return the identity of the slave in configuration.
 
         Raises:
             LssError: If none answers.
         """
         parts = [self._expect(Service.INQUIRE_VENDOR + part) for part in range(4)]
-        return Identity(*(int.from_bytes(answer[1:5], "little") for answer in parts))
+        return LssIdentity(*(int.from_bytes(answer[1:5], "little") for answer in parts))
 
     def node_id(self) -> int:
         """Return its node-ID, 255 for none.
@@ -205,7 +205,7 @@ class LssMaster:
         return answer
 
 
-def identity_of(port: Port, node: int, timeout: float) -> Identity:
+def identity_of(port: Port, node: int, timeout: float) -> LssIdentity:
     """Return the identity of a node that has a node-ID, by SDO.
 
     Raises:
@@ -219,7 +219,7 @@ def identity_of(port: Port, node: int, timeout: float) -> Identity:
         except ObjectAccessError:
             data = b""  # what a device lacks is 0 in its LSS address
         parts.append(int.from_bytes(data[:4], "little"))
-    return Identity(*parts)
+    return LssIdentity(*parts)
 
 
 def is_taken(port: Port, node: int, timeout: float) -> bool:
@@ -242,12 +242,12 @@ def row_of(bit_rate: int) -> int:
     return row
 
 
-def show(identity: Identity) -> str:
+def show(identity: LssIdentity) -> str:
     """Return an identity as the command line takes it."""
     return ":".join(f"{number:X}" for number in identity)
 
 
-def parse_identity(text: str) -> Identity:
+def parse_identity(text: str) -> LssIdentity:
     """Return the identity of "286:664:10009:5"; ValueError for what is none."""
     parts = text.replace("0x", "").split(":")
     try:
@@ -259,4 +259,4 @@ def parse_identity(text: str) -> Identity:
             f"{text!r} is no identity; it is vendor, product, revision and serial number (1018h) in hexadecimal, as "
             "`drive-env lss scan` prints them: 286:664:10009:5"
         )
-    return Identity(*numbers)
+    return LssIdentity(*numbers)
