@@ -387,7 +387,7 @@ def test_stable_baselines_view_follows_the_schedule(kind):
     ({"colour": 1}, "there is no option 'colour'; there are load, device, motor"),
     ({"stage": "half"}, "stage must be a number, not 'half'"),
     ({"num_threads": 1.5}, "num_threads must be a whole number or left out, not 1.5"),
-    ({"motor": 7}, "motor must be a motor's name, the path of its file, a Motor or left out, not 7"),
+    ({"motor": 7}, "motor must be a motor's name, the path of its file, or a Motor( or left out)?, not 7"),
 ])  # fmt: skip
 def test_a_wrong_value_names_the_valid_ones(kind, options, says):
     with pytest.raises(ValueError, match=says):

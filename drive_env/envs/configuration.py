@@ -27,7 +27,7 @@ def _is_whole(value: Any) -> bool:
 # Type of a field -> what it takes, in words, and whether a value is one; fields of other types check themselves.
 _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "str": ("text", lambda value: isinstance(value, str)),
-    "str | Motor": ("a motor's name, the path of its file, a Motor", lambda value: isinstance(value, (str, Motor))),
+    "str | Motor": ("a motor's name, the path of its file, or a Motor", lambda value: isinstance(value, (str, Motor))),
     "int": ("a whole number", _is_whole),
     "float": ("a number", _is_number),
     "bool": ("true or false", lambda value: isinstance(value, bool)),
