@@ -113,6 +113,34 @@ def test_a_node_gets_another_node_id_with_its_reset(serve):
     assert served.restart() == [9, 6]
 
 
+def test_a_node_named_by_its_identity_has_a_new_node_id_no_sooner_than_one_named_by_its_old(serve):
+    served = serve(5, 6)
+    identity = show(FIRST._replace(serial=5))
+    code, said = served.run("node-id", "8", "--identity", identity, "--yes")
+    assert (code, said) == (
+        0, f"the node {identity} has the node-ID 8; it takes effect with the next reset (NMT, or power)\n"
+    )  # fmt: skip
+    assert [node.node_id for node in served.nodes] == [5, 6]
+    assert served.restart() == [8, 6]
+
+
+@pytest.mark.parametrize(
+    ("node", "new", "arguments", "said"),
+    [
+        (255, "9", (), "does not answer under it within 0.5 s"),
+        (5, "9", ("--node", "5", "--reset"), "does not answer under it within 0.5 s"),
+        (5, "255", ("--node", "5", "--reset"), "after 0.5 s it still answers under 5"),
+    ],
+)
+def test_a_node_that_does_not_boot_is_told(serve, monkeypatch, node, new, arguments, said):
+    """It took the node-ID, and its firmware hangs: what it answered to LSS is no proof."""
+    monkeypatch.setattr("drive_env.commands.lss.BOOT_TIMEOUT", 0.5)
+    monkeypatch.setattr(Node, "_restart", lambda *arguments: None)
+    served = serve(node, 6)
+    found = served.run("node-id", new, *arguments, "--yes")
+    assert (found[0], said in found[1].replace("\n", " ")) == (1, True), found
+
+
 def test_a_bit_rate_is_stored_for_the_next_power_on(serve):
     served = serve(5, 6)
     code, said = served.run("bit-rate", "500000", "--node", "5", "--yes")
@@ -124,7 +152,11 @@ def test_a_bit_rate_is_stored_for_the_next_power_on(serve):
 
 def test_an_activated_bit_rate_takes_the_node_off_this_bus(serve):
     served = serve(5, 6)
-    assert served.run("bit-rate", "250000", "--node", "5", "--yes", "--no-store", "--activate", "0.02")[0] == 0
+    assert served.run("bit-rate", "250000", "--node", "5", "--yes", "--no-store", "--activate", "0.02") == (
+        0,
+        "node 5 changes to 250000 bit/s in 0.02 s; it is lost with the power; open the bus with it to see that it is "
+        "there\n",
+    )
     served.wait_for(lambda: served.nodes[0].bit_rate == 250)
     code, said = served.run("bit-rate", "1000000", "--node", "5", "--yes")
     assert code == 1

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 NOTHING_FOUND = 1
 STORE_TIMEOUT = 5.0  # s: erasing flash takes up to seconds
+BOOT_TIMEOUT = 5.0  # s: drives boot within one or two
 LONGEST_DELAY = 60.0  # s of the 65.535 that a frame holds
 RESET_COMMUNICATION = 0x82
 
@@ -109,7 +110,7 @@ def set_node_id(
     """
     with errors_as_exit_codes():
         from drive_env.canopen.lss import UNCONFIGURED
-        from drive_env.master.can.lss import is_taken
+        from drive_env.master.can.lss import await_node, is_taken
 
         check_time("--timeout", timeout)
         if not (1 <= new <= 127 or new == UNCONFIGURED):
@@ -128,6 +129,7 @@ def set_node_id(
                 ask(f"Give {what} to {_name(chosen, node)}{', and reset it' if reset else ''}?", yes)
             with master.configuring():
                 master.select(chosen)
+                boots = reset or (not dry_run and master.node_id() == UNCONFIGURED)
                 master.configure_node_id(new)
                 if store:
                     master.store(STORE_TIMEOUT)
@@ -135,7 +137,9 @@ def set_node_id(
                 port.send(0, bytes((RESET_COMMUNICATION, node or 0)))
             if not dry_run:
                 kept = "" if store else "; it is lost with the power"
-                when = "" if node is None or reset else "; it takes effect with the next reset (NMT, or power)"
+                when = "" if boots else "; it takes effect with the next reset (NMT, or power)"
+                if boots:  # by SDO, which is none of LSS
+                    await_node(port, chosen, new, node, BOOT_TIMEOUT)
                 print(f"{_name(chosen, node)} has {what}{when}{kept}")
 
 
@@ -188,8 +192,12 @@ def set_bit_rate(
                 if activate is not None:
                     master.activate_bit_rate(activate)
             if not dry_run:
-                when = "with the next power-on" if activate is None else f"in {activate:g} s"
-                print(f"{_name(chosen, node)} has {new} bit/s {when}{'' if store else '; it is lost with the power'}")
+                kept = "" if store else "; it is lost with the power"
+                if activate is None:
+                    print(f"{_name(chosen, node)} has {new} bit/s with the next power-on")
+                else:  # no frame of this bus can show it
+                    print(f"{_name(chosen, node)} changes to {new} bit/s in {activate:g} s{kept}; open the bus with it "
+                          "to see that it is there")  # fmt: skip
 
 
 # --- what they share --------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -12,6 +13,7 @@ from drive_env.canopen.lss import (
     OK,
     REQUEST,
     RESPONSE,
+    UNCONFIGURED,
     WAITING,
     LssIdentity,
     Service,
@@ -24,6 +26,7 @@ from drive_env.master.errors import BusError, NoAnswerError
 # s. Several slaves answer a step of a scan, one after the other: what comes this long after the first answer is theirs,
 # and must not be taken for the answer to the next step.
 ECHO = 0.005
+ANSWER_TIMEOUT = 0.3  # s, of an SDO request to a node that may not be there
 MOST_NODES = 127
 _STORE_ERRORS = {1: "it cannot store", 2: "its memory failed"}
 _IDENTITY = 0x1018
@@ -231,6 +234,33 @@ def is_taken(port: Port, node: int, timeout: float) -> bool:
     except (ObjectAccessError, BusError):
         return True
     return True
+
+
+def await_node(port: Port, identity: LssIdentity, node: int, before: int | None, timeout: float) -> None:
+    """Wait until a node that boots answers under its new node-ID, or, where that is 255, under its old one no more.
+
+    Raises:
+        LssError: If it does not within `timeout` [s].
+    """
+    end = time.monotonic() + timeout
+    while True:
+        if node == UNCONFIGURED:
+            is_there = before is None or not is_taken(port, before, ANSWER_TIMEOUT)
+        else:
+            try:
+                is_there = identity_of(port, node, ANSWER_TIMEOUT) == identity
+            except NoAnswerError:
+                is_there = False
+        if is_there:
+            return
+        if time.monotonic() > end:
+            raise LssError(
+                f"the node {show(identity)} took the node-ID {node}, and after {timeout:g} s it still answers under "
+                f"{before}; switch it off and on"
+                if node == UNCONFIGURED
+                else f"the node {show(identity)} took the node-ID {node}, and does not answer under it within "
+                f"{timeout:g} s; switch it off and on, and look with `drive-env scan`"
+            )
 
 
 def row_of(bit_rate: int) -> int:
