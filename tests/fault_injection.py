@@ -487,6 +487,20 @@ def run_real_time(drives, session, fault=None, limits=LIMITS):
         return world.truth, bus.count
 
 
+KINDS = ("lose", "double", "delay", "interrupt", "three interrupts")
+
+
+def run_with(drives, session, kind, frame, limits=LIMITS, travel=TRAVEL):
+    """Run a session in lockstep with a fault of KINDS at a frame; return what is wrong, as texts."""
+    if "interrupt" in kind:
+        pressed = (frame,) if kind == "interrupt" else (frame, frame + 1, frame + 2)
+        with no_interrupt_left():
+            truth, _, _ = run_lockstep(drives, session, interrupts=pressed, limits=limits)
+    else:
+        truth, _, _ = run_lockstep(drives, session, Fault(kind, frame), limits=limits)
+    return problems(truth, travel=travel)
+
+
 def sample(rng: random.Random, frames: int, count: int) -> list[int]:
     """Return `count` frames of a session's `frames`, one from each of as many equal parts."""
     edges = np.linspace(0, frames, count + 1).astype(int)

@@ -21,6 +21,7 @@ import can
 import numpy as np
 import pytest
 from fault_injection import (
+    KINDS,
     SESSIONS,
     WORLD_PATIENCE,
     Fault,
@@ -29,13 +30,13 @@ from fault_injection import (
     Programs,
     WorldBus,
     eds_read_once,
-    no_interrupt_left,
     no_longer_than,
     overshoot,
     problems,
     rest,
     run_lockstep,
     run_real_time,
+    run_with,
     sample,
     served,
     until,
@@ -47,7 +48,6 @@ from drive_env.cores import usable_cores
 
 # Every frame takes half an hour, every twentieth two minutes.
 STRIDE = int(os.environ.get("FAULT_STRIDE", "1"))
-KINDS = ("lose", "double", "delay", "interrupt", "three interrupts")
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGKILL", "SIGSTOP")
 
 
@@ -61,17 +61,6 @@ def emulated():
 def no_test_hangs(request):
     with no_longer_than(1800.0 if request.node.get_closest_marker("slow") else 120.0):
         yield
-
-
-def run_with(emulated, session, kind, frame):
-    """Run a session with a fault at a frame; return what is wrong, as texts."""
-    if "interrupt" in kind:
-        pressed = (frame,) if kind == "interrupt" else (frame, frame + 1, frame + 2)
-        with no_interrupt_left():
-            truth, _, _ = run_lockstep(emulated, session, interrupts=pressed)
-    else:
-        truth, _, _ = run_lockstep(emulated, session, Fault(kind, frame))
-    return problems(truth)
 
 
 # --- lockstep: frames of one thread, every k the same in every run --------------------------------------------------

@@ -11,13 +11,13 @@ import random
 import numpy as np
 import pytest
 from fault_injection import (
+    KINDS,
     RADIANS,
-    Fault,
     eds_read_once,
-    no_interrupt_left,
     no_longer_than,
     problems,
     run_lockstep,
+    run_with,
     sample,
     stop_by_ramp,
     worst_of,
@@ -29,7 +29,6 @@ AXES = 6
 TURN = 200 * 256  # microsteps
 LIMITS = Limits(position=(-3 * TURN, 3 * TURN), velocity=6 * TURN)
 TRAVEL = tuple(3 * sign * 2.0 * np.pi / RADIANS for sign in (-1, 1))  # as `problems` counts
-KINDS = ("lose", "double", "delay", "interrupt", "three interrupts")
 
 
 @pytest.fixture(scope="module")
@@ -78,17 +77,6 @@ def some_are_off(drives):
 SESSIONS = {session.__name__: session for session in (speeds, paths, some_are_off)}
 
 
-def run_with(emulated, session, kind, frame):
-    """Run a session with a fault at a frame; return what is wrong, as texts."""
-    if "interrupt" in kind:
-        pressed = (frame,) if kind == "interrupt" else (frame, frame + 1, frame + 2)
-        with no_interrupt_left():
-            truth, *_ = run_lockstep(emulated, session, interrupts=pressed, limits=LIMITS)
-    else:
-        truth, *_ = run_lockstep(emulated, session, Fault(kind, frame), limits=LIMITS)
-    return problems(truth, travel=TRAVEL)
-
-
 @pytest.mark.parametrize("name", SESSIONS)
 def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
     truth, frames, ended = run_lockstep(emulated, SESSIONS[name], limits=LIMITS)
@@ -104,4 +92,6 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, name):
 def test_a_fault_at_a_frame_leaves_no_axis_running(emulated, name, kind, count):
     _, frames, _ = run_lockstep(emulated, SESSIONS[name], limits=LIMITS)
     chosen = sample(random.Random(f"{name} {kind} {count}"), frames, count)
-    assert worst_of([(f"{kind} {k}", run_with(emulated, SESSIONS[name], kind, k)) for k in chosen]) == ""
+    assert (
+        worst_of([(f"{kind} {k}", run_with(emulated, SESSIONS[name], kind, k, LIMITS, TRAVEL)) for k in chosen]) == ""
+    )
