@@ -46,7 +46,7 @@ from fault_injection import (
 from drive_env import EmulatedDrives
 from drive_env.cores import usable_cores
 
-# Every frame takes half an hour, every twentieth two minutes.
+# Every frame takes a quarter of an hour on two cores, every twentieth a minute.
 STRIDE = int(os.environ.get("FAULT_STRIDE", "1"))
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGKILL", "SIGSTOP")
 
