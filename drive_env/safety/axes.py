@@ -169,14 +169,16 @@ class Axes:
             self.assumed &= ~current
             self.live = np.where(where, shown | self.assumed, self.live)
             self.outside = np.where(self.live & ~was, -1, self.outside)
-            for axis in np.flatnonzero(was & ~self.live):
-                self.aim.pop(int(axis), None)
+            if self.aim:
+                for axis in np.flatnonzero(was & ~self.live):
+                    self.aim.pop(int(axis), None)
             self.seen = np.where(where, now, self.seen)
         if CURRENT in rows:
             # By the time since the axes were seen last: a run has a row for each cycle, a look one now and then.
-            span = np.clip(now - self._current_time, self._drives.description.cycle, CURRENT_MEMORY)
+            span = np.minimum(np.maximum(now - self._current_time, self._drives.description.cycle), CURRENT_MEMORY)
             share = np.where(where, span / CURRENT_MEMORY, 0.0)
-            self.mean_current += share * (rows[CURRENT].mean(axis=0) - self.mean_current)
+            mean = rows[CURRENT].mean(axis=0) if len(rows[CURRENT]) > 1 else rows[CURRENT][0]
+            self.mean_current += share * (mean - self.mean_current)
             self._current_time = np.where(where, now, self._current_time)
         if VELOCITY in rows and self.is_counted:
             self.velocity = np.where(where, rows[VELOCITY][-1], self.velocity).astype(float)
@@ -207,14 +209,18 @@ class Axes:
         Only an axis in operation enabled homes, and what its speed explains is a movement: an axis that another cause
         accelerates in homing mode must not be taken for one whose zero moves with it.
         """
-        path = np.vstack([before, rows])
-        steps = wrapped(np.diff(path, axis=0))
-        elapsed = np.clip((now - self._position_time) / len(rows), self._drives.description.cycle, 1.0)
-        before_it = np.vstack([self._step_speed * elapsed, steps[:-1]])  # the step before each
-        known_speed, self._step_speed = self._step_speed, np.where(where, steps[-1] / elapsed, self._step_speed)
-        homing = where & self._placed & (self.mode == HM) & (self.is_enabled() | self._was_enabled)
+        elapsed = np.minimum(np.maximum((now - self._position_time) / len(rows), self._drives.description.cycle), 1.0)
+        last = wrapped(rows[-1] - (rows[-2] if len(rows) > 1 else before))
+        known_speed, self._step_speed = self._step_speed, np.where(where, last / elapsed, self._step_speed)
+        homes = self.mode == HM
+        if not homes.any():  # as in every cycle of a policy
+            return False
+        homing = where & self._placed & homes & (self.is_enabled() | self._was_enabled)
         if not homing.any():
             return False
+        path: Integers = np.vstack([before, rows])
+        steps = wrapped(np.diff(path, axis=0))
+        before_it = np.vstack([known_speed * elapsed, steps[:-1]])  # the step before each
         speed = np.maximum(np.abs(self.velocity) * elapsed, np.abs(before_it))
         explained = np.maximum(JUMP_TURNS * self.rotor.scale, JUMP_COUNTS) + JUMP_SHARE * speed
         jumps = np.where(homing & (np.abs(steps) > explained), steps, 0).sum(axis=0)

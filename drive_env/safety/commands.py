@@ -81,6 +81,7 @@ class Commands:
         self._drives = drives
         self._known = drives.description.dictionary
         self._current_limit = drives.description.role(Role.CURRENT_LIMIT)
+        self._scale_objects = scale_objects(drives.description)
         self._axes = axes
         self._limits = limits
         self._modes = modes
@@ -192,7 +193,10 @@ class Commands:
             return  # with the target
         target = by_key.get(TARGET_POSITION, self._last(TARGET_POSITION))
         offset = by_key.get(POSITION_OFFSET, self._last(POSITION_OFFSET))
-        self._check_position(entry, np.broadcast_to(target + offset, rows.shape), self._axes.everywhere, (CSP,))
+        aim = target + offset
+        if aim.shape != rows.shape:
+            aim = np.broadcast_to(aim, rows.shape)
+        self._check_position(entry, aim, self._axes.everywhere, (CSP,))
         if (entry.index, entry.sub) == TARGET_POSITION:
             self._check_position(entry, rows, self._axes.everywhere, (PP,))
 
@@ -214,7 +218,7 @@ class Commands:
     def _check_meaning(self, entry: Entry, where: Mask, *, is_played: bool = False) -> None:
         """Raise SafetyError for what would change the meaning of positions at the wrong time."""
         key = (entry.index, entry.sub)
-        moves_scale = key in scale_objects(self._drives.description)
+        moves_scale = key in self._scale_objects
         if moves_scale and is_played:
             raise SafetyError(f"{entry.label} changes the scale of positions, and is not played; write it")
         if moves_scale and np.any(where & self._axes.may_turn):

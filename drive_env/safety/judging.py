@@ -117,7 +117,7 @@ class Judging:
     def _stopping_distance(self, bounds: Bounds) -> Floats:
         """Return how far the axes go on, if they are stopped now [inc]."""
         speed = self._axes.velocity
-        planned = np.isin(self._axes.mode, (PP, CSP))  # ends by itself, at a target that was checked
+        planned = (self._axes.mode == PP) | (self._axes.mode == CSP)  # ends by itself, at a target that was checked
         braking = np.where(planned, bounds.profile, bounds.braking)
         # Where the ramp is not known, as long a way as a stop may take at most.
         unknown = np.where(planned, 0.0, np.abs(speed) * STOP_WITHIN / 2.0)
