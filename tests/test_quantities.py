@@ -120,8 +120,8 @@ def test_an_integer_by_itself():
 
 @pytest.mark.parametrize(("raw", "unit", "increments", "text"), [
     (500, "pps", TURN, "500 pps (30 rpm)"), (500, "inc", TURN, "500 inc (0.5 rev)"), (-7, "A", TURN, "-7 A"),
-    (1500, "mA", TURN, "1500 mA (1.5 A)"), (500, "pps", None, "500 pps"), (5, "", TURN, "5"), (240, "0.1V", TURN, "240 0.1V (24 V)"),
-    (1, "rpm", TURN, "1 rpm"), (500, "pps^2", TURN, "500 pps^2 (0.5 rev/s^2)"),
+    (1500, "mA", TURN, "1500 mA (1.5 A)"), (500, "pps", None, "500 pps"), (5, "", TURN, "5"),
+    (240, "0.1V", TURN, "240 0.1V (24 V)"), (1, "rpm", TURN, "1 rpm"), (500, "pps^2", TURN, "500 pps^2 (0.5 rev/s^2)"),
 ])  # fmt: skip
 def test_an_integer_is_shown_with_its_unit_and_as_people_say_it(raw, unit, increments, text):
     assert show(raw, entry(unit), increments) == text
@@ -134,5 +134,5 @@ def test_an_integer_is_shown_with_its_unit_and_as_people_say_it(raw, unit, incre
 def test_increments_of_a_revolution_where_the_drive_says_them(values, roles, expected):
     drives = HeldObjects(values, 2)
     drives.description.dictionary.roles.update(roles)
-    drives.read = lambda name: drives.values[roles[name] if name in roles else name]
+    drives.read = lambda name: drives.values[roles.get(name, name)]
     assert increments_per_revolution(drives) == expected
