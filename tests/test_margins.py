@@ -185,7 +185,7 @@ def test_a_loop_that_passes_minus_180_degrees_with_gain_and_comes_back_is_stable
 
 def test_rows_have_one_dimension_and_two_frequencies():
     for f, L in (([1.0], [1.0]), ([[1.0, 2.0]], [[1.0, 1.0]]), ([1.0, 1.0], [1.0, 1.0])):
-        with pytest.raises(ValueError, match="rows of one length|must be above 0 and increase"):
+        with pytest.raises(ValueError, match=r"rows of one length|must be above 0 and increase"):
             margins(f, L)
     with pytest.raises(ValueError, match="rows of one length"):
         margins([1.0, 2.0], [1.0, 1.0], [True])
