@@ -219,8 +219,8 @@ def converted_preset(
     for name, raw in preset.items():
         key = keys[name]
         if key in before and before[key].unit != after[key].unit:
-            si = raw * units.UNITS[before[key].unit].factor(context)
-            raw = round(si / units.UNITS[after[key].unit].factor(context))
+            si = raw * units.find_unit(before[key].unit).factor(context)
+            raw = round(si / units.find_unit(after[key].unit).factor(context))
         result[name] = raw
     return result
 

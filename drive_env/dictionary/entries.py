@@ -98,6 +98,13 @@ def _read_text(path: Path) -> str:
         return raw.decode("cp1252", errors="replace")
 
 
+def _as_key(name: str) -> tuple[int, int] | None:
+    """Return index and sub-index of "6081:0", as the files of a device write them; None of another text."""
+    index, colon, sub = name.partition(":")
+    is_key = bool(colon) and len(index) == 4 and all(letter in "0123456789abcdefABCDEF" for letter in index)
+    return (int(index, 16), int(sub)) if is_key and sub.isdecimal() else None
+
+
 class ObjectDictionary:
     """All entries of a device, from its EDS.
 
@@ -146,7 +153,9 @@ class ObjectDictionary:
                 raise ObjectAccessError(NO_SUCH_OBJECT, f"this drive has no {name.value}")
             name = self.roles[name]
         if isinstance(name, str):
-            key = self._names.get(name.strip().casefold())
+            key = self._names.get(name.strip().casefold()) or _as_key(name)
+            if key is not None and key not in self._entries:
+                return self.find(key)
             if key is None:
                 near = difflib.get_close_matches(name.casefold(), self._names, 3, 0.5)
                 hint = "; did you mean " + " or ".join(repr(self._entries[self._names[n]].name) for n in near)

@@ -223,7 +223,8 @@ class LiveDictionary:
         modes = sum(
             1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None and mode.number in taken
         )
-        stored[cia402.SUPPORTED_MODES, 0] = np.array([modes], np.int64)
+        if self.entries.has(cia402.SUPPORTED_MODES):
+            stored[cia402.SUPPORTED_MODES, 0] = np.array([modes], np.int64)
         for name, value in preset.items():
             entry = self.entries.find(name)
             raw = checked_values(entry, value, 1)
@@ -268,6 +269,7 @@ class LiveDictionary:
         return units.Context(
             position_scaler=get_lanes(self._records, SCALE_FIELD, self.num_axes).astype(float),
             current_lsb=device.current_full_scale / 32768.0,
+            rated_current=device.rated_current,
         )
 
     def _read(self, entry: Entry) -> Integers:
