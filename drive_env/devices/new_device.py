@@ -334,7 +334,7 @@ class _Draft:
             where = units.sources[quantity]
             if not where:
                 self._fill_in.append(
-                    Note(f"{quantity}s of bindings.toml, in {_shown(unit)}", "the EDS tells no unit: the standard's, or what "
+                    Note(f"unit of {quantity} in bindings.toml, in {_shown(unit)}", "the EDS tells no unit: the standard's, or what "
                          "fits the others; read the manual")
                 )  # fmt: skip
         if units.scale and min(self._default(*key) for key in units.scale.values()) <= 0:

@@ -163,7 +163,7 @@ class _Repairer:
             if name.lower() == "devicecommissioning":
                 canonical = "DeviceComissioning"  # as CiA 306 spells it
         if canonical.lower() != name.lower() or not is_closed:
-            self._tell(f"line {number}", f"section [{name}] is read as [{canonical}]")
+            self._tell(f"line {number}", f"section [{name}{']' if is_closed else ''} is read as [{canonical}]")
         return canonical
 
     def _take_value(self, section: Section, name: str, line: str, *, is_second: bool) -> None:
