@@ -1,4 +1,4 @@
-"""A device's folder from a vendor's EDS: dictionary, bindings, roles, gains, class values, and what a person must fill in.
+"""A device's folder from a vendor's EDS: dictionary, bindings, roles, gains, class values, what a person must fill in.
 
 Everything that the EDS says is taken; what it does not say and the emulator needs is a class value or an object of the
 emulator's own, in the manufacturer's area where the EDS has none; each is in the list. An object of the EDS that has no
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from canopen.objectdictionary import ODVariable
 
@@ -29,7 +29,7 @@ from drive_env.devices.standard_objects import (
     OwnObject,
 )
 from drive_env.devices.variants import TYPES
-from drive_env.devices.vendor_units import VendorUnits, vendor_units
+from drive_env.devices.vendor_units import vendor_units
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.drive_eds import axes_of, read_types
 from drive_env.dictionary.eds_file import EdsFile, Section, object_section, parse_eds
@@ -44,6 +44,8 @@ Key = tuple[int, int]
 Types = Mapping[Key, ODVariable]
 
 TEMPLATE = Path(__file__).parent / "template.toml"
+CLASS_VALUES = "no EDS has them: class values of a 24 to 48 V stage"
+AS_THE_STANDARD = "no EDS has them: the standard's way; `quirks` and `canopen` of the file formats name what may differ"
 LIST_NAME, EDS_NAME = "to_fill_in.md", "drive.eds"
 # Where the emulator's own objects may lie: the first block of the manufacturer's area that the EDS leaves free.
 OWN_BLOCKS = range(0x5F00, 0x1FFF, -0x100)
@@ -52,6 +54,17 @@ STORE, RESTORE = 0x1010, 0x1011
 ERROR_BEHAVIOUR = 0x1029
 STORE_ALL, STORE_COMMUNICATION, STORE_PROFILE = 1, 2, 3  # sub-indices of 1010h (CiA 301); those above are the maker's
 TRANSMISSION_TYPES = ["0...240", 254, 255]
+
+
+# What a drive has that has a mode, where its 6502h tells none.
+MODE_NEEDS = {
+    cia402.PP: cia402.TARGET_POSITION,
+    cia402.PV: cia402.TARGET_VELOCITY,
+    cia402.HM: cia402.HOMING_METHOD,
+    cia402.CSP: cia402.TARGET_POSITION,
+    cia402.CSV: cia402.TARGET_VELOCITY,
+    cia402.CST: cia402.TARGET_TORQUE,
+}
 
 
 class Note(NamedTuple):
@@ -86,7 +99,13 @@ class NewDevice(NamedTuple):
         )  # fmt: skip
         lines = [f"# {self.folder.name}: what its EDS does not say", ""]
         for title, notes in titles:
-            lines += [f"## {title}", "", *(f"- {note.what}: {note.why}" for note in notes), *([] if notes else ["nothing"]), ""]
+            lines += [
+                f"## {title}",
+                "",
+                *(f"- {note.what}: {note.why}" for note in notes),
+                *([] if notes else ["nothing"]),
+                "",
+            ]
         return "\n".join(lines)
 
 
@@ -184,12 +203,13 @@ class _Draft:
         bits = self._default(cia402.SUPPORTED_MODES)
         here = [mode for mode in MODES if mode.supported_bit is not None]
         if bits == 0:
-            needs = {"pp": cia402.TARGET_POSITION, "pv": cia402.TARGET_VELOCITY, "hm": cia402.HOMING_METHOD,
-                     "csp": cia402.TARGET_POSITION, "csv": cia402.TARGET_VELOCITY, "cst": cia402.TARGET_TORQUE}  # fmt: skip
-            found = [mode for mode in here if (needs.get(mode.abbreviation, -1), 0) in self._types]
+            found = [mode for mode in here if (MODE_NEEDS.get(mode.number, -1), 0) in self._types]
             listed = ", ".join(mode.abbreviation for mode in found)
             self._fill_in.append(
-                Note(f'[values] "{cia402.MODE:04X}:0" of device.toml', f"6502h tells no modes: {listed} by the objects that it has")
+                Note(
+                    f'[values] "{cia402.MODE:04X}:0" of device.toml',
+                    f"6502h tells no modes: {listed} by the objects that it has",
+                )
             )
         else:
             found = [mode for mode in here if mode.supported_bit is not None and bits >> mode.supported_bit & 1]
@@ -203,11 +223,13 @@ class _Draft:
         names = [mode.abbreviation for mode in found if mode.number in numbers]
         self._told_of_modes.insert(0, Note("taken", ", ".join(names) or "none"))
         if cia402.HM in numbers:
-            self._told_of_modes.append(Note("homing methods", ", ".join(map(str, methods)) + " of 6098h; others are refused"))
+            self._told_of_modes.append(
+                Note("homing methods", ", ".join(map(str, methods)) + " of 6098h; others are refused")
+            )
         return numbers
 
     def _homing_methods(self) -> list[int]:
-        """Return the methods of homing that both have: within the limits of 6098h, and listed in 60E3h where that lists any."""
+        """Return the methods of homing that both have: within 6098h's limits, and in 60E3h where that lists any."""
         variable = self._types.get((cia402.HOMING_METHOD, 0))
         low = -128 if variable is None or variable.min is None else variable.min
         high = 127 if variable is None or variable.max is None else variable.max
@@ -225,9 +247,11 @@ class _Draft:
         return found
 
     def _unit(self, name: str) -> str:
-        return {"velocity": self._units.velocity, "acceleration": self._units.acceleration, "torque": self._units.torque}.get(
-            name, name
-        )
+        return {
+            "velocity": self._units.velocity,
+            "acceleration": self._units.acceleration,
+            "torque": self._units.torque,
+        }.get(name, name)
 
     def _take_current_limit(self) -> None:
         """Let 6072h limit the current of a drive without 6073h: by its rated torque it is the same."""
@@ -271,11 +295,14 @@ class _Draft:
             if row.field in role:
                 self._roles[role[row.field]] = key
             if row.why:
-                self._fill_in.append(Note(f"{_text(key)} {row.name}", f"the EDS has {row.why}: an object of the emulator's own"))
-        self._fill_in.append(
-            Note(f"{self._base:04X}h and {self._base + 1:04X}h", "gains and motor: objects of the emulator's own, which the real "
-                 "drive has elsewhere or not at all; their values follow from --motor")
-        )  # fmt: skip
+                self._fill_in.append(
+                    Note(f"{_text(key)} {row.name}", f"the EDS has {row.why}: an object of the emulator's own")
+                )
+        own = f"{self._base:04X}h and {self._base + 1:04X}h"
+        why = (
+            "gains and motor: the emulator's own, which the real drive has elsewhere; their values follow from --motor"
+        )
+        self._fill_in.append(Note(own, why))
 
     def _write_own(self, index: int, title: str, rows: Sequence[OwnObject]) -> None:
         self._sections[object_section(index)] = {"ParameterName": title, "ObjectType": "0x9"}
@@ -285,10 +312,9 @@ class _Draft:
         }  # fmt: skip
         for sub, row in enumerate(rows, 1):
             unit = self._unit(row.unit)
-            self._sections[object_section(index, sub)] = {
-                "ParameterName": row.name, "DataType": f"0x{TYPES[row.kind]:04X}", "AccessType": "rw", "DefaultValue": "0",
-                **({} if unit == "raw" else {"Unit": _shown(unit)}),
-            }  # fmt: skip
+            section = {"ParameterName": row.name, "DataType": f"0x{TYPES[row.kind]:04X}", "AccessType": "rw"}
+            shown = {} if unit == "raw" else {"Unit": _shown(unit)}
+            self._sections[object_section(index, sub)] = section | {"DefaultValue": "0"} | shown
 
     def _correct_defaults(self) -> None:
         """Give objects whose factory value the emulator cannot have another, and units to what is bound."""
@@ -326,29 +352,34 @@ class _Draft:
             if self._axes > 1 and first != index and (first, sub) not in self._types and index in cia402.PROFILE_AREAS:
                 self._sections.pop(object_section(index, sub), None)
                 self._sections.pop(object_section(index), None)
-                self._changes.append(Note(f"[{_text((index, sub))}]", "was left out: the first axis has no such object"))
+                self._changes.append(
+                    Note(f"[{_text((index, sub))}]", "was left out: the first axis has no such object")
+                )
 
     def _tell_of_units(self) -> None:
         units = self._units
-        for quantity, unit in (("velocity", units.velocity), ("acceleration", units.acceleration), ("torque", units.torque)):
+        for quantity, unit in (
+            ("velocity", units.velocity),
+            ("acceleration", units.acceleration),
+            ("torque", units.torque),
+        ):
             where = units.sources[quantity]
             if not where:
-                self._fill_in.append(
-                    Note(f"unit of {quantity} in bindings.toml, in {_shown(unit)}", "the EDS tells no unit: the standard's, or what "
-                         "fits the others; read the manual")
-                )  # fmt: skip
+                why = "the EDS tells no unit: the standard's, or what fits the others; read the manual"
+                self._fill_in.append(Note(f"unit of {quantity} in bindings.toml, {_shown(unit)}", why))
         if units.scale and min(self._default(*key) for key in units.scale.values()) <= 0:
-            self._fill_in.append(Note(units.sources["position"], "has no factory value: the counts of the motor's encoder"))
+            self._fill_in.append(
+                Note(units.sources["position"], "has no factory value: the counts of the motor's encoder")
+            )
 
     def _class_values(self) -> list[Note]:
+        base = f"base of thousandths: {self._motor.rated_current:g} A peak of {self._motor.name}"
         return [
-            Note("[current] rated of device.toml", f"base of thousandths: {self._motor.rated_current:g} A peak of {self._motor.name}"),
-            Note("[rates], [current], [supply], [temperature], [stage] of device.toml", "no EDS has them: class values of a "
-                 "24 to 48 V stage"),
-            Note("[quirks] and [canopen] of device.toml", "no EDS has them: the standard's behaviour; where the real drive "
-                 "differs, drive_env/devices/drive_quirks.py and services.py name the switches"),
+            Note("[current] rated of device.toml", base),
+            Note("[rates], [current], [supply], [temperature], [stage] of device.toml", CLASS_VALUES),
+            Note("[quirks] and [canopen] of device.toml", AS_THE_STANDARD),
             Note("[emergencies] of device.toml", "codes of CiA 402; the maker's table may have others"),
-        ]  # fmt: skip
+        ]
 
     def _without_effect(self) -> Iterable[Note]:
         own = {index for (index, _), _ in self._own}
@@ -363,7 +394,7 @@ class _Draft:
     # --- files ----------------------------------------------------------------------------------------------------
     def _device_toml(self, folder: Path) -> str:
         text = TEMPLATE.read_text(encoding="utf-8")
-        info = self._sections.get("DeviceInfo", {})
+        info, current = self._sections.get("DeviceInfo", {}), self._motor.rated_current
         title = " ".join(filter(None, (info.get("VendorName"), info.get("ProductName")))) or self._eds.stem
         head = (
             f"# Made from {self._eds.name} by drive-env new; {LIST_NAME} lists what a person must fill in.\n"
@@ -374,7 +405,7 @@ class _Draft:
             text = text.replace("axis_offsets = []", self._axis_offsets())
         text = text.replace(
             "[current]  # A of peak i_q\n",
-            f"[current]  # A of peak i_q\nrated = {self._motor.rated_current:.6g} # base of thousandths: {self._motor.name}\n",
+            f"[current]  # A of peak i_q\nrated = {current:.6g}  # base of thousandths: {self._motor.name}\n",
         )
         if info.get("LSS_Supported", "0") not in ("", "0"):
             text = text.replace("lss = false", "lss = true")
@@ -389,7 +420,7 @@ class _Draft:
         return f"axis_offsets = [\n{listed}]"
 
     def _tables(self) -> str:
-        values: dict[str, list[int | str]] = {f"{cia402.MODE:04X}:0": [0, *self._modes]}
+        values: dict[str, list[Any]] = {f"{cia402.MODE:04X}:0": [0, *self._modes]}
         if (cia402.QUICK_STOP_OPTION, 0) in self._types:
             values[f"{cia402.QUICK_STOP_OPTION:04X}:0"] = [*QUICK_STOP_OPTIONS]
         method = next((key for key, row in self._bindings.items() if row.field == "homing_method"), None)
@@ -401,14 +432,19 @@ class _Draft:
             if index == ERROR_BEHAVIOUR and sub > 0:
                 values[_text((index, sub))] = [0, 1, 2]
         stored = sorted(sub for index, sub in self._types if index == STORE and sub > 0)
-        services = [_text((index, sub)) for index in (STORE, RESTORE) for i, sub in self._types if i == index and sub > 0]
+        services = [
+            _text((index, sub)) for index in (STORE, RESTORE) for i, sub in self._types if i == index and sub > 0
+        ]
         lines = ["[states]", "", "[values]  # objects that know a few values only"]
         lines += [f'"{key}" = [{", ".join(map(_toml, row))}]' for key, row in values.items()]
         lines += ["", "[strict_transmission_types]", "", "[unsupported]  # without a node on a bus"]
         lines += [f"objects = [{', '.join(map(_quoted, services))}]", "", "[canopen.store_groups]  # CiA 301, 1010h"]
         motors = [f"motor {axis}" for axis in range(self._axes)] + ["module"]
-        groups = {STORE_ALL: ["bus", "communication", "profile", *motors], STORE_COMMUNICATION: ["bus", "communication"],
-                  STORE_PROFILE: ["profile"]}  # fmt: skip
+        groups = {
+            STORE_ALL: ["bus", "communication", "profile", *motors],
+            STORE_COMMUNICATION: ["bus", "communication"],
+            STORE_PROFILE: ["profile"],
+        }
         lines += [f"{sub} = [{', '.join(map(_quoted, groups.get(sub, motors)))}]" for sub in stored]
         return "\n".join(lines) + "\n"
 

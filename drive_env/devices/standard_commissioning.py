@@ -1,7 +1,7 @@
-"""Commissioning of any CiA 402 drive for a motor, from the motor's data alone: gains of our servo cascade, and class
-values of speeds, ramps and windows, each in the unit that the drive's bindings give it.
+"""Commissioning of any CiA 402 drive for a motor, from the motor's data alone.
 
-They are to move any sound machine, not to be good; a file of the device's own presets goes before them.
+Gains are those of our servo cascade; speeds, ramps and windows are class values, each in the unit that the drive's
+bindings give it. They are to move any sound machine, not to be good; a file of the device's own presets goes before.
 """
 
 from __future__ import annotations
@@ -27,7 +27,10 @@ CURRENT_HZ, VELOCITY_HZ, POSITION_HZ = 1000.0, 20.0, 5.0
 PEAK = 2.0  # of the rated current
 SPEED, HOMING_SPEED, SLOW_SPEED = 0.5, 0.05, 0.01  # of the rated speed
 TORQUE = 0.4  # of the rated torque, for ramps of that inertia
-WINDOW, LAG = 0.003, 10.0  # revolutions: of rest at a target; of a following error, since the loops have no feed-forward
+WINDOW, LAG = (
+    0.003,
+    10.0,
+)  # revolutions: of rest at a target; of a following error, since the loops have no feed-forward
 WINDOW_TIME = 0.002  # s
 
 
@@ -54,9 +57,12 @@ def preset(device: Device, motor: Motor) -> dict[str, int]:
         device, motor, ROTORS * motor.inertia, current_hz=CURRENT_HZ, velocity_hz=VELOCITY_HZ, position_hz=POSITION_HZ
     )
     found |= {_text(row.key): int(raw) for row, raw in zip(device.gains.rows, gains, strict=True)}
-    for index, raw in ((cia402.RATED_CURRENT, 1e3 * motor.rated_current), (cia402.RATED_TORQUE, 1e3 * motor.rated_torque)):
+    for index, rated in (
+        (cia402.RATED_CURRENT, 1e3 * motor.rated_current),
+        (cia402.RATED_TORQUE, 1e3 * motor.rated_torque),
+    ):
         if dictionary.has(index) and dictionary.find(index).access not in ("ro", "const"):
-            found[_text((index, 0))] = max(round(raw), 1)
+            found[_text((index, 0))] = max(round(rated), 1)
     methods = device.allowed_values.get((cia402.HOMING_METHOD, 0), ())
     if methods and dictionary.find(cia402.HOMING_METHOD).default not in methods:
         found[_text((cia402.HOMING_METHOD, 0))] = methods[-1]

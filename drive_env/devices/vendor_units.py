@@ -1,8 +1,8 @@
 """The units that a drive counts in, as its EDS tells them: scale of positions, speeds, accelerations, torques.
 
 Positions follow 6092h over 6091h, or 608Fh; speeds and accelerations 60A9h and 60AAh, or the unit that the EDS writes
-beside an object. Where nothing tells a unit it is the standard's: units of position per second, thousandths of the rated
-torque.
+beside an object. Where nothing tells a unit it is the standard's: units of position per second, thousandths of the
+rated torque.
 """
 
 from __future__ import annotations
@@ -21,7 +21,11 @@ COARSEST = 100.0  # units of position in a turn: a scale below is none that a po
 # Codes of CiA 303-2 in 60A8h to 60AAh: powers of ten above, then numerator, denominator, and a byte that is 0.
 REVOLUTIONS, INCREMENTS, PER_MINUTE = 0xB4, 0xB5, 0xC0
 SECOND, MINUTE, SECOND_SQUARED = 0x03, 0x47, 0x57
-_SPEEDS = {(REVOLUTIONS, MINUTE): (1.0, "rpm"), (REVOLUTIONS, SECOND): (60.0, "rpm"), (INCREMENTS, SECOND): (1.0, "pps")}
+_SPEEDS = {
+    (REVOLUTIONS, MINUTE): (1.0, "rpm"),
+    (REVOLUTIONS, SECOND): (60.0, "rpm"),
+    (INCREMENTS, SECOND): (1.0, "pps"),
+}
 _ACCELERATIONS = {
     (PER_MINUTE, SECOND): (1.0, "rpm/s"),
     (REVOLUTIONS, SECOND_SQUARED): (60.0, "rpm/s"),

@@ -51,7 +51,9 @@ _DEVICE_NUMBERS = ("VendorNumber", "ProductNumber", "RevisionNumber", "SimpleBoo
                    "LSS_Supported")  # fmt: skip
 _SECTION = re.compile(r"\s*\[\s*(.*?)\s*(\].*)?$")
 _OBJECT = re.compile(r"(?:0x)?([0-9A-Fa-f]{4})h?$", re.IGNORECASE)
-_MEMBER = re.compile(r"(?:0x)?([0-9A-Fa-f]{4})h?[\s_]*sub[\s_]*(?:index)?[\s_]*(?:0x)?([0-9A-Fa-f]{1,2})h?$", re.IGNORECASE)
+_MEMBER = re.compile(
+    r"(?:0x)?([0-9A-Fa-f]{4})h?[\s_]*sub[\s_]*(?:index)?[\s_]*(?:0x)?([0-9A-Fa-f]{1,2})h?$", re.IGNORECASE
+)
 _COMPACT = re.compile(r"([0-9A-Fa-f]{4})(Name|Value)$", re.IGNORECASE)
 
 Section = dict[str, str]
@@ -229,7 +231,7 @@ class _Repairer:
         if text is None:
             return VAR
         kind = OBJECT_TYPES.get(text.upper(), number_of(text))
-        if kind not in OBJECT_TYPES.values():
+        if kind is None or kind not in OBJECT_TYPES.values():
             self._tell(f"[{name}]", f"ObjectType={text} is none of CiA 306")
             kind = VAR
         row["ObjectType"] = f"0x{kind:X}"
@@ -270,10 +272,10 @@ class _Repairer:
     def _missing_type(self, index: int, sub: int) -> int | None:
         """Return the type that an entry can only have; None where nothing says it."""
         if sub == 0:
-            return datatypes.UNSIGNED8
+            return int(datatypes.UNSIGNED8)
         if index in STANDARD_TYPES:
             return STANDARD_TYPES[index][0]
-        return datatypes.UNSIGNED32 if 0x1000 <= index < 0x1004 else None
+        return int(datatypes.UNSIGNED32) if 0x1000 <= index < 0x1004 else None
 
     def _repair_access(self, name: str, row: Section, index: int) -> None:
         text = row.get("AccessType", "").lower().strip()
@@ -337,6 +339,7 @@ class _Repairer:
 
     # --- what is no object ----------------------------------------------------------------------------------------
     def _repair_headers(self) -> None:
+        self._sections.setdefault("DeviceInfo", {})
         dummies = self._sections.get("DummyUsage")
         if dummies is not None:
             used = {key: number_of(value) or 0 for key, value in dummies.items()}

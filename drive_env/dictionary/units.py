@@ -131,7 +131,9 @@ def find_unit(name: str) -> Unit:
     if base not in UNITS or not 0.0 < number < math.inf or UNITS[base].specials or UNITS[base].period:
         raise ValueError(f"there is no unit {name!r}{did_you_mean(base, UNITS)}")
     row = UNITS[base]
-    return Unit(name, f"{number:g} times: {row.meaning}", lambda c: number * row.factor(c), follows_scale=row.follows_scale)
+    return Unit(
+        name, f"{number:g} times: {row.meaning}", lambda c: number * row.factor(c), follows_scale=row.follows_scale
+    )
 
 
 def wrap(value: NDArray[Any], bits: int = 32) -> Floats:

@@ -91,8 +91,8 @@ def _await_mode(drives: BasicDrives, mode: str, axes: Mask, timeout: float = 1.0
         if waited >= timeout:
             axis = int(np.flatnonzero(late)[0])
             raise TimeoutError(
-                f"axis {axis} did not change to {mode} in {timeout:g} s, at a halt neither: 6061h shows another mode, and "
-                "the axis is halted; disable it, then select the mode"
+                f"axis {axis} did not change to {mode} in {timeout:g} s, at a halt neither: 6061h shows another "
+                "mode, and the axis is halted; disable it, then select the mode"
             )
         drives.advance(STEP)
         waited += STEP
