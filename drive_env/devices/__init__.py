@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -11,6 +12,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from drive_env import cia402
+from drive_env.devices import standard_commissioning
+from drive_env.devices.drive_quirks import DriveQuirks, drive_quirks_of
 from drive_env.devices.gain_set import GainSet, load_gain_set
 from drive_env.devices.own_folder import BINDINGS, is_own_folder, naming, own_bindings, own_data
 from drive_env.devices.services import NodeQuirks, NodeServices, node_quirks_of, services_of
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
     from drive_env.firmware.cycle import Firmware
 
 FOLDER = Path(__file__).parent
+STANDARD_COMMISSIONING = "standard"
 
 
 class StageParameter(NamedTuple):
@@ -178,6 +182,9 @@ class Device(NamedTuple):
     gains: GainSet
     firmware_name: str
     variant_of: str = ""
+    quirks: DriveQuirks = DriveQuirks()
+    rated_current: float = math.nan  # [A] of peak i_q, the base of thousandths of the rated current or torque
+    commissioning: str = ""  # "standard": presets follow from the motor's data by the rule of any CiA 402 drive
     about: str = ""  # what a reader of its page must know besides its data
 
     @property
@@ -252,6 +259,8 @@ class Device(NamedTuple):
         preset: dict[str, int]
         if path.exists() and MOTORS.get(motor.name) == motor and self._scales_gains_as(written_for):
             preset = dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
+        elif self.commissioning == STANDARD_COMMISSIONING:
+            preset = standard_commissioning.preset(self, motor)
         elif self.presets.parent.parent != FOLDER:
             raise ValueError(
                 f"{self.name} has no preset for a {motor.name}; write {path} with [objects], name = integer, or take a "
@@ -393,6 +402,9 @@ def _device(
         gains=gains,
         firmware_name=checked_firmware(data["firmware"]),
         variant_of=data.get("variant_of", ""),
+        quirks=drive_quirks_of(data),
+        rated_current=data["current"].get("rated", data["current"]["nominal"]),
+        commissioning=data.get("commissioning", ""),
         about=data.get("about", "").strip(),
     )
 

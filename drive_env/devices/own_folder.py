@@ -20,8 +20,7 @@ from typing import Any
 
 from drive_env.devices.variants import Key, parse_key
 from drive_env.dictionary.bindings import Binding
-from drive_env.dictionary.units import UNITS
-from mechanics.near_names import did_you_mean
+from drive_env.dictionary.units import find_unit
 from mechanics.untrusted import read_toml
 
 BINDINGS = "bindings.toml"
@@ -56,8 +55,10 @@ def own_bindings(folder: Path) -> dict[Key, Binding]:
     bindings = {}
     for text, row in rows.items():
         bindings[parse_key(text)] = binding = Binding(*parse_key(text), **row)
-        if binding.unit not in UNITS:
-            raise ValueError(f"{text} has no unit {binding.unit!r}{did_you_mean(binding.unit, UNITS)}")
+        try:
+            find_unit(binding.unit)
+        except ValueError as error:
+            raise ValueError(f"{text}: {error}") from None
     return bindings
 
 

@@ -1,7 +1,8 @@
 """How many increments of position a revolution has: one object says it, or two whose values make it.
 
 A servo drive has an object of its own for it (Role.POSITION_SCALE). A stepper counts microsteps: full steps of a turn,
-times two to the power of the resolution.
+times two to the power of the resolution. Of CiA 402 are the encoder's resolution (608Fh), and feed constant over gear
+ratio (6092h, 6091h), each a fraction of two objects.
 """
 
 from __future__ import annotations
@@ -31,7 +32,25 @@ def position_scale(roles: Mapping[Role, Key]) -> PositionScale | None:
         return PositionScale((roles[Role.POSITION_SCALE],), lambda values: values[0])
     if Role.FULL_STEPS in roles and Role.MICROSTEPS in roles:
         return PositionScale((roles[Role.FULL_STEPS], roles[Role.MICROSTEPS]), _microsteps)
+    for parts, increments in ((_GEARED_FEED, _per_motor_turn), (_FEED, _quotient), (_RESOLUTION, _quotient)):
+        if all(part in roles for part in parts):
+            return PositionScale(tuple(roles[part] for part in parts), increments)
     return None
+
+
+_RESOLUTION = (Role.ENCODER_INCREMENTS, Role.ENCODER_TURNS)
+_FEED = (Role.FEED, Role.FEED_TURNS)
+_GEARED_FEED = (*_FEED, Role.GEAR_MOTOR, Role.GEAR_SHAFT)
+
+
+def _quotient(values: Sequence[Floats]) -> Floats:
+    number, turns = values
+    return number / turns
+
+
+def _per_motor_turn(values: Sequence[Floats]) -> Floats:
+    units, turns, motor, shaft = values
+    return units / turns * shaft / motor
 
 
 def _microsteps(values: Sequence[Floats]) -> Floats:

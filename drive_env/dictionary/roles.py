@@ -13,6 +13,12 @@ class Role(Enum):
     """A part that an object plays; the value is what a message calls it."""
 
     POSITION_SCALE = "scale of positions (increments of a revolution)"
+    ENCODER_INCREMENTS = "increments of the encoder"
+    ENCODER_TURNS = "revolutions of the motor that have them"
+    FEED = "units of position"
+    FEED_TURNS = "revolutions of the driving shaft that have them"
+    GEAR_MOTOR = "revolutions of the motor"
+    GEAR_SHAFT = "revolutions of the driving shaft that it makes of them"
     FULL_STEPS = "full steps of a revolution"
     MICROSTEPS = "microsteps of a full step, as a power of two"
     CURRENT_LIMIT = "current limit"

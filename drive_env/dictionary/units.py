@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mechanics.near_names import did_you_mean
 
 Floats = NDArray[np.float64]
 TWO_PI = 2.0 * np.pi
@@ -22,6 +25,7 @@ class Context(NamedTuple):
 
     position_scaler: Floats | float  # [inc/rev]
     current_lsb: float  # [A] per LSB of the current loop
+    rated_current: float = math.nan  # [A] of peak i_q, the base of CiA 402's thousandths
 
 
 class Unit(NamedTuple):
@@ -81,7 +85,9 @@ UNITS: dict[str, Unit] = {
             specials=((2**31 - 1, math.inf), (-(2**31), -math.inf)),
             follows_scale=True,
         ),
+        Unit("1/1000 rated", "thousandths of the rated current or torque", lambda c: 1e-3 * c.rated_current),
         Unit("0.1V", "tenths of a volt", lambda c: 0.1),
+        Unit("mV", "millivolts", lambda c: 1e-3),
         Unit("pps", "increments per second", _angle, follows_scale=True),
         Unit("pps^2", "increments per second squared", _angle, follows_scale=True),
         Unit("pps^3", "increments per second cubed", _angle, follows_scale=True),
@@ -99,6 +105,35 @@ UNITS: dict[str, Unit] = {
         Unit("1/65536 turn", "electrical angle, wraps at half a turn", lambda c: TWO_PI / 65536.0, period=65536.0),
     )
 }
+
+
+def split_unit(name: str) -> tuple[float, str]:
+    """Return how many of which unit one is: "0.1 rpm" is 0.1 of "rpm", and a row of the table 1 of itself."""
+    number, _, base = name.partition(" ")
+    if name in UNITS or base not in UNITS:
+        return 1.0, name
+    try:
+        return float(number), base
+    except ValueError:
+        return 1.0, name
+
+
+@cache
+def find_unit(name: str) -> Unit:
+    """Return a row by its name, or so many of one: "0.1 rpm", "10 pps^2".
+
+    Raises:
+        ValueError: For a unit that there is not, with a near one.
+    """
+    if name in UNITS:
+        return UNITS[name]
+    number, base = split_unit(name)
+    if base not in UNITS or not 0.0 < number < math.inf or UNITS[base].specials or UNITS[base].period:
+        raise ValueError(f"there is no unit {name!r}{did_you_mean(base, UNITS)}")
+    row = UNITS[base]
+    return Unit(
+        name, f"{number:g} times: {row.meaning}", lambda c: number * row.factor(c), follows_scale=row.follows_scale
+    )
 
 
 def wrap(value: NDArray[Any], bits: int = 32) -> Floats:

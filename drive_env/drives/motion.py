@@ -6,11 +6,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
+from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives.interface import BasicDrives
 
 Mask = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+WIDEST = 2**31  # increments: a window of more is a switch
 
 STEP = 0.001  # time between two looks at the statusword [s]
+MODE_PATIENCE = 0.25  # s for which a mode may be asked for before something must be done about it
+TAKEN_BACK = 0.05  # s after which a set-point whose acknowledge stays is in a drive's buffer
+REST = 0.25  # s at the target, or at home, after which a drive without bit 10 has got there
+NEAR = 10  # increments around a target, where the drive has no window of its own
 
 
 def wait_for(
@@ -57,6 +64,54 @@ def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> No
     other = axes & (drives.read(cia402.MODE) != cia402.MODES[mode])
     if other.any():
         drives.write(cia402.MODE, cia402.MODES[mode], where=other)
+    _await_mode(drives, mode, axes)
+
+
+def _await_mode(drives: BasicDrives, mode: str, axes: Mask, timeout: float = 1.0) -> None:
+    """Let time pass until 6061h shows a mode.
+
+    A drive may be slow; it may change modes at a halt alone, so that enabled axes that do not show the mode are halted
+    until they do; and it may show a mode only once it is enabled, so that a disabled axis is not waited for for long.
+
+    Raises:
+        TimeoutError: If an enabled axis does not get into the mode; it is halted then.
+    """
+    late = _not_in_mode(drives, mode, axes)
+    waited = 0.0
+    while late.any() and waited < MODE_PATIENCE:
+        drives.advance(STEP)
+        waited += STEP
+        late = _not_in_mode(drives, mode, late)
+    halted = late & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED) if late.any() else late
+    if not halted.any():
+        return
+    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=halted)
+    waited, late = 0.0, halted
+    while late.any():
+        if waited >= timeout:
+            axis = int(np.flatnonzero(late)[0])
+            raise TimeoutError(
+                f"axis {axis} did not change to {mode} in {timeout:g} s, at a halt neither: 6061h shows another "
+                "mode, and the axis is halted; disable it, then select the mode"
+            )
+        drives.advance(STEP)
+        waited += STEP
+        late = _not_in_mode(drives, mode, late)
+    drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=halted)
+
+
+def _not_in_mode(drives: BasicDrives, mode: str, axes: Mask) -> Mask:
+    """Return the axes that show another mode; none where a drive does not show its mode."""
+    shown = _shown_modes(drives)
+    return np.zeros_like(axes) if shown is None else np.asarray(axes & (shown != cia402.MODES[mode]))
+
+
+def _shown_modes(drives: BasicDrives) -> Integers | None:
+    """Return what 6061h shows, None of drives that have none."""
+    try:
+        return drives.read(cia402.MODE_DISPLAY)
+    except ObjectAccessError:
+        return None
 
 
 def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = None, timeout: float = 1.0) -> None:
@@ -69,7 +124,8 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
         timeout: Longest wait for each state [s]; a drive that waits for its brake needs its delays, and more.
 
     Raises:
-        TimeoutError: If a state is not reached in time. An axis that is late is not left on its way there.
+        TimeoutError: If a state, or the mode, is not reached in time. An axis that is late is not left on its way
+            there.
     """
     status = drives.read(cia402.STATUSWORD)
     axes = np.ones(drives.num_axes, bool) if where is None else where
@@ -97,6 +153,12 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
             # A drive that waits for its brake would enable later, when nobody expects it any more.
             late = not_enabled & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
             drives.write(cia402.CONTROLWORD, cia402.SHUTDOWN, where=late)
+            raise
+    if mode is not None:
+        try:
+            _await_mode(drives, mode, not_enabled)
+        except TimeoutError:
+            drives.write(cia402.CONTROLWORD, cia402.SHUTDOWN, where=not_enabled)
             raise
 
 
@@ -138,6 +200,8 @@ def start_move(
 ) -> None:
     """Start a move in pp to a position [inc], with the set-point handshake of bits 4 and 12.
 
+    A drive that would put the set-point into a buffer, until the move before has ended, is told to change it at once.
+
     Raises:
         RuntimeError: If an axis is not enabled, or not in pp; nothing is written.
         TimeoutError: If the drive does not take the set-point within `timeout` [s].
@@ -148,7 +212,25 @@ def start_move(
     drives.write(cia402.CONTROLWORD, word | cia402.NEW_SET_POINT, where=where)
     wait_for(drives, cia402.SET_POINT_ACKNOWLEDGED, timeout, "set-point acknowledge", where)
     drives.write(cia402.CONTROLWORD, word, where=where)
+    kept = _still_acknowledged(drives, where)
+    if kept.any() and not relative:  # a relative one ends at the same place from the buffer, and must not go twice
+        at_once = word | cia402.CHANGE_AT_ONCE
+        drives.write(cia402.CONTROLWORD, at_once | cia402.NEW_SET_POINT, where=kept)
+        wait_for(drives, cia402.SET_POINT_ACKNOWLEDGED, timeout, "set-point acknowledge", kept)
+        drives.write(cia402.CONTROLWORD, word, where=kept)
     wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "end of set-point acknowledge", where)
+
+
+def _still_acknowledged(drives: BasicDrives, where: Mask | None) -> Mask:
+    """Return the axes whose acknowledge stays though bit 4 of the controlword is back."""
+    axes = np.ones(drives.num_axes, bool) if where is None else where
+    waited = 0.0
+    while True:
+        kept = axes & cia402.matches(drives.read(cia402.STATUSWORD), cia402.SET_POINT_ACKNOWLEDGED)
+        if not kept.any() or waited >= TAKEN_BACK:
+            return np.asarray(kept)
+        drives.advance(STEP)
+        waited += STEP
 
 
 def move_to(
@@ -161,17 +243,55 @@ def move_to(
 ) -> None:
     """Move in pp to a position [inc] and wait until it is reached.
 
+    A drive that never shows bit 10 is there once it has stood at its target for a while.
+
     Raises:
         RuntimeError: If an axis is not enabled, or not in pp; nothing is written.
         TimeoutError: If the target is not reached within `timeout` [s].
     """
+    axes = np.ones(drives.num_axes, bool) if where is None else where
+    goal = np.broadcast_to(np.asarray(position), (drives.num_axes,))
+    if relative:
+        goal = goal + drives.read(cia402.POSITION_ACTUAL)
     start_move(drives, position, relative=relative, where=where)
-    wait_for(drives, cia402.TARGET_REACHED, timeout, "target reached", where)
+    waited = 0.0
+    while axes.any() and waited < timeout:
+        step = min(REST, timeout - waited)
+        try:
+            wait_for(drives, cia402.TARGET_REACHED, step, "target reached", axes)
+            return
+        except TimeoutError:
+            waited += step
+        axes = axes & ~_stands_at(drives, goal, axes)
+    wait_for(drives, cia402.TARGET_REACHED, 0.0, f"target reached after {waited:g} s", axes)
+
+
+def _stands_at(drives: BasicDrives, goal: Integers, axes: Mask) -> Mask:
+    """Let a while pass, and return the axes that stand at their target without saying so; none if one may move."""
+    before = drives.read(cia402.POSITION_ACTUAL)
+    near = max(NEAR, _window(drives))
+    if not np.any(axes & (np.abs(before - goal) <= near)):
+        return np.zeros_like(axes)
+    drives.advance(REST)
+    after = drives.read(cia402.POSITION_ACTUAL)
+    reached = cia402.matches(drives.read(cia402.STATUSWORD), cia402.TARGET_REACHED)
+    stands = (np.abs(after - goal) <= near) & (np.abs(after - before) <= NEAR)
+    return np.asarray(axes & (reached | stands))
+
+
+def _window(drives: BasicDrives) -> int:
+    """Return the widest position window of the axes [inc]; 0 where there is none, or it is switched off."""
+    try:
+        window = int(drives.read(cia402.POSITION_WINDOW).max())
+    except ObjectAccessError:
+        return 0
+    return window if window < WIDEST else 0
 
 
 def _check_can_move(drives: BasicDrives, where: Mask | None) -> None:
     axes = np.ones(drives.num_axes, bool) if where is None else where
-    status, mode = drives.read(cia402.STATUSWORD), drives.read(cia402.MODE_DISPLAY)
+    status, shown = drives.read(cia402.STATUSWORD), _shown_modes(drives)
+    mode = drives.read(cia402.MODE) if shown is None else shown
     off = axes & ~cia402.matches(status, cia402.OPERATION_ENABLED)
     other = axes & (mode != cia402.MODES["pp"])
     for wrong, what in ((off, "is not enabled"), (other, "is not in pp")):
@@ -194,7 +314,7 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
     enable(drives, mode="hm", where=where)
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)  # bit 4 must rise
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.NEW_SET_POINT, where=where)
-    waited = 0.0
+    waited, silent = 0.0, 0
     while True:
         drives.advance(2 * STEP)  # the first look comes after the drive has begun
         waited += 2 * STEP
@@ -208,9 +328,21 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
             raise RuntimeError(
                 f"axis {axis} {what}: statusword {status[axis]:04X}h; check the method 6098h, its switches and speeds"
             )
-        if not np.any(axes & (bits != cia402.HOMED)):
+        still = axes & (bits != cia402.HOMED)
+        if not still.any():
+            break
+        # Bit 12 alone is home that is left again for where the axis rests, or home on a drive without bit 10.
+        silent = silent + 1 if np.all(bits[still] == cia402.HOMING_UNDER_WAY[1]) else 0
+        if silent * 2 * STEP >= REST and _rests(drives, still):
             break
         if waited >= timeout:
             axis = int(np.flatnonzero(axes & (bits != cia402.HOMED))[0])
             raise TimeoutError(f"axis {axis} did not attain home in {timeout:g} s: statusword {status[axis]:04X}h")
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)
+
+
+def _rests(drives: BasicDrives, axes: Mask) -> bool:
+    """Let a while pass, and return whether axes have stood through it."""
+    before = drives.read(cia402.POSITION_ACTUAL)
+    drives.advance(REST)
+    return bool(np.all(np.abs(drives.read(cia402.POSITION_ACTUAL) - before)[axes] <= NEAR))

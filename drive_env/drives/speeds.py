@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.dictionary.roles import Role
+from drive_env.dictionary.units import split_unit
 from drive_env.drives.interface import Drives
 
 _BY_MINUTE = ("rpm", "rpm/s")
@@ -22,11 +23,15 @@ def per_increment(drives: Drives, name: int | tuple[int, int]) -> NDArray[np.flo
     """
     device = drives.device
     key = name if isinstance(name, tuple) else (name, 0)
-    if device is None or device.bindings[key].unit not in _BY_MINUTE:
+    if device is None:
         return 1.0
-    return 60.0 / np.asarray(drives.read(Role.POSITION_SCALE), float)
+    number, unit = split_unit(device.bindings[key].unit)
+    if unit not in _BY_MINUTE:
+        return 1.0 / number
+    return 60.0 / np.asarray(drives.read(Role.POSITION_SCALE), float) / number
 
 
 def per_increment_of(unit: str, scaler: float) -> float:
     """Return the same for a unit, and a scale of positions [inc/rev]."""
-    return 60.0 / scaler if unit in _BY_MINUTE else 1.0
+    number, base = split_unit(unit)
+    return (60.0 / scaler if base in _BY_MINUTE else 1.0) / number

@@ -374,6 +374,10 @@ class EmulatedDrives:
             wired = get_lanes(records, "wired", self.num_axes).astype(np.int32)
             set_lanes(records, "wired", wired | (1 << kind), axes)
         records["supply_voltage"] = supply
+        records["mode_delay"] = device.quirks.mode_display_delay
+        records["mode_needs_halt"] = device.quirks.mode_change_needs_halt
+        records["absent_status_bits"] = device.quirks.absent_status_bits
+        records["set_point_buffer"] = device.quirks.set_point_buffer
         self._kind.set_constants(records, device, self.motor)
         self._set_noise(np.ones(self.num_axes, bool))
 

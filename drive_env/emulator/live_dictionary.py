@@ -34,7 +34,7 @@ Mask = NDArray[np.bool_]
 
 _EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
-MODE_OF_OPERATION = (cia402.MODE, 0)
+MODE_OF_OPERATION, MODE_DISPLAY = (cia402.MODE, 0), (cia402.MODE_DISPLAY, 0)
 
 
 class LiveDictionary:
@@ -70,6 +70,8 @@ class LiveDictionary:
         if name is Role.POSITION_SCALE and len(self.scale_keys) > 1:  # no object has it: several make it
             return np.rint(self._context().position_scaler).astype(np.int64)
         entry = self.entries.find(name)
+        if entry.access == "wo" and (entry.index, entry.sub) == MODE_OF_OPERATION and self.entries.has(MODE_DISPLAY):
+            entry = self.entries.find(MODE_DISPLAY)  # which shows it (CiA 402)
         check_readable(entry)
         return self._read(entry)
 
@@ -223,7 +225,8 @@ class LiveDictionary:
         modes = sum(
             1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None and mode.number in taken
         )
-        stored[cia402.SUPPORTED_MODES, 0] = np.array([modes], np.int64)
+        if self.entries.has(cia402.SUPPORTED_MODES):
+            stored[cia402.SUPPORTED_MODES, 0] = np.array([modes], np.int64)
         for name, value in preset.items():
             entry = self.entries.find(name)
             raw = checked_values(entry, value, 1)
@@ -268,6 +271,7 @@ class LiveDictionary:
         return units.Context(
             position_scaler=get_lanes(self._records, SCALE_FIELD, self.num_axes).astype(float),
             current_lsb=device.current_full_scale / 32768.0,
+            rated_current=device.rated_current,
         )
 
     def _read(self, entry: Entry) -> Integers:

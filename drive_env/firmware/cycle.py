@@ -279,6 +279,8 @@ def reset_shared_state(drive, lane):
     drive.stopping[lane] = 0
     drive.set_point_valid[lane] = 0
     drive.set_point_acknowledged[lane] = 0
+    drive.set_point_waiting[lane] = 0
+    drive.mode_wait[lane] = 0.0
     drive.target_reached[lane] = 0
     drive.drive_function[lane] = 0.0
     drive.stage_on[lane] = 0.0
@@ -338,10 +340,8 @@ def _events(causes_gone: Stage, cause_bits: Stage) -> _Events:
 
     @stage
     def write_mode(drive, lane, mode):
-        """Process a write of 6060h: the mode changes at once."""
-        drive.mode[lane] = mode
-        if mode != drive.mode_display[lane]:
-            modes.change_mode(drive, lane)
+        """Process a write of 6060h."""
+        modes.request_mode(drive, lane, mode)
         tell_state(drive, lane)
 
     return _Events(tell_state, write_controlword, write_mode)

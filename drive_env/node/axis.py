@@ -183,7 +183,9 @@ class Axis:
         return write
 
     def _factor(self, code: Code) -> float:
-        return float(code.factor(Context(self._reals[self._scaler], self._device.current_full_scale / 32768.0)))
+        device = self._device
+        context = Context(self._reals[self._scaler], device.current_full_scale / 32768.0, device.rated_current)
+        return float(code.factor(context))
 
     def _reader(self, code: Code) -> Callable[[], int]:
         memory, place = self._place(code.field, code.part)

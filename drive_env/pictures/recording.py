@@ -187,4 +187,5 @@ def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
     return units.Context(
         position_scaler=drives.read(Role.POSITION_SCALE)[axes].astype(float),
         current_lsb=drives.device.current_full_scale / 32768.0,
+        rated_current=drives.device.rated_current,
     )

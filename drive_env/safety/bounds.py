@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.dictionary.units import split_unit
 from drive_env.master.description import Key
 from drive_env.master.errors import RefusedError
 from drive_env.safety.limits import DEFAULT_SPEED, NO_LIMIT, Limits, given
@@ -228,9 +229,10 @@ def increments_per_count(unit: str, scale: Floats) -> Floats:
         unit: As the EDS names it.
         scale: Increments of a revolution, shape (num_axes,); 1 and less where they are not known.
     """
-    if unit in (COUNTED, f"{COUNTED}^2"):
-        return np.ones(len(scale))
-    return np.where(scale > 1.0, scale / 60.0, np.nan) if unit in BY_MINUTE else np.full(len(scale), np.nan)
+    number, base = split_unit(unit)
+    if base in (COUNTED, f"{COUNTED}^2"):
+        return np.full(len(scale), number)
+    return np.where(scale > 1.0, number * scale / 60.0, np.nan) if base in BY_MINUTE else np.full(len(scale), np.nan)
 
 
 def _rate(drives: BusDrives, key: Key, scale: Floats) -> Floats:

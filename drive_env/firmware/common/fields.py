@@ -63,6 +63,11 @@ PARAMETERS = (
     Field("following_error_window", "f8", "rad", "6065h; 0: switched off"),
     Field("position_min", "f8", "rad", "607Dh:01"),
     Field("position_max", "f8", "rad", "607Dh:02"),
+    # Quirks of a device (drive_env/devices/drive_quirks.py); one without them leaves them 0.
+    Field("mode_delay", "f8", "s", "from a write of 6060h until the mode changes"),
+    Field("mode_needs_halt", "i4", "", "1: an enabled axis changes its mode only at rest, with halt set"),
+    Field("absent_status_bits", "i4", "", "bits of 6041h that are never set"),
+    Field("set_point_buffer", "i4", "", "1: pp keeps a second set-point while it moves to the first"),
     # --- data of the device and of its power stage ----------------------------------------------------------------
     Field("undervoltage", "f8", "V", "limit below which the stage is cut"),
     Field("overvoltage", "f8", "V", "limit above which the stage is cut"),
@@ -113,6 +118,10 @@ STATE = (
     Field("stop_time", "f8", "s", "since the stop ramp's end"),
     Field("set_point_acknowledged", "i4", "", "statusword bit 12 in pp"),
     Field("set_point_valid", "i4", "", "a set-point of pp was accepted"),
+    Field("set_point_waiting", "i4", "", "1: a second set-point waits in the buffer"),
+    Field("waiting_target", "f8", "rad", "607Ah of the set-point that waits"),
+    Field("waiting_word", "i4", "", "controlword of the set-point that waits: relative or not"),
+    Field("mode_wait", "f8", "s", "until the mode that was written takes effect"),
     Field("internal_limit", "i4", "", "statusword bit 11"),
     Field("target_reached", "i4", "", "statusword bit 10"),
     Field("in_window_time", "f8", "s", "time spent within the position window"),

@@ -270,4 +270,4 @@ def update_statusword(drive, lane, mode_bits):
         word |= 0x4000
         if drive.omega_slow[lane] < 0.0:
             word |= 0x8000
-    drive.statusword[lane] = word
+    drive.statusword[lane] = word & ~drive.absent_status_bits[lane]

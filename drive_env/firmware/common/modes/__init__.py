@@ -112,6 +112,25 @@ def change_mode(drive, lane):
 
 
 @stage
+def may_change_mode(drive, lane):
+    """Return whether the mode that was written takes effect now: after its delay, and where it must be, at a halt."""
+    if drive.mode_wait[lane] > 0.0:
+        return False
+    if drive.mode_needs_halt[lane] == 0 or drive.fsa[lane] != fsa.ENABLED:
+        return True
+    return (drive.controlword[lane] & cia402.HALT) != 0 and drive.velocity_demand[lane] == 0.0
+
+
+@stage
+def request_mode(drive, lane, mode):
+    """Take a write of 6060h: the mode changes at once, where nothing makes it wait."""
+    drive.mode[lane] = mode
+    drive.mode_wait[lane] = drive.mode_delay[lane]
+    if mode != drive.mode_display[lane] and may_change_mode(drive, lane):
+        change_mode(drive, lane)
+
+
+@stage
 def asked_direction(drive, lane):
     """Return the sign of the motion that the targets of the present mode ask for."""
     mode = drive.mode_display[lane]
@@ -160,7 +179,13 @@ def follow(drive, lane, mode, dt):
 def generate_demand(drive, lane, dt):
     """Run the mode for one period of dt [s]: reads targets; writes position, velocity or torque demand and bit 10."""
     if drive.mode[lane] != drive.mode_display[lane]:
-        change_mode(drive, lane)
+        drive.mode_wait[lane] -= dt
+        if drive.mode_wait[lane] < 0.5 * dt:
+            drive.mode_wait[lane] = 0.0
+        if may_change_mode(drive, lane):
+            change_mode(drive, lane)
+    if drive.set_point_waiting[lane] == 1 and drive.set_point_valid[lane] == 0:
+        pp.empty_buffer(drive, lane)
     mode = drive.mode_display[lane]
     # Whatever moves the demand without bows leaves no acceleration behind for a ramp that has them.
     drive.acceleration_before[lane] = drive.acceleration_demand[lane]
