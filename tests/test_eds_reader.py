@@ -1,4 +1,4 @@
-"""EDS files as makers write them: each piece of dirt is understood, or left out and told; python-canopen reads the rest."""
+"""EDS files as makers write them: each piece of dirt is understood, or left out and told."""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import io
+import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,6 +99,14 @@ def _read_text(path: Path) -> str:
         return raw.decode("cp1252", errors="replace")
 
 
+def _content(variable: ODVariable) -> str:
+    """Return the factory's content of a text, a domain or a float; of those each byte is a character."""
+    if variable.data_type in datatypes.FLOAT_TYPES:
+        content = struct.pack("<f" if variable.data_type == datatypes.REAL32 else "<d", float(variable.default or 0.0))
+        return content.decode("latin-1")
+    return variable.default.decode("latin-1") if isinstance(variable.default, bytes) else str(variable.default or "")
+
+
 def _as_key(name: str) -> tuple[int, int] | None:
     """Return index and sub-index of "6081:0", as the files of a device write them; None of another text."""
     index, colon, sub = name.partition(":")
@@ -185,7 +194,7 @@ class ObjectDictionary:
         if kind is None:
             bits = low = high = None
             signed = False
-            default = str(variable.default or "")
+            default = _content(variable)
         else:
             bits, low, high = kind
             signed = low < 0
