@@ -62,6 +62,7 @@ class NodeErrors:
     ) -> None:
         self._device = device
         self._axes = list(axes)
+        self._queues = [(axis, axis.take_emergencies) for axis in axes]
         self._sink = sink
         self._flush = flush
         self._react = react
@@ -115,8 +116,8 @@ class NodeErrors:
 
     def collect(self, now: float) -> None:
         """Tell of what the axes had since the last call; call it after each cycle of the drives."""
-        for axis in self._axes:
-            for emergency in axis.take_emergencies():
+        for axis, take in self._queues:
+            for emergency in take():
                 self._tell_of(axis, emergency, now)
         if self._sink.told and not self.register():
             # CiA 301: whoever was told of an error is told when there is none any more, however it ended.
