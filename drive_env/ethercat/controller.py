@@ -352,6 +352,8 @@ class SlaveController:
             self.clock.latch(0, now)
         elif has(registers.SYSTEM_TIME, 4) and len(data) >= 4 and address == registers.SYSTEM_TIME:
             self.clock.compare(int.from_bytes(data[:4], "little"), now)
+        elif has(registers.SPEED_START, 2):
+            self.clock.restart_comparison(now)
         elif has(registers.SYNC_ACTIVATION, 1):
             self.clock.activate(now)
 

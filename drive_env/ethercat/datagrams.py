@@ -53,19 +53,23 @@ class Place(NamedTuple):
 
 
 class Datagram(NamedTuple):
-    """A datagram by itself. `address` has 32 bits: the low 16 are the station's, the high 16 that in its memory."""
+    """A datagram by itself.
+
+    `address` has 32 bits: the low 16 are the station's, the high 16 that in its memory. `number` is its index, by which
+    a master knows it again.
+    """
 
     command: int
     address: int
     data: bytes
     counter: int = 0
-    index: int = 0
+    number: int = 0
     interrupt: int = 0
 
 
-def at_station(command: int, station: int, offset: int, data: bytes, index: int = 0) -> Datagram:
+def at_station(command: int, station: int, offset: int, data: bytes, number: int = 0) -> Datagram:
     """Return a datagram for a station's memory; of auto-increment addresses the first station is 0, the next -1."""
-    return Datagram(command, (station & 0xFFFF) | offset << 16, data, index=index)
+    return Datagram(command, (station & 0xFFFF) | offset << 16, data, number=number)
 
 
 def build(datagrams: Sequence[Datagram]) -> bytes:
@@ -73,7 +77,7 @@ def build(datagrams: Sequence[Datagram]) -> bytes:
     parts = []
     for k, one in enumerate(datagrams):
         length = len(one.data) | (MORE if k < len(datagrams) - 1 else 0)
-        parts.append(struct.pack("<BBIHH", one.command, one.index, one.address, length, one.interrupt))
+        parts.append(struct.pack("<BBIHH", one.command, one.number, one.address, length, one.interrupt))
         parts += [one.data, struct.pack("<H", one.counter)]
     body = b"".join(parts)
     return struct.pack("<H", len(body) | DATAGRAMS << 12) + body
@@ -121,10 +125,10 @@ def read(frame: bytes | bytearray, start: int) -> list[Datagram]:
     """Return the datagrams of a frame; none of one that is not whole."""
     found = []
     for _, at, length in find(frame, start) or ():
-        command, index, address, _, interrupt = struct.unpack_from("<BBIHH", frame, at)
+        command, number, address, _, interrupt = struct.unpack_from("<BBIHH", frame, at)
         data = bytes(frame[at + DATAGRAM : at + DATAGRAM + length])
         (counter,) = struct.unpack_from("<H", frame, at + DATAGRAM + length)
-        found.append(Datagram(command, address, data, counter, index, interrupt))
+        found.append(Datagram(command, address, data, counter, number, interrupt))
     return found
 
 

@@ -86,6 +86,14 @@ class DistributedClock:
         speed = min(max(round(self._correction * 0x1000), -0x8000), 0x7FFF)
         struct.pack_into("<h", memory, registers.SPEED_DIFFERENCE, speed)
 
+    def restart_comparison(self, now: int) -> None:
+        """Forget what comparisons have brought, as a write of the speed counter's start does."""
+        self._anchor, self._anchor_local = now, float(self.local(now))
+        self._correction = self._mean = 0.0
+        self._compared = None
+        struct.pack_into("<I", self._memory, registers.TIME_DIFFERENCE, 0)
+        struct.pack_into("<h", self._memory, registers.SPEED_DIFFERENCE, 0)
+
     # --- SYNC0 ------------------------------------------------------------------------------------------------------
     @property
     def has_sync0(self) -> bool:

@@ -66,7 +66,8 @@ class Mailbox:
         self._waiting: deque[tuple[int, bytes, int]] = deque()  # protocol, message, address
         self._came = 0  # counter of the last message
         self._sent = 0  # counter of the last answer
-        self._last = b""  # the last answer, whole
+        self._current = self._read = b""  # the answer that was put last, and the one that the master read last
+        self._delayed = b""  # one that gave way to a repetition
         self._repeat = False
         self.files.close()
 
@@ -78,26 +79,32 @@ class Mailbox:
         """Do what is due: repeat an answer, take a message, put the next answer where the master reads."""
         controller = self._controller
         receive, send = controller.managers[RECEIVE], controller.managers[SEND]
+        if send.was_read:
+            send.was_read = False
+            self._read = self._current
         if send.repeat_request != self._repeat:
             self._repeat = send.repeat_request
-            if self._last:
-                if send.is_full:  # it was not lost: it has not been read yet
-                    pass
-                else:
-                    send.put(self._last)
+            if self._read:
+                self._delayed = self._current if send.is_full else b""
+                self._current = self._read
+                send.put(self._current)
             controller.acknowledge_repeat(SEND)
         if receive.written is not None and len(self._waiting) < MOST_WAITING:
             data = receive.take()
             if data is not None:
                 self._take(data, now)
-        if self._waiting and send.end and not send.is_full:
-            protocol, message, address = self._waiting.popleft()
-            self._sent = self._sent % COUNTER + 1
-            kind = protocol | self._sent << COUNTER_SHIFT
-            self._last = struct.pack("<HHBB", len(message), address, 0, kind) + message
-            send.put(self._last)
+        if send.end and not send.is_full and (self._delayed or self._waiting):
+            self._current, self._delayed = self._delayed or self._next(), b""
+            send.put(self._current)
 
     # --- inside -----------------------------------------------------------------------------------------------------
+    def _next(self) -> bytes:
+        """Return the next answer with its header."""
+        protocol, message, address = self._waiting.popleft()
+        self._sent = self._sent % COUNTER + 1
+        kind = protocol | self._sent << COUNTER_SHIFT
+        return struct.pack("<HHBB", len(message), address, 0, kind) + message
+
     def _take(self, data: bytes, now: float) -> None:
         length, address, channel, kind = struct.unpack_from("<HHBB", data)
         counter = kind >> COUNTER_SHIFT & COUNTER
@@ -132,8 +139,8 @@ class Mailbox:
                 return MailboxError.TOO_SHORT
             room = self._controller.managers[SEND].setting.length - HEADER
             full = self._controller.managers[RECEIVE].setting.length - HEADER
-            answer = self.files.request(message, full, room, is_bootstrap=self._is_bootstrap)
-            if answer is not None:
-                self.send(MailboxProtocol.FOE, answer, address)
+            response = self.files.request(message, full, room, is_bootstrap=self._is_bootstrap)
+            if response is not None:
+                self.send(MailboxProtocol.FOE, response, address)
             return None
         return MailboxError.UNSUPPORTED_PROTOCOL
