@@ -42,7 +42,7 @@ def sii(alias=ALIAS, sizes=(4, 6)):
         entries = b"".join(struct.pack("<HBBBBH", 0x7000, k, 0, 5, 8, 0) for k in range(1, size + 1))
         content += category(number, struct.pack("<HBBBBH", index, size, manager, 0, 0, 0) + entries)
     content += b"\xff\xff"
-    return bytes(content.ljust(256, b"\xff"))
+    return bytes(content.ljust(512, b"\xff"))
 
 
 class EchoDevice:
@@ -183,21 +183,16 @@ class Rig:
 
         Lines sent that have a + are of the frame of the next one.
         """
-        sent, expected = [], []
+        sent, answers = [], iter(())
         for line in text.strip().splitlines():
             direction, *words = line.partition("#")[0].split()
             row = " ".join(words)
-            if direction in ("tx", "tx+"):
-                sent.append(parse(row))
-            elif direction == "rx":
-                expected.append(row)
-            if direction == "tx+":
+            if direction == "rx":
+                assert " ".join(next(answers, "nothing").split()) == row, line
                 continue
+            sent.append(parse(row))
             if direction == "tx":
-                answers = iter(datagrams.lines(self.send(*sent)))
-                sent = []
-            elif direction == "rx":
-                assert " ".join(next(answers).split()) == expected.pop(), line
+                answers, sent = iter(datagrams.lines(self.send(*sent))), []
 
 
 def parse(row):

@@ -138,15 +138,13 @@ class SlaveController:
     # --- datagrams ----------------------------------------------------------------------------------------------------
     def process(self, frame: bytearray, places: list[Place], now: int) -> None:
         """Let a frame with these datagrams pass at world time `now` [ns]."""
+        memory = self.memory
         for command, at, length in places:
             if command in LOGICAL:
                 self._process_logical(frame, command, at, length, now)
             elif command in AUTO_INCREMENT or command in BROADCAST or command in CONFIGURED:
                 self._process_physical(frame, command, at, length, now)
-            event = self.register(registers.ECAT_EVENT, 2) & self.register(registers.ECAT_EVENT_MASK, 2)
-            if event:
-                frame[at + 8] |= event & 0xFF
-                frame[at + 9] |= event >> 8
+            frame[at + 8] |= memory[registers.ECAT_EVENT] & memory[registers.ECAT_EVENT_MASK]
 
     def _process_physical(self, frame: bytearray, command: int, at: int, length: int, now: int) -> None:
         station = frame[at + 2] | frame[at + 3] << 8
