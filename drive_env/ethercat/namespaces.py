@@ -11,8 +11,6 @@ import subprocess
 import sys
 from dataclasses import dataclass
 
-RIGHT = "it takes the right CAP_NET_ADMIN: run it as root, as in: sudo {program} ethercat namespace"
-
 
 @dataclass(frozen=True)
 class Namespaces:
@@ -72,7 +70,11 @@ def _check() -> None:
             "use --interface ethercat-udp"
         )
     if os.geteuid() != 0:
-        raise OSError(f"no namespace can be made: {RIGHT.format(program=shutil.which('drive-env') or 'drive-env')}")
+        program = shutil.which("drive-env") or "drive-env"
+        raise OSError(
+            f"no namespace can be made: it takes the right CAP_NET_ADMIN: run it as root, as in: sudo {program} "
+            "ethercat namespace"
+        )
 
 
 def _ip(*arguments: str) -> str:

@@ -17,10 +17,6 @@ LOOPBACK = "127.0.0.1"
 LARGEST = 2048  # bytes of a frame
 PACKET_OUTGOING = 4  # of AF_PACKET: one that this machine sent
 TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux
-RIGHT = (
-    "it takes the right CAP_NET_RAW: run as root, or give it to Python with: sudo setcap cap_net_raw+ep {python}; "
-    "without that right use --interface ethercat-udp on this machine"
-)
 
 
 class EtherCatWay(Protocol):
@@ -68,8 +64,11 @@ class RawSocket:
         try:
             self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(protocol))
         except PermissionError:
-            python = os.path.realpath(sys.executable)
-            raise OSError(f"{interface} cannot be opened: {RIGHT.format(python=python)}") from None
+            raise OSError(
+                f"{interface} cannot be opened: it takes the right CAP_NET_RAW: run as root, or give it to Python "
+                f"with: sudo setcap cap_net_raw+ep {os.path.realpath(sys.executable)}; without that right use "
+                "--interface ethercat-udp on this machine"
+            ) from None
         try:
             self._socket.bind((interface, protocol))
             self._socket.setsockopt(socket.SOL_SOCKET, TIMESTAMP, 1)
