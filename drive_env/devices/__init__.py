@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from drive_env import cia402
 from drive_env.devices import standard_commissioning
 from drive_env.devices.drive_quirks import DriveQuirks, drive_quirks_of
+from drive_env.devices.ethercat import EtherCatBehaviour, ethercat_of
 from drive_env.devices.gain_set import GainSet, load_gain_set
 from drive_env.devices.own_folder import BINDINGS, is_own_folder, naming, own_bindings, own_data
 from drive_env.devices.services import NodeQuirks, NodeServices, node_quirks_of, services_of
@@ -185,6 +186,7 @@ class Device(NamedTuple):
     quirks: DriveQuirks = DriveQuirks()
     rated_current: float = math.nan  # [A] of peak i_q, the base of thousandths of the rated current or torque
     commissioning: str = ""  # "standard": presets follow from the motor's data by the rule of any CiA 402 drive
+    ethercat: EtherCatBehaviour | None = None
     about: str = ""  # what a reader of its page must know besides its data
 
     @property
@@ -405,6 +407,7 @@ def _device(
         quirks=drive_quirks_of(data),
         rated_current=data["current"].get("rated", data["current"]["nominal"]),
         commissioning=data.get("commissioning", ""),
+        ethercat=ethercat_of(data.get("ethercat")),
         about=data.get("about", "").strip(),
     )
 
