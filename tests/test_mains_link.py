@@ -123,7 +123,7 @@ def test_the_sum_of_all_energies_is_0_within_a_thousandth():
 
 
 def test_what_an_axis_brakes_the_other_one_uses():
-    module = new_module()
+    module = new_module(chopper_voltage=790.0)
     run(module, 200, (10.0, 0.0))  # axis 0 runs, axis 1 stands
     run(module, 5, (-6.0, 6.0))
     taken = module["mains_energy"][0, 0]
@@ -132,7 +132,7 @@ def test_what_an_axis_brakes_the_other_one_uses():
     assert sums[SHAFT, 0] < -60.0
     assert sums[SHAFT, 1] > 5.0
     assert trace[:, 0].min() > 560.0
-    assert trace[:, 0].max() < 760.0
+    assert trace[:, 0].max() < 790.0
     assert module["mains_energy"][0, 0] - taken == pytest.approx(sums[MAINS, 0], rel=1e-9, abs=1e-6)
     assert sums[MAINS, 0] == 0.0  # the braking axis gives it all
     assert module["brake_energy"][0, 0] == 0.0
@@ -167,7 +167,7 @@ def test_without_its_resistor_a_braking_axis_charges_the_link_alone():
     field = (stored(module)[1] - before[1])[:2].sum()
     fed = sums[MAINS, 0] - sums[SUPPLY_LOSS, 0]  # until the link is above the mains
     braked = -sums[SHAFT, :2].sum() - sums[COPPER, :2].sum() - sums[IDLE, :2].sum() - field
-    assert gained == pytest.approx(fed + braked, rel=1e-3)
+    assert gained == pytest.approx(fed + braked, rel=3e-3)
     assert braked > 4.0 * fed
     assert trace[-1, 0] > 700.0
 

@@ -90,8 +90,8 @@ def owner(drive, lane):
 def derive_link(drive, dt):
     """Compute the constants of a tick of dt [s]: a division costs a tick as much as ten products.
 
-    Writes tick_mobility, half_capacitance, link_pull, link_share, link_burn, link_decay, and brings the second axis of a
-    pair, which may have been started anew alone, back to the link's voltage.
+    Writes tick_mobility, half_capacitance, link_pull, link_share, link_burn, link_decay, and brings the second axis of
+    a pair, which may have been started anew alone, back to the link's voltage.
     """
     for lane in range(LANES):
         first = owner(drive, lane)
