@@ -19,10 +19,17 @@ from drive_env.dictionary.aborts import CANNOT_BE_STORED, WRONG_STATE, ObjectAcc
 from drive_env.dictionary.access import check_allowed, check_in_range, check_readable, check_writable, checked_values
 from drive_env.dictionary.codec import Code, code_of, decode, encode
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName
-from drive_env.dictionary.position_scale import position_scale
+from drive_env.dictionary.position_scale import PositionScale, position_scale, velocity_ratio
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
-from drive_env.emulator.prepared_record import SCALE_FIELD, SCALES, PreparedObject, PreparedRecord
+from drive_env.emulator.prepared_record import (
+    PEAK_FIELD,
+    RATIO_FIELD,
+    SCALE_FIELD,
+    SCALES,
+    PreparedObject,
+    PreparedRecord,
+)
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.firmware import cycle
 from drive_env.firmware.common.modes import MODES
@@ -53,8 +60,14 @@ class LiveDictionary:
     ) -> None:
         self.device = device
         self.entries: ObjectDictionary = device.new_dictionary()
-        self._scale = position_scale(device.roles)
-        self.scale_keys = () if self._scale is None else self._scale.keys  # whose write gives positions another scale
+        found = {SCALE_FIELD: position_scale(device.roles), RATIO_FIELD: velocity_ratio(device.roles)}
+        # Fields of scales that objects make, as far as the device has them.
+        self._scales: dict[str, PositionScale] = {name: scale for name, scale in found.items() if scale is not None}
+        # Objects whose write gives what is stored another meaning.
+        self.scale_keys = tuple(key for scale in self._scales.values() for key in scale.keys)
+        self._position_keys = self._scales[SCALE_FIELD].keys if SCALE_FIELD in self._scales else ()
+        if Role.PEAK_CURRENT in device.roles:
+            self.scale_keys += (device.roles[Role.PEAK_CURRENT],)
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
         self._layout = device.firmware.layout
         self._parameters = frozenset(field.name for field in self._layout.parameters)
@@ -67,8 +80,8 @@ class LiveDictionary:
 
     def read(self, name: ObjectName) -> Integers:
         """Return an object of every axis, int64 of shape (num_axes,); a text as an array of str."""
-        if name is Role.POSITION_SCALE and len(self.scale_keys) > 1:  # no object has it: several make it
-            return np.rint(self._context().position_scaler).astype(np.int64)
+        if name is Role.POSITION_SCALE and len(self._position_keys) > 1:  # no object has it: several make it
+            return np.rint(self.context().position_scaler).astype(np.int64)
         entry = self.entries.find(name)
         check_readable(entry)
         return self._read(entry)
@@ -100,7 +113,7 @@ class LiveDictionary:
 
     def restart(self, axes: Mask) -> None:
         """Restore the stored values of the axes where the mask is true, and start their firmware anew."""
-        before = self._context()
+        before = self.context()
         if self._snapshot is None:
             self._snapshot = self._stored_snapshot()
         self._snapshot.restore(axes)
@@ -108,8 +121,8 @@ class LiveDictionary:
             values = self._values.get(key)
             if isinstance(values, np.ndarray):
                 np.copyto(values, raw, where=axes)
-        after = self._context()
-        if np.any(before.position_scaler != after.position_scaler):
+        after = self.context()
+        if any(np.any(one != other) for one, other in zip(before, after, strict=True)):
             self._scale_changes += 1
         self.device.firmware.power_on(self._records, axes)
 
@@ -173,7 +186,7 @@ class LiveDictionary:
         key = (entry.index, entry.sub)
         code = self.codes[key]
         return PreparedObject(
-            key, code, np.array(np.broadcast_to(code.factor(self._context()), (self.num_axes,)), float)
+            key, code, np.array(np.broadcast_to(code.factor(self.context()), (self.num_axes,)), float)
         )
 
     def recordable(self, entry: Entry) -> Code | None:
@@ -240,11 +253,15 @@ class LiveDictionary:
         What the firmware computes, and nobody can write, is none of them; a parameter that nobody can write is fixed.
         """
         length = max(map(len, self._stored.values()))
-        context = self._context()
-        scaler = None
-        if self._scale is not None:
-            scaler = self._scale.increments([self._stored[key].astype(float) for key in self.scale_keys])
-            context = context._replace(position_scaler=scaler)
+        context = self.context()
+        made = {
+            name: scale.increments([self._stored[key].astype(float) for key in scale.keys])
+            for name, scale in self._scales.items()
+        }
+        context = context._replace(**made)
+        peak = self.device.roles.get(Role.PEAK_CURRENT)
+        if peak is not None:
+            context = context._replace(peak_current=self._from_od(self.codes[peak], self._stored[peak], context))
         bound = [
             key
             for key in self._stored
@@ -253,9 +270,10 @@ class LiveDictionary:
         ]
         values = [self._from_od(self.codes[key], self._stored[key], context) for key in bound]
         fields = [(self.codes[key].field, self.codes[key].part) for key in bound]
-        if scaler is not None and (SCALE_FIELD, 0) not in fields:
-            values.append(scaler)
-            fields.append((SCALE_FIELD, 0))
+        for name, scale in made.items():
+            if (name, 0) not in fields:
+                values.append(scale)
+                fields.append((name, 0))
         return RecordSnapshot(
             self._layout, self._records, fields, np.array([np.broadcast_to(value, (length,)) for value in values])
         )
@@ -263,12 +281,13 @@ class LiveDictionary:
     def _is_bound(self, entry: Entry) -> bool:
         return (entry.index, entry.sub) in self.codes
 
-    def _context(self) -> units.Context:
-        device = self.device
-        return units.Context(
-            position_scaler=get_lanes(self._records, SCALE_FIELD, self.num_axes).astype(float),
-            current_lsb=device.current_full_scale / 32768.0,
-        )
+    def context(self) -> units.Context:
+        """Return what the factors of units depend on now, one value per axis."""
+        more = {name: self._scale_field(name) for name in (RATIO_FIELD, PEAK_FIELD) if self._layout.has(name)}
+        return units.Context(self._scale_field(SCALE_FIELD), self.device.current_full_scale / 32768.0, **more)
+
+    def _scale_field(self, name: str) -> Floats:
+        return get_lanes(self._records, name, self.num_axes).astype(float)
 
     def _read(self, entry: Entry) -> Integers:
         if self._is_bound(entry):
@@ -279,10 +298,10 @@ class LiveDictionary:
 
     def to_od(self, code: Code, value: Floats) -> Integers:
         """Return integers on the wire of SI values; axes are the last dimension."""
-        return encode(code, value, code.factor(self._context()))
+        return encode(code, value, code.factor(self.context()))
 
     def _from_od(self, code: Code, raw: NDArray[Any], context: units.Context | None = None) -> Floats:
-        return decode(code, raw, code.factor(self._context() if context is None else context))
+        return decode(code, raw, code.factor(self.context() if context is None else context))
 
     def _check(self, entry: Entry, raw: Integers, where: Mask) -> None:
         self._check_value(entry, raw[where])
@@ -320,8 +339,7 @@ class LiveDictionary:
             self._set_field(entry, raw, where)
 
     def _rescale(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Change the scale of positions: what is stored in increments keeps its integers, whose SI value changes."""
-        assert self._scale is not None, "an object of the scale was written"
+        """Change a scale: what is stored in units that follow it keeps its integers, whose SI value changes."""
         kept = [
             (other, self._read(other))
             for other in self.entries
@@ -333,8 +351,9 @@ class LiveDictionary:
             self._set_field(entry, raw, where)
         else:
             self._set_value(entry, raw, where)
-        made = self._scale.increments([self._read(self.entries.find(key)).astype(float) for key in self.scale_keys])
-        set_lanes(self._records, SCALE_FIELD, made, where)
+        for name, scale in self._scales.items():
+            made = scale.increments([self._read(self.entries.find(key)).astype(float) for key in scale.keys])
+            set_lanes(self._records, name, made, where)
         self._scale_changes += 1
         for other, value in kept:
             self._set_field(other, value, where)

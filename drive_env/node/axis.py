@@ -24,6 +24,7 @@ from drive_env.emulator.live_dictionary import (
     check_supported,
     refuse_same_mode,
 )
+from drive_env.emulator.prepared_record import PEAK_FIELD, RATIO_FIELD, SCALE_FIELD
 from drive_env.firmware import cycle
 from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
 
@@ -74,7 +75,9 @@ class Axis:
         self._queue = [self._place("emergency", k)[1] for k in range(EMERGENCY_QUEUE)]
         self._fsa = self._place("fsa")[1]
         self._fresh = self._place("set_point_fresh")[1]
-        self._scaler = self._place("position_scaler")[1]
+        layout = self._device.firmware.layout
+        self._scaler = self._place(SCALE_FIELD)[1]
+        self._other_scales = {name: self._place(name)[1] for name in (RATIO_FIELD, PEAK_FIELD) if layout.has(name)}
         self._error_register = self._place("error_register")[1]
         self._ports: dict[tuple[int, int], ObjectPort] = {}
         self._texts: dict[tuple[int, int], str] = {}  # that were written, until the firmware starts anew
@@ -183,7 +186,11 @@ class Axis:
         return write
 
     def _factor(self, code: Code) -> float:
-        return float(code.factor(Context(self._reals[self._scaler], self._device.current_full_scale / 32768.0)))
+        lsb = self._device.current_full_scale / 32768.0
+        if not self._other_scales:
+            return float(code.factor(Context(self._reals[self._scaler], lsb)))
+        more = {name: self._reals[place] for name, place in self._other_scales.items()}
+        return float(code.factor(Context(self._reals[self._scaler], lsb, **more)))
 
     def _reader(self, code: Code) -> Callable[[], int]:
         memory, place = self._place(code.field, code.part)

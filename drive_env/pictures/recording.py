@@ -184,7 +184,4 @@ def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> N
 
 
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
-    return units.Context(
-        position_scaler=drives.read(Role.POSITION_SCALE)[axes].astype(float),
-        current_lsb=drives.device.current_full_scale / 32768.0,
-    )
+    return units.Context(*(one[axes] if isinstance(one, np.ndarray) else one for one in drives.inside.objects.context()))
