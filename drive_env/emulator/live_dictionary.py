@@ -23,7 +23,6 @@ from drive_env.dictionary.position_scale import PositionScale, position_scale, v
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
 from drive_env.emulator.prepared_record import (
-    PEAK_FIELD,
     RATIO_FIELD,
     SCALE_FIELD,
     SCALES,
@@ -66,8 +65,6 @@ class LiveDictionary:
         # Objects whose write gives what is stored another meaning.
         self.scale_keys = tuple(key for scale in self._scales.values() for key in scale.keys)
         self._position_keys = self._scales[SCALE_FIELD].keys if SCALE_FIELD in self._scales else ()
-        if Role.PEAK_CURRENT in device.roles:
-            self.scale_keys += (device.roles[Role.PEAK_CURRENT],)
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
         self._layout = device.firmware.layout
         self._parameters = frozenset(field.name for field in self._layout.parameters)
@@ -259,9 +256,6 @@ class LiveDictionary:
             for name, scale in self._scales.items()
         }
         context = context._replace(**made)
-        peak = self.device.roles.get(Role.PEAK_CURRENT)
-        if peak is not None:
-            context = context._replace(peak_current=self._from_od(self.codes[peak], self._stored[peak], context))
         bound = [
             key
             for key in self._stored
@@ -283,8 +277,10 @@ class LiveDictionary:
 
     def context(self) -> units.Context:
         """Return what the factors of units depend on now, one value per axis."""
-        more = {name: self._scale_field(name) for name in (RATIO_FIELD, PEAK_FIELD) if self._layout.has(name)}
-        return units.Context(self._scale_field(SCALE_FIELD), self.device.current_full_scale / 32768.0, **more)
+        scales = units.Context(self._scale_field(SCALE_FIELD), self.device.current_full_scale / 32768.0)
+        if not self._layout.has(RATIO_FIELD):
+            return scales
+        return scales._replace(velocity_ratio=self._scale_field(RATIO_FIELD))
 
     def _scale_field(self, name: str) -> Floats:
         return get_lanes(self._records, name, self.num_axes).astype(float)

@@ -1,6 +1,7 @@
 """Make the EDS of the TGZ-D from the rows of `tgz.csv`: `python -m research.servo_amplifiers.make_eds`.
 
-A row is an entry of the first axis; those with a step get another, so much higher, for the second axis.
+A row is an entry of the first axis; those with a step get another, so much higher, for the second axis. Where a default
+has two values, the second one is that axis'.
 """
 
 from __future__ import annotations
@@ -80,9 +81,11 @@ def rows() -> Iterator[tuple[int, int, Row]]:
     with (HERE / "tgz.csv").open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             index, sub = int(row["index"].rstrip("h"), 16), int(row["sub"])
-            yield index, sub, row
+            first, *further = row["default"].split()
+            yield index, sub, {**row, "default": first}
             if row["axes"] != "node":
-                yield index + int(row["axes"].strip("+h"), 16), sub, row
+                default = further[0] if further else first
+                yield index + int(row["axes"].strip("+h"), 16), sub, {**row, "default": default}
 
 
 def number(text: str) -> str:
