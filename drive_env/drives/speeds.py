@@ -1,4 +1,4 @@
-"""How drives count speeds and accelerations: in increments of position, in rpm, or in a unit that objects make of rpm."""
+"""How drives count speeds and accelerations: in increments of position, in rpm, or in a unit of their own."""
 
 from __future__ import annotations
 

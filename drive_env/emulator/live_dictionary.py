@@ -5,7 +5,7 @@ Reading and writing check type, access, range and state exactly as the bus does;
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -37,6 +37,7 @@ from drive_env.firmware.record import get_lanes, set_lanes
 Integers = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Key = tuple[int, int]
 
 _EVENTS = {"": -1, "controlword": cycle.CONTROLWORD, "mode": cycle.MODE, "set_point": cycle.SET_POINT}
 NOTHING = Channels(np.empty(0, np.int64), np.empty(0, np.int64))
@@ -78,7 +79,7 @@ class LiveDictionary:
     def read(self, name: ObjectName) -> Integers:
         """Return an object of every axis, int64 of shape (num_axes,); a text as an array of str."""
         if name is Role.POSITION_SCALE and len(self._position_keys) > 1:  # no object has it: several make it
-            return np.rint(self.context().position_scaler).astype(np.int64)
+            return np.asarray(np.rint(self.context().position_scaler), np.int64)
         entry = self.entries.find(name)
         check_readable(entry)
         return self._read(entry)
@@ -144,6 +145,23 @@ class LiveDictionary:
             self._stored[key][axis] = raw
         self._snapshot = None
 
+    def part(self, entry: Entry, read: Callable[[Key], Integers] | None = None) -> Integers:
+        """Return an object that shows a part of another, whose values `read` returns, axes last; by default those now.
+
+        An axis of the node that is not there shows what the dictionary says.
+        """
+        part = self.device.parts[entry.index, entry.sub]
+        read = read or (lambda key: self._read(self.entries.find(key)))
+        number = np.arange(self.num_axes)
+        within = number % self.device.num_axes
+        source = number if part.axis is None else number - within + part.axis
+        there = (source < self.num_axes) & ((part.axis or 0) < self.device.num_axes)
+        values: Integers = np.stack([read(key) for key in part.of])
+        which = within % len(part.of)
+        shown = part.shown(values[which, ..., np.where(there, source, 0)]).T
+        assert isinstance(entry.default, int), "parts are numbers"
+        return np.asarray(np.where(there, shown, entry.default), np.int64)
+
     def write_checked(self, entry: Entry, raw: int, axis: int) -> None:
         """Write an object of one axis that was checked before."""
         where = np.zeros(self.num_axes, bool)
@@ -189,7 +207,15 @@ class LiveDictionary:
     def recordable(self, entry: Entry) -> Code | None:
         """Return where the value of an entry is that changes by itself, None of one that only a write changes."""
         check_readable(entry)
-        return self.codes.get((entry.index, entry.sub))
+        key = (entry.index, entry.sub)
+        if key in self.device.parts:
+            key = self.device.parts[key].of[0]
+        return self.codes.get(key)
+
+    def recorded(self, entry: Entry, code: Code, values: Floats) -> Integers:
+        """Return what an object was, of SI values of where `recordable` has it, axes last."""
+        raw = self.to_od(code, values)
+        return self.part(entry, lambda _: raw) if (entry.index, entry.sub) in self.device.parts else raw
 
     def plan_play(self, play: Mapping[ObjectName, ArrayLike], cycles: int) -> tuple[Floats, Channels]:
         """Return SI values, shape (cycles, objects, num_axes), and the fields that they go to.
@@ -251,7 +277,7 @@ class LiveDictionary:
         """
         length = max(map(len, self._stored.values()))
         context = self.context()
-        made = {
+        made: dict[str, Any] = {
             name: scale.increments([self._stored[key].astype(float) for key in scale.keys])
             for name, scale in self._scales.items()
         }
@@ -289,6 +315,8 @@ class LiveDictionary:
         if self._is_bound(entry):
             code = self.codes[entry.index, entry.sub]
             return self.to_od(code, get_lanes(self._records, code.field, self.num_axes, code.part).astype(float))
+        if (entry.index, entry.sub) in self.device.parts:
+            return self.part(entry)
         stored = self._values[entry.index, entry.sub]
         return np.full(self.num_axes, stored) if isinstance(stored, str) else stored.copy()
 
@@ -321,6 +349,11 @@ class LiveDictionary:
         key = (entry.index, entry.sub)
         if key in self.scale_keys:
             self._rescale(entry, raw, where)
+            return
+        if key in self.device.parts:
+            part = self.device.parts[key]
+            whole = self.entries.find(part.of[0])
+            self._write(whole, part.put(self._read(whole), raw), where)
             return
         if not self._is_bound(entry):
             self._set_value(entry, raw, where)
@@ -363,6 +396,11 @@ class LiveDictionary:
     def _set_value(self, entry: Entry, raw: Integers, where: Mask) -> None:
         key = (entry.index, entry.sub)
         before = self._values.get(key)
+        if key in self.device.shared_values:
+            node = np.arange(self.num_axes) // self.device.num_axes
+            for first in np.flatnonzero(where):
+                raw = np.where(node == node[first], raw[first], raw)
+            where = np.isin(node, node[where])
         self._values[key] = raw.copy() if before is None else np.where(where, raw, before)
 
 

@@ -392,7 +392,8 @@ class Tracking(VectorEnvironment):
         assert config.motor is not None
         motor = find_motor(config.motor)
         inertia = cycle.COMMISSIONED_INERTIA * motor.inertia
-        return counts_per_ampere(drives) * inertia / motor.torque_constant * 2.0 * np.pi / np.repeat(self._per_turn, self._axes)
+        per_rad = counts_per_ampere(drives) * inertia / motor.torque_constant
+        return np.asarray(per_rad * 2.0 * np.pi / np.repeat(self._per_turn, self._axes))
 
     # --- an episode -----------------------------------------------------------------------------------------------
     def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[NDArray[np.float32], Info]:

@@ -167,6 +167,8 @@ class Axis:
 
     def _unbound_reader(self, entry: Entry) -> Callable[[], int | str]:
         objects, number = self._objects, self.number
+        if (entry.index, entry.sub) in self._device.parts:
+            return lambda: int(objects.part(entry)[number])
 
         def read() -> int | str:
             values = objects.unbound(entry)
@@ -176,6 +178,8 @@ class Axis:
 
     def _unbound_writer(self, entry: Entry) -> Callable[[int], None]:
         objects, number = self._objects, self.number
+        if (entry.index, entry.sub) in {*self._device.parts, *self._device.shared_values}:
+            return lambda raw: objects.write_checked(entry, raw, number)
 
         def write(raw: int) -> None:
             values = objects.unbound(entry)

@@ -14,7 +14,6 @@ from drive_env import cia402
 from drive_env.dictionary import units
 from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
-from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -185,4 +184,5 @@ def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> N
 
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
     whole = drives.inside.objects.context()
-    return whole._replace(**{name: one[axes] for name, one in whole._asdict().items() if isinstance(one, np.ndarray)})
+    scaler, lsb, ratio = whole
+    return units.Context(scaler[axes], lsb, ratio[axes] if isinstance(ratio, np.ndarray) else ratio)

@@ -59,7 +59,7 @@ LSS_Supported=0
 [Comments]
 Lines=4
 Line1=Objects of the TGZ-D and TGZ-S: names, access, mapping and defaults of their manual, types by CiA 301 and 402
-Line2=where it tells none. Decisions stand in device.toml and, with the lines of the manual, in research/servo_amplifiers.
+Line2=where it tells none. Decisions stand in device.toml, the lines of the manual in research/servo_amplifiers.
 Line3=Objects whose names begin with Extension are the emulator's. Registers of 23C0h to 23FFh, 25C0h to 25FFh and
 Line4=33C0h to 33FFh have our numbers: the manual tells none.
 

@@ -138,6 +138,7 @@ class Resolved(NamedTuple):
     position_scaler: int  # inc/rev
     velocity: int  # as 60FFh counts it
     acceleration: int  # as 6083h does
+    velocity_ratio: float = 1.0  # rpm of a velocity unit
 
     @property
     def swept(self) -> tuple[Key, ...]:

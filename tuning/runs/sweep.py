@@ -341,7 +341,8 @@ def _record(
         report(end / excitation.duration)
     t = np.arange(sum(map(len, traces)), dtype=np.float64) * excitation.sampling_period
     velocity_unit = resolved.device.bindings[cia402.VELOCITY_ACTUAL, 0].unit
-    rpm = 60.0 / resolved.position_scaler / per_increment_of(velocity_unit, resolved.position_scaler, resolved.velocity_ratio)
+    scaler = resolved.position_scaler
+    rpm = 60.0 / scaler / per_increment_of(velocity_unit, scaler, resolved.velocity_ratio)
     ramp = np.clip((t - excitation.velocity_time) * resolved.acceleration, 0.0, abs(resolved.velocity))
     if is_open_loop:
         signals = _stepper_signals(drives, traces, period, resolved.closes_loop)
