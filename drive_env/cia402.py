@@ -139,6 +139,7 @@ STATE_CODING = {
 LIVE = (OPERATION_ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE)  # the power stage is on, or may be
 FAULT_BIT = Pattern(0x08, 0x08)  # fault or fault reaction active
 WARNING = Pattern(0x80, 0x80)
+REMOTE = Pattern(0x200, 0x200)  # the axis takes commands from its network
 TARGET_REACHED = Pattern(0x0400, 0x0400)
 INTERNAL_LIMIT = Pattern(0x0800, 0x0800)
 SET_POINT_ACKNOWLEDGED = Pattern(0x1000, 0x1000)  # in pp

@@ -23,6 +23,7 @@ class Context(NamedTuple):
     position_scaler: Any  # [inc/rev]
     current_lsb: float  # [A] per LSB of the current loop
     velocity_ratio: Any = 1.0  # rpm of a velocity unit (6094h)
+    peak_current: Any = math.nan  # of the motor [A], where torques are told in its parts
 
 
 class Unit(NamedTuple):
@@ -31,7 +32,7 @@ class Unit(NamedTuple):
     Attributes:
         period: Of a counter that goes on past the end of its type: how many integers it has; 0 of what saturates.
         specials: Integers that stand for an SI value which the factor does not give, with that value.
-        follows_scale: Whether the factor follows a scale, of positions or velocities: what is stored in such a
+        follows_scale: Whether the factor follows a scale, of positions, velocities or torques: what is stored in such a
             unit is kept in raw integers when a scale changes.
     """
 
@@ -103,7 +104,8 @@ UNITS: dict[str, Unit] = {
         Unit(
             "1/32767 M-Ipeak",
             "parts of the motor's peak current, of which 32767 are the whole",
-            lambda c: 1.0 / 32767.0,
+            lambda c: c.peak_current / 32767.0,
+            follows_scale=True,
         ),
         Unit("inc 64", "increments of the position inside, 2^28 a revolution", lambda c: TWO_PI / 2.0**28),
         Unit("1/1000", "thousandths", lambda c: 1e-3),

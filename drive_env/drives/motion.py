@@ -84,7 +84,7 @@ def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> No
 def _own_modes(drives: BasicDrives) -> Mapping[int, int]:
     """Return the drive's own mode that each mode of operation needs; empty of drives that have no such thing."""
     device: Device | None = getattr(drives, "device", None)  # BasicDrives need not know what they are
-    return {} if device is None else device.d_modes
+    return {} if device is None else device.mode_gate
 
 
 def _enable_again(drives: BasicDrives, axes: Mask) -> None:

@@ -375,6 +375,8 @@ class EmulatedDrives:
             set_lanes(records, "wired", wired | (1 << kind), axes)
         records["supply_voltage"] = supply
         self._kind.set_constants(records, device, self.motor)
+        if self._kind.connect is not None:
+            self._kind.connect(records, self.load.num_axes)
         self._set_noise(np.ones(self.num_axes, bool))
 
     def _set_noise(self, axes: Mask) -> None:

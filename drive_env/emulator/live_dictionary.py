@@ -23,6 +23,7 @@ from drive_env.dictionary.position_scale import PositionScale, position_scale, v
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.group import Channels, channels
 from drive_env.emulator.prepared_record import (
+    PEAK_FIELD,
     RATIO_FIELD,
     SCALE_FIELD,
     SCALES,
@@ -65,6 +66,8 @@ class LiveDictionary:
         self._scales: dict[str, PositionScale] = {name: scale for name, scale in found.items() if scale is not None}
         # Objects whose write gives what is stored another meaning.
         self.scale_keys = tuple(key for scale in self._scales.values() for key in scale.keys)
+        if Role.PEAK_CURRENT in device.roles:
+            self.scale_keys += (device.roles[Role.PEAK_CURRENT],)
         self._position_keys = self._scales[SCALE_FIELD].keys if SCALE_FIELD in self._scales else ()
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
         self._layout = device.firmware.layout
@@ -254,7 +257,7 @@ class LiveDictionary:
             if isinstance(entry.default, str):
                 self._values[entry.index, entry.sub] = entry.default
             else:
-                stored[entry.index, entry.sub] = np.array([entry.default], np.int64)
+                stored[entry.index, entry.sub] = self._defaults(entry)
         taken = allowed_values(self.device, self.entries.find(MODE_OF_OPERATION)) or ()
         modes = sum(
             1 << mode.supported_bit for mode in MODES if mode.supported_bit is not None and mode.number in taken
@@ -270,6 +273,15 @@ class LiveDictionary:
                 self._values[key] = np.repeat(raw, self.num_axes)
         return stored
 
+    def _defaults(self, entry: Entry) -> Integers:
+        """Return an object's factory value, one of all axes, or one per axis where those of a node differ."""
+        step = next((one.step for one in self.device.axis_offsets if one.first <= entry.index <= one.last), 0)
+        keys = [(entry.index + k * step, entry.sub) for k in range(self.device.num_axes if step else 1)]
+        found = [self.entries.find(key).default if self.entries.has(key) else entry.default for key in keys]
+        if len(set(found)) == 1:
+            return np.array(found[:1], np.int64)
+        return np.resize(np.array(found, np.int64), self.num_axes)
+
     def _stored_snapshot(self) -> RecordSnapshot:
         """Return the fields that a restart sets from what is stored, converted by the scales that are stored.
 
@@ -282,6 +294,9 @@ class LiveDictionary:
             for name, scale in self._scales.items()
         }
         context = context._replace(**made)
+        peak = self.device.roles.get(Role.PEAK_CURRENT)
+        if peak is not None:
+            context = context._replace(peak_current=self._from_od(self.codes[peak], self._stored[peak], context))
         bound = [
             key
             for key in self._stored
@@ -306,7 +321,9 @@ class LiveDictionary:
         scales = units.Context(self._scale_field(SCALE_FIELD), self.device.current_full_scale / 32768.0)
         if not self._layout.has(RATIO_FIELD):
             return scales
-        return scales._replace(velocity_ratio=self._scale_field(RATIO_FIELD))
+        return scales._replace(
+            velocity_ratio=self._scale_field(RATIO_FIELD), peak_current=self._scale_field(PEAK_FIELD)
+        )
 
     def _scale_field(self, name: str) -> Floats:
         return get_lanes(self._records, name, self.num_axes).astype(float)

@@ -32,7 +32,8 @@ Integers = NDArray[np.int64]
 # Fields that factors depend on: played, they would change between two rows.
 SCALE_FIELD = "position_scaler"  # increments of a revolution
 RATIO_FIELD = "velocity_ratio"  # rpm of a velocity unit; of drives that have such
-SCALES = frozenset({SCALE_FIELD, RATIO_FIELD})
+PEAK_FIELD = "peak_current"  # of the motor [A]; of drives that tell torques in its parts
+SCALES = frozenset({SCALE_FIELD, RATIO_FIELD, PEAK_FIELD})
 
 
 class PreparedObject(NamedTuple):

@@ -24,7 +24,7 @@ from drive_env.emulator.live_dictionary import (
     check_supported,
     refuse_same_mode,
 )
-from drive_env.emulator.prepared_record import RATIO_FIELD, SCALE_FIELD
+from drive_env.emulator.prepared_record import PEAK_FIELD, RATIO_FIELD, SCALE_FIELD
 from drive_env.firmware import cycle
 from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
 
@@ -77,7 +77,8 @@ class Axis:
         self._fresh = self._place("set_point_fresh")[1]
         layout = self._device.firmware.layout
         self._scaler = self._place(SCALE_FIELD)[1]
-        self._ratio = self._place(RATIO_FIELD)[1] if layout.has(RATIO_FIELD) else None
+        names = (RATIO_FIELD, PEAK_FIELD) if layout.has(RATIO_FIELD) else ()
+        self._other_scales = [self._place(name)[1] for name in names]
         self._error_register = self._place("error_register")[1]
         self._ports: dict[tuple[int, int], ObjectPort] = {}
         self._texts: dict[tuple[int, int], str] = {}  # that were written, until the firmware starts anew
@@ -191,9 +192,8 @@ class Axis:
 
     def _factor(self, code: Code) -> float:
         lsb = self._device.current_full_scale / 32768.0
-        if self._ratio is None:
-            return float(code.factor(Context(self._reals[self._scaler], lsb)))
-        return float(code.factor(Context(self._reals[self._scaler], lsb, self._reals[self._ratio])))
+        others = [self._reals[place] for place in self._other_scales]
+        return float(code.factor(Context(self._reals[self._scaler], lsb, *others)))
 
     def _reader(self, code: Code) -> Callable[[], int]:
         memory, place = self._place(code.field, code.part)

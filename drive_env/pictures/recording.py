@@ -184,5 +184,4 @@ def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> N
 
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
     whole = drives.inside.objects.context()
-    scaler, lsb, ratio = whole
-    return units.Context(scaler[axes], lsb, ratio[axes] if isinstance(ratio, np.ndarray) else ratio)
+    return units.Context(*(one[axes] if isinstance(one, np.ndarray) else one for one in whole))

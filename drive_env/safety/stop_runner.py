@@ -275,9 +275,9 @@ class StopRunner:
     def _own_mode(self, axis: int) -> int | None:
         """Return the drive's own mode with which an axis that ignores commands takes them; None of one that does."""
         device = self._drives.device
-        if device is None or not device.d_modes or cia402.matches(int(self._axes.status[axis]), cia402.REMOTE):
+        if device is None or not device.mode_gate or cia402.matches(int(self._axes.status[axis]), cia402.REMOTE):
             return None
-        return device.d_modes.get(int(self._axes.mode[axis]))
+        return device.mode_gate.get(int(self._axes.mode[axis]))
 
     def _sample(self, axis: int) -> Sample:
         return Sample(float(self._axes.seen[axis]), int(self._axes.status[axis]), float(self._axes.speed[axis]))
