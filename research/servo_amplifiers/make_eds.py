@@ -85,7 +85,8 @@ def rows() -> Iterator[tuple[int, int, Row]]:
             yield index, sub, {**row, "default": first}
             if row["axes"] != "node":
                 default = further[0] if further else first
-                yield index + int(row["axes"].strip("+h"), 16), sub, {**row, "default": default}
+                name = row["name"] if sub else f"{row['name']} axis 1"
+                yield index + int(row["axes"].strip("+h"), 16), sub, {**row, "default": default, "name": name}
 
 
 def number(text: str) -> str:
