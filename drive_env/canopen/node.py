@@ -26,6 +26,7 @@ from drive_env.canopen.nmt import Command, NmtState
 from drive_env.canopen.pdo import ReceivePdo, TransmitPdo
 from drive_env.canopen.sync import SyncProducer, SyncWindow
 from drive_env.canopen.time_of_day import Clock, TimeProducer
+from drive_env.devices import EmergencyCode
 from drive_env.dictionary.aborts import CANNOT_BE_STORED, HARDWARE_ERROR, VALUE_RANGE, ObjectAccessError
 from drive_env.dictionary.access import check_limits
 from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -699,7 +700,7 @@ class Node:
         emergency = self._device.emergencies[name].of_axis(0)
         self._told_last = 0
         self._emergency.push(emergency, self._error_register() | condition.error_register)
-        self._history.add(emergency.code)
+        self._history.add(emergency.code, 0, self._number_of(emergency))
         self._flush(now)
 
     def _tell_if_known(self, name: str, now: float) -> None:
@@ -712,15 +713,20 @@ class Node:
         cause = self._device.firmware.causes[queued.row]
         if queued.row == FAULT_RESET:
             self._conditions.clear()
-        register = queued.error_register | self._error_register(without=axis)
         self._told_last = self._axes.index(axis)
+        own = self._of_axis(self._told_last, queued.error_register)
+        register = own | self._error_register(without=axis)
         emergency = self._device.emergencies[cause.name].of_axis(self._told_last)
         if not self._is_told_of_module(queued.row, now):
             self._emergency.push(emergency, register)
-            self._history.add(emergency.code, self._told_last)
+            self._history.add(emergency.code, self._told_last, self._number_of(emergency))
         if cause.reaction in (CUT, STOP) and queued.row != FAULT_RESET:
             self._flush(now)
             self._react(APPLICATION_ERROR)
+
+    def _number_of(self, emergency: EmergencyCode) -> int:
+        """Return the device's own number of an error, as 1003h has it."""
+        return emergency.extra[0] if self._device.canopen.quirks.history_tells_number else 0
 
     def _is_told_of_module(self, row: int, now: float) -> bool:
         """Return whether another axis has told of the same thing of the module in this cycle, and note it if not.
@@ -744,12 +750,17 @@ class Node:
 
     def _error_register(self, without: Axis | None = None) -> int:
         register = 0
-        for axis in self._axes:
+        for number, axis in enumerate(self._axes):
             if axis is not without:
-                register |= axis.error_register
+                register |= self._of_axis(number, axis.error_register)
         for condition in self._conditions.values():
             register |= condition.error_register
         return register
+
+    def _of_axis(self, number: int, register: int) -> int:
+        """Return an axis' share of 1001h; some devices show that it is not the first one's."""
+        bit = self._device.canopen.quirks.further_axis_bit
+        return register | bit if number and register else register
 
     def _flush(self, now: float) -> None:
         if self._is_online and nmt.SERVICES[self.state].emergency:

@@ -25,6 +25,7 @@ from drive_env.devices.variants import (
 )
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
+from drive_env.dictionary.parts import Part, parts_of
 from drive_env.dictionary.roles import Role
 from drive_env.firmware import checked_firmware, default_motor, find_firmware, motor_kinds
 from drive_env.motors import EXTRA_LOW_VOLTAGE, KINDS, MOTORS, Motor, is_extra_low, motors_of
@@ -179,6 +180,9 @@ class Device(NamedTuple):
     firmware_name: str
     variant_of: str = ""
     about: str = ""  # what a reader of its page must know besides its data
+    parts: Mapping[tuple[int, int], Part] = MappingProxyType({})  # objects that show a part of another
+    shared_values: frozenset[tuple[int, int]] = frozenset()  # one value for all axes of a node, whichever is written
+    num_outputs: int = 4
     mode_gate: Mapping[int, int] = MappingProxyType({})  # mode of operation -> the drive's own mode that it needs
 
     @property
@@ -403,6 +407,9 @@ def _device(
         firmware_name=checked_firmware(data["firmware"]),
         variant_of=data.get("variant_of", ""),
         about=data.get("about", "").strip(),
+        parts=parts_of({parse_key(text): row for text, row in data.get("parts", {}).items()}, parse_key),
+        shared_values=frozenset(parse_key(text) for text in data.get("shared_values", [])),
+        num_outputs=data.get("outputs", 4),
         mode_gate={int(mode): needed for mode, needed in data.get("mode_gate", {}).items()},
     )
 

@@ -13,6 +13,13 @@ class Role(Enum):
     """A part that an object plays; the value is what a message calls it."""
 
     POSITION_SCALE = "scale of positions (increments of a revolution)"
+    TURN_INSIDE = "increments of a revolution inside the drive"
+    POSITION_NUMERATOR = "increments inside of a position unit: numerator"
+    POSITION_DIVISOR = "increments inside of a position unit: divisor"
+    VELOCITY_NUMERATOR = "rpm of a velocity unit: numerator"
+    VELOCITY_DIVISOR = "rpm of a velocity unit: divisor"
+    PEAK_CURRENT = "peak current of the motor, which torques are told in"
+    MODE_GATE = "mode of the drive that a mode of operation needs"
     FULL_STEPS = "full steps of a revolution"
     MICROSTEPS = "microsteps of a full step, as a power of two"
     CURRENT_LIMIT = "current limit"

@@ -271,7 +271,7 @@ class EmulatedDrives:
         self._run(cycles, call_of(values, played, samples, sampled, every))
         result: dict[tuple[int, int], Integers] = {}
         for k, (key, code) in enumerate(live.items()):
-            result[key] = self._objects.to_od(code, samples[:, k])
+            result[key] = self._objects.recorded(known.find(key), code, samples[:, k])
         for key in codes:
             if key not in result:
                 result[key] = np.broadcast_to(self._objects.read(key), (rows, self.num_axes))

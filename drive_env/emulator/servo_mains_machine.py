@@ -72,7 +72,7 @@ def connect(records: Records, axes_per_machine: int) -> None:
     shared = axes_per_machine % 2 == 0
     records["link_shared"] = 1.0 if shared else 0.0
     for lane in range(LANES):
-        first = 3 * (lane % 2) if shared else 0
+        first = 3 * (lane % 2)
         records["switch_input"][:, :, lane] = first + np.arange(3)
 
 

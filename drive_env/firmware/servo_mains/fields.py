@@ -25,8 +25,8 @@ from drive_env.firmware.record import Field
 from drive_env.firmware.servo import fields as servo
 from drive_env.firmware.servo_mains import d_mode, mains_link
 
-# Of a servo drive on a supply without mains, and of its torque limit as a share of 2003h.
-_NOT_HERE = ("idle_current", "supply_sinks", "torque_limit")
+# Of a servo drive on a supply without mains.
+_NOT_HERE = ("idle_current", "supply_sinks")
 
 PARAMETERS = (
     *(field for field in servo.PARAMETERS if field.name not in _NOT_HERE),
