@@ -222,3 +222,10 @@ def test_the_second_axis_follows_the_link_of_the_first():
     module["u_dc"][0, 1] = 100.0  # as if it had been started anew alone
     run(module, 1, (0.0, 0.0))
     assert module["u_dc"][0, 0] == module["u_dc"][0, 1]
+
+
+def test_what_is_no_number_in_the_lane_beside_does_not_reach_an_axis_with_a_link_of_its_own():
+    module = new_module(link_shared=0.0)
+    module["psi_m"][0, 1] = np.nan
+    _, trace = run(module, 2, (1.0, 1.0))
+    assert trace[-1, 0] == pytest.approx(560.0, abs=15.0)
