@@ -17,6 +17,7 @@ from drive_env.firmware.servo.alignment import BLDC, ENCODER, USE_OFFSET
 from drive_env.motors import Motor
 
 OFFSET_SHARE = 0.05  # of the current's range, that may be measured while the stage is off
+CHOPPER, CHOPPER_HYSTERESIS = 0.92, 0.025  # of the over-voltage: where the chopper begins, and how far it draws down
 OVERSPEED = 1.5  # of the rated speed
 # degC; class values. A thermostat of class F insulation, its sensor's limit just below, and a cabinet.
 THERMOSTAT, MOTOR_TEMPERATURE, AMBIENT = 155.0, 145.0, 60.0
@@ -53,6 +54,9 @@ def apply(records: Records, device: Device, motor: Motor, name: str, values: Flo
 def set_constants(records: Records, device: Device, motor: Motor) -> None:
     """Write what stage and motor are besides their parameters, and what the drive has been told of its motor."""
     servo_machine.set_constants(records, device, motor)
+    records["chopper_enable"] = 1.0
+    records["chopper_voltage"] = CHOPPER * device.overvoltage
+    records["chopper_hysteresis"] = CHOPPER_HYSTERESIS * device.overvoltage
     records["offset_limit"] = OFFSET_SHARE * device.current_full_scale
     records["current_range"] = device.current_full_scale
     records["overspeed"] = OVERSPEED * motor.rated_speed

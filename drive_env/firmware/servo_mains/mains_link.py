@@ -5,14 +5,16 @@
 The rectifier feeds whenever its voltage is above the link's, through the resistance of the supply, and through the
 charging resistance until the link is charged; it takes nothing back. What one axis brakes another axis uses; the rest
 charges the link until the chopper burns it. A tick is split: what bridges and idle take leaves the energy exactly
-(u^2 falls by 2 P dt / C), then resistor and rectifier act, each implicitly, and each counts the energy of what it did
-to the voltage, so that the sum of all is that of the link.
+(u^2 falls by 2 P dt / C), then resistor, short circuit and rectifier act one after the other, each as the exponential
+of its own time constant, and each counts the energy of what it did to the voltage: the sum of all is that of the link.
 
 Axes 2k and 2k + 1 of one machine share a link. Both compute it, with the same numbers, so that neither waits for the
 other. Voltage of the rectifier: the greatest of the three line voltages, that of a lost phase's remaining pair.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -39,7 +41,7 @@ STATE = (
     Field("rectifier_voltage", "f8", "V", "greatest line voltage now"),
     Field("link_charged", "f8", "", "1: the charging resistance is bridged", 1.0),
     Field("link_pull", "f8", "V^2/W", "square of voltage lost per watt in a tick"),
-    Field("link_burn", "f8", "1", "what the brake resistor would leave of the voltage after a tick"),
+    Field("link_burn", "f8", "1", "what the brake resistor leaves of the voltage after a tick"),
     Field("half_capacitance", "f8", "F", "half the capacitance of the link"),
     Field("partner_power", "f8", "W", "what the bridge of the other axis takes"),
     Field("mains_energy", "f8", "J", "taken from the mains, from power-on; of the whole link"),
@@ -88,8 +90,8 @@ def owner(drive, lane):
 def derive_link(drive, dt):
     """Compute the constants of a tick of dt [s]: a division costs a tick as much as ten products.
 
-    Writes tick_mobility, half_capacitance, link_pull, link_feed, link_share, link_burn, link_decay, and brings the
-    second axis of a pair, which may have been started anew alone, back to the link's voltage.
+    Writes tick_mobility, half_capacitance, link_pull, link_share, link_burn, link_decay, and brings the second axis of
+    a pair, which may have been started anew alone, back to the link's voltage.
     """
     for lane in range(LANES):
         first = owner(drive, lane)
@@ -100,10 +102,9 @@ def derive_link(drive, dt):
         drive.tick_mobility[lane] = dt / drive.J_rotor[lane]
         drive.half_capacitance[lane] = 0.5 * drive.dc_capacitance[first]
         drive.link_pull[lane] = 2.0 * step
-        drive.link_feed[lane] = step / resistance
-        drive.link_share[lane] = 1.0 / (1.0 + step / resistance)
-        drive.link_burn[lane] = 1.0 / (1.0 + step / drive.chopper_resistance[first])
-        drive.link_decay[lane] = 1.0 / (1.0 + step * drive.short_conductance[first])
+        drive.link_share[lane] = math.exp(-step / resistance)
+        drive.link_burn[lane] = math.exp(-step / drive.chopper_resistance[first])
+        drive.link_decay[lane] = math.exp(-step * drive.short_conductance[first])
 
 
 @stage
@@ -156,7 +157,7 @@ def move_link(drive, dt):
         kept = left * drive.link_decay[lane]
         drive.short_energy[lane] += half * (left + kept) * (left - kept)
         mains = drive.rectifier_voltage[lane]
-        fed = (kept + drive.link_feed[lane] * mains) * drive.link_share[lane]
+        fed = mains + (kept - mains) * drive.link_share[lane]
         fed = fed if mains > kept else kept
         charge = 2.0 * half * (fed - kept)
         drive.mains_energy[lane] += charge * mains
