@@ -65,6 +65,8 @@ def set_constants(records: Records, device: Device, motor: Motor) -> None:
     records["ambient_limit"] = AMBIENT
     for mode, needed in device.mode_gate.items():
         records["d_mode_needed"][:, mode, :] = needed
+    for lane in range(LANES):  # three inputs for the switches of each axis of a module
+        records["switch_input"][:, :, lane] = 3 * (lane % device.num_axes) + np.arange(3)
     # Of an absolute encoder, which knows the rotor's angle.
     records["motor_type"], records["commutation_mode"], records["encoder_init_mode"] = BLDC, ENCODER, USE_OFFSET
     records["pole_pairs"], records["encoder_steps"] = motor.n_p, motor.encoder_counts
@@ -72,12 +74,9 @@ def set_constants(records: Records, device: Device, motor: Motor) -> None:
 
 
 def connect(records: Records, axes_per_machine: int) -> None:
-    """Let the axes of a machine share links in pairs, and wire its switches: three inputs for each axis of a pair."""
+    """Let the axes of a machine share links in pairs."""
     shared = axes_per_machine % 2 == 0
     records["link_shared"] = 1.0 if shared else 0.0
-    for lane in range(LANES):
-        first = 3 * (lane % 2)
-        records["switch_input"][:, :, lane] = first + np.arange(3)
 
 
 SERVO_MAINS = MachineKind(

@@ -134,8 +134,9 @@ def move_link(drive, dt):
     for pair in range(LANES // 2):
         first, second = 2 * pair, 2 * pair + 1
         one, other = drive.bridge_power[first], drive.bridge_power[second]
-        drive.partner_power[first] = other
-        drive.partner_power[second] = one
+        # A lane that is no axis may hold anything, and 0 times nan is none: it is chosen, not multiplied.
+        drive.partner_power[first] = other if drive.link_shared[first] > 0.5 else 0.0
+        drive.partner_power[second] = one if drive.link_shared[second] > 0.5 else 0.0
     for lane in range(LANES):
         u = drive.u_dc[lane]
         limit = drive.chopper_voltage[lane]
@@ -147,7 +148,7 @@ def move_link(drive, dt):
         shared = drive.link_shared[lane]
         idle = (1.0 + shared) * drive.idle_power[lane]
         # Whatever the order, both axes of a pair must find the same sum: one of two terms has only one.
-        bridges = drive.bridge_power[lane] + shared * drive.partner_power[lane]
+        bridges = drive.bridge_power[lane] + drive.partner_power[lane]
         square = u * u - drive.link_pull[lane] * (bridges + idle)
         square = square if square > SMALLEST_VOLTAGE * SMALLEST_VOLTAGE else SMALLEST_VOLTAGE * SMALLEST_VOLTAGE
         drawn = square**0.5
