@@ -14,7 +14,6 @@ from drive_env import cia402
 from drive_env.dictionary import units
 from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
-from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -184,8 +183,5 @@ def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> N
 
 
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
-    return units.Context(
-        position_scaler=drives.read(Role.POSITION_SCALE)[axes].astype(float),
-        current_lsb=drives.device.current_full_scale / 32768.0,
-        rated_current=drives.device.rated_current,
-    )
+    whole = drives.inside.objects.context()
+    return units.Context(*(one[axes] if isinstance(one, np.ndarray) else one for one in whole))
