@@ -9,6 +9,7 @@ import typer
 from drive_env.commands.check_model import check_model
 from drive_env.commands.compiling import compile_kernels
 from drive_env.commands.eds import print_eds
+from drive_env.commands.esi import print_esi
 from drive_env.commands.ethercat import ethercat_app
 from drive_env.commands.fault import fault
 from drive_env.commands.get import get, set_object
@@ -45,7 +46,7 @@ PANELS = {
         ("jog", jog),
     ),
     "Parameters": (("backup", backup), ("diff", diff), ("restore", restore), ("commission", commission)),
-    "This installation": (("list", list_names), ("eds", print_eds), ("compile", compile_kernels)),
+    "This installation": (("list", list_names), ("eds", print_eds), ("esi", print_esi), ("compile", compile_kernels)),
     "Frames": (("log", log), ("replay", replay)),
     "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("check-model", check_model)),
 }

@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from drive_env import cia402
+from drive_env.devices.ethercat import EtherCatBehaviour, ethercat_of
 from drive_env.devices.gain_set import GainSet, load_gain_set
 from drive_env.devices.own_folder import BINDINGS, is_own_folder, naming, own_bindings, own_data
 from drive_env.devices.services import NodeQuirks, NodeServices, node_quirks_of, services_of
@@ -178,6 +179,7 @@ class Device(NamedTuple):
     gains: GainSet
     firmware_name: str
     variant_of: str = ""
+    ethercat: EtherCatBehaviour | None = None
     about: str = ""  # what a reader of its page must know besides its data
 
     @property
@@ -393,6 +395,7 @@ def _device(
         gains=gains,
         firmware_name=checked_firmware(data["firmware"]),
         variant_of=data.get("variant_of", ""),
+        ethercat=ethercat_of(data.get("ethercat")),
         about=data.get("about", "").strip(),
     )
 
