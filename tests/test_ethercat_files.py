@@ -93,7 +93,8 @@ def test_the_esi_has_every_object_once_and_says_what_the_eeprom_says():
         ] == expected
     managers = [(one.text, one.get("StartAddress"), one.get("DefaultSize")) for one in device.findall("Sm")]
     assert managers == [
-        ("MBoxOut", "#x1000", "256"), ("MBoxIn", "#x1100", "256"), ("Outputs", "#x1200", "30"), ("Inputs", "#x1300", "30"),
+        ("MBoxOut", "#x1000", "256"), ("MBoxIn", "#x1100", "256"),
+        ("Outputs", "#x1200", "30"), ("Inputs", "#x1300", "30"),
     ]  # fmt: skip
     assert root.findtext("Vendor/Id") == "#x00000286"
     kind = device.find("Type")

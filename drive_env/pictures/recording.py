@@ -184,4 +184,4 @@ def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> N
 
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
     whole = drives.inside.objects.context()
-    return units.Context(*(one[axes] if isinstance(one, np.ndarray) else one for one in whole))
+    return whole._replace(**{name: one[axes] for name, one in whole._asdict().items() if isinstance(one, np.ndarray)})
