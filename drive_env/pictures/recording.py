@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -184,4 +184,5 @@ def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> N
 
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
     whole = drives.inside.objects.context()
-    return whole._replace(**{name: one[axes] for name, one in whole._asdict().items() if isinstance(one, np.ndarray)})
+    here: dict[str, Any] = {name: one[axes] for name, one in whole._asdict().items() if isinstance(one, np.ndarray)}
+    return whole._replace(**here)
