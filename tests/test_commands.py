@@ -234,6 +234,8 @@ def test_rows_of_csp_are_held_with_their_offset():
     bench.play(target=[700])
     with pytest.raises(SafetyError, match="would lead to 1001"):
         bench.play(target=[701])
+    with pytest.raises(SafetyError, match="would lead to 1302, beyond"):  # the first row that is wrong
+        bench.play(target=[0, 1002, 1500, 0])
     bench.play(target=[])
     bench.axes.mode[:] = PP
     bench.play(target=[1000])  # in pp the target alone
@@ -261,6 +263,8 @@ def test_rows_of_set_points_that_add_up():
     bench.play(speed=[500, -500, 300], speed_offset=[0, 0, 200])
     with pytest.raises(SafetyError, match=r"axis 0: .* = 501 is beyond"):
         bench.play(speed=[500, -500, 300], speed_offset=[0, 0, 201])
+    with pytest.raises(SafetyError, match=r"axis 0: .* = 502 is beyond"):  # the first row that is wrong
+        bench.play(speed=[0, 502, 999])
     bench.commands.note(SPEED_OFFSET, np.array([200, 0]), np.array([True, True]))
     with pytest.raises(SafetyError, match=r"axis 0: .* = 501 is beyond"):
         bench.play(speed=[301])

@@ -23,7 +23,7 @@ from drive_env.trials.gain_trial import (
     softness,
 )
 from drive_env.trials.oscillation import OSCILLATION, shakes
-from drive_env.trials.positioning import CYCLE, PROFILE, TRIAL, WATCH, plan_move, power_up, start, write_profile
+from drive_env.trials.positioning import CYCLE, PROFILE, TRIAL, WATCH, plan_move, power_up, start, swing, write_profile
 from drive_env.trials.score import Terms, cost
 
 DEVICE, MOTOR = find_device("tmcm1636"), find_motor("qbl4208")
@@ -74,6 +74,14 @@ def test_an_axis_oscillates_above_two_fifths_of_the_rated_current_from_milliseco
     current = np.zeros((25, 2), np.int64)
     current[1::2, 1] = step
     assert shakes(current, MOTOR.rated_current).tolist() == [False, oscillates]
+
+
+def test_a_swing_is_the_largest_of_any_window_of_25_ms_and_each_axis_has_its_own():
+    current = np.zeros((4 * WATCH, 2))
+    current[1:WATCH:2, 0] = 0.5  # every change is 0.5 A
+    current[WATCH + 5, 0] = 2.0  # two changes of 2 A among 24
+    current[3 * WATCH :, 1] = 7.0  # a jump between two windows is in neither
+    np.testing.assert_allclose(swing(current, 2.0), [max(0.25, np.sqrt(2 * 4.0 / 24) / 2.0), 0.0])
 
 
 # --- identification -------------------------------------------------------------------------------------------------

@@ -81,6 +81,15 @@ def test_the_axis_that_is_wrong_is_named_and_one_that_is_not_judged_is_left_alon
     bench.see(velocity=[[999, 999, 999]])
 
 
+def test_of_several_axes_that_are_wrong_the_first_is_named():
+    bench = Bench(axes=3, velocity=500, current=400, speed=1000.0, low=-1000, high=1000)
+    bench.stops("axis 1: ", velocity=[[0, 501, 502]])
+    bench.stops("axis 1: the position is 1000", position=[[0, 2000, 3000]])
+    bench.stops("axis 1: the current is 501", current=[[0, 501, 502]] * CURRENT_CYCLES)
+    bench.axes.speed[:] = (0.0, 1500.0, 1600.0)
+    bench.stops("axis 1 turns by 1500", position=[[0, 0, 0]])
+
+
 def test_a_speed_by_positions_where_the_drives_own_counts_something_else():
     bench = Bench(speed=1000.0)
     bench.axes.speed[:] = -1000.0

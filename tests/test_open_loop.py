@@ -199,6 +199,49 @@ def test_a_rotor_that_rolls_is_waited_for_and_not_for_ever(rolling, looks):
     assert drives.advanced == looks and not trials._fell
 
 
+def test_inertia_and_friction_are_what_the_load_angle_says_at_the_run_current(monkeypatch):
+    """sin(n_p lag) of the run current's holding torque is the torque; the encoder's count is one period old."""
+    motor, scale, age = STEPPER_MOTOR, 512_000_000, 1.0 / STEPPER.velocity_rate
+    J, coulomb, run = 5.0 * motor.inertia, 0.05, 100
+    held = float(holding_torque(motor, amplitude(STEPPER, run)))
+    t = np.arange(TRIAL)
+    speed = np.interp(t, [0, 30, 60, TRIAL], [0.0, 40.0, 0.0, 0.0])
+    acceleration = np.diff(speed, prepend=0.0) / 1e-3
+    angle = np.cumsum(speed) * 1e-3
+    lag = np.arcsin((J * acceleration + motor.torque_constant * coulomb * np.clip(speed, -1, 1)) / held) / motor.n_p
+    to_increments = scale / (2.0 * np.pi)
+    phases = []
+
+    class Drives:
+        num_axes, time_waits = 1, True
+
+        def read(self, name):
+            return np.array([scale if name is module.Role.POSITION_SCALE else 0])
+
+        def advance(self, seconds):
+            pass
+
+        def record(self, objects, seconds):
+            way = 1 if not phases else -1
+            first = 0.0 if not phases else angle[-1]
+            phases.append(1)
+            true = first + way * angle
+            rows = {
+                cia402.POSITION_ACTUAL: true - way * speed * age,
+                cia402.POSITION_DEMAND: true + way * lag,
+            }
+            return {name: np.rint(rows[name] * to_increments).astype(np.int64)[:, None] for name in objects}
+
+    monkeypatch.setattr(module, "device_of", lambda drives: STEPPER)
+    monkeypatch.setattr(module, "read_gains", lambda drives: gains([run], [250]))
+    monkeypatch.setattr(module, "write_profile", lambda drives, move, where: None)
+    monkeypatch.setattr(module, "start", lambda drives, target, where: None)
+    found, origin = OpenLoopTrials(Drives(), motor, 1, 0.01).identify(np.array([0.5]), np.array([True]))
+    assert origin == 0
+    np.testing.assert_allclose(found.inertia, J, rtol=0.1)
+    assert 0.3 * coulomb < found.coulomb < 1.5 * coulomb
+
+
 @pytest.mark.parametrize(("way", "moved"), [(2500, True), (2499, False), (-2500, True)])
 def test_an_encoder_must_show_a_quarter_of_the_move(way, moved):
     trials = OpenLoopTrials(Counters([0, 0], [0, 0]), STEPPER_MOTOR, 1, 0.01)

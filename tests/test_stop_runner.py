@@ -301,6 +301,14 @@ def test_who_is_switched_off_anyway_or_does_not_answer_is_not_held():
     assert bench.drives.values[QUICK].tolist() == [99, 6]
 
 
+def test_one_axis_that_need_not_be_held_does_not_hide_the_next():
+    bench = runner_of({QUICK: (1, 1)})
+    bench.runner.begin(np.array([True, False]), holds=False)
+    bench.runner.begin(np.array([False, True]), holds=True)
+    bench.runner.hold()
+    assert bench.drives.values[QUICK].tolist() == [1, 5]
+
+
 def test_a_node_that_is_not_seen_any_more_is_woken_five_times_a_second_and_given_up(caplog):
     bench = runner_of(count=1)
     bench.runner.begin(np.array([True]), holds=False)

@@ -12,7 +12,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from drive_env import cia402
-from drive_env.devices import standard_commissioning
 from drive_env.devices.drive_quirks import DriveQuirks, drive_quirks_of
 from drive_env.devices.ethercat import EtherCatBehaviour, ethercat_of
 from drive_env.devices.gain_set import GainSet, load_gain_set
@@ -275,7 +274,8 @@ class Device(NamedTuple):
         if path.exists() and MOTORS.get(motor.name) == motor and self._scales_gains_as(written_for):
             preset = dict(tomllib.loads(path.read_text(encoding="utf-8"))["objects"])
         elif self.commissioning == STANDARD_COMMISSIONING:
-            preset = standard_commissioning.preset(self, motor)
+            rule = importlib.import_module("drive_env.devices.standard_commissioning")
+            preset = rule.preset(self, motor)
         elif self.presets.parent.parent != FOLDER:
             raise ValueError(
                 f"{self.name} has no preset for a {motor.name}; write {path} with [objects], name = integer, or take a "

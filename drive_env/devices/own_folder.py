@@ -20,7 +20,8 @@ from typing import Any
 
 from drive_env.devices.variants import Key, parse_key
 from drive_env.dictionary.bindings import Binding
-from drive_env.dictionary.units import find_unit
+from drive_env.dictionary.units import UNITS, find_unit
+from mechanics.near_names import did_you_mean
 from mechanics.untrusted import read_toml
 
 BINDINGS = "bindings.toml"
@@ -57,8 +58,8 @@ def own_bindings(folder: Path) -> dict[Key, Binding]:
         bindings[parse_key(text)] = binding = Binding(*parse_key(text), **row)
         try:
             find_unit(binding.unit)
-        except ValueError as error:
-            raise ValueError(f"{text}: {error}") from None
+        except ValueError:
+            raise ValueError(f"{text} has no unit {binding.unit!r}{did_you_mean(binding.unit, UNITS)}") from None
     return bindings
 
 

@@ -70,7 +70,7 @@ BY_THEMSELVES = (cia402.SUPPORTED_MODES,)
 # What a reader must know of objects that are stored and have no effect here.
 WITHOUT_EFFECT: Mapping[int, str] = {
     cia402.ABORT_CONNECTION_OPTION: "a lost master is answered by 1029h and a fault, whatever it says",
-    cia402.ERROR_CODE: "stays as it is: errors are told by EMCY and 1003h",
+    cia402.ERROR_CODE: "stays as it is: EMCY and 1003h report errors",
     cia402.SHUTDOWN_OPTION: "a shutdown takes the voltage away at once",
     cia402.DISABLE_OPERATION_OPTION: "disable operation brakes with the mode's ramp",
     cia402.HALT_OPTION: "halt brakes with the mode's ramp and holds the axis",

@@ -2,8 +2,8 @@
 
 CiA 306 says how an EDS is written; real ones have stray lines, other spellings of numbers and names, sections twice,
 lists that count wrong, sub-objects without their object. Nothing is invented here: what cannot be understood is left
-out, and each repair is told. Of a section or a key that stands twice the first counts, as with the functions of Windows
-that most tools read an EDS with.
+out, and each repair is listed. Of a section or a key that stands twice the first counts, as with the functions of
+Windows that most tools read an EDS with.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from canopen.objectdictionary import datatypes
 
+from drive_env import cia402
 from drive_env.dictionary.eds_values import (
     ACCESS,
     LEGAL_ACCESS,
@@ -35,7 +36,7 @@ USER_TYPES = 0x1B  # data types above are those of the file itself (CiA 301)
 HEADERS = ("FileInfo", "DeviceInfo", "DeviceComissioning", "DummyUsage", "Comments", "MandatoryObjects",
            "OptionalObjects", "ManufacturerObjects")  # fmt: skip
 LISTS = HEADERS[-3:]
-MANDATORY, MANUFACTURER = (0x1000, 0x1001, 0x1018), range(0x2000, 0x6000)
+MANDATORY, MANUFACTURER = (0x1000, 0x1001, 0x1018), range(0x2000, cia402.PROFILE_AREAS.start)
 KEYS = {
     key.lower(): key
     for key in ("ParameterName", "ObjectType", "DataType", "AccessType", "DefaultValue", "LowLimit", "HighLimit",
@@ -357,7 +358,7 @@ class _Repairer:
                 number = number_of(row[key])
                 if number is None:
                     if row[key]:
-                        self._tell(f"[{name}]", f"{key}={row[key]} is no number, and was left out")
+                        self._tell(f"[{name}]", f"{key}={row[key]} is not a number, and was left out")
                     del row[key]
                 else:
                     row[key] = str(number)

@@ -261,7 +261,7 @@ def start_move(
 ) -> None:
     """Start a move in pp to a position [inc], with the set-point handshake of bits 4 and 12.
 
-    A drive that would put the set-point into a buffer, until the move before has ended, is told to change it at once.
+    A drive that would put the set-point into a buffer, until the move before has ended, gets it with bit 5: at once.
 
     Raises:
         RuntimeError: If an axis is not enabled, or not in pp; nothing is written.
