@@ -23,7 +23,8 @@ def build_ethercat_world(bus: Bus, *, lockstep: bool) -> EtherCatWorld:
     Raises:
         BusConfigError: If it cannot be.
     """
-    from drive_env.ethercat.node import EtherCatNode
+    from drive_env.bus.world import without_motors
+    from drive_env.ethercat.coe_node import CoeNode
 
     check_seed(bus)
     world = EtherCatWorld(lockstep=lockstep)
@@ -35,9 +36,13 @@ def build_ethercat_world(bus: Bus, *, lockstep: bool) -> EtherCatWorld:
             for first in range(0, drives.num_axes, per_slave):
                 position = len(world.segment.slaves)
                 name = f"slave-{position}-{Path(drives.device.name).stem}.json"
-                device = EtherCatNode(drives, first, store=None if store is None else store / name)
-                slave = EtherCatSlave(device, takes_time=not lockstep, epoch=position)
-                world.add(slave, drives if first == 0 else None)
+                left_over = max(first + per_slave - drives.num_axes, 0)
+                spare = without_motors(drives, left_over) if left_over else None
+                device = CoeNode(
+                    drives, first, spare=spare, store=None if store is None else store / name, serial=position + 1
+                )
+                world.add(EtherCatSlave(device, takes_time=not lockstep, epoch=position))
+                world.drives += ([drives] if first == 0 else []) + ([] if spare is None else [spare])
     except (ValueError, OSError) as error:
         world.close()
         raise BusConfigError(str(error)) from None
