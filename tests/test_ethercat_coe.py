@@ -1,4 +1,4 @@
-"""The TMCM-3313 behind a slave controller: SDO, SDO information, states and process data, by ETG.1000.6 and its manual."""
+"""The TMCM-3313 behind a slave controller: SDO, SDO information, states, process data, by ETG.1000.6 and its manual."""
 
 from __future__ import annotations
 

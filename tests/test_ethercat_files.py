@@ -93,7 +93,8 @@ def test_the_esi_has_every_object_once_and_says_what_the_eeprom_says():
         ] == expected
     managers = [(one.text, one.get("StartAddress"), one.get("DefaultSize")) for one in device.findall("Sm")]
     assert managers == [
-        ("MBoxOut", "#x1000", "256"), ("MBoxIn", "#x1100", "256"), ("Outputs", "#x1200", "30"), ("Inputs", "#x1300", "30"),
+        ("MBoxOut", "#x1000", "256"), ("MBoxIn", "#x1100", "256"),
+        ("Outputs", "#x1200", "30"), ("Inputs", "#x1300", "30"),
     ]  # fmt: skip
     assert root.findtext("Vendor/Id") == "#x00000286"
     kind = device.find("Type")
@@ -113,7 +114,7 @@ def test_the_command_prints_it():
     assert done.exit_code == 0
     assert done.output == esi_text(DEVICE)
     done = CliRunner().invoke(app, ["esi", "tmcm1636"])
-    assert done.exit_code == 1
+    assert done.exit_code == 2
     assert "tmcm1636 has no EtherCAT; its data (device.toml) have no table [ethercat]" in done.output
 
 
@@ -127,7 +128,7 @@ GOOD = {
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"recieve": [1, 2]}, "ethercat has no 'recieve'; did you mean receive"),
+        ({"recieve": [1, 2]}, "ethercat has no 'recieve'; did you mean 'receive'?"),
         ({"send": [0x0F00, 256]}, "ethercat.send = 0F00h, 256 bytes: a mailbox has 32 bytes or more, between 1000h"),
         ({"send": [0x1000, 16]}, "ethercat.send = 1000h, 16 bytes: a mailbox has 32 bytes or more"),
         ({"eeprom": 1000}, "ethercat.eeprom = 1000 bytes must be a multiple of 128"),
