@@ -16,7 +16,10 @@ from tuning.auto.calmer_gains import calmer
 from tuning.auto.choice import Figures, choose_set, keep_the_better, try_rule
 from tuning.auto.moves import stand
 from tuning.auto.proving import Proof, Shown
-from tuning.auto.stages import RuleTried
+from tuning.auto.stages import IdentifiedAxes, RuleTried
+from tuning.identify.quick_identification import identify_briefly
+from tuning.identify.true_plant import true_plant
+from tuning.target import emulated
 
 RULE, OWN = [4000, 1500, 700, 1800, 700], [4000, 1000, 2000, 4800, 2000]
 NAN = float("nan")
@@ -89,9 +92,8 @@ def bench_on(ground, axes):
 def of(own, ground, bench, **known):
     n = len(own)
     cost = ground.cost(np.array(own))
-    start = recorded(own, shown=shown(cost, ground.swing(np.array(own)), np.ones(n, bool)), cost=np.ones(n),
-                     proof=cost, unseen=np.ones(n, bool), kept=np.zeros(n, bool), eased=np.zeros(n, int), **known)  # fmt: skip
-    return start
+    made = shown(cost, ground.swing(np.array(own)), np.ones(n, bool))
+    return recorded(own, shown=made, cost=np.ones(n), proof=cost, unseen=np.ones(n, bool), **known)
 
 
 def twins(monkeypatch, rule, own):
@@ -189,3 +191,32 @@ def test_what_shakes_in_spite_of_easing_gets_the_rule_s_gains_before_it_is_rejec
     found = stand(bench, start, of([OWN], ground, None, rule=peer(passed)), bench.target)
     assert (found.gains.tolist() == [RULE], not bench.journals[0].reason) == (passed, passed)
     assert passed or bench.journals[0].reason.startswith("it does not come to rest")
+
+
+# --- a gear with play ---------------------------------------------------------------------------------------------
+LOOSE = {
+    "motor.R_s": 0.2996, "motor.L_d": 0.0002285, "motor.L_q": 0.0002122, "motor.psi_m": 0.002528,
+    "motor.inertia": 1.914e-05, "motor.cogging_torque": 0.00397, "motor.coulomb": 0.002084, "motor.viscous": 1.953e-05,
+    "stage.adc_noise": 0.03061, "stage.velocity_filter": 313.6, "load.inertia": 0.05085, "load.stiffness": 5411.0,
+    "load.damping": 0.2619, "load.backlash": 0.005671, "load.efficiency": 0.8892, "load.coulomb": 0.1326,
+    "load.breakaway": 0.1284, "load.viscous": 0.03574,
+}  # fmt: skip
+
+
+def test_a_response_within_the_play_of_a_gear_is_no_identification_of_the_axis():
+    """It gave 0.42 of the inertia; the two moves, which drive through the play, give 0.8."""
+    with emulated(load="geared_joint", motor="ec_45_flat", parameters=LOOSE, num_threads=1) as target:
+        (found,) = identify_briefly(target)
+        true = true_plant(target.drives).inertia
+    assert found.value("inertia") == pytest.approx(true, rel=0.25)
+    assert "it was measured within the play of a gear" in found.doubt
+    assert IdentifiedAxes((found,), (None,)).doubtful == (True,)
+    assert not found.estimates["velocity_filter"].is_known
+
+
+def test_twins_of_an_axis_in_doubt_are_not_asked(monkeypatch):
+    monkeypatch.setattr(choice, "cost_on_twins", lambda *given: pytest.fail("twins"))
+    ground = Ground(lambda gains: np.where((gains == RULE).all(axis=1), 2.0, 1.0))
+    bench, start = bench_on(ground, 1), basis([RULE], found=SimpleNamespace(doubt="within the play of a gear"))
+    found = keep_the_better(bench, start, try_rule(bench, start, of([OWN], ground, None)), bench.target)
+    assert found.gains.tolist() == [OWN]

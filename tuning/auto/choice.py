@@ -140,7 +140,7 @@ def choose_set(costs: Floats, figures: Figures, where: Mask, lanes: int) -> Inte
 
     Args:
         costs: Measured cost J of the rule's gains, those found and, where there are any, those mixed, (sets, num_axes).
-        figures: Of the rule's gains and those found.
+        figures: Of the rule's gains and of those found.
         where: Axes of the machines that are judged, (num_axes,).
         lanes: Axes of a machine.
     """

@@ -153,7 +153,7 @@ def _compare(
                     )  # fmt: skip
             except KeyboardInterrupt:
                 if (done := so_far(machines, list(tuners), log)) is not None:
-                    print_lines([f"interrupted: of {len(machines)} machines these are the ones that are done"])
+                    print_lines([f"interrupted: of {len(machines)} machines these are done"])
                     _print_figures(done)
                 raise
 
@@ -215,8 +215,8 @@ def _where_the_rule_passes(comparison: Comparison) -> list[str]:
         median, p95, worse = row.median_there, row.p95_there, row.worse_there
         if median is not None and p95 is not None and worse is not None:
             lines.append(
-                f"{row.tuner} on the other {row.rule_passes}: median {median:.3f}, p95 {p95:.2f}, {100.0 * worse:.0f} % "
-                "more than 5 % worse"
+                f"{row.tuner} on the other {row.rule_passes}: median {median:.3f}, p95 {p95:.2f}, "
+                f"{100.0 * worse:.0f} % more than 5 % worse"
             )
     return lines
 
