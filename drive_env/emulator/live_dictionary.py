@@ -273,7 +273,7 @@ class LiveDictionary:
             stored[entry.index, entry.sub] = raw.copy()
         for key, raw in stored.items():
             if not self._is_bound(self.entries.find(key)):
-                self._values[key] = np.repeat(raw, self.num_axes)
+                self._values[key] = np.array(np.broadcast_to(raw, self.num_axes))
         return stored
 
     def _defaults(self, entry: Entry) -> Integers:
