@@ -240,7 +240,9 @@ class Life:
         self.mode(mode)
         ampere = ampere_per_count(self.drives)
         current = max(0.1 * self.drives.motor.rated_current, 0.3)
-        trace = self.run(0.02, {0x6071: np.tile(to_counts(self.drives, np.full(self.drives.num_axes, current)), (20, 1))})
+        trace = self.run(
+            0.02, {0x6071: np.tile(to_counts(self.drives, np.full(self.drives.num_axes, current)), (20, 1))}
+        )
         # The integrator follows the back-EMF of a motor that speeds up: the current lags.
         assert np.all(np.abs(np.mean(trace[0x6077][5:], axis=0) * ampere - current) < 0.25 * current + 0.06)
         trace = self.run(0.02, {0x6071: np.zeros(20, int)})

@@ -20,6 +20,8 @@ class Role(Enum):
     VELOCITY_DIVISOR = "rpm of a velocity unit: divisor"
     PEAK_CURRENT = "peak current of the motor, which torques are told in"
     MODE_GATE = "mode of the drive that a mode of operation needs"
+    OUTPUT_IMAGE = "process image into the drive that it begins with"
+    INPUT_IMAGE = "process image out of the drive that it begins with"
     FULL_STEPS = "full steps of a revolution"
     MICROSTEPS = "microsteps of a full step, as a power of two"
     CURRENT_LIMIT = "current limit"
