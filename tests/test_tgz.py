@@ -323,7 +323,7 @@ def test_analog_inputs_and_drive_status_are_parts_of_registers(wire):
         )
 
 
-# --- process images: structures as the manual prints them, but for names -----------------------------------------------
+# --- process images: structures as the manual prints them, but for names --------------------------------------------
 STRUCTURES = """
 1701 int32 607A uint32 60FF uint32 60FE:1 uint16 6040 int16 6071 uint16 23C6 int16 -
 1701 int32 687A uint32 68FF uint32 - uint16 6840 int16 6871 uint16 24C6 int16 -
