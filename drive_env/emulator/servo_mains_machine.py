@@ -54,6 +54,7 @@ def apply(records: Records, device: Device, motor: Motor, name: str, values: Flo
 def set_constants(records: Records, device: Device, motor: Motor) -> None:
     """Write what stage and motor are besides their parameters, and what the drive has been told of its motor."""
     servo_machine.set_constants(records, device, motor)
+    records["cyclic_wraps"] = 1  # positions of 64 bits inside: the 32 bits outside are their end
     records["chopper_enable"] = 1.0
     records["chopper_voltage"] = CHOPPER * device.overvoltage
     records["chopper_hysteresis"] = CHOPPER_HYSTERESIS * device.overvoltage

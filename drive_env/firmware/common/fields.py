@@ -31,6 +31,7 @@ PARAMETERS = (
     Field("position_offset", "f8", "rad", "60B0h"),
     Field("velocity_offset", "f8", "rad/s", "60B1h"),
     Field("torque_offset", "f8", "A", "60B2h, as peak i_q"),
+    Field("cyclic_wraps", "i4", "", "1: a set-point of csp goes on past the end of its 32 bits from the first turn on"),
     Field("interpolation_value", "f8", "", "60C2h:01", 1.0),
     Field("interpolation_index", "f8", "", "60C2h:02", -3.0),
     Field("max_velocity", "f8", "rad/s", "6081h: velocity of the profile"),

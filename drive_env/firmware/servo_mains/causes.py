@@ -30,7 +30,7 @@ from drive_env.firmware.servo.causes import overcurrent_high_side as overcurrent
 from drive_env.firmware.servo_mains.mains_link import owner
 from mechanics.compiled import inlined, stage
 
-REVERSE_TIME = 0.05  # s of speeding up against the current, after which the commutation is wrong
+REVERSE_TIME = 0.01  # s of speeding up against the current, after which the commutation is wrong
 REVERSE_SHARE = 0.5  # of the current's limit, that must be asked for
 STUCK_TIME = 0.1  # s of standing still under a brake that should be open
 # Bits of 1001h (TGZ manual): current, voltage, temperature, communication.
