@@ -18,7 +18,7 @@ class Role(Enum):
     POSITION_DIVISOR = "increments inside of a position unit: divisor"
     VELOCITY_NUMERATOR = "rpm of a velocity unit: numerator"
     VELOCITY_DIVISOR = "rpm of a velocity unit: divisor"
-    PEAK_CURRENT = "peak current of the motor, which torques are told in"
+    PEAK_CURRENT = "peak current of the motor, whose parts torques are"
     MODE_GATE = "mode of the drive that a mode of operation needs"
     OUTPUT_IMAGE = "process image into the drive that it begins with"
     INPUT_IMAGE = "process image out of the drive that it begins with"
