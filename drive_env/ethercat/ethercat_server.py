@@ -84,16 +84,19 @@ class EtherCatServer:
         return time.perf_counter() - self._start
 
     def _receive_in_time(self, frame: bytes) -> bytes | None:
-        self.world.time = max(self.world.time, self._now())
+        world = self.world
+        world.time = max(world.time, min(self._now(), world.next_cycle))  # never beyond a cycle that is due
         return self._receive(frame)
 
     def _catch_up(self) -> None:
-        """Let everything happen that is due."""
-        late = self._now() - self.world.next_cycle
+        """Let what is due happen, but one cycle at most: frames that wait are not to wait for several."""
+        world, now = self.world, self._now()
+        late = now - world.next_cycle
         if late > MOST_BEHIND:
             self.skipped += late
             self._start += late
-        self.world.run_until(self._now(), self._count_lateness, EARLY)
+            now -= late
+        world.run_until(min(now, world.next_cycle), self._count_lateness, EARLY if late < 0.0 else 0.0)
 
     def _count_lateness(self, due: float) -> None:
         self.lateness.add(self._now() - due)
