@@ -57,7 +57,7 @@ def main(interface: str, cycles: int) -> None:
     master.write_state()
     for _ in range(500):
         exchange(master)
-    seen["stopped"] = [word & 0x6F for word in IMAGE.unpack(drive.input)[::3]]
+    seen["stopped"] = [word & 0x4F for word in IMAGE.unpack(drive.input)[::3]]
     seen["error"] = refusal(lambda: drive.mbx_receive())
     master.state = pysoem.INIT_STATE
     master.write_state()
@@ -66,7 +66,7 @@ def main(interface: str, cycles: int) -> None:
 
 
 def patiently(call):
-    """Return what a call brings; SOEM waits 20 ms for room in a mailbox, in which a busy machine may do other things."""
+    """Return what a call brings; SOEM waits 20 ms for room in a mailbox, and a busy machine may do other things then."""
     end = time.monotonic() + PATIENCE
     while True:
         try:
