@@ -184,4 +184,5 @@ def to_raw(drives: EmulatedDrives, name: tuple[int, int], value: ArrayLike) -> N
 
 def _context(drives: EmulatedDrives, axes: slice) -> units.Context:
     whole = drives.inside.objects.context()
-    return units.Context(*(one[axes] if isinstance(one, np.ndarray) else one for one in whole))
+    scaler, lsb, ratio, peak = (one[axes] if isinstance(one, np.ndarray) else one for one in whole)
+    return units.Context(scaler, float(lsb), ratio, peak)

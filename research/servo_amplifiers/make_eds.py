@@ -11,14 +11,16 @@ import io
 from collections.abc import Iterator
 from pathlib import Path
 
+from drive_env import cia402
+
 HERE = Path(__file__).parent
 EDS = HERE.parents[1] / "drive_env" / "devices" / "tgz_d" / "tgz_d.eds"
 # Data types of CiA 301, table 44.
 TYPES = {"I8": 0x02, "I16": 0x03, "I32": 0x04, "U8": 0x05, "U16": 0x06, "U32": 0x07, "I64": 0x15}
 MANDATORY = (0x1000, 0x1001, 0x1018)
-MAKERS = range(0x2000, 0x6000)
+MAKERS = range(0x2000, cia402.PROFILE_AREAS.start)
 VARIABLE, ARRAY, RECORD = "0x7", "0x8", "0x9"
-ARRAYS = (0x1003, 0x1010, 0x1011, 0x1016, 0x1029, 0x1C12, 0x1C13, 0x4002, 0x4003, 0x607D, 0x60E3)
+ARRAYS = "1003 1010 1011 1016 1029 1C12 1C13 4002 4003 607D 60E3".split()
 HEAD = """[FileInfo]
 FileName=tgz_d.eds
 FileVersion=1
@@ -123,8 +125,7 @@ def eds() -> str:
         if len(subs) == 1 and 0 in subs:
             out.write("\n" + entry(subs[0], f"{index:04X}"))
             continue
-        first = index - (0x800 if 0x6800 <= index < 0x7000 else 0)
-        kind = ARRAY if first in ARRAYS else RECORD
+        kind = ARRAY if f"{cia402.of_first_axis(index):04X}" in ARRAYS else RECORD
         out.write(f"\n[{index:04X}]\nParameterName={subs[0]['name']}\nObjectType={kind}\nSubNumber=0x{len(subs):X}\n")
         for sub, row in sorted(subs.items()):
             out.write("\n" + entry(row, f"{index:04X}sub{sub:X}"))
