@@ -86,7 +86,7 @@ def test_an_axis_whose_d_mode_changes_stops_and_its_power_goes_off(drives, optio
     assert not np.any(trace[cia402.STATUSWORD][2:, 0] & REMOTE)
     stopping = trace[cia402.STATUSWORD][:, 0] & QUICK_STOP[0] == QUICK_STOP[1]
     ramp = before / field(drives, "quick_stop_deceleration")[0]
-    assert stopping.sum() * 1e-3 == pytest.approx(ramp, abs=0.05)
+    assert ramp <= stopping.sum() * 1e-3 < ramp + 0.2  # until the motor stands, too
     assert shows(drives, DISABLED)
     assert abs(drives.machine.rotor_speed[0]) < 1.0
     assert field(drives, "stage_on")[0] == 0.0
@@ -200,12 +200,12 @@ def test_cyclic_positions_go_on_past_the_end_of_the_counter_and_come_back_withou
     step_up(drives)
     start = int(drives.read(cia402.POSITION_ACTUAL)[0])
     true = float(drives.machine.rotor_angle[0])
-    way = np.concatenate([np.arange(500), np.full(50, 500), np.arange(500)[::-1], np.zeros(200)]).astype(int) * 800
+    way = np.concatenate([np.arange(500), np.full(400, 500), np.arange(500)[::-1], np.zeros(400)]).astype(int) * 800
     targets = (start + way + 2**31) % 2**32 - 2**31
     assert targets.min() < 0 < targets.max()
-    trace = drives.record([cia402.POSITION_ACTUAL], duration=1.25, play={cia402.TARGET_POSITION: targets})
+    trace = drives.record([cia402.POSITION_ACTUAL], duration=1.8, play={cia402.TARGET_POSITION: targets})
     moved = (trace[cia402.POSITION_ACTUAL][:, 0] - start + 2**31) % 2**32 - 2**31
-    assert moved[520:550] == pytest.approx(400_000, abs=60)
+    assert moved[850:890] == pytest.approx(400_000, abs=60)
     drives.advance(0.2)
     assert int(drives.read(cia402.POSITION_ACTUAL)[0]) == pytest.approx(start, abs=60)
     assert float(drives.machine.rotor_angle[0]) == pytest.approx(true, abs=60 * 2.0 * math.pi / TURN)
@@ -336,6 +336,7 @@ def by_parameters(drives):
 def by_brake(drives):
     drives.write(cia402.FOLLOWING_WINDOW, 0)
     drives.machine.brake = "closed"
+    put(drives, "image_limit", 20_000)  # all of its current would drag the motor through the brake
     drives.write(cia402.TARGET_VELOCITY, rpm(drives, 500))
 
 
