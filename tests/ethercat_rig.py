@@ -6,7 +6,7 @@ import re
 import struct
 
 from drive_env.ethercat import datagrams
-from drive_env.ethercat.application import AlState, AlStatusCode, Layout, MailboxPlace
+from drive_env.ethercat.application import AlState, AlStatusCode, MailboxPlace, SlaveLayout
 from drive_env.ethercat.datagrams import Datagram, DatagramCommand
 from drive_env.ethercat.sii_interface import checksum
 from drive_env.ethercat.slave import EtherCatSlave
@@ -14,8 +14,8 @@ from drive_env.ethercat.world import EtherCatWorld
 
 STATION = 0x1001
 RECEIVE, SEND = MailboxPlace(0x1000, 64), MailboxPlace(0x1080, 64)
-LAYOUT = Layout(RECEIVE, SEND, 0x1100, 0x1180, RECEIVE, SEND)
-NO_BOOTSTRAP = Layout(RECEIVE, SEND, 0x1100, 0x1180)
+LAYOUT = SlaveLayout(RECEIVE, SEND, 0x1100, 0x1180, RECEIVE, SEND)
+NO_BOOTSTRAP = SlaveLayout(RECEIVE, SEND, 0x1100, 0x1180)
 # What a master writes: place, length, control, status, activation of each sync manager.
 MAILBOXES = "00 10 40 00 26 00 01 00  80 10 40 00 22 00 01 00"
 PROCESS_DATA = "00 11 04 00 64 00 01 00  80 11 06 00 20 00 01 00"

@@ -120,7 +120,7 @@ class MailboxPlace:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class SlaveLayout:
     """Where a device has its sync managers; its SII says the same to the master (words 0014h to 001Bh, category 41).
 
     `receive` is what the master writes (sync manager 0), `send` what it reads (1). A device without
@@ -142,7 +142,7 @@ class Application(Protocol):
         layout: Where its sync managers lie.
     """
 
-    layout: Layout
+    layout: SlaveLayout
 
     @property
     def output_size(self) -> int:

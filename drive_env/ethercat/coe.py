@@ -16,7 +16,7 @@ MAILBOX_HEADER = 6
 QUEUE = 8  # emergencies for each axis of the node
 
 
-class Service(IntEnum):
+class CoeService(IntEnum):
     """Services of CoE (ETG.1000.6, table 28)."""
 
     EMERGENCY = 1
@@ -25,7 +25,7 @@ class Service(IntEnum):
     INFORMATION = 8
 
 
-def message(service: Service, content: bytes) -> bytes:
+def message(service: CoeService, content: bytes) -> bytes:
     """Return a message with its header."""
     return struct.pack("<H", service << 12) + content
 
@@ -56,7 +56,7 @@ class MailboxEmergencies:
         """Queue one; a full queue loses the newest."""
         if len(self._waiting) < self._room:
             content = emergency.code.to_bytes(2, "little") + bytes((error_register,)) + bytes(emergency.extra)
-            self._waiting.append(message(Service.EMERGENCY, content))
+            self._waiting.append(message(CoeService.EMERGENCY, content))
             self.told = error_register
 
     def take(self) -> list[bytes]:

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Mapping
 
 from drive_env.dictionary.aborts import NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX, UNKNOWN_COMMAND
-from drive_env.ethercat.coe import HEADER, MAILBOX_HEADER, Service, message
+from drive_env.ethercat.coe import HEADER, MAILBOX_HEADER, CoeService, message
 from drive_env.ethercat.object_descriptions import (
     BACKUP,
     MAPS_INPUT,
@@ -82,7 +82,7 @@ class SdoInformation:
         messages = []
         for left, part in zip(range(len(parts) - 1, -1, -1), parts, strict=True):
             head = struct.pack("<BBH", operation | (INCOMPLETE if left else 0), 0, left)
-            messages.append(message(Service.INFORMATION, head + part))
+            messages.append(message(CoeService.INFORMATION, head + part))
         return messages
 
 
@@ -103,4 +103,4 @@ def _entry(index: int, entry: EntryDescription, wanted: int) -> bytes:
 
 
 def _error(code: int) -> list[bytes]:
-    return [message(Service.INFORMATION, struct.pack("<BBHI", ERROR, 0, 0, code))]
+    return [message(CoeService.INFORMATION, struct.pack("<BBHI", ERROR, 0, 0, code))]

@@ -17,11 +17,11 @@ from drive_env.ethercat.application import (
     AlState,
     AlStatusCode,
     ClockSetting,
-    Layout,
     MailboxPlace,
+    SlaveLayout,
     SyncManagerSetting,
 )
-from drive_env.ethercat.coe import MailboxEmergencies, Service, split
+from drive_env.ethercat.coe import CoeService, MailboxEmergencies, split
 from drive_env.ethercat.coe_information import SdoInformation
 from drive_env.ethercat.coe_sdo import CoeSdoServer
 from drive_env.ethercat.object_descriptions import describe
@@ -85,7 +85,7 @@ class CoeNode:
             raise ValueError(f"{device.name} has no EtherCAT; its data (device.toml) have no table [ethercat]")
         self.drives = drives
         self.state = AlState.INIT
-        self.layout = Layout(
+        self.layout = SlaveLayout(
             MailboxPlace(*behaviour.receive), MailboxPlace(*behaviour.send), behaviour.outputs, behaviour.inputs,
             MailboxPlace(*behaviour.bootstrap_receive), MailboxPlace(*behaviour.bootstrap_send),
         )  # fmt: skip
@@ -205,13 +205,13 @@ class CoeNode:
     def coe(self, message: bytes, now: float) -> list[bytes]:
         """Return the CoE messages that answer one; ValueError for none that is answered."""
         service, content = split(message)
-        if service == Service.SDO_REQUEST:
+        if service == CoeService.SDO_REQUEST:
             try:
                 return self._sdo.request(content)
             except PowerLostError:
                 self.power_on(now)
                 return []
-        if service == Service.INFORMATION:
+        if service == CoeService.INFORMATION:
             return self._information.request(content)
         raise ValueError(f"service {service} of CoE is none that this device has")
 

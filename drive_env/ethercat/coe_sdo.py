@@ -21,7 +21,7 @@ from drive_env.dictionary.aborts import (
 )
 from drive_env.dictionary.access import check_readable, check_writable
 from drive_env.dictionary.entries import Entry
-from drive_env.ethercat.coe import HEADER, MAILBOX_HEADER, Service, message
+from drive_env.ethercat.coe import HEADER, MAILBOX_HEADER, CoeService, message
 from drive_env.node.axis import ObjectPort
 from drive_env.node.process_image import ImageObjects
 from drive_env.node.sdo_server import check_length, encode, size_of, take
@@ -35,7 +35,7 @@ LEAST = 7  # bytes of data in a segment, in use or not
 
 
 @dataclass(slots=True)
-class Transfer:
+class CoeTransfer:
     """A segmented transfer that is open; `multiplexor` is index and sub-index as in the messages."""
 
     multiplexor: bytes
@@ -67,7 +67,7 @@ class CoeSdoServer:
         self._entries = entries
         self._image = image
         self._room = room - MAILBOX_HEADER - HEADER
-        self._open: Transfer | None = None
+        self._open: CoeTransfer | None = None
 
     def close(self) -> None:
         """Forget an open transfer."""
@@ -89,8 +89,8 @@ class CoeSdoServer:
         except ObjectAccessError as error:
             self._open = None
             code = error.abort_code.to_bytes(4, "little")
-            return [message(Service.SDO_REQUEST, bytes((ABORTED,)) + multiplexor + code)]
-        return [] if answer is None else [message(Service.SDO_RESPONSE, answer)]
+            return [message(CoeService.SDO_REQUEST, bytes((ABORTED,)) + multiplexor + code)]
+        return [] if answer is None else [message(CoeService.SDO_RESPONSE, answer)]
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _answer(self, specifier: int, data: bytes) -> bytes | None:
@@ -121,7 +121,7 @@ class CoeSdoServer:
             return bytes((first,)) + data[1:4] + content.ljust(4, b"\0")
         part = content[: self._room - INITIATE]
         if len(part) < size:
-            self._open = Transfer(data[1:4], bytearray(content), None, position=len(part))
+            self._open = CoeTransfer(data[1:4], bytearray(content), None, position=len(part))
         return bytes((UPLOADED | complete | HAS_SIZE,)) + data[1:4] + size.to_bytes(4, "little") + part
 
     def _upload_segment(self, data: bytes) -> bytes:
@@ -149,7 +149,7 @@ class CoeSdoServer:
             raise ObjectAccessError(TOO_LONG, f"{len(content)} bytes came, {expected} were announced")
         self._check_room(index, sub, expected, is_whole=bool(data[0] & COMPLETE))
         if len(content) < expected:
-            self._open = Transfer(data[1:4], bytearray(content), finish, expected)
+            self._open = CoeTransfer(data[1:4], bytearray(content), finish, expected)
         else:
             finish(content)
         return answer
@@ -174,7 +174,7 @@ class CoeSdoServer:
         transfer.toggle ^= TOGGLE
         return bytes((SEGMENT_CONFIRMED | toggle,)) + bytes(7)
 
-    def _transfer(self, data: bytes, *, is_upload: bool) -> Transfer:
+    def _transfer(self, data: bytes, *, is_upload: bool) -> CoeTransfer:
         transfer = self._open
         if transfer is None or (transfer.finish is None) != is_upload:
             raise ObjectAccessError(UNKNOWN_COMMAND, "a segment of a transfer that was not initiated")

@@ -10,7 +10,7 @@ import struct
 
 from drive_env.ethercat import fmmu, registers
 from drive_env.ethercat.application import SyncManagerSetting
-from drive_env.ethercat.datagrams import DATAGRAM, DatagramCommand, Place
+from drive_env.ethercat.datagrams import DATAGRAM, DatagramCommand, DatagramPlace
 from drive_env.ethercat.distributed_clock import DistributedClock
 from drive_env.ethercat.fmmu import Fmmu
 from drive_env.ethercat.registers import REGISTERS_END
@@ -136,7 +136,7 @@ class SlaveController:
         self.count(registers.WATCHDOG_COUNTER)
 
     # --- datagrams ----------------------------------------------------------------------------------------------------
-    def process(self, frame: bytearray, places: list[Place], now: int) -> None:
+    def process(self, frame: bytearray, places: list[DatagramPlace], now: int) -> None:
         """Let a frame with these datagrams pass at world time `now` [ns]."""
         memory = self.memory
         for command, at, length in places:

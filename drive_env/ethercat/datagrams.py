@@ -44,7 +44,7 @@ class DatagramCommand(IntEnum):
     FRMW = 14
 
 
-class Place(NamedTuple):
+class DatagramPlace(NamedTuple):
     """Where a datagram lies in a frame: command, first byte of its header, length of its data [bytes]."""
 
     command: int
@@ -97,7 +97,7 @@ def begin(frame: bytes | bytearray) -> int | None:
     return None
 
 
-def find(frame: bytes | bytearray, start: int) -> list[Place] | None:
+def find(frame: bytes | bytearray, start: int) -> list[DatagramPlace] | None:
     """Return the datagrams of a frame whose header begins at `start`; None: the frame is not whole.
 
     It is whole when its datagrams fill exactly the length in its header, and the last of them alone says so.
@@ -114,7 +114,7 @@ def find(frame: bytes | bytearray, start: int) -> list[Place] | None:
     while at + DATAGRAM + COUNTER <= end:
         field = frame[at + 6] | frame[at + 7] << 8
         length = field & 0x7FF
-        places.append(Place(frame[at], at, length))
+        places.append(DatagramPlace(frame[at], at, length))
         at += DATAGRAM + length + COUNTER
         if not field & MORE:
             return places if at == end else None
