@@ -178,7 +178,7 @@ def test_soem_brings_four_slaves_to_op(spaces, tmp_path):
     try:
         assert server.stdout.readline() == "ready\n"
         done = subprocess.run(
-            inside(spaces.master, HERE / "ethercat_master.py", spaces.master_interface, "echo", 200),
+            inside(spaces.master, HERE / "ethercat_master.py", spaces.master_interface, 200),
             capture_output=True, text=True, timeout=PATIENCE,
         )  # fmt: skip
     finally:
@@ -191,43 +191,6 @@ def test_soem_brings_four_slaves_to_op(spaces, tmp_path):
     assert seen["expected"] == 3 * number
     assert seen["cycles"] == 200
     assert seen["wrong"] <= 5  # a frame that was not answered in time, on a machine that others use, too
-    assert log.stat().st_size > 10_000
-
-
-@needs_namespaces
-def test_soem_moves_a_served_drive(spaces, tmp_path):
-    """`drive-env serve` in one namespace, a stock master in the other; each frame is a millisecond (lockstep)."""
-    pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
-    log = tmp_path / "bus.pcap"
-    serve = (
-        "-c",
-        "from drive_env.programs import drive_env; drive_env()",
-        "serve",
-        "tmcm3313",
-        "--load",
-        "portal",
-        "--lockstep",
-    )
-    way = ("--interface", "ethercat", "--channel", spaces.slave_interface, "--pcap", log, "--stats")
-    server = subprocess.Popen(inside(spaces.slave, *serve, *way), stdout=subprocess.PIPE, text=True)
-    try:
-        assert "drive-env: 1 slave (tmcm3313, " in server.stdout.readline()
-        done = subprocess.run(
-            inside(spaces.master, HERE / "ethercat_master.py", spaces.master_interface, "drive", 300),
-            capture_output=True, text=True, timeout=PATIENCE,
-        )  # fmt: skip
-    finally:
-        server.terminate()
-        told, _ = server.communicate(timeout=PATIENCE)
-    assert done.returncode == 0, done.stderr
-    seen = json.loads(done.stdout.splitlines()[-1])
-    assert seen["slaves"] == 1 and seen["identities"] == [[0x286, 0xCF1, 65545]]
-    assert seen["name"] == "TMCM-3313" and seen["objects"] > 300
-    assert seen["safe_op"] and seen["op"] and seen["expected"] == 3
-    assert seen["words"] == [0x21, 0x23, 0x27]  # ready to switch on, switched on, operation enabled
-    assert seen["moved"] == pytest.approx(seen["asked"], abs=20) and seen["end"] == 0x27
-    assert seen["off"] == 0x40  # switch on disabled
-    assert "frames answered" in told and "drive-env: stopped" in told
     assert log.stat().st_size > 10_000
 
 
