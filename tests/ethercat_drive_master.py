@@ -66,7 +66,7 @@ def main(interface: str, cycles: int) -> None:
 
 
 def patiently(call):
-    """Return what a call brings; SOEM waits 20 ms for room in a mailbox, and a busy machine may be late."""
+    """Return what a call brings; SOEM waits 20 ms for room in a mailbox, a busy machine may do other things then."""
     end = time.monotonic() + PATIENCE
     while True:
         try:

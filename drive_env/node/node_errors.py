@@ -88,12 +88,17 @@ class NodeErrors:
     def register(self, without: Axis | None = None) -> int:
         """Return 1001h: what the axes and the node's communication have."""
         register = 0
-        for axis in self._axes:
+        for number, axis in enumerate(self._axes):
             if axis is not without:
-                register |= axis.error_register
+                register |= self._of_axis(number, axis.error_register)
         for condition in self.conditions.values():
             register |= condition.error_register
         return register
+
+    def _of_axis(self, number: int, register: int) -> int:
+        """Return an axis' share of 1001h; some devices show that it is not the first one's."""
+        bit = self._device.canopen.quirks.further_axis_bit
+        return register | bit if number and register else register
 
     def condition(self, name: str, now: float, key: Hashable = None) -> None:
         """Tell of a condition of the bus at `now` [s], unless it is known already; `key` says whose it is."""
@@ -106,7 +111,7 @@ class NodeErrors:
         emergency = self._device.emergencies[name].of_axis(0)
         self._told_last = 0
         self._sink.push(emergency, self.register() | condition.error_register)
-        self.history.add(emergency.code)
+        self.history.add(emergency.code, 0, self._number_of(emergency))
         self._flush(now)
 
     def condition_if_known(self, name: str, now: float) -> None:
@@ -129,15 +134,19 @@ class NodeErrors:
         cause = self._device.firmware.causes[queued.row]
         if queued.row == FAULT_RESET:
             self.conditions.clear()
-        register = queued.error_register | self.register(without=axis)
         self._told_last = self._axes.index(axis)
+        register = self._of_axis(self._told_last, queued.error_register) | self.register(without=axis)
         emergency = self._device.emergencies[cause.name].of_axis(self._told_last)
         if not self._is_told_of_module(queued.row, now):
             self._sink.push(emergency, register)
-            self.history.add(emergency.code, self._told_last)
+            self.history.add(emergency.code, self._told_last, self._number_of(emergency))
         if cause.reaction in (CUT, STOP) and queued.row != FAULT_RESET:
             self._flush(now)
             self._react()
+
+    def _number_of(self, emergency: EmergencyCode) -> int:
+        """Return the device's own number of an error, as 1003h has it."""
+        return emergency.extra[0] if self._device.canopen.quirks.history_tells_number else 0
 
     def _is_told_of_module(self, row: int, now: float) -> bool:
         """Return whether another axis has told of the same thing of the module in this cycle, and note it if not.

@@ -2,7 +2,8 @@
 
 Sync manager 2 carries what the master sends (outputs), sync manager 3 what the drive answers (inputs). 1C12h and 1C13h
 name the mapping objects that each carries, and those the objects, one behind the other without gaps. An image is not
-bound to the 8 bytes of a frame on CAN. It is changed from the outside in: no assignment (1C12h:00 = 0), no entries
+bound to the 8 bytes of a frame on CAN. Some devices have images that are ready-made (`fixed_images.py`), and no mapping
+objects: 1C12h and 1C13h name one of these. It is changed from the outside in: no assignment (1C12h:00 = 0), no entries
 (1600h:00 = 0), entries, their number, the assignment.
 """
 
@@ -23,14 +24,17 @@ from drive_env.dictionary.aborts import (
 )
 from drive_env.dictionary.access import check_allowed, check_limits, check_writable
 from drive_env.dictionary.entries import Entry, ObjectDictionary
+from drive_env.dictionary.roles import Role
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.node import mapping
 from drive_env.node.axis import Axis, ObjectPort
+from drive_env.node.fixed_images import PackedFields, fixed_images
 from drive_env.node.node_dictionary import NodeDictionary
 from drive_env.node.process_data import MappedObjects
 
 SYNC_MANAGER_TYPES = 0x1C00
 OUTPUTS, INPUTS = 0x1C12, 0x1C13  # what sync managers 2 and 3 carry
+SYNCHRONISATION = (0x1C32, 0x1C33)  # of both
 ASSIGNMENTS = {OUTPUTS: range(0x1600, 0x1800), INPUTS: range(0x1A00, 0x1C00)}  # and the mappings that each can
 
 
@@ -55,6 +59,7 @@ class ImageObjects:
         self._may_change = may_change
         self._allowed = device.allowed_values
         self._entries = entries
+        self._roles = device.roles
         carried = {direction: [i for i in indices if entries.has(i)] for direction, indices in ASSIGNMENTS.items()}
         # Of CANopen's PDOs, which the device may have too, each has a communication parameter 200h below its mapping.
         self._mappings = {
@@ -63,7 +68,8 @@ class ImageObjects:
             for index in indices
             if not entries.has(index - 0x200)
         }
-        owned = {SYNC_MANAGER_TYPES, *ASSIGNMENTS, *self._mappings}
+        self._fixed = fixed_images(device.presets.parent)
+        owned = {SYNC_MANAGER_TYPES, *ASSIGNMENTS, *SYNCHRONISATION, *self._mappings}
         self._factory = {(entry.index, entry.sub): _number(entry) for entry in entries if entry.index in owned}
         self._values = dict(self._factory)
 
@@ -104,6 +110,12 @@ class ImageObjects:
     def restart(self) -> None:
         """Bring the factory's image back, as a device does that is switched on."""
         self._values.update(self._factory)
+        for direction, role in ((OUTPUTS, Role.OUTPUT_IMAGE), (INPUTS, Role.INPUT_IMAGE)):
+            key = self._roles.get(role)
+            if key is not None:  # a register of the device's own says which image it begins with
+                raw = self._port_of(*key).read()
+                assert isinstance(raw, int), "the number of an image"
+                self._values[direction, 1] = raw
         self._configure()
 
     # --- the objects ------------------------------------------------------------------------------------------------
@@ -144,9 +156,12 @@ class ImageObjects:
         return index in ASSIGNMENTS or index in self._mappings
 
     def mapped(self, direction: int) -> list[tuple[int, list[int]]]:
-        """Return what `OUTPUTS` or `INPUTS` carry: mapping objects, and the entries of each as they are written."""
+        """Return what `OUTPUTS` or `INPUTS` carry: mapping objects, and the entries of each as they are written.
+
+        A ready-made image has no mapping object, and so no entries.
+        """
         return [
-            (index, [self._values[index, sub] for sub in range(1, self._values[index, 0] + 1)])
+            (index, [self._values[index, sub] for sub in range(1, self._values.get((index, 0), 0) + 1)])
             for index in self._assigned(direction)
         ]
 
@@ -155,7 +170,10 @@ class ImageObjects:
         """Take over what the objects say."""
         self._images = {direction: self._image(direction) for direction in ASSIGNMENTS}
 
-    def _image(self, direction: int) -> MappedObjects:
+    def _image(self, direction: int) -> MappedObjects | PackedFields:
+        assigned = self._assigned(direction)
+        if assigned and assigned[0] in self._fixed:
+            return PackedFields(self._fixed[assigned[0]].fields, self._port_of)
         mapped = [mapping.parse(raw) for _, raws in self.mapped(direction) for raw in raws]
         return MappedObjects([self._port_of(index, sub) for index, sub, _ in mapped])
 
@@ -178,9 +196,15 @@ class ImageObjects:
         direction = entry.index
         self._check_sub_index(entry)
         for index in [self._values[direction, sub] for sub in range(1, raw + 1)] if entry.sub == 0 else [raw]:
-            if self._mappings.get(index) != direction:
-                known = ", ".join(f"{one:04X}h" for one, way in self._mappings.items() if way == direction)
+            if not self._can_carry(direction, index):
+                numbers = [one for one in (*self._mappings, *self._fixed) if self._can_carry(direction, one)]
+                known = ", ".join(f"{one:04X}h" for one in numbers)
                 raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {index:04X}h; there is {known}")
+
+    def _can_carry(self, direction: int, index: int) -> bool:
+        """Return whether there is an image of that number, for that way."""
+        fixed = self._fixed.get(index)
+        return fixed.is_output == (direction == OUTPUTS) if fixed else self._mappings.get(index) == direction
 
     def _check_mapping(self, entry: Entry, raw: int) -> None:
         direction = self._mappings[entry.index]
