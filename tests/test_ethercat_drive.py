@@ -65,6 +65,7 @@ def seen(spaces):
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @needs_namespaces
 def test_soem_moves_all_three_axes_in_csp(seen):
     assert seen["slaves"] == 1 and seen["identity"] == [0x286, 3313, 0x10009] and seen["name"] == "TMCM-3313"
