@@ -92,9 +92,14 @@ TARGET_VELOCITY = 0x60FF
 MOTOR_TYPE = 0x6402
 SUPPORTED_MODES = 0x6502
 SINGLE_DEVICE_TYPE = 0x67FF
+# What commands or leads an axis, or its outputs: no parameters.
+COMMANDED = (
+    CONTROLWORD, MODE, TARGET_TORQUE, TARGET_POSITION, POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET,
+    INTERPOLATION_DATA, DIGITAL_OUTPUTS, TARGET_VELOCITY,
+)  # fmt: skip
 # --- modes of operation (6060h) --------------------------------------------------------------------------------------
 PP, VL, PV, TQ, HM, IP, CSP, CSV, CST = 1, 2, 3, 4, 6, 7, 8, 9, 10
-MODES = {"pp": PP, "pv": PV, "hm": HM, "csp": CSP, "csv": CSV, "cst": CST}
+MODES = {"pp": PP, "pv": PV, "tq": TQ, "hm": HM, "ip": IP, "csp": CSP, "csv": CSV, "cst": CST}
 
 
 # --- states and the statusword ---------------------------------------------------------------------------------------
@@ -139,6 +144,7 @@ STATE_CODING = {
 LIVE = (OPERATION_ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE)  # the power stage is on, or may be
 FAULT_BIT = Pattern(0x08, 0x08)  # fault or fault reaction active
 WARNING = Pattern(0x80, 0x80)
+REMOTE = Pattern(0x200, 0x200)  # the axis takes commands from its network
 TARGET_REACHED = Pattern(0x0400, 0x0400)
 INTERNAL_LIMIT = Pattern(0x0800, 0x0800)
 SET_POINT_ACKNOWLEDGED = Pattern(0x1000, 0x1000)  # in pp

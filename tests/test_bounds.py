@@ -35,6 +35,8 @@ def bounds_of(values=None, limits=None, *, scale=TURN, then=None, here=0, num_ax
 @pytest.mark.parametrize(
     ("unit", "scale", "count"),
     [
+        ("velocity unit", TURN, 2.5 * TURN / 60.0), ("velocity unit", 1.0, math.nan),  # 2.5 rpm, by the ratio below
+        ("0.1 rpm", TURN, 0.1 * TURN / 60.0),
         ("pps", TURN, 1.0), ("pps^2", TURN, 1.0), ("pps", 1.0, 1.0),
         ("rpm", TURN, TURN / 60.0), ("rpm/s", TURN, TURN / 60.0),
         ("rpm", 2.0, 2.0 / 60.0),  # the least scale that a drive may say
@@ -43,7 +45,9 @@ def bounds_of(values=None, limits=None, *, scale=TURN, then=None, here=0, num_ax
     ],
 )  # fmt: skip
 def test_a_count_of_a_speed_is_so_many_increments(unit, scale, count):
-    np.testing.assert_array_equal(increments_per_count(unit, np.array([scale, scale])), [count, count])
+    rotor = RotorAngle(2)
+    rotor.scale, rotor.ratio = np.array([scale, scale]), np.array([2.5, 2.5])
+    np.testing.assert_allclose(increments_per_count(unit, rotor), [count, count], rtol=1e-15)
 
 
 def test_a_drive_without_limits_may_turn_at_6000_rpm_and_go_anywhere():

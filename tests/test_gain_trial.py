@@ -70,9 +70,8 @@ def test_cost_of_one_term_at_a_time(settling, noise, overshoot, tripped, J):
 
 @pytest.mark.parametrize(("change", "oscillates"), [(0.99, False), (1.01, True)])
 def test_an_axis_oscillates_above_two_fifths_of_the_rated_current_from_millisecond_to_millisecond(change, oscillates):
-    step = round(change * OSCILLATION * MOTOR.rated_current * 1e3)
-    current = np.zeros((25, 2), np.int64)
-    current[1::2, 1] = step
+    current = np.zeros((25, 2))
+    current[1::2, 1] = change * OSCILLATION * MOTOR.rated_current
     assert shakes(current, MOTOR.rated_current).tolist() == [False, oscillates]
 
 
@@ -172,6 +171,7 @@ class Played:
 @pytest.fixture
 def trials(monkeypatch):
     monkeypatch.setattr(gain_trial, "device_of", lambda drives: DEVICE)
+    monkeypatch.setattr(gain_trial, "ampere_per_count", lambda drives: 1e-3)
     monkeypatch.setattr("drive_env.gains.device_of", lambda drives: DEVICE)
     monkeypatch.setattr("drive_env.trials.positioning.per_increment", lambda drives, name: 1.0)
     return lambda drives, axes=2: Trials(drives, MOTOR, axes, 0.004)

@@ -19,6 +19,7 @@ from tuning.compare import comparison as compare_module
 from tuning.compare import tuners
 from tuning.compare.comparison import compare
 from tuning.compare.comparison_files import save
+from tuning.compare.rule_check import rule_passes
 from tuning.compare.suite import load_suite, open_group
 from tuning.compare.tuners import MissingTunerError, find_tuner, search_tuner, tuner_rows
 from tuning.outcome import Outcome
@@ -256,6 +257,26 @@ def test_a_rule_identifies_once_for_all_rules(monkeypatch):
     assert not simc.failed and simc.relative < 2.0
 
 
+def test_a_rule_that_fails_the_checks_of_auto_is_no_peer_there():
+    """The first of four like machines has wild gains, which shake; on the others the rule passes and stands."""
+    gains, inertia = true_rule()
+    gains[0] = [4021, 1573, 30_000, 3000, 30_000]
+    with open_group(RIGID) as target:
+        assert rule_passes(target, gains, inertia).tolist() == [False, True, True, True]
+
+
+def test_figures_are_of_all_machines_and_of_those_where_the_rule_passes(monkeypatch):
+    monkeypatch.setattr(
+        compare_module, "rule_passes", lambda target, gains, inertia: np.array([True, False, True, True])
+    )
+    found = compare(RIGID, {"slow": moves_and_slows})
+    assert [row.rule_passes for row in found.rows] == [True, False, True, True]
+    (summary,), there = found.tuners, [row.relative for row in found.rows if row.rule_passes]
+    assert summary.machines == 4 and summary.rule_passes == 3
+    assert summary.median_there == pytest.approx(sorted(there)[1]) and summary.worse_there == 1.0
+    assert summary.p95_there == pytest.approx(np.percentile(there, 95))
+
+
 class Entry:
     """An entry point of a package that somebody has installed."""
 
@@ -343,6 +364,24 @@ def test_the_command_prints_the_table_and_writes_the_folder(tmp_path):
     first = list(csv.DictReader((folder / "tuners.csv").open(encoding="utf-8")))
     (row,) = json.loads(told.stdout)["tuners"]
     assert f"{row['median']:.6g}" == next(line["median"] for line in first if line["tuner"] == "baseline")
+
+
+def test_a_run_that_is_interrupted_prints_the_figures_it_has(monkeypatch, tmp_path):
+    """Two loads: the second is never done."""
+    calls = []
+
+    def stops(target, rng):
+        calls.append(target.machine)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return outcome(target, read_gains(target))
+
+    register(monkeypatch, Entry("stops", lambda: stops))
+    result = run("rank", "-t", "stops", "--count", 2, "--out", tmp_path / "out")
+    assert result.exit_code == 130
+    assert "interrupted: of 2 machines these are done" in result.stdout
+    assert "Robust cost relative to the baseline rule on 1 machine" in result.stdout
+    assert "--resume" in result.stderr
 
 
 def test_the_command_lists_tuners_and_suites():

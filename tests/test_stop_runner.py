@@ -43,6 +43,7 @@ def runner_of(values=None, count=2, *, bounds=None, latest=True, ranges=None, **
     )
     drives.start, drives.must_start = start, lambda: None
     drives.description.key = lambda entry, part: (entry.index, entry.sub)
+    drives.description.encode = lambda entry, value: int(value).to_bytes(2, "little")
     drives.description.decode = lambda entry, data: int.from_bytes(data, "little")
     drives.description.answer_timeout = 0.1
     axes = Axes(drives)

@@ -237,6 +237,48 @@ def test_drives_are_left_as_they_were_found_and_off_where_they_were_off(written)
     assert len(bench.target.drives.log) == 1  # an axis that was enabled stays so
 
 
+# --- the moves of identification ----------------------------------------------------------------------------------
+@pytest.mark.parametrize("swings", [0, 1, 2, 3])
+def test_an_axis_that_oscillates_in_them_gets_softer_gains_three_times(swings, written, monkeypatch):
+    bench = bench_of()
+    bench._drives, bench._reach = bench.target.drives, np.full(4, 10.0)
+    bench.target.current = 3.5
+    made = []
+
+    def watch(where, current, noise):
+        assert where.all() and current.tolist() == [3.5] * 4
+        made.append(SimpleNamespace(swung=np.array([False, len(made) < swings, False, False])))
+        return made[-1]
+
+    def identify(reach, where):
+        bench.target.drives.position = bench.target.drives.position + 100  # it ends elsewhere when it is stopped
+        return f"found by {reach[0]:.4f}"
+
+    monkeypatch.setattr(module, "OscillationWatch", watch)
+    monkeypatch.setattr(module, "ObservedDrives", lambda drives, watch: drives)
+    bench.method = SimpleNamespace(
+        measures_current=True, trials=lambda drives, axes: SimpleNamespace(identify=identify)
+    )
+    bench.target.drives.read = lambda name: (
+        bench.target.drives.position.copy() if name == cia402.POSITION_ACTUAL else np.full(4, 1000)
+    )
+    if swings == 3:
+        with pytest.raises(
+            RuntimeError, match="axis 1 oscillates in the moves of identification, even with 1/16 of the"
+        ):
+            bench._moved(GAINS)
+    else:
+        # Every move that was stopped leaves less of the way: 100 of 1,000 increments of a turn.
+        assert bench._moved(GAINS) == f"found by {10.0 - swings * 0.1 * 2.0 * np.pi:.4f}"
+    assert bench.moves.tolist() == [2 * min(swings + 1, 3)] * 4
+    for k, (gains, where) in enumerate(written, 1):
+        assert where == [False, True, False, False]
+        softer = np.array(gains)[1] / GAINS[1]
+        np.testing.assert_allclose(softer[[2, 4]], 0.25**k, rtol=0.3)
+        assert np.array(gains)[[0, 2, 3]].tolist() == GAINS[:3].tolist()
+    assert len(written) == swings
+
+
 # --- trials that a log has ----------------------------------------------------------------------------------------
 @pytest.fixture
 def searched(monkeypatch):

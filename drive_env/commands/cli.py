@@ -9,6 +9,8 @@ import typer
 from drive_env.commands.check_model import check_model
 from drive_env.commands.compiling import compile_kernels
 from drive_env.commands.eds import print_eds
+from drive_env.commands.esi import print_esi
+from drive_env.commands.ethercat import ethercat_app
 from drive_env.commands.export import export
 from drive_env.commands.fault import fault
 from drive_env.commands.get import get, set_object
@@ -55,6 +57,7 @@ PANELS = {
     "This installation": (
         ("list", list_names),
         ("eds", print_eds),
+        ("esi", print_esi),
         ("new", new_from_eds),
         ("compile", compile_kernels),
     ),
@@ -62,6 +65,7 @@ PANELS = {
     "Emulated drives": (("serve", serve), ("fault", fault), ("render", render), ("check-model", check_model)),
 }
 app.add_typer(lss_app, name="lss", rich_help_panel="Drives on a bus")
+app.add_typer(ethercat_app, name="ethercat", rich_help_panel="Emulated drives")
 app.add_typer(motor_app, name="motor", rich_help_panel="This installation")
 for panel, commands in PANELS.items():
     for name, function in commands:

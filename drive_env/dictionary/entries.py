@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import io
 import struct
@@ -185,6 +186,15 @@ class ObjectDictionary:
                 NO_SUCH_SUB_INDEX, f"object {index:04X}h has no sub-index {sub}; the highest is {max(subs)}"
             )
         raise ObjectAccessError(NO_SUCH_OBJECT, f"object {index:04X}h does not exist in {self.path.name}")
+
+    def without(self, prefix: str) -> ObjectDictionary:
+        """Return the dictionary less the objects whose names begin with `prefix`; with "", all of it."""
+        if not prefix:
+            return self
+        other = copy.copy(self)
+        other._entries = {key: one for key, one in self._entries.items() if not one.name.startswith(prefix)}
+        other._names = {name: key for name, key in self._names.items() if key in other._entries}
+        return other
 
     def _add(self, variable: ODVariable, name: str) -> None:
         kind = INTEGER_TYPES.get(variable.data_type or 0)

@@ -23,9 +23,11 @@ TWO_PI = 2.0 * np.pi
 class Context(NamedTuple):
     """What factors depend on, one value per axis or one for all."""
 
-    position_scaler: Floats | float  # [inc/rev]
+    position_scaler: Any  # [inc/rev]
     current_lsb: float  # [A] per LSB of the current loop
     rated_current: float = math.nan  # [A] of peak i_q, the base of CiA 402's thousandths
+    velocity_ratio: Any = 1.0  # rpm of a velocity unit (6094h)
+    peak_current: Any = math.nan  # of the motor [A], where torques are told in its parts
 
 
 class Unit(NamedTuple):
@@ -34,8 +36,8 @@ class Unit(NamedTuple):
     Attributes:
         period: Of a counter that goes on past the end of its type: how many integers it has; 0 of what saturates.
         specials: Integers that stand for an SI value which the factor does not give, with that value.
-        follows_scale: Whether the factor follows the scale of positions: what is stored in such a unit is kept in raw
-            integers when the scale changes.
+        follows_scale: Whether the factor follows a scale, of positions, velocities or torques: what is stored in such a
+            unit is kept in raw integers when a scale changes.
     """
 
     name: str
@@ -93,6 +95,25 @@ UNITS: dict[str, Unit] = {
         Unit("pps^3", "increments per second cubed", _angle, follows_scale=True),
         Unit("rpm", "revolutions per minute", lambda c: RPM),
         Unit("rpm/s", "revolutions per minute, per second", lambda c: RPM),
+        Unit(
+            "velocity unit",
+            "rpm times numerator over divisor of the velocity encoder resolution",
+            lambda c: RPM * c.velocity_ratio,
+            follows_scale=True,
+        ),
+        Unit(
+            "velocity unit/s",
+            "velocity units per second",
+            lambda c: RPM * c.velocity_ratio,
+            follows_scale=True,
+        ),
+        Unit(
+            "1/32767 M-Ipeak",
+            "parts of the motor's peak current, of which 32767 are the whole",
+            lambda c: c.peak_current / 32767.0,
+            follows_scale=True,
+        ),
+        Unit("inc 64", "increments of the position inside, 2^28 a revolution", lambda c: TWO_PI / 2.0**28),
         Unit("1/1000", "thousandths", lambda c: 1e-3),
         Unit("1/65536 rev", "1/65536 revolution", lambda c: TWO_PI / 65536.0),
         Unit("current P", "Q8.8: duty LSB per current LSB", lambda c: 1.0 / (256.0 * 32768.0 * c.current_lsb)),

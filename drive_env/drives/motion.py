@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drive_env import cia402
 from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import BasicDrives
+
+if TYPE_CHECKING:
+    from drive_env.devices import Device
 
 Mask = NDArray[np.bool_]
 Integers = NDArray[np.int64]
@@ -18,6 +25,7 @@ MODE_PATIENCE = 0.25  # s for which a mode may be asked for before something mus
 TAKEN_BACK = 0.05  # s after which a set-point whose acknowledge stays is in a drive's buffer
 REST = 0.25  # s at the target, or at home, after which a drive without bit 10 has got there
 NEAR = 10  # increments around a target, where the drive has no window of its own
+STOP_TIMEOUT = 5.0  # s, for the stop of an axis whose own mode was changed while it was enabled
 
 
 def wait_for(
@@ -57,13 +65,27 @@ def wait_for(
 
 
 def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
-    """Select a mode of operation by abbreviation on the axes that are not in it yet."""
+    """Select a mode of operation by abbreviation on the axes that are not in it yet.
+
+    Of a drive whose own mode must fit it, that is written, too. It stops an axis that is enabled where it sees the one
+    without the other, as on a bus; such an axis is enabled again.
+    """
     if mode not in cia402.MODES:
         raise ValueError(f"no mode is named {mode!r}; there are {', '.join(cia402.MODES)}")
     axes = np.ones(drives.num_axes, bool) if where is None else where
-    other = axes & (drives.read(cia402.MODE) != cia402.MODES[mode])
+    number = cia402.MODES[mode]
+    other = axes & (drives.read(cia402.MODE) != number)
+    needed = _own_modes(drives).get(number)
+    closed = axes & False if needed is None else axes & (drives.read(Role.MODE_GATE) != needed)
+    if not (other | closed).any():
+        return
+    was_on = closed & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     if other.any():
-        drives.write(cia402.MODE, cia402.MODES[mode], where=other)
+        drives.write(cia402.MODE, number, where=other)
+    if needed is not None and closed.any():
+        drives.write(Role.MODE_GATE, needed, where=closed)
+    if was_on.any():
+        _enable_again(drives, was_on)
     _await_mode(drives, mode, axes)
 
 
@@ -114,6 +136,40 @@ def _shown_modes(drives: BasicDrives) -> Integers | None:
         return None
 
 
+def _own_modes(drives: BasicDrives) -> Mapping[int, int]:
+    """Return the drive's own mode that each mode of operation needs; empty of drives that have no such thing."""
+    device: Device | None = getattr(drives, "device", None)  # BasicDrives need not know what they are
+    return {} if device is None else device.mode_gate
+
+
+def _enable_again(drives: BasicDrives, axes: Mask) -> None:
+    """Enable axes that the change of their own mode has stopped."""
+    drives.advance(STEP)
+    lost = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
+    if lost.any():
+        wait_for(drives, cia402.SWITCH_ON_DISABLED, STOP_TIMEOUT, "the end of the stop for its own mode", lost)
+        enable(drives, where=lost)
+
+
+def take_command(drives: BasicDrives, where: Mask | None = None) -> None:
+    """Have axes take commands that ignore them, since their own mode does not fit the mode of operation.
+
+    Whatever stops an axis calls it first: a command that is ignored stops nothing.
+    """
+    own_modes = _own_modes(drives)
+    if not own_modes:
+        return
+    axes = np.ones(drives.num_axes, bool) if where is None else where
+    ignores = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.REMOTE)
+    if not ignores.any():
+        return
+    needed = np.array([own_modes.get(int(mode), -1) for mode in drives.read(cia402.MODE)])
+    known = ignores & (needed >= 0)
+    if known.any():
+        drives.write(Role.MODE_GATE, np.maximum(needed, 0), where=known)
+        drives.advance(STEP)  # the drive looks at it once in a period
+
+
 def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = None, timeout: float = 1.0) -> None:
     """Take drives to operation enabled, a fault being reset first; `mode` is selected before.
 
@@ -132,7 +188,9 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
     in_fault = axes & cia402.matches(status, cia402.FAULT)
     if in_fault.any():
         reset_fault(drives, where=in_fault, timeout=timeout)
-    if mode is not None:
+    if mode is None:
+        take_command(drives, where)
+    else:
         select_mode(drives, mode, where)
     stopped = axes & cia402.matches(drives.read(cia402.STATUSWORD), cia402.QUICK_STOP_ACTIVE)
     if stopped.any():
@@ -164,12 +222,14 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
 
 def disable(drives: BasicDrives, where: Mask | None = None, timeout: float = 1.0) -> None:
     """Switch the voltage off; the axis coasts."""
+    take_command(drives, where)
     drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
     wait_for(drives, cia402.SWITCH_ON_DISABLED, timeout, "switch on disabled", where)
 
 
 def quick_stop(drives: BasicDrives, where: Mask | None = None) -> None:
     """Command a quick stop; what follows the ramp is 605Ah's."""
+    take_command(drives, where)
     drives.write(cia402.CONTROLWORD, cia402.QUICK_STOP, where=where)
 
 
@@ -179,6 +239,7 @@ def reset_fault(drives: BasicDrives, where: Mask | None = None, timeout: float =
     Raises:
         TimeoutError: If the cause is still there.
     """
+    take_command(drives, where)
     drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
     drives.write(cia402.CONTROLWORD, cia402.FAULT_RESET, where=where)
     axes = np.ones(drives.num_axes, bool) if where is None else where

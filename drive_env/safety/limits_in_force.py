@@ -27,7 +27,7 @@ from drive_env.safety.bounds import (
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits import NO_LIMIT, Limits
 from drive_env.safety.objects import POSITION
-from drive_env.safety.rotor import HOME_OFFSET, read_scale
+from drive_env.safety.rotor import HOME_OFFSET, read_ratio, read_scale
 
 if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
@@ -83,7 +83,9 @@ class LimitsInForce:
     def keep_place(self) -> None:
         """Note where the rotors are before an object is written that moves their scale; `place` is called after it."""
         position, scale = read_own(self._drives, POSITION, 0), read_scale(self._drives)
+        ratio = read_ratio(self._drives)
         with self._axes.lock:
+            self._axes.rotor.ratio = ratio
             self._axes.place(position, scale)
             self._axes.keep_place()
 
@@ -102,8 +104,9 @@ class LimitsInForce:
     def place(self) -> None:
         """Read where the rotors are and what a revolution counts; what moved scale or zero has not moved them."""
         position = read_own(self._drives, POSITION, 0)
-        scale = read_scale(self._drives)
+        scale, ratio = read_scale(self._drives), read_ratio(self._drives)
         with self._axes.lock:
+            self._axes.rotor.ratio = ratio
             self._axes.place(position, scale)
             self._must_place = False
             self.forget()

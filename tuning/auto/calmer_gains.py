@@ -73,12 +73,16 @@ def calmer(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, fact
                 row[[velocity_p, velocity_i, position_p]] *= share, share**integral, share**position
                 gains = tuple(map(int, np.maximum(np.rint(row), 1)))
                 rows.append(gains if response is not None else sound_gains(device, plant, gains))
+    # With those of the rule as they are the axis itself has stood, whatever their velocity P.
+    if recorded.rule is not None and recorded.rule.passed[k]:
+        rows.append(tuple(map(int, rule)))
     candidates = np.array(rows, np.int64)
     cost = cost_on_twins(bench, basis, [k], candidates[None])[0]
     if response is not None:  # it knows more than the model
         near = np.array([sensitivity(target, basis, response, row, k) > SENSITIVITY for row in candidates])
         cost = np.where(near & ~near.all(), np.inf, cost)
-    of_own, of_rule = np.split(cost, 2)
+    count = len(INTEGRAL) * len(POSITION)
+    of_own, of_rule = cost[:count], cost[count:]
     if of_own.min() < WELL * of_rule.min():
         return np.asarray(candidates[int(of_own.argmin())])
-    return np.asarray(candidates[len(of_own) + int(of_rule.argmin())])
+    return np.asarray(candidates[count + int(of_rule.argmin())])

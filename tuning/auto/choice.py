@@ -1,88 +1,246 @@
-"""Keep the better of the gains found and the baseline rule's, by digital twins, after slowing by the measured loop."""
+"""Keep the better of the gains found and the baseline rule's, by the same trials on the drives and by digital twins.
+
+The rule is a peer: its gains make the same trial and the same move as those found, and it is looked whether the axes
+stand with them. What was found is kept only where it is better on the drives and on the twins, or where the rule's
+gains fail what is asked of any. Axes of one machine are judged as a whole.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.safety.envelope import SafetyError
-from tuning.auto.bench import MOVE_TIME
+from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
 from tuning.auto.calmer_gains import cost_on_twins
 from tuning.auto.measured_margins import SENSITIVITY, sensitivity
-from tuning.auto.moves import show
+from tuning.auto.moves import shaking
+from tuning.auto.stages import RuleTried
 
 if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis, RecordedGains
+    from tuning.target import Target
 
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-BAD = 8.0  # measured cost J of a move, above which another is made with the rule's gains
-CLEARLY = 0.98  # of the robust cost on the twins: what is less than that is worth another move
+BAD = 8.0  # measured cost J of a move, above which the rule is tried, too, with gains that no twin has scored
+OVERTIME = 3.5  # s beyond the budget: without the rule's trial nobody knows whether the gains found are better
+RULE = 0  # of the sets of gains that are compared: the rule's, those found, and those mixed of both
 
 
-def choose(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
-    """Take the rule's gains where they are better on the twins and the measured loop is stable enough with them.
-
-    The gains found are better on the twins before they are slowed; afterwards they need not be.
-    """
-    recorded = _try_rule_where_bad(bench, basis, recorded)
-    better = _rule_is_better(bench, basis, recorded)
-    for k in map(int, np.flatnonzero(better)):
-        recorded = recorded.with_gains(k, basis.reference[k])
-        bench.journals[k].note(
-            "the gains of the baseline rule are kept: on the digital twins, the gains found by "
-            "search are worse once slowed"
-        )
-    return show(bench, basis, recorded, better) if better.any() else recorded
-
-
-def _try_rule_where_bad(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
-    """Record a move with the rule's gains on axes that moved badly, and keep what moved better."""
-    shown = recorded.shown
-    if shown is None or bench.ground is None:
+def try_rule(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
+    """Try the rule's gains in a trial and a move, and see whether the axes stand with them."""
+    shown, ground = recorded.shown, bench.ground
+    if shown is None or ground is None:
         return recorded
-    where = bench.going & shown.where & (shown.cost > BAD) & (recorded.gains != basis.reference).any(axis=1)
-    where = bench.whole_machines(where & bench.affordable(MOVE_TIME))
+    wanted = np.isfinite(recorded.cost) | shown.where & (shown.cost > BAD)
+    differs = (recorded.gains != basis.reference).any(axis=1)
+    where = _machines(bench, wanted & differs) & bench.affordable(TRIAL_TIME + MOVE_TIME - OVERTIME)
+    where = bench.whole_machines(where & bench.going)
     if not where.any():
         return recorded
+    nothing = np.zeros(bench.target.num_axes, bool)
     try:
-        with bench.spending(where):
-            with_rule = bench.ground.show(basis.reference, where)
+        with bench.spending(bench.target.together(where)):
+            proof = ground.run(basis.reference, where)
+        passed = bench.whole_machines(where & proof.passed & ~_reset(bench))
+        moved = None
+        if passed.any():
+            with bench.spending(bench.target.together(passed)):
+                moved = ground.show(basis.reference, passed)
+            failed = np.array([bool(why) for why in moved.reason]) | _reset(bench)
+            passed = bench.whole_machines(passed & ~failed & ~moved.restless)
     except SafetyError as error:
         bench.note(where, f"the envelope stopped the move with the baseline rule's gains: {error}")
-        return recorded
+        return replace(recorded, rule=RuleTried(where, nothing, np.full(len(where), np.nan)))
+    return replace(recorded, rule=RuleTried(where, passed & _far_from_the_edge(bench, basis, recorded), proof.cost))
+
+
+def _machines(bench: AutoBench, axes: Mask) -> Mask:
+    """Return all axes of the machines of which some are chosen, (num_axes,)."""
+    lanes = bench.target.axes_per_machine
+    return np.asarray(np.repeat(axes.reshape(-1, lanes).any(axis=1), lanes))
+
+
+def _reset(bench: AutoBench) -> Mask:
+    """Reset the faults of axes, which are the rule's doing; return which had one, (num_axes,)."""
     faulted = np.isin(np.arange(bench.target.num_axes), list(bench.faults()))
     if faulted.any():
+        assert bench.ground is not None, "proving makes it"
         with bench.spending(bench.target.together(faulted)):
             bench.ground.recover(faulted)
-        bench.drop_faults("moving with the baseline rule's gains, and the fault cannot be reset")
-    passed = np.array([not reason for reason in with_rule.reason])
-    better = bench.whole_machines(where & passed & ~with_rule.restless & (with_rule.cost < shown.cost))
-    for k in map(int, np.flatnonzero(better)):
-        recorded = recorded.with_gains(k, basis.reference[k])
-        bench.journals[k].note(
-            f"the gains of the baseline rule are kept: the measured cost J of a move was {with_rule.cost[k]:.2f} with "
-            f"them and {shown.cost[k]:.2f} with the gains found by search"
-        )
-    return recorded.with_move(with_rule._replace(where=better))
+        bench.drop_faults("trying the baseline rule's gains, and the fault cannot be reset")
+    return faulted
 
 
-def _rule_is_better(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Mask:
-    """Return the axes for which the rule's gains are better than the present ones, (num_axes,)."""
-    target, response = bench.target, recorded.response
-    better = np.zeros(target.num_axes, bool)
-    differs = (recorded.gains != basis.reference).any(axis=1)
-    affordable = bench.affordable(MOVE_TIME + basis.look_back_time(bench))
-    chosen = np.flatnonzero(bench.going & ~recorded.unseen & np.isfinite(recorded.cost) & differs & affordable)
-    if response is None or not chosen.size:
-        return better
-    axes = chosen.tolist()
-    both = np.stack([recorded.gains[chosen], basis.reference[chosen]], axis=1)
-    for k, (own, rule) in zip(axes, cost_on_twins(bench, basis, axes, both), strict=True):
-        better[k] = rule < CLEARLY * own and (
-            sensitivity(target, basis, response, basis.reference[k], k) <= SENSITIVITY
+def _far_from_the_edge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Mask:
+    """Return the machines on which the rule's gains are not too near to instability by the measured loop."""
+    far, response = np.ones(bench.target.num_axes, bool), recorded.response
+    if response is not None:
+        for k in map(int, np.flatnonzero(bench.going & ~recorded.unseen)):
+            far[k] = sensitivity(bench.target, basis, response, basis.reference[k], k) <= SENSITIVITY
+    return bench.whole_machines(far)
+
+
+class Figures(NamedTuple):
+    """What sets of gains are worth, each of shape (sets, num_axes); nan is not known.
+
+    drive: Measured cost J of a trial. twin: Robust cost on digital twins.
+    """
+
+    drive: Floats
+    twin: Floats
+
+
+def keep_the_better(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Target) -> RecordedGains:
+    """Keep what was found only on machines where it is better than the rule on the drives and on the twins.
+
+    Args:
+        bench: The drives.
+        basis: The rule's gains.
+        recorded: The gains found, and what the rule's have shown.
+        target: The drives, whose time is not counted.
+    """
+    rule, differs = recorded.rule, (recorded.gains != basis.reference).any(axis=1)
+    if rule is None:
+        return recorded
+    where = bench.whole_machines(_machines(bench, differs) & rule.passed & bench.going)
+    if not where.any():
+        return recorded
+    own = recorded.gains
+    recorded = _own_trial(bench, recorded, where)
+    figures = _figures(bench, basis, recorded, where)
+    wins = where & _wins(figures, 1)
+    mixed = np.where(wins[:, None], own, basis.reference)
+    sets, costs = [basis.reference, own], [figures.drive[0], figures.drive[1]]
+    some = _machines(bench, wins) & ~bench.whole_machines(wins) & where
+    if some.any() and (tried := _trial(bench, mixed, some)) is not None:
+        sets.append(mixed)
+        costs.append(tried)
+    chosen = choose_set(np.array(costs), figures, where, bench.target.axes_per_machine)
+    gains = np.take_along_axis(np.array(sets), np.maximum(chosen, 0)[None, :, None], axis=0)[0]
+    gains = np.where(where[:, None], gains, own)
+    changed = bench.whole_machines(_machines(bench, (gains != own).any(axis=1)) & where)
+    if not changed.any():
+        return recorded
+    return _take(bench, basis, recorded, gains, changed, figures, np.choose(np.maximum(chosen, 0), costs), target)
+
+
+def choose_set(costs: Floats, figures: Figures, where: Mask, lanes: int) -> Integers:
+    """Return which set of gains each axis gets, (num_axes,): the same one on all axes of a machine.
+
+    A set other than the rule's must be better than it on the drive, the machine as its worst axis; and those found on
+    the twins, too. Mixed ones are of axes on which each was so.
+
+    Args:
+        costs: Measured cost J of the rule's gains, those found and, where there are any, those mixed, (sets, num_axes).
+        figures: Of the rule's gains and of those found.
+        where: Axes of the machines that are judged, (num_axes,).
+        lanes: Axes of a machine.
+    """
+    worst = np.where(np.isfinite(costs), costs, np.inf).reshape(len(costs), -1, lanes).max(axis=2)
+    twin = figures.twin.reshape(2, -1, lanes).max(axis=2)
+    worst[1] = np.where(twin[1] > twin[RULE], np.inf, worst[1])  # what no twin has scored is judged by the drive
+    best = np.where(worst.min(axis=0) < worst[RULE], worst.argmin(axis=0), RULE)
+    return np.where(where, np.repeat(best, lanes), -1)
+
+
+def _wins(figures: Figures, own: int) -> Mask:
+    """Return the axes whose own gains are better on the drive, and on the twins where these have scored them."""
+    return np.asarray((figures.drive[own] < figures.drive[RULE]) & ~(figures.twin[own] > figures.twin[RULE]))
+
+
+def _own_trial(bench: AutoBench, recorded: RecordedGains, where: Mask) -> RecordedGains:
+    """Try gains that were changed since their trial once more: what is compared has made the same trial."""
+    stale = _machines(bench, (recorded.gains != recorded.proven).any(axis=1)) & where
+    if not stale.any():
+        return recorded
+    cost = _trial(bench, recorded.gains, stale)
+    if cost is None:
+        return replace(recorded, proof=np.where(stale, np.nan, recorded.proof))
+    proven = np.where(stale[:, None], recorded.gains, recorded.proven)
+    return replace(recorded, proof=np.where(stale, cost, recorded.proof), proven=proven)
+
+
+def _trial(bench: AutoBench, gains: Integers, where: Mask) -> Floats | None:
+    """Return J of a trial of machines, infinite where it did not pass, (num_axes,); None if the envelope stopped it."""
+    assert bench.ground is not None, "proving makes it"
+    try:
+        with bench.spending(bench.target.together(where)):
+            proof = bench.ground.run(gains, where)
+    except SafetyError as error:
+        bench.note(where, f"the envelope stopped a trial that was to be compared with the baseline rule's: {error}")
+        return None
+    faulted = _reset(bench)
+    return np.where(bench.whole_machines(proof.passed & ~faulted | ~where), proof.cost, np.inf)
+
+
+def _figures(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> Figures:
+    """Return what the rule's gains and those found are worth on machines."""
+    assert recorded.rule is not None, "it was tried"
+    twin = np.full((2, bench.target.num_axes), np.nan)
+    known = where & np.isfinite(recorded.cost) & ~np.array(basis.identified.doubtful)
+    # Twins take longer than an enabled axis may be left alone where time does not wait.
+    if known.any() and bench.target.drives.time_waits:
+        axes = np.flatnonzero(known)
+        both = np.stack([basis.reference[axes], recorded.gains[axes]], axis=1)
+        twin[:, axes] = cost_on_twins(bench, basis, axes.tolist(), both).T
+    return Figures(np.stack([recorded.rule.cost, recorded.proof]), twin)
+
+
+def _take(
+    bench: AutoBench,
+    basis: Basis,
+    recorded: RecordedGains,
+    gains: Integers,
+    changed: Mask,
+    figures: Figures,
+    cost: Floats,
+    target: Target,
+) -> RecordedGains:
+    """Take other gains on machines, if a move shows that their axes stand with them; else what was found stays."""
+    assert bench.ground is not None and recorded.shown is not None, "moves were recorded"
+    try:
+        with bench.spending(bench.target.together(changed)):
+            shown = bench.ground.show(gains, changed)
+    except SafetyError as error:
+        bench.note(changed, f"the envelope stopped the move with the baseline rule's gains: {error}")
+        return recorded
+    failed = np.array([bool(why) for why in shown.reason]) | _reset(bench) | shown.restless
+    changed = bench.whole_machines(changed & ~failed) & bench.going
+    # On emulated machines a load step is made, too: what swings on after it is not taken in place of what stood.
+    moved = replace(recorded, gains=np.where(changed[:, None], gains, recorded.gains), shown=shown)
+    moved, restless = shaking(bench, basis, moved, target, changed)
+    changed &= ~_machines(bench, np.isin(np.arange(len(changed)), list(restless)))
+    loaded = {k: one for k, one in moved.loaded.items() if changed[k]}
+    _tell(bench, basis, gains, changed, figures)
+    return replace(
+        recorded,
+        gains=np.where(changed[:, None], gains, recorded.gains),
+        shown=recorded.shown.replaced(shown._replace(where=changed)),
+        loaded={**recorded.loaded, **loaded},
+        kept=recorded.kept & ~changed,
+        proof=np.where(changed, cost, recorded.proof),
+        proven=np.where(changed[:, None], gains, recorded.proven),
+    )
+
+
+def _tell(bench: AutoBench, basis: Basis, gains: Integers, where: Mask, figures: Figures) -> None:
+    """Note on axes that get the rule's gains why they do."""
+    for k in map(int, np.flatnonzero(where)):
+        if not np.array_equal(gains[k], basis.reference[k]):
+            continue
+        text = (
+            f"the gains of the baseline rule are kept: the measured cost J of a trial was {figures.drive[RULE, k]:.2f} "
+            f"with them and {figures.drive[1, k]:.2f} with the gains found by search"
         )
-    return better
+        if np.isfinite(figures.twin[:, k]).all():
+            rule, own = figures.twin[:, k]
+            text += f", the robust cost on the digital twins {rule:.2f} and {own:.2f}"
+        bench.journals[k].note(text)

@@ -160,7 +160,8 @@ def _try_again(bench: AutoBench, basis: Basis, recorded: RecordedGains, calmed: 
     if where.any():
         with bench.spending(bench.target.together(where)):
             proof = bench.ground.run(recorded.gains, where)
-        recorded = replace(recorded, proof=np.where(where, proof.cost, recorded.proof))
+        proven = np.where(where[:, None], recorded.gains, recorded.proven)
+        recorded = replace(recorded, proof=np.where(where, proof.cost, recorded.proof), proven=proven)
         for k in map(int, np.flatnonzero(where & ~proof.passed)):
             bench.journals[k].stop(f"the lowered gains failed their trial: {proof.reason[k]}")
     return show(bench, basis, recorded, calmed & bench.going)

@@ -100,7 +100,8 @@ def ease(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, swing:
     factor = float(np.clip(EASED_TO * RESTLESS / swing, EASED_LEAST, EASED))
     # What less velocity P has not calmed may be the current loop's doing.
     has_fast_current = recorded.eased[k] and own[torque_p] > rule[torque_p]
-    if not np.array_equal(own, rule) and (swing > LIMIT_CYCLE or has_fast_current):
+    failed = recorded.rule is not None and recorded.rule.where[k] and not recorded.rule.passed[k]
+    if not np.array_equal(own, rule) and not failed and (swing > LIMIT_CYCLE or has_fast_current):
         gains = rule
         journal.note(f"the gains of the baseline rule are kept: with faster ones {why}")
     else:
@@ -129,11 +130,16 @@ def stand(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Targe
         recorded: The gains, and their move.
         target: The drives, whose time is not counted, since a load step is not part of tuning.
     """
-    for attempt in range(EASINGS + 1):
-        recorded, shaking = _shaking(bench, basis, recorded, target)
+    for attempt in range(EASINGS + 2):
+        recorded, restless = shaking(bench, basis, recorded, target)
         again = np.zeros(bench.target.num_axes, bool)
-        for k, (swing, why) in shaking.items():
-            if attempt == EASINGS or recorded.kept[k] or not bench.affordable(MOVE_TIME - OVERTIME)[k]:
+        for k, (swing, why) in restless.items():
+            last = attempt >= EASINGS or recorded.kept[k] or not bench.affordable(MOVE_TIME - OVERTIME)[k]
+            if last and attempt <= EASINGS and rule_stands(recorded, k) and not is_rule(basis, recorded, k):
+                recorded = with_rule(bench, basis, recorded, k)
+                bench.journals[k].note(f"the gains of the baseline rule are kept: {why}")
+                again[k] = True
+            elif last:
                 bench.journals[k].stop(f"it does not come to rest: {why}")
             else:
                 recorded = ease(bench, basis, recorded, k, swing, why)
@@ -148,11 +154,39 @@ def stand(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Targe
     return recorded
 
 
-def _shaking(
-    bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Target
+def rule_stands(recorded: RecordedGains, k: int) -> bool:
+    """Return whether the baseline rule's gains have passed, and stood at rest, on the machine of an axis."""
+    return recorded.rule is not None and bool(recorded.rule.passed[k])
+
+
+def is_rule(basis: Basis, recorded: RecordedGains, k: int) -> bool:
+    """Return whether an axis has the baseline rule's gains."""
+    return np.array_equal(recorded.gains[k], basis.reference[k])
+
+
+def with_rule(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int) -> RecordedGains:
+    """Return the baseline rule's gains on all axes of a machine, as they have stood there, of which one is given."""
+    lanes = bench.target.axes_per_machine
+    first = k - k % lanes
+    for axis in range(first, first + lanes):
+        recorded = recorded.with_gains(axis, basis.reference[axis])
+    here = np.arange(len(recorded.gains)) // lanes == k // lanes
+    return replace(recorded, kept=recorded.kept & ~here)
+
+
+def shaking(
+    bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Target, where: Mask | None = None
 ) -> tuple[RecordedGains, dict[int, tuple[float, str]]]:
-    """Return the axes that are not at rest: the swing of their current over the rated current, and a message."""
-    going, shown = bench.going, recorded.shown
+    """Return the axes that are not at rest: the swing of their current over the rated current, and a message.
+
+    Args:
+        bench: The drives.
+        basis: What to fall back on.
+        recorded: The gains, and their move.
+        target: The drives, whose time is not counted.
+        where: Axes that are looked at, (num_axes,); those that go on by default.
+    """
+    going, shown = bench.going if where is None else where, recorded.shown
     if shown is None or not going.any():
         return recorded, {}
     found = {}

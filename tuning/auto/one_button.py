@@ -17,7 +17,7 @@ import numpy as np
 
 from drive_env.gains import check_linear_model
 from tuning.auto.bench import AutoBench
-from tuning.auto.choice import choose
+from tuning.auto.choice import keep_the_better, try_rule
 from tuning.auto.loop_margins import judge, measure
 from tuning.auto.moves import look_back, show, stand
 from tuning.auto.result import collect
@@ -129,9 +129,12 @@ def prove_found(
         say("recording a move", 0.8)
         recorded = show(bench, basis, RecordedGains.of(tried))
         say("measuring the frequency response", 0.85)
-        recorded = choose(bench, basis, measure(bench, basis, recorded))
-        say("comparing with the gains before", 0.93)
-        recorded = stand(bench, basis, look_back(bench, basis, recorded), target)
+        recorded = measure(bench, basis, recorded)
+        say("comparing with the gains before", 0.9)
+        recorded = look_back(bench, basis, recorded)
+        say("comparing with the baseline rule", 0.93)
+        recorded = stand(bench, basis, try_rule(bench, basis, recorded), target)
+        recorded = keep_the_better(bench, basis, recorded, target)
         verdict = judge(bench, basis, recorded)
         tell_of_lateness(bench)
         say("writing", 0.96)

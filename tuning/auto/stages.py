@@ -38,6 +38,11 @@ class IdentifiedAxes:
     found: tuple[Identification | None, ...]
     plants: tuple[Plant | None, ...]
 
+    @property
+    def doubtful(self) -> tuple[bool, ...]:
+        """Whether the model of an axis, and so its digital twins, is of an axis as it is not."""
+        return tuple(one is not None and bool(one.doubt) for one in self.found)
+
     def known(self, axis: int) -> tuple[Plant, Identification]:
         """Return model and identification of an axis that goes on."""
         plant, found = self.plants[axis], self.found[axis]
@@ -120,6 +125,21 @@ class TriedGains:
 
 
 @dataclass(frozen=True)
+class RuleTried:
+    """What the baseline rule's gains have shown in the same trial and move as those found.
+
+    Attributes:
+        where: Axes on which they were tried, (num_axes,).
+        passed: Axes on whose machines they passed, stood at rest and are not too near to instability, (num_axes,).
+        cost: J by measured terms of the trial, (num_axes,).
+    """
+
+    where: Mask
+    passed: Mask
+    cost: Floats
+
+
+@dataclass(frozen=True)
 class RecordedGains(TriedGains):
     """What moves and frequency responses showed of the gains, which were lowered where they had to be.
 
@@ -128,6 +148,8 @@ class RecordedGains(TriedGains):
         eased: How often the gains of an axis were lowered because it shook at rest, (num_axes,).
         response: The velocity loop's, None if none was measured.
         unseen: Axes without a usable frequency response, (num_axes,).
+        proven: The gains whose trial `proof` is of, (num_axes, count).
+        rule: What the baseline rule's gains have shown, None where they were not tried.
         earlier: A recorded move with the gains before, None if none was made.
         kept: Axes that keep the gains before, which were better, (num_axes,).
         loaded: Response to a load step, of emulated machines, by axis.
@@ -137,6 +159,8 @@ class RecordedGains(TriedGains):
     eased: Integers
     response: MeasuredLoop | None
     unseen: Mask
+    proven: Integers
+    rule: RuleTried | None = None
     earlier: Shown | None = None
     kept: Mask = field(default_factory=lambda: np.zeros(0, bool))
     loaded: Mapping[int, StepResponse] = field(default_factory=dict)
@@ -147,7 +171,8 @@ class RecordedGains(TriedGains):
         known = {one.name: getattr(tried, one.name) for one in fields(TriedGains)}
         n = len(tried.gains)
         none = np.zeros(n, bool)
-        return cls(**known, shown=None, eased=np.zeros(n, np.int64), response=None, unseen=none, kept=none)
+        eased = np.zeros(n, np.int64)
+        return cls(**known, shown=None, eased=eased, response=None, unseen=none, proven=tried.gains, kept=none)
 
     def with_move(self, shown: Shown) -> RecordedGains:
         """Return this with a later move of some axes in place of theirs."""

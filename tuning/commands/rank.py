@@ -129,7 +129,7 @@ def _compare(
     """Compare tuners on machines; what is done of a run that is stopped is kept beside the folder."""
     import hashlib
 
-    from tuning.compare.comparison import compare
+    from tuning.compare.comparison import compare, so_far
     from tuning.compare.comparison_files import settings_text
     from tuning.compare.suite import groups
     from tuning.runs import unfinished
@@ -145,11 +145,17 @@ def _compare(
             for line in pool.differences():
                 print(f"note: {line}", file=sys.stderr)
             elsewhere = workers is not None or cluster is not None
-            with progress_bar(f"{len(tuners)} tuners on {len(machines)} machines") as show:
-                return compare(
-                    machines, tuners, seed=settings["seed"], log=log, progress=lambda what, share: show(share),
-                    pool=pool if elsewhere else None, trials=settings["trials"],
-                )  # fmt: skip
+            try:
+                with progress_bar(f"{len(tuners)} tuners on {len(machines)} machines") as show:
+                    return compare(
+                        machines, tuners, seed=settings["seed"], log=log, progress=lambda what, share: show(share),
+                        pool=pool if elsewhere else None, trials=settings["trials"],
+                    )  # fmt: skip
+            except KeyboardInterrupt:
+                if (done := so_far(machines, list(tuners), log)) is not None:
+                    print_lines([f"interrupted: of {len(machines)} machines these are done"])
+                    _print_figures(done)
+                raise
 
 
 def _report(comparison: Comparison, folder: Path, left_out: list[str], json: bool) -> None:
@@ -165,6 +171,16 @@ def _report(comparison: Comparison, folder: Path, left_out: list[str], json: boo
 
 
 def _print(comparison: Comparison, folder: Path, left_out: list[str]) -> None:
+    _print_figures(comparison)
+    lines = [f"left out: {text}" for text in left_out]
+    failures = {(row.tuner, row.note) for row in comparison.rows if row.failed}
+    lines += [f"{tuner} failed: {note}" for tuner, note in sorted(failures)]
+    lines.append(f"written to {folder}: tuners.csv, rivals.csv, machines.csv, comparison.png, settings.toml")
+    print_lines(lines)
+
+
+def _print_figures(comparison: Comparison) -> None:
+    """Print the table of tuners, and what they are worth machine by machine."""
     from tuning.compare.against_best import all_rivals
 
     machines = comparison.tuners[0].machines
@@ -182,11 +198,27 @@ def _print(comparison: Comparison, folder: Path, left_out: list[str]) -> None:
             f"{row.tuner}: robust cost {row.median:.3f} times that of the best other tuner on the same machine "
             f"(median, 95 % interval {row.low:.3f} to {row.high:.3f}), best on {row.better} of {row.machines} machines"
         )
-    lines += [f"left out: {text}" for text in left_out]
-    failures = {(row.tuner, row.note) for row in comparison.rows if row.failed}
-    lines += [f"{tuner} failed: {note}" for tuner, note in sorted(failures)]
-    lines.append(f"written to {folder}: tuners.csv, rivals.csv, machines.csv, comparison.png, settings.toml")
-    print_lines(lines)
+    print_lines([*lines, *_where_the_rule_passes(comparison)])
+
+
+def _where_the_rule_passes(comparison: Comparison) -> list[str]:
+    """Return the figures on the machines on which the baseline rule's own gains pass the checks of auto."""
+    first = comparison.tuners[0]
+    refused = [row.machine for row in comparison.of(first.tuner) if not row.rule_passes]
+    if not refused:
+        return []
+    lines = [
+        "The baseline rule's own gains fail the checks of drive-tune auto (they shake at rest, or fail a trial) "
+        f"on {len(refused)} of {first.machines} machines: {', '.join(refused)}."
+    ]
+    for row in comparison.tuners:
+        median, p95, worse = row.median_there, row.p95_there, row.worse_there
+        if median is not None and p95 is not None and worse is not None:
+            lines.append(
+                f"{row.tuner} on the other {row.rule_passes}: median {median:.3f}, p95 {p95:.2f}, "
+                f"{100.0 * worse:.0f} % more than 5 % worse"
+            )
+    return lines
 
 
 def _list() -> None:

@@ -26,6 +26,7 @@ from drive_env.gains import rule_gains
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
 from mechanics.untrusted import parse_json
+from tuning.compare.rule_check import rule_passes
 from tuning.compare.suite import SuiteMachine, groups, open_group
 from tuning.compare.tuners import RuleTuner, find_tuner, identify_all
 from tuning.drive_audit import KINDS, DriveAudit
@@ -55,6 +56,7 @@ class MachineRow:
     moves: Of all its axes, each from standstill to standstill (moves.py). aborts: As the tuner says.
     violations: Of all kinds. gains: Raw gains of the machine's first axis, by the names that its device has for them.
     note: What the tuner says, or why it failed; then the gains are those that it left behind.
+    rule_passes: Whether the baseline rule's gains themselves pass the checks of auto on this machine (rule_check.py).
     """
 
     tuner: str
@@ -70,6 +72,7 @@ class MachineRow:
     failed: bool
     gains: Mapping[str, int]
     note: str
+    rule_passes: bool = True
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,8 @@ class TunerRow:
 
     median, p95: Of the robust cost over the baseline rule's. worse: Share of machines that are more than 5 % worse.
     drive_seconds, moves: Median of a machine. aborts, violations: Of all machines together. failed: Machines on which
-    it gave up with an error.
+    it gave up with an error. rule_passes: Machines on which the baseline rule's own gains pass the checks of auto, with
+    median, p95 and share worse on these alone; None where there are none.
     """
 
     tuner: str
@@ -91,6 +95,10 @@ class TunerRow:
     aborts: int
     violations: int
     failed: int
+    rule_passes: int = 0
+    median_there: float | None = None
+    p95_there: float | None = None
+    worse_there: float | None = None
 
 
 @dataclass(frozen=True)
@@ -145,8 +153,26 @@ def compare(
         if log is not None:
             log.append(k, {"rows": np.array(_text_of(rows))})
     progress("", 1.0)
+    found = _compared(machines, list(tuners), done)
+    assert found is not None, "all tasks are done"
+    return found
+
+
+def so_far(machines: Sequence[SuiteMachine], tuners: Sequence[str], log: ShardLog) -> Comparison | None:
+    """Return the comparison on those machines that a run which was stopped has had all tuners tune; None if none."""
+    return _compared(machines, tuners, {k: _rows_of(str(arrays["rows"])) for k, arrays in log.done.items()})
+
+
+def _compared(
+    machines: Sequence[SuiteMachine], tuners: Sequence[str], done: Mapping[int, Sequence[MachineRow]]
+) -> Comparison | None:
+    """Return the comparison by the rows of tasks; on the machines that all tuners have tuned."""
+    tasks = [(indices, name) for indices in groups(machines) for name in tuners]
     found = {(tasks[k][1], i): row for k, own in done.items() for i, row in zip(tasks[k][0], own, strict=True)}
-    ordered = tuple(found[name, i] for name in tuners for i in range(len(machines)))
+    common = [i for i in range(len(machines)) if all((name, i) in found for name in tuners)]
+    if not common:
+        return None
+    ordered = tuple(found[name, i] for name in tuners for i in common)
     summaries = [_summary(name, [row for row in ordered if row.tuner == name]) for name in tuners]
     return Comparison(ordered, tuple(sorted(summaries, key=lambda row: (row.median, row.tuner))))
 
@@ -234,6 +260,8 @@ class Yardstick:
                     for J, volts in zip(inertia, target.supply, strict=True)
                 ]
             )
+            # On the machines themselves, fresh from the box; the score has its own.
+            self.rule_passes = rule_passes(target, rule, inertia)
         self.rule = self._score.set_reference(rule).robust_cost
 
     def score(self, gains: Integers) -> Floats:
@@ -324,6 +352,7 @@ def _rows(name: str, group: Sequence[SuiteMachine], tuned: _Tuned, yardstick: Ya
                 failed=outcome is None,
                 gains=dict(zip(names, map(int, tuned.gains[axes.start]), strict=True)),
                 note=" | ".join(notes).replace("\n", " "),
+                rule_passes=bool(yardstick.rule_passes[k]),
             )
         )
     return rows
@@ -342,6 +371,10 @@ def _checked_gains(outcome: Any, target: Target) -> Integers:
 
 def _summary(name: str, rows: Sequence[MachineRow]) -> TunerRow:
     relative = np.array([row.relative for row in rows])
+    there = np.array([row.relative for row in rows if row.rule_passes])
+    figures: tuple[float | None, ...] = (None,) * 3
+    if there.size:
+        figures = float(np.median(there)), float(np.percentile(there, 95)), float(np.mean(there > WORSE))
     return TunerRow(
         name,
         len(rows),
@@ -353,4 +386,6 @@ def _summary(name: str, rows: Sequence[MachineRow]) -> TunerRow:
         sum(row.aborts for row in rows),
         sum(row.violations for row in rows),
         sum(row.failed for row in rows),
+        len(there),
+        *figures,
     )

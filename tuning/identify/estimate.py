@@ -76,6 +76,7 @@ class Identification:
         wiring: The settings that encoder and halls need, by object, and those of the drive. With wrong ones the motor
             runs away or locks.
         fit: The linear model fitted to the frequency response, None where none was measured or it is another axis's.
+        doubt: Why a model made of this is not to be relied on beside what the drive itself shows; "" where it is.
     """
 
     estimates: Mapping[str, Estimate]
@@ -83,6 +84,7 @@ class Identification:
     told: Mapping[str, Estimate] | None = None
     wiring: Settings = field(default_factory=dict)
     fit: PlantFit | None = None
+    doubt: str = ""
 
     def value(self, name: str) -> float:
         """Return a value, nan where it was not identified."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drive_env import cia402
-from drive_env.firmware.common import fsa, profiles, s_ramp, six_point
+from drive_env.firmware.common import fsa, profiles, s_ramp, shaped, six_point
 from drive_env.firmware.common.limits import ROUNDING, corrected_maximum, corrected_minimum
 from mechanics.compiled import stage
 
@@ -93,6 +93,8 @@ def generate(drive, lane, ramp, dt):
         down = drive.deceleration[lane] if drive.deceleration[lane] > 0.0 else up
         if s_ramp.is_set(drive, lane):
             s_ramp.advance(drive, lane, target, v_max, up, down, dt)
+        elif shaped.is_set(drive, lane):
+            shaped.advance(drive, lane, target, v_max, up, down, dt)
         elif six_point.is_set(drive, lane):
             six_point.advance(drive, lane, target, v_max, up, down, dt)
         else:
